@@ -47,7 +47,7 @@ SELECTIONS: Final = {
     "background": Selection(
         "lidarops bench accuracy --case homogeneous --quick --out bench",
         ("Mean error of the background",),
-        ("length of the section (km)", "lag 1", "compressed", "scatter", "flagged", "published"),
+        ("length of the section (km)", "lag 1", "direct", "scatter", "flagged", "published"),
     ),
     "memory": Selection("lidarops bench throughput --case memory --out bench", ("Peak memory",)),
     "published": Selection(

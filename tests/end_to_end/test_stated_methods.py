@@ -28,7 +28,6 @@ BACKGROUND = {
 """Functions of the methods that products state; a later one may call an earlier one too."""
 RETRIEVAL = {
     "homogeneous": {
-        "compressed": "homogeneous/_compressed:weight_roots",
         "direct": "homogeneous/_methods:solve_by_direct_fit",
         "cubic": "homogeneous/_methods:solve_by_cubic",
         "known_background": "homogeneous/_methods:solve_with_known_background",

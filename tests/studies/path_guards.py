@@ -18,7 +18,7 @@ from studies.ablation import Guard, cluster_count, measure, table, write_table
 
 from lidarops.bench.stability import random_homogeneous
 from lidarops.flags import Quality
-from lidarops.retrieve.homogeneous import _fit_quality, _methods, path_fit
+from lidarops.retrieve.homogeneous import _fit_quality, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -29,22 +29,14 @@ PROFILES: Final = 60
 
 @contextmanager
 def limits(**changes: float) -> Iterator[None]:
-    """Replace limits of the tests, by name of `CommonLimits`."""
-    common, every = _fit_quality.common_limits, _fit_quality._limits
-    names = {"curvature": "trend", "square": "trend"}
-
-    def changed_common(*arguments: Any, **options: Any) -> Any:
-        return common(*arguments, **options)._replace(**changes)
+    """Replace limits of the tests, by name of `_Limits`."""
+    every = _fit_quality._limits
 
     def changed(*arguments: Any, **options: Any) -> Any:
         own = every(*arguments, **options)
-        fields = {names.get(name, name): value for name, value in changes.items()}
-        return replace(own, **{k: np.full_like(own.widening, v) for k, v in fields.items()})
+        return replace(own, **{k: np.full_like(own.widening, v) for k, v in changes.items()})
 
-    with (
-        mock.patch.object(_methods, "common_limits", changed_common),
-        mock.patch.object(_fit_quality, "_limits", changed),
-    ):
+    with mock.patch.object(_fit_quality, "_limits", changed):
         yield
 
 
@@ -79,8 +71,6 @@ GUARDS: Final = (
     Guard("AT_BOUND", int(HomogeneousQuality.AT_BOUND)),
     Guard("POOR_FIT", int(HomogeneousQuality.POOR_FIT)),
     Guard("NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
-    Guard("NOT_HOMOGENEOUS, square", off=_off(square=np.inf)),
-    Guard("NOT_HOMOGENEOUS, curvature", off=_off(curvature=np.inf)),
     Guard("OUTLIER", int(Quality.OUTLIER)),
     Guard("widening of estimated noise", off=_off(widening=1.0)),
     Guard("bend in the model error", off=without_bend),

@@ -221,7 +221,7 @@ def _overview(scores: Scores) -> Chapter:
     summary, paths = rows_of_scores(_summary(scores)), rows_of_scores(scores)
     methods_of = list(dict.fromkeys(method for _, method in scores))
     hollow = {method for method in methods_of if not _solves_all(scores, method)} | _INFORMED
-    drawn = [row for row in paths if row.method in {"compressed", "direct", "cubic"}]
+    drawn = [row for row in paths if row.method in {"direct", "cubic"}]
     profiles = next(row.value for row in paths if row.quantity == "profiles")
     return Chapter(
         "Error against time",
@@ -271,7 +271,6 @@ def _overview(scores: Scores) -> Chapter:
                         drawn,
                         f"{quantity.replace('_', ' ')}: RMSE",
                         x=_DIFFICULTY,
-                        hollow={HomogeneousMethod.DIRECT},
                         level=1.0,
                     )
                     for quantity in QUANTITIES
@@ -331,12 +330,12 @@ def _offset(
     power = path.powers(*draw)
     # A variance of 0 means no noise, so that its bias is not subtracted, as published.
     published = cubic(power, path.range, lag=1, variance=0.0).background
-    solution = methods()[HomogeneousMethod.COMPRESSED](power, path)
+    solution = methods()[HomogeneousMethod.DIRECT](power, path)
     background = solution.values["background"]
     score: Score = {
         _LENGTH: length / 1e3,
         "lag 1": mean((published - path.background) / scale),
-        "compressed": mean((background - path.background) / scale),
+        "direct": mean((background - path.background) / scale),
         "scatter": float(np.nanstd(background)) / scale,
         "expected": background_bias(path) / scale,
         "flagged": share(float(solution.flagged.mean())),
@@ -355,14 +354,14 @@ def _offsets(scores: Scores) -> Chapter:
         "the section. This is due to noise: with a lag of one bin and no correction for the "
         "noise, the cubic counts part of the signal as background, however many profiles are "
         "averaged. The tables do not state the signal; 17 times the noise at 2.5 km, 15 m bins "
-        "and 0.03 per km are assumed. The remaining error of the compressed method is the bias "
+        "and 0.03 per km are assumed. The remaining error of the direct fit is the bias "
         "of all least-squares solutions to second order in the noise; averaging removes it.",
         [
             Results(
                 "Mean error of the background, in units of the noise of one profile",
                 rows,
                 "Mean error and, in brackets, its standard error: of the cubic with a lag of one "
-                "bin, and of the compressed method with its scatter. Expected: second-order bias "
+                "bin, and of the direct fit with its scatter. Expected: second-order bias "
                 "of least squares, not meaningful where it exceeds the scatter.",
                 case="section",
                 method="mean of",
@@ -379,7 +378,7 @@ def _offsets(scores: Scores) -> Chapter:
                     panel(
                         title,
                         [row for row in near if row.method == f"{averaged}"],
-                        ("lag 1", "compressed", "published"),
+                        ("lag 1", "direct", "published"),
                         x=_LENGTH,
                         joined=True,
                         hollow={"published"},

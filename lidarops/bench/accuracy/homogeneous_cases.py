@@ -194,11 +194,7 @@ def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str,
 
 def methods() -> dict[str, PathSolver]:
     """Return a solver for every method of `fit_homogeneous_path` and for `TAIL_MEAN`, by name."""
-    solvers = {
-        str(method): _solver(method)
-        for method in HomogeneousMethod
-        if method is not HomogeneousMethod.AUTO
-    }
+    solvers = {str(method): _solver(method) for method in HomogeneousMethod}
     return solvers | {TAIL_MEAN: _fit_above_tail}
 
 

@@ -62,7 +62,7 @@ def deciding_bits(cluster: int) -> Iterator[Part]:
     power = power + rng.standard_normal((_DECIDING, paths.range.size))
     known = np.minimum(paths.extinction[:, 0], 100.0 / (paths.range[-1] - paths.range[0]))
     methods: dict[str, dict[str, Any]] = {
-        "compressed": {},
+        "direct": {},
         "known_extinction": {"method": "known_extinction", "extinction": known},
         "known_background": {"method": "known_background", "background": paths.background[:, 0]},
     }

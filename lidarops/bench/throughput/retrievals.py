@@ -22,7 +22,7 @@ from lidarops.bench.harness.timing import READ, affordable
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)
-_THREADED: Final = (HomogeneousMethod.COMPRESSED,)
+_THREADED: Final = (HomogeneousMethod.DIRECT,)
 _PRECISIONS: Final = ("float32", "float64")
 _MISSING: Final = 0.3
 """Share of the bins that are NaN, at random."""
@@ -64,7 +64,7 @@ def measure_solvers(effort: Effort, *, profiles: int | None = None) -> Study:
     )
     text = (
         f"Path {PATH.label}, {PATH.bins} bins; one variance for all profiles or none, no "
-        "correlation length or exposure: with those of products, compressed is solved by direct. "
+        "correlation length or exposure. "
         "All outputs and flags, one thread, least CPU time of interleaved repeats. numba is timed "
         "once compiled."
     )
@@ -89,8 +89,7 @@ def _solver_costs(
         method.value: partial(_solve, method, variance)
         for method in HomogeneousMethod
         # The cubic allows no gaps: it raises an error at once.
-        if method is not HomogeneousMethod.AUTO
-        and not (missing and method is HomogeneousMethod.CUBIC)
+        if not (missing and method is HomogeneousMethod.CUBIC)
     }
     calls: dict[str, tuple[Callable[[], object], int]] = {READ: (partial(np.max, power), count)}
     for name, solver in {**solvers, **peers}.items():

@@ -3,10 +3,8 @@
 `fit_homogeneous_path` (`path_fit`) checks its input and passes a `_problem.PathProblem` to the
 solver of the chosen `HomogeneousMethod` in `_methods`:
 
-1. `_compressed`: the default for profiles without gaps and with common weights, from a few linear
-   functionals (`_functional_tables`, `_vector_loops`).
-2. `_direct`: all others, by Newton steps over their bins (`_projection`).
-3. `_given`, `_linearized`, `_propagation`: with a given background, extinction or prior.
+1. `_direct`: least squares by Newton steps over the bins (`_projection`).
+2. `_given`, `_linearized`, `_propagation`: with a given background, extinction or prior.
 
 `_misfit` sums the residuals, `_fit_quality` estimates the noise and sets the quality bits.
 

@@ -1,10 +1,9 @@
 """Compiled least squares of the homogeneous path, one profile at a time.
 
-For profiles with gaps, weights of their own and any spacing of the bins. The objective of
-`lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is evaluated at fixed
-nodes, mostly on sums over groups of bins. Newton steps over all bins, each from one pass over them,
-improve the best node until they are negligible. Every sum runs over the bins of one profile in a
-fixed order: a result does not depend on the rest of the batch.
+The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
+evaluated at fixed nodes, mostly on sums over groups of bins. Newton steps over all bins improve the
+best node until they are negligible. Every sum runs over the bins of one profile in a fixed order: a
+result does not depend on the rest of the batch.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -52,6 +51,7 @@ from lidarops.retrieve.homogeneous._projection import (
     Sums,
     compiled,
     evaluate,
+    fusing,
     largest_of,
     make_scratch,
     power_of_two,
@@ -60,7 +60,6 @@ from lidarops.retrieve.homogeneous._projection import (
     summing,
     total_of,
 )
-from lidarops.retrieve.homogeneous._vector_loops import project_1_24, project_2_24
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
@@ -139,13 +138,23 @@ def _fold(values: Array, out: Array) -> None:
         out[k] = values[i] + values[i + 1] + values[i + 2] + values[i + 3]
 
 
+@fusing
+def _multiply(values: Array, shapes: Array, out: Array) -> None:
+    """Fill the products of values with the shapes of all nodes."""
+    for j in range(NODES):
+        out[j] = 0.0
+    for i in range(values.size):
+        value = values[i]
+        for j in range(NODES):
+            out[j] += value * shapes[i, j]
+
+
 @compiled
-def _multiply(rows: Array, shapes: Array, s: ProjectionScratch) -> None:
+def _multiply_all(rows: Array, shapes: Array, out: Array) -> None:
     """Fill the products of weights and values with the shapes of all nodes, and their squares."""
-    values, terms, out = rows.ctypes.data, rows.shape[1], s.products.ctypes.data
-    project_2_24(values, 8 * terms, shapes[0].ctypes.data, terms, out, values, 0)
-    squares = shapes[1].ctypes.data
-    project_1_24(values, 8, squares, terms, out + 2 * 8 * NODES, values, 0)
+    _multiply(rows[0], shapes[0], out[0])
+    _multiply(rows[1], shapes[0], out[1])
+    _multiply(rows[0], shapes[1], out[2])
 
 
 @compiled
@@ -185,9 +194,9 @@ def _start(g: Grid, s: ProjectionScratch, sums: Sums) -> float:
     if s.groups.shape[1] < s.w.size and total_of(s.w[:BLOCK]) > 0.0:
         _fold(s.w, s.groups[0])
         _fold(s.wz, s.groups[1])
-        _multiply(s.groups, g.group_shapes, s)
+        _multiply_all(s.groups, g.group_shapes, s.products)
     else:
-        _multiply(s.rows, g.shapes, s)
+        _multiply_all(s.rows, g.shapes, s.products)
     _take_lengths(s, sums)
     lengths, best, largest = s.products[0], 0, 0.0
     for j in range(NODES):

@@ -8,7 +8,7 @@ hardly affects; the tests allow for the scatter of that estimate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -80,56 +80,6 @@ class CountMoments:
     """Mean of the inverse expected counts."""
     inverse_square: Array
     """Mean of their inverse squares."""
-
-
-class CommonLimits(NamedTuple):
-    """Limits beyond which the tests fail, for profiles with the same number of bins."""
-
-    lowest_signal: float
-    largest_relative_error: float
-    misfit: float
-    curvature: float
-    square: float
-    """Limit of the residuals along the square of the shape, in standard deviations."""
-    outlier: float
-    widening: float
-    """Factor on standard errors; not a limit, but a function of the same counts."""
-
-
-def common_limits(bins: int, shapes: int, *, known_variance: bool) -> CommonLimits:
-    """Return the limits for profiles of `bins` bins without gaps.
-
-    Parameters
-    ----------
-    bins : int
-    shapes : int
-        Degrees of freedom of the curvature misfit.
-    known_variance : bool
-    """
-    limits_of = _known_limits if known_variance else _estimated_limits
-    counts = [np.array([float(count)]) for count in (bins, bins - 2, shapes)]
-    limits = limits_of(counts[0], counts[1], counts[2], 3)
-    misfit, _, outlier, widening, _ = (float(limit[0]) for limit in limits)
-    curvature, square = _shape_limits(bins, shapes, known_variance=known_variance)
-    return CommonLimits(
-        THRESHOLDS.least_signal,
-        THRESHOLDS.largest_relative_error,
-        misfit,
-        curvature,
-        square,
-        outlier,
-        widening,
-    )
-
-
-def _shape_limits(bins: int, shapes: int, *, known_variance: bool) -> tuple[float, float]:
-    """Return the limits of the tests of curvature and square, each at half the rate."""
-    rate = 0.5 * _FALSE_ALARM
-    if known_variance:
-        return float(special.chdtri(shapes, rate)), -float(special.ndtri(0.5 * rate))
-    dof = _DIFFERENCE_DOF * (bins - 2)
-    energy = shapes * special.fdtri(shapes, dof, 1.0 - rate)
-    return float(energy), -float(special.stdtrit(dof, 0.5 * rate))
 
 
 def judge_fit(
@@ -223,7 +173,7 @@ def curved_widening(relative_error: Any) -> Any:
     the background is off by ``z / (1 - q z)`` of the errors that follow from that curvature.
     The factor holds such values within 4 stated errors if z is less than the quantile of the normal
     distribution at `Thresholds.false_curved`. Of simulated thin sections near the limit of
-    determination, 3 to 4 in a thousand are farther off. Also compiled for scalars.
+    determination, 3 to 4 in a thousand are farther off.
 
     Parameters
     ----------

@@ -10,27 +10,21 @@ from typing import Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.flags import Quality
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.homogeneous import _compressed, _direct, _given, _linearized, _propagation
+from lidarops.retrieve.homogeneous import _direct, _given, _linearized, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
 from lidarops.retrieve.homogeneous._fit_quality import (
     CountMoments,
-    common_limits,
     curved_widening,
     judge_fit,
 )
-from lidarops.retrieve.homogeneous._functional_tables import Tables, make_tables
 from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
 from lidarops.retrieve.homogeneous._projection import make_grid
-from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
 _FITTED_BACKGROUND: Final = np.full(1, np.nan)
-_UNIFORM: Final = 4.0 * np.finfo(np.float64).eps
-"""Deviation from even spacing by rounding, over the last range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,63 +34,6 @@ class _AddedVariances:
     background: Array
     amplitude_relative: Array
     extinction: Array
-
-
-def solve_by_compression(problem: PathProblem) -> PathSolution:
-    """Solve by a few functionals of each profile where they apply, else by the direct fit."""
-    tables = _tables(problem)
-    if tables is None:
-        return solve_by_direct_fit(problem)
-    # The limits of the kernel are those of normal noise.
-    few = np.nanmin(problem.counts(), axis=1, initial=np.inf) < THRESHOLDS.many_counts
-    if few.all():
-        return solve_by_direct_fit(problem)
-    count, bins = problem.power.shape
-    out = np.empty((len(_compressed.RESULTS), count))
-    quality, state = np.empty(count, np.int32), np.empty(count, np.int64)
-    _compressed.solve_compressed(
-        frozen(problem.power),
-        _compressed.weight_roots(tables, problem.common_weights, problem.power),
-        tables.envelope.astype(problem.power.dtype),
-        tables,
-        _compressed.Mode(problem.known_variance, problem.rounding),
-        common_limits(bins, _compressed.CURVATURES - 2, known_variance=problem.known_variance),
-        out,
-        quality,
-        state,
-    )
-    solution = PathSolution(
-        **dict(zip(_compressed.RESULTS, out, strict=True)),
-        mean_range=np.where(quality & int(Quality.NO_SIGNAL), np.nan, tables.mean_range),
-        valid_bins=np.full(count, bins, np.int32),
-        quality=quality,
-    )
-    routed = np.flatnonzero((state == _compressed.ROUTED) | few)
-    if routed.size == 0:
-        return solution
-    if routed.size == count:
-        return solve_by_direct_fit(problem)
-    return solution.updated(routed, solve_by_direct_fit(problem.select(routed)))
-
-
-def _tables(problem: PathProblem) -> Tables | None:
-    """Return the tables of the functionals, or None where they do not apply."""
-    range_, limits = problem.range, THRESHOLDS
-    if not limits.fewest_compressed_bins <= range_.size <= limits.most_compressed_bins:
-        return None
-    even = np.linspace(range_[0], range_[-1], range_.size)
-    if (
-        not problem.common_noise
-        or problem.correlation_length is not None
-        or range_[-1] - range_[0] < limits.thinnest * range_[0]
-        or np.max(np.abs(range_ - even)) > _UNIFORM * range_[-1]
-    ):
-        return None
-    weights = problem.common_weights
-    if not np.all((weights > 0.0) & (weights < _compressed.HUGE)):
-        return None
-    tables = make_tables(range_, weights, problem.bounds)
-    return tables if tables.monotonic else None
 
 
 def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
@@ -209,7 +146,8 @@ def _count_moments(problem: PathProblem) -> CountMoments | None:
     """Return the moments of the counts of the used bins; None where the noise is normal."""
     if problem.exposure is None:
         return None
-    counts = np.where(np.isfinite(problem.power), problem.counts(), np.nan)
+    expected = problem.noise * problem.exposure[:, np.newaxis] ** 2
+    counts = np.where(np.isfinite(problem.power), expected, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
         # Profiles without bins have no moments.
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -268,7 +206,6 @@ def _solution(
         extinction_standard_error=masked(extinction_error, fitted),
         signal_to_noise=masked(signal_to_noise, fitted),
         reduced_chi2=masked(verdict.reduced_chi2, fitted),
-        curvature_misfit=np.full(fit.status.shape, np.nan),
         mean_range=masked(fit.mean_range, fitted),
         background_bend=masked(fit.background_bend, fitted),
         extinction_bend=masked(fit.extinction_bend, fitted),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,6 @@ class PathProblem:
     noise: Array
     """(profile or 1, bin): variances or weights; a bin is left out where that is not positive
     and finite."""
-    common_noise: bool
-    """Whether `noise` was given for all profiles together. One row for a batch of one profile is
-    not common noise: the choice of the solver must not depend on the batch."""
     known_variance: bool
     """Whether `noise` holds variances, else weights up to a common factor."""
     bounds: tuple[float, float]
@@ -59,27 +56,6 @@ class PathProblem:
             return 1.0
         return float(self.range[-1] - self.range[0]) / (self.range.size - 1)
 
-    @property
-    def common_weights(self) -> Array:
-        """(bin,): weights of all profiles where the noise is common."""
-        with np.errstate(divide="ignore"):
-            weights: Array = 1.0 / self.noise[0] if self.known_variance else self.noise[0]
-        return weights
-
-    def counts(self) -> Array:
-        """Return (profile or 1, bin) expected counts, infinite where the noise is normal."""
-        if self.exposure is None:
-            return np.full((1, 1), np.inf)
-        return np.asarray(self.noise * self.exposure[:, np.newaxis] ** 2)
-
-    def select(self, rows: npt.NDArray[np.intp]) -> PathProblem:
-        """Return the problem of the selected profiles, for methods that need the power alone."""
-        noise = self.noise if self.noise.shape[0] == 1 else self.noise[rows]
-        exposure = self.exposure
-        if exposure is not None and exposure.shape[0] > 1:
-            exposure = exposure[rows]
-        return replace(self, power=self.power[rows], noise=noise, exposure=exposure)
-
 
 @dataclass(frozen=True, slots=True)
 class PathSolution:
@@ -94,8 +70,6 @@ class PathSolution:
     signal_to_noise: Array
     """Amplitude over its standard error at known extinction, with the sign of the amplitude."""
     reduced_chi2: Array
-    curvature_misfit: Array
-    """Energy of the curvature functionals over the noise; NaN where the solver has none."""
     mean_range: Array
     """m, weighted over the bins used; NaN where nothing was fitted."""
     background_bend: Array
@@ -105,12 +79,3 @@ class PathSolution:
     """The same for the extinction."""
     valid_bins: Flags
     quality: Flags
-
-    def updated(self, rows: npt.NDArray[np.intp], other: PathSolution) -> PathSolution:
-        """Return a copy with the selected profiles replaced by those of `other`."""
-        merged = {}
-        for field in fields(self):
-            values = getattr(self, field.name).copy()
-            values[rows] = getattr(other, field.name)
-            merged[field.name] = values
-        return PathSolution(**merged)

@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.homogeneous._vector_loops import STRIDE, shape_moments
 
 Array = npt.NDArray[np.float64]
 
@@ -28,7 +27,7 @@ GROUPED: Final = 4
 _MOST_SINGLE: Final = 128
 """Profiles with more bins are searched on the first `BLOCK` bins and on sums over groups of
 `GROUPED` bins beyond."""
-BLOCK: Final = STRIDE
+BLOCK: Final = 16
 """Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning. Functions that may be
@@ -45,6 +44,8 @@ _INLINED: Final[dict[str, Any]] = {
 _BARE: Final[dict[str, Any]] = {**_INLINED, "_nrt": False}
 allocating = numba.njit(**_INLINED)
 compiled = numba.njit(**_BARE)
+fusing = numba.njit(**_BARE, fastmath={"contract"})
+"""Compile a sum in the order of its terms, each added by one fused multiplication."""
 summing = numba.njit(**_BARE, fastmath=_SUMS)
 finding = numba.njit(**_BARE, fastmath={*_SUMS, "nnan"})
 
@@ -85,6 +86,14 @@ class ProjectionScratch(NamedTuple):
     """The second."""
     z: Array
     phi: Array
+    shape: Array
+    """phi, weighted."""
+    square: Array
+    """Its square, weighted."""
+    signal: Array
+    """phi times the weighted values."""
+    lever: Array
+    ones: Array
     residual: Array
     used: Array
     products: Array
@@ -188,6 +197,11 @@ def make_scratch(g: Grid) -> ProjectionScratch:
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.ones(n),
+        np.zeros(n),
+        np.zeros(n),
         np.zeros((3, NODES)),
         np.zeros((2, g.group_shapes.shape[1])),
     )
@@ -236,35 +250,63 @@ def total_of(values: Array) -> float:
 
 
 @compiled
-def _moments(tau: float, g: Grid, s: ProjectionScratch) -> Any:
-    """Fill the shape; return the products of `_vector_loops.shape_moments`."""
-    envelope = g.envelope
+def _fill_shape(tau: float, g: Grid, phi: Array) -> None:
+    """Fill the shape of a tau, over blocks of an even spacing by the decay within a block."""
     if g.step == 0.0:
-        envelope = s.phi
-        for i in range(envelope.size):
-            envelope[i] = math.exp(-2.0 * tau * g.x[i]) * g.envelope[i]
+        for i in range(phi.size):
+            phi[i] = math.exp(-2.0 * tau * g.x[i]) * g.envelope[i]
+        return
     decay = math.exp(-2.0 * tau * g.step)
     e2 = decay * decay
     e4 = e2 * e2
-    return shape_moments(
-        g.x.ctypes.data,
-        s.w.ctypes.data,
-        s.wz.ctypes.data,
-        envelope.ctypes.data,
-        envelope.size // BLOCK,
-        decay,
-        e2,
-        e4,
-        e4 * e4,
-        s.phi.ctypes.data,
-    )
+    e8 = e4 * e4
+    # Powers of the decay over the bins of half a block, each a product of the powers of two.
+    powers = (1.0, decay, e2, decay * e2, e4, decay * e4, e2 * e4, decay * e2 * e4)
+    factor = 1.0
+    for start in range(0, phi.size, BLOCK):
+        half = start + BLOCK // 2
+        for i in range(BLOCK // 2):
+            phi[start + i] = factor * powers[i] * g.envelope[start + i]
+            phi[half + i] = factor * (powers[i] * e8) * g.envelope[half + i]
+        factor *= e8 * e8
+
+
+@fusing
+def _in_lanes(a: Array, b: Array) -> float:
+    """Return the product of two arrays of whole blocks, summed in eight lanes side by side."""
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
+    for i in range(0, a.size, 8):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+        s4 += a[i + 4] * b[i + 4]
+        s5 += a[i + 5] * b[i + 5]
+        s6 += a[i + 6] * b[i + 6]
+        s7 += a[i + 7] * b[i + 7]
+    return ((s0 + s4) + (s2 + s6)) + ((s1 + s5) + (s3 + s7))
+
+
+@compiled
+def _moments(term: Array, g: Grid, s: ProjectionScratch) -> tuple[float, float, float]:
+    """Return the sums of an array, times 1, x and x^2."""
+    for i in range(term.size):
+        s.lever[i] = term[i] * g.x[i]
+    return _in_lanes(term, s.ones), _in_lanes(s.lever, s.ones), _in_lanes(s.lever, g.x)
 
 
 @compiled
 def evaluate(tau: float, g: Grid, s: ProjectionScratch, sums: Sums) -> Point:
     """Return the linear fit at one extinction, from one pass over the bins."""
     w0, wz, free = sums.weight, sums.value, sums.free
-    q0, q1, q2, p0, p1, p2, y0, y1, y2 = _moments(tau, g, s)
+    _fill_shape(tau, g, s.phi)
+    for i in range(s.phi.size):
+        s.shape[i] = s.phi[i] * s.w[i]
+        s.square[i] = s.shape[i] * s.phi[i]
+        s.signal[i] = s.phi[i] * s.wz[i]
+    q0, q1, q2 = _moments(s.shape, g, s)
+    p0, p1, p2 = _moments(s.square, g, s)
+    y0, y1, y2 = _moments(s.signal, g, s)
     mean_phi, mean_z = free * q0 / w0, free * wz / w0
     norm = p0 - q0 * mean_phi
     # About the information centroid, amplitude and extinction are uncorrelated.

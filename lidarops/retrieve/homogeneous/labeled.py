@@ -44,7 +44,7 @@ def fit_homogeneous_path(
     sections: Sequence[tuple[float, float]],
     variance: xr.DataArray | float | None = None,
     quality: xr.DataArray | None = None,
-    method: str = "auto",
+    method: str = "direct",
     relative_variance: bool = False,
     noise_correlation_length: xr.DataArray | None = None,
     background_range: tuple[float, float] | None = None,

@@ -20,8 +20,6 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 class HomogeneousMethod(StrEnum):
     """Methods to solve a homogeneous path."""
 
-    AUTO = "auto"
-    COMPRESSED = "compressed"
     DIRECT = "direct"
     CUBIC = "cubic"
     LINEARIZED = "linearized"
@@ -30,8 +28,6 @@ class HomogeneousMethod(StrEnum):
 
 
 _SOLVERS: Final[dict[HomogeneousMethod, Callable[[PathProblem], PathSolution]]] = {
-    HomogeneousMethod.AUTO: _methods.solve_by_compression,
-    HomogeneousMethod.COMPRESSED: _methods.solve_by_compression,
     HomogeneousMethod.DIRECT: _methods.solve_by_direct_fit,
     HomogeneousMethod.CUBIC: _methods.solve_by_cubic,
     HomogeneousMethod.LINEARIZED: _methods.solve_by_linearization,
@@ -90,9 +86,6 @@ class HomogeneousResult:
     """Amplitude over its standard error at known extinction, with the sign of the amplitude."""
     reduced_chi2: Array
     """1 where the residuals are noise; relative to the estimated noise without a variance."""
-    curvature_misfit: Array
-    """Energy of the residuals in smooth shapes that the model lacks, over the noise: a chi-square
-    of the compressed methods; NaN for the others."""
     valid_bins: Flags
     """Bins used."""
     quality: Flags
@@ -105,7 +98,7 @@ def fit_homogeneous_path(
     *,
     variance: npt.ArrayLike | None = None,
     weights: npt.ArrayLike | None = None,
-    method: str = "auto",
+    method: str = "direct",
     extinction: npt.ArrayLike | None = None,
     background: npt.ArrayLike | None = None,
     background_standard_error: npt.ArrayLike | None = None,
@@ -177,11 +170,6 @@ def fit_homogeneous_path(
 
     Notes
     -----
-    auto
-        "compressed".
-    compressed
-        The least-squares solution from 11 linear functionals of the profile, where it has no gaps,
-        a uniform range, common weights and independent bins; all others by "direct".
     direct
         The least-squares solution by Newton steps over the bins, with background and amplitude
         eliminated (variable projection, golub1973), from the best of 24 extinctions.
@@ -256,7 +244,6 @@ def fit_homogeneous_path(
         power=rows,
         range=grid.values,
         noise=noise,
-        common_noise=np.ndim(np.asarray(weights if variance is None else variance)) <= 1,
         known_variance=known_variance,
         bounds=(
             THRESHOLDS.lowest_extinction / float(grid.values[-1]),

@@ -8,7 +8,7 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Limits of the search, of the tests and of the choice of the solver."""
+    """Limits of the search and of the tests."""
 
     # The search
     lowest_extinction: float = -0.3
@@ -43,9 +43,6 @@ class Thresholds:
     """With fewer, there are no more values than unknowns."""
     fewest_differences: int = 5
     """Second differences; with fewer, the noise is estimated from the residuals. Assumed."""
-    many_counts: float = 1e4
-    """Counts of a bin from which Poisson noise is normal: its skewness moves a deviation of 5
-    standard deviations by 0.04. Calculated."""
     false_estimated: float = 5.7e-4
     """Share of the values beyond 4 standard errors by the scatter of an estimated noise, above
     which NOISE_UNCERTAIN marks them: fewer than 32 bins. Simulations: selection by the same noise
@@ -59,15 +56,6 @@ class Thresholds:
     model_error: float = 0.05
     """Departure of the logarithmic slope from the model, as a share of 2 (extinction + 1 / mean
     range). Simulations: reduces false values among accepted ones by a factor of 7."""
-
-    # The choice of the solver
-    fewest_compressed_bins: int = 32
-    """Below, the direct fit is as fast, and 11 shapes span most of a profile. Assumed."""
-    most_compressed_bins: int = 4096
-    """Above, tables need more than 100 MB and more time than a fit. Measured."""
-    thinnest: float = 0.15
-    """Length over first range. In thinner sections shapes are nearly straight lines, for which the
-    cells of the tables are too coarse. Assumed."""
 
     # The product
     full_overlap: float = 0.99

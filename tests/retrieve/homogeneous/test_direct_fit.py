@@ -1,4 +1,4 @@
-"""Profiles with gaps or weights of their own, against a slow fit and the information bound."""
+"""Profiles with and without gaps, against a slow fit and the information bound."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def weights_of(kind, count, seed=0):
     return weights
 
 
-KINDS = ("scattered", "near", "gap", "all", "uneven")
+KINDS = ("dense", "scattered", "near", "gap", "all", "uneven")
 
 
 def measured(case, kind, count, seed=1):
@@ -140,3 +140,30 @@ def test_a_step_that_is_small_by_chance_does_not_end_the_search():
     for k in np.argsort(pull)[-10:]:
         found = slow_fit(r, power[k], np.isfinite(power[k]).astype(float))[2]
         assert abs(fit.extinction[k] - found) < 0.01 * fit.extinction_standard_error[k]
+
+
+@pytest.mark.parametrize(("start", "length", "bins"), [(500.0, 200.0, 32), (30.0, 15e3, 2000)])
+@pytest.mark.parametrize("level", [0.0, 1.0, 10.0, 100.0])
+def test_noise_free_extinction_of_profiles_without_gaps_is_exact(start, length, bins, level):
+    r = np.linspace(start, start + length, bins)
+    truth = np.geomspace(1e-5, 50.0 / length, 300)[:, np.newaxis]
+    power = level + np.exp(-2.0 * truth * (r - start)) * (start / r) ** 2
+    fit = fit_homogeneous_path(power, r)
+    np.testing.assert_allclose(fit.extinction, truth[:, 0], rtol=1e-9)
+    assert np.max(np.abs(fit.background - level)) < 1e-9
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e30, 1e150])
+def test_scale_of_the_power_does_not_matter(scale):
+    r = section(2500.0, 8000.0)
+    power = 370.0 + signal(r, 100.0, 0.1 * KM)
+    power = power + np.random.default_rng(7).normal(size=(20, 225))
+    expected = fit_homogeneous_path(power, r)
+    fit = fit_homogeneous_path(power * scale, r)
+    np.testing.assert_allclose(fit.extinction, expected.extinction, rtol=1e-9)
+    np.testing.assert_allclose(fit.background, expected.background * scale, rtol=1e-9)
+    np.testing.assert_array_equal(fit.quality, expected.quality)
+    if 1e-38 < scale < 1e30:
+        single = fit_homogeneous_path((power * scale).astype(np.float32), r)
+        np.testing.assert_allclose(single.extinction, expected.extinction, rtol=1e-2)
+        np.testing.assert_array_equal(single.quality, expected.quality)

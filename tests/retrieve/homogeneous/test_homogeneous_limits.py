@@ -40,18 +40,17 @@ def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance, shar
     assert np.mean(false[others]) == pytest.approx(share, abs=0.01)
 
 
-@pytest.mark.parametrize("method", ["compressed", "direct"])
 @pytest.mark.parametrize(
     ("bins", "factor", "far"),
     [(225, 1.01, 1e-4), (50, 1.05, 3e-4), (32, 1.08, 5.5e-4), (31, 1.09, 5.8e-4),
      (20, 1.15, 1.2e-3), (8, 1.60, 7.1e-3)],
 )  # fmt: skip
-def test_errors_from_estimated_noise_are_widened_as_the_page_tells(method, bins, factor, far):
+def test_errors_from_estimated_noise_are_widened_as_the_page_tells(bins, factor, far):
     r = np.linspace(1000.0, 4000.0, bins)
     noise = np.random.default_rng(34).normal(size=bins)
     power = 100.0 + 1e5 * (r[0] / r) ** 2 * np.exp(-4e-4 * (r - r[0])) + noise
     known, estimated = (
-        fit_homogeneous_path(power, r, variance=variance, method=method) for variance in (1.0, None)
+        fit_homogeneous_path(power, r, variance=variance) for variance in (1.0, None)
     )
     level = np.sqrt(known.reduced_chi2 / estimated.reduced_chi2)
     widening = estimated.extinction_standard_error / (level * known.extinction_standard_error)
@@ -179,16 +178,15 @@ def test_the_page_tells_where_errors_of_backgrounds_are_widened():
     assert at_limit == pytest.approx(1.53, abs=6e-3)
 
 
-@pytest.mark.parametrize("method", ["compressed", "direct"])
 @pytest.mark.parametrize("known", [True, False])
-def test_backgrounds_near_the_limit_of_determination_are_not_selected_by_their_noise(method, known):
+def test_backgrounds_near_the_limit_of_determination_are_not_selected_by_their_noise(known):
     """Noise that bends a signal makes background and error too small: 1 % were false."""
     r, count = 2500.0 + 37.5 * np.arange(80), 16_000
     rng = np.random.default_rng(11)
     shape = r[0] ** 2 / r**2 * np.exp(-2e-5 * (r - r[0]))
     signal = np.exp(rng.uniform(np.log(3.0), np.log(100.0), (count, 1)))
     power = 100.0 + signal * shape + rng.standard_normal((count, r.size))
-    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None, method=method)
+    fit = fit_homogeneous_path(power, r, variance=1.0 if known else None)
     scale = fit.extinction + 1.0 / r.mean()
     near = (fit.quality == 0) & (fit.extinction_standard_error > 0.1 * scale)
     errors = np.abs(fit.background - 100.0)[near] / fit.background_standard_error[near]

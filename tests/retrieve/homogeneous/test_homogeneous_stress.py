@@ -1,4 +1,4 @@
-"""Hard cases of the homogeneous path, for the direct and the compressed solver.
+"""Hard cases of the homogeneous path, for the direct solver.
 
 Signals are in units of the noise, extinction in km-1 in the tables; unless stated otherwise, there
 are 225 bins from 2.5 km over 8 km.
@@ -30,7 +30,6 @@ from lidarops.retrieve.background.photon_counts import mean_profile_variance
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 
-METHODS = ("direct", "compressed")
 KM = 1e-3
 LONG = section(2500.0, 8000.0)
 FIELDS = tuple(HomogeneousResult.__dataclass_fields__)
@@ -40,8 +39,6 @@ UNDETERMINED = (
 )
 
 NONE = Quality(0)
-
-pytestmark = pytest.mark.parametrize("method", METHODS)
 
 
 def noise(count, bins=225, seed=0):
@@ -209,11 +206,11 @@ TABLE = {
 
 
 @pytest.mark.parametrize("case", TABLE)
-def test_robustness_table(case, method):
+def test_robustness_table(case):
     outcome = TABLE[case]
     power = clean()
     outcome.change(power)
-    fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
     for bit in flags_of("homogeneous").raised(int(outcome.every)):
         assert share(fit, bit) == 1.0, bit
     accepted = 1.0 - share(fit, flags_of("homogeneous").rejecting)
@@ -235,31 +232,31 @@ def test_robustness_table(case, method):
         assert abs(np.mean(off)) < 0.4
 
 
-def test_outlying_bin_is_flagged(method):
+def test_outlying_bin_is_flagged():
     power = clean()
     spike(power)
     for variance, least in ((1.0, 0.97), (None, 0.9)):
-        fit = fit_homogeneous_path(power, LONG, variance=variance, method=method)
+        fit = fit_homogeneous_path(power, LONG, variance=variance)
         assert share(fit, Quality.OUTLIER) > least
 
 
 @pytest.mark.parametrize("case", [name for name in TABLE if name != "clean"])
-def test_bad_profiles_do_not_affect_their_neighbours(case, method):
+def test_bad_profiles_do_not_affect_their_neighbours(case):
     power = clean(24)
-    expected = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    expected = fit_homogeneous_path(power, LONG, variance=1.0)
     bad = np.zeros(24, dtype=bool)
     bad[[0, 5, 6, 7, 13, 23]] = True
     changed = power[bad]
     TABLE[case].change(changed)
     power[bad] = changed
-    fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
     assert_same(rows_of(fit, ~bad), rows_of(expected, ~bad))
-    assert_same(rows_of(fit, bad), fit_homogeneous_path(changed, LONG, variance=1.0, method=method))
+    assert_same(rows_of(fit, bad), fit_homogeneous_path(changed, LONG, variance=1.0))
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("known", [True, False])
-def test_result_does_not_depend_on_size_start_or_order_of_the_batch(method, dtype, known):
+def test_result_does_not_depend_on_size_start_or_order_of_the_batch(dtype, known):
     power = clean(130, seed=3).astype(dtype)
     for k, outcome in enumerate(TABLE.values()):
         changed = power[7 * k : 7 * k + 1]
@@ -270,7 +267,6 @@ def test_result_does_not_depend_on_size_start_or_order_of_the_batch(method, dtyp
             power[rows],
             LONG,
             variance=1.0 if known else None,
-            method=method,
         )
 
     whole = solved(slice(None))
@@ -284,62 +280,59 @@ def test_result_does_not_depend_on_size_start_or_order_of_the_batch(method, dtyp
 # Stress cases -------------------------------------------------------------------------------
 
 
-def test_s1_thin_far_section(method):
+def test_s1_thin_far_section():
     r = section(10500.0, 100.0)
     power = 700.0 + signal(r, 1.0, WEAK)
-    assert abs(fit_homogeneous_path(power, r, method=method).background - 700.0) < 1e-8
+    assert abs(fit_homogeneous_path(power, r).background - 700.0) < 1e-8
     for lag, digits in ((1, 8), (75, 9)):
         fit = cubic_and_tail.cubic(power, r, lag=lag, variance=0.0).background
         assert abs(fit - 700.0) < 10.0**-digits
     # As float32, half a digit is left: the estimated noise is that of rounding, and the standard
     # error reflects it.
-    fit = fit_homogeneous_path(power.astype(np.float32), r, method=method)
+    fit = fit_homogeneous_path(power.astype(np.float32), r)
     assert abs(fit.extinction - WEAK) < 4 * fit.extinction_standard_error
     assert fit.extinction_standard_error > 0.2 * WEAK
 
 
-def test_s2_signal_below_the_rounding(method):
+def test_s2_signal_below_the_rounding():
     power = 1e8 + signal(LONG, 1.0, WEAK)
-    assert (
-        fit_homogeneous_path(power.astype(np.float32), LONG, method=method).quality
-        == Quality.NO_SIGNAL
-    )
+    assert fit_homogeneous_path(power.astype(np.float32), LONG).quality == Quality.NO_SIGNAL
     assert abs(cubic_and_tail.cubic(power, LONG, lag=1, variance=0.0).background - 1e8) < 10**-6.0
-    fit = fit_homogeneous_path(power, LONG, method=method)
+    fit = fit_homogeneous_path(power, LONG)
     assert abs(fit.extinction - WEAK) < 4 * fit.extinction_standard_error
 
 
-def test_s3_no_extinction(method):
+def test_s3_no_extinction():
     power = 25.0 + signal(LONG, 1.0, 1e-8 * KM)
-    fit = fit_homogeneous_path(power, LONG, method=method)
+    fit = fit_homogeneous_path(power, LONG)
     assert abs(fit.background - 25.0) < 1e-12
     assert fit.extinction == pytest.approx(1e-8 * KM, abs=1e-13 * KM)
     assert fit.quality == 0
 
 
-def test_s4_opaque_path(method):
+def test_s4_opaque_path():
     extinction = 5.0 * KM
     power = clean(4000, 1e4, extinction, seed=5)
-    fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
     lowest = lowest_errors(LONG, 1e4, extinction)[2]
     assert np.sqrt(np.mean((fit.extinction - extinction) ** 2)) < 1.04 * lowest
     assert np.mean(fit.quality == 0) > 0.995
 
 
-def test_s5_three_real_roots(method):
+def test_s5_three_real_roots():
     r = section(2500.0, 1000.0)
     power = 25.0 + signal(r, 1.0, WEAK)
     with mp.workdps(50):
         assert len(real_roots(quartic_derivative(r, power, 1))) == 3
     assert abs(cubic_and_tail.cubic(power, r, lag=1, variance=0.0).background - 25.0) < 1e-8
-    assert abs(fit_homogeneous_path(power, r, method=method).background - 25.0) < 1e-11
+    assert abs(fit_homogeneous_path(power, r).background - 25.0) < 1e-11
 
 
-def test_s6_lower_bound_excludes_the_second_minimum(method):
+def test_s6_lower_bound_excludes_the_second_minimum():
     r = section(10500.0, 8000.0)
     power = clean(3000, 15.0, 0.1 * KM, seed=6, r=r)
     lowest = lowest_errors(r, 15.0, 0.1 * KM)[2]
-    fit = fit_homogeneous_path(power, r, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, r, variance=1.0)
     errors = fit.extinction - 0.1 * KM
     assert np.all(np.abs(errors) < 8 * lowest)
     assert np.sqrt(np.mean(errors**2)) < 1.06 * lowest
@@ -352,49 +345,47 @@ def test_s6_lower_bound_excludes_the_second_minimum(method):
     assert second >= 2
 
 
-def test_s7_unit_of_range_does_not_matter(method):
+def test_s7_unit_of_range_does_not_matter():
     # A section in km is refused; scaling by a power of two must give the same digits.
     power = clean(50, seed=7)
     with pytest.raises(RetrievalInputError, match="in m"):
-        fit_homogeneous_path(power, LONG / 1000.0, method=method)
-    one = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
-    other = fit_homogeneous_path(power, LONG / 8.0, variance=1.0, method=method)
+        fit_homogeneous_path(power, LONG / 1000.0)
+    one = fit_homogeneous_path(power, LONG, variance=1.0)
+    other = fit_homogeneous_path(power, LONG / 8.0, variance=1.0)
     np.testing.assert_allclose(other.extinction / 8.0, one.extinction, rtol=1e-13)
     np.testing.assert_allclose(other.background, one.background, rtol=1e-13)
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1.0, 10.0, 100.0])
 @pytest.mark.parametrize(("start", "length"), GEOMETRIES)
-def test_s8_large_background_costs_no_digits(start, length, ratio, method):
+def test_s8_large_background_costs_no_digits(start, length, ratio):
     r = section(start, length)
     extinction = np.geomspace(0.01 * KM, 50.0 / length, 400)
-    fit = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r, method=method)
+    fit = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r)
     assert np.max(np.abs(fit.extinction / extinction - 1.0)) < 1e-9
     assert np.max(np.abs(fit.background - ratio)) < 1e-10
-    single = fit_homogeneous_path(
-        (ratio + signal(r, 1.0, extinction)).astype(np.float32), r, method=method
-    )
+    single = fit_homogeneous_path((ratio + signal(r, 1.0, extinction)).astype(np.float32), r)
     weak = extinction < 5.0 / length
     off = np.abs(single.extinction / extinction - 1.0)
     assert np.max(off) < 5e-5 * max(1.0, ratio)
     assert np.median(off[weak]) < 5e-6 * max(1.0, ratio)
 
 
-def test_s9_many_bins_in_single_precision(method):
+def test_s9_many_bins_in_single_precision():
     r = section(2500.0, 8000.0, 4096)
     power = (25.0 + signal(r, 1.0, WEAK)).astype(np.float32)
     fit = cubic_and_tail.cubic(power, r, lag=1365, variance=0.0).background
     with mp.workdps(40):
         exact = real_roots(quartic_derivative(r, power.astype(np.float64), 1365))[-1]
     assert abs(mp.mpf(float(fit)) - exact) < 1e-8
-    assert abs(fit_homogeneous_path(power, r, method=method).extinction / WEAK - 1.0) < 1e-3
+    assert abs(fit_homogeneous_path(power, r).extinction / WEAK - 1.0) < 1e-3
 
 
 @pytest.mark.parametrize("bins", [3, 4, 7, 16])
-def test_s10_few_bins(bins, method):
+def test_s10_few_bins(bins):
     r = section(2500.0, 8000.0, bins)
     power = 370.0 + signal(r, 1e3, WEAK) + 0.01 * noise(300, bins, seed=8)
-    fit = fit_homogeneous_path(power, r, variance=1e-4, method=method)
+    fit = fit_homogeneous_path(power, r, variance=1e-4)
     assert share(fit, Quality.TOO_FEW_BINS) == float(bins < 8)
     if bins < 4:
         assert np.isnan(fit.extinction).all()
@@ -404,13 +395,13 @@ def test_s10_few_bins(bins, method):
     assert np.all(np.isfinite(cubic_and_tail.cubic(power, r, variance=1e-4).background))
 
 
-def test_s11_counts_over_a_large_dynamic_range(method):
+def test_s11_counts_over_a_large_dynamic_range():
     expected = 10.0 + signal(LONG, 1e5, WEAK)
     power = np.random.default_rng(9).poisson(expected, (4000, 225))
     lowest = lowest_errors(LONG, 1e5, WEAK, 1.0 / expected)[2]
 
     def relative(variance):
-        fit = fit_homogeneous_path(power, LONG, variance=variance, method=method)
+        fit = fit_homogeneous_path(power, LONG, variance=variance)
         return fit, np.sqrt(np.mean((fit.extinction - WEAK) ** 2)) / lowest
 
     fit, scatter = relative(mean_profile_variance(power))
@@ -421,34 +412,34 @@ def test_s11_counts_over_a_large_dynamic_range(method):
     assert relative(100.0)[1] > 1.25
 
 
-def test_s12_single_weak_shot(method):
+def test_s12_single_weak_shot():
     power = np.random.default_rng(10).poisson(10.0 + signal(LONG, 20.0, WEAK), (2000, 225))
-    fit = fit_homogeneous_path(power, LONG, variance=mean_profile_variance(power), method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=mean_profile_variance(power))
     assert share(fit, HomogeneousQuality.POORLY_DETERMINED) == 1.0
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_s13_saturation(known, method):
+def test_s13_saturation(known):
     power = clean()
     saturated(power)
     variance = 1.0 if known else None
     assert (
         share(
-            fit_homogeneous_path(power, LONG, variance=variance, method=method),
+            fit_homogeneous_path(power, LONG, variance=variance),
             flags_of("homogeneous").rejecting,
         )
         == 1.0
     )
     saturated_masked(power)
-    fit = fit_homogeneous_path(power, LONG, variance=variance, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=variance)
     assert np.mean(fit.quality == 0) > 0.99
     assert np.mean(fit.extinction) == pytest.approx(WEAK, rel=0.01)
 
 
-def test_s14_overlap_that_no_test_can_detect(method):
+def test_s14_overlap_that_no_test_can_detect():
     power = clean(2000, seed=11)
     overlap_near(power)
-    fit = fit_homogeneous_path(power, LONG, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0)
     bias = np.mean(fit.extinction - WEAK) / np.median(fit.extinction_standard_error)
     assert -2.0 < bias < -1.0
     assert 1.0 - share(fit, flags_of("homogeneous").rejecting) > 0.9
@@ -456,26 +447,24 @@ def test_s14_overlap_that_no_test_can_detect(method):
     assert np.all(np.abs(fit.extinction - WEAK) < fit.extinction_model_error)
 
 
-def test_s15_strong_signal_over_a_short_section(method):
+def test_s15_strong_signal_over_a_short_section():
     r, extinction = section(2500.0, 1700.0), 0.01 * KM
-    fit = fit_homogeneous_path(
-        clean(4000, 1e5, extinction, seed=12, r=r), r, variance=1.0, method=method
-    )
+    fit = fit_homogeneous_path(clean(4000, 1e5, extinction, seed=12, r=r), r, variance=1.0)
     lowest = lowest_errors(r, 1e5, extinction)[2]
     assert np.sqrt(np.mean((fit.extinction - extinction) ** 2)) < 1.04 * lowest
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_s16_inverted_signal(known, method):
+def test_s16_inverted_signal(known):
     power = 740.0 - clean()
-    fit = fit_homogeneous_path(power, LONG, variance=1.0 if known else None, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0 if known else None)
     assert share(fit, Quality.NEGATIVE_AMPLITUDE) == 1.0
 
 
-def test_s17_spacing_that_is_not_uniform(method):
+def test_s17_spacing_that_is_not_uniform():
     r = np.sort(np.random.default_rng(13).uniform(2500.0, 10500.0, 225))
     power = clean(4000, seed=13, r=r)
-    fit = fit_homogeneous_path(power, r, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, r, variance=1.0)
     errors = fit.extinction - WEAK
     assert np.sqrt(np.mean(errors**2)) < 1.04 * lowest_errors(r, 1e3, WEAK)[2]
     with pytest.raises(RetrievalInputError, match="uniform"):
@@ -483,10 +472,10 @@ def test_s17_spacing_that_is_not_uniform(method):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_s18_cloud(known, method):
+def test_s18_cloud(known):
     power = clean()
     cloud(power)
-    fit = fit_homogeneous_path(power, LONG, variance=1.0 if known else None, method=method)
+    fit = fit_homogeneous_path(power, LONG, variance=1.0 if known else None)
     assert share(fit, HomogeneousQuality.POOR_FIT) == 1.0
     if known:
         assert np.all(fit.reduced_chi2 > 100.0)
@@ -497,7 +486,7 @@ def test_s18_cloud(known, method):
 
 @pytest.mark.parametrize("first", [1, 20, 60, 150])
 @pytest.mark.parametrize(("start", "length"), GEOMETRIES)
-def test_missing_near_range_leaves_the_global_minimum(start, length, first, method):
+def test_missing_near_range_leaves_the_global_minimum(start, length, first):
     rng = np.random.default_rng(14)
     r = section(start, length)
     bounds = (-0.3 / r[-1], 60.0 / length)
@@ -505,7 +494,7 @@ def test_missing_near_range_leaves_the_global_minimum(start, length, first, meth
     power = 370.0 + signal(r, 1.0, extinction) * 10 ** rng.uniform(1.5, 5.0, (25, 1))
     power += rng.normal(size=power.shape)
     power[:, :first] = np.nan
-    fit = fit_homogeneous_path(power, r, variance=1.0, method=method)
+    fit = fit_homogeneous_path(power, r, variance=1.0)
     compared = 0
     for k in range(25):
         least, best = brute_force(r[first:], power[k, first:], bounds)
@@ -519,8 +508,8 @@ def test_missing_near_range_leaves_the_global_minimum(start, length, first, meth
     assert compared > (4 if first < 60 else 0)
 
 
-def test_amplitude_of_the_table_is_right(method):
-    fit = fit_homogeneous_path(clean(), LONG, variance=1.0, method=method)
+def test_amplitude_of_the_table_is_right():
+    fit = fit_homogeneous_path(clean(), LONG, variance=1.0)
     off = (fit.amplitude - amplitude(LONG, 1e3, WEAK)) / fit.amplitude_standard_error
     assert abs(np.mean(off)) < 0.15
     assert np.std(off) == pytest.approx(1.0, abs=0.08)

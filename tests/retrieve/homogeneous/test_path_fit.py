@@ -20,7 +20,6 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import (
-    HomogeneousMethod,
     HomogeneousResult,
     fit_homogeneous_path,
 )
@@ -524,7 +523,7 @@ def test_descending_range_reverses_variance_too():
         ({"variance": "1"}, "variance", "real numbers"),
         ({"weights": np.ones(7)}, "weights", "broadcast"),
         ({"variance": 1.0, "weights": 1.0}, "weights", "one of the two"),
-        ({"method": "klett"}, "method", "auto, compressed, direct, cubic"),
+        ({"method": "klett"}, "method", "direct, cubic"),
     ],
 )
 def test_invalid_arguments_are_refused(arguments, field, words):
@@ -535,18 +534,6 @@ def test_invalid_arguments_are_refused(arguments, field, words):
 
 
 # The cubic ----------------------------------------------------------------------------------
-
-
-def test_auto_is_compressed():
-    power = clean(5)
-    same(
-        fit_homogeneous_path(power, LONG, variance=1.0),
-        fit_homogeneous_path(power, LONG, variance=1.0, method="compressed"),
-    )
-    same(
-        fit_homogeneous_path(power, LONG),
-        fit_homogeneous_path(power, LONG, method=HomogeneousMethod.AUTO),
-    )
 
 
 @pytest.mark.parametrize("known", [True, False])

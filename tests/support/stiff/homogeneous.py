@@ -266,12 +266,9 @@ def _study() -> tuple[StiffCase, ...]:
                         Between("RMSE over bound", 0.95, 1.06))),
         _case("S7 extinction in m-1", build=lambda: _exact(CLEAR), solve=solve_path,
               expected=(Near("extinction", 3e-5, 1e-9), Accepted())),
-        *(
-            _case(f"S8 background 100 signals, 2.5 km at 10.5 km, {method}",
-                  build=partial(_exact, _SHIFTED, method=method), solve=solve_path,
-                  expected=(Near("extinction", 3e-5, tolerance),))
-            for method, tolerance in (("direct", 1e-9), ("compressed", 1e-6))
-        ),
+        _case("S8 background 100 signals, 2.5 km at 10.5 km",
+              build=partial(_exact, _SHIFTED), solve=solve_path,
+              expected=(Near("extinction", 3e-5, 1e-9),)),
         _case("S9 cubic, 4096 bins of float32, lag 1365", build=lambda: _single(_FINE, lag=1365),
               solve=cubic,
               expected=(Near("background", partial(_rooted, _FINE, 1365, np.float32),
@@ -429,13 +426,13 @@ def _unsolvable() -> tuple[StiffCase, ...]:
               solve=solve_path, expected=(Rejected(),)),
         _case("200 000 bins, direct", build=partial(_long, 200_000, "direct"), solve=solve_path,
               expected=(Covered("extinction", 3e-5, valued=1.0),)),
-        _case("a million bins", build=partial(_long, 1_000_000, "auto"), solve=solve_path,
+        _case("a million bins", build=partial(_long, 1_000_000, "direct"), solve=solve_path,
               expected=(Covered("extinction", 3e-5, valued=1.0),)),
         *(
             _case(f"memory of {bins} bins, {most} MB at most", solve=_memory,
-                  build=partial(_long, bins, "auto"),
+                  build=partial(_long, bins, "direct"),
                   expected=(Between("MB", 0.0, float(most)),))
-            for bins, most in ((4096, 100), (4097, 100), (1_000_000, 1000))
+            for bins, most in ((4096, 100), (1_000_000, 1000))
         ),
         _case("8 bins", build=lambda: _few(8), solve=solve_path,
               expected=(Covered("extinction", 3e-5),)),
