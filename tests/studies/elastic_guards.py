@@ -117,7 +117,7 @@ def without_rejection(bit: Rejection) -> Iterator[None]:
 
 def threshold(**changes: float) -> Any:
     """Return the context in which thresholds have other values."""
-    changed = replace(THRESHOLDS, **changes)
+    changed = THRESHOLDS._replace(**changes)
     return partial(replaced, (inversion, "THRESHOLDS", changed))
 
 

@@ -20,7 +20,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -95,8 +94,8 @@ VARIANTS: dict[str, list[Patch]] = {
     "at least typical": [(_block_errors, "at_least_typical", lambda _, variance, *__: variance)],
     "curvature errors": [(_block_errors, "curvature_variance", lambda *_: 0.0)],
     "outlying bins": [(outlying_bins, "search", lambda *_: None)],
-    "weak signals": [(_beam_signals, "THRESHOLDS", replace(THRESHOLDS, largest_bin_error=1e6))],
-    "noisy profiles": [(_beam_signals, "THRESHOLDS", replace(THRESHOLDS, noisy_profile=1e30))],
+    "weak signals": [(_beam_signals, "THRESHOLDS", THRESHOLDS._replace(largest_bin_error=1e6))],
+    "noisy profiles": [(_beam_signals, "THRESHOLDS", THRESHOLDS._replace(noisy_profile=1e30))],
 }
 """Names of guards, each with what replaces it. A variant of several names switches off all."""
 

@@ -7,14 +7,11 @@ It writes the table into the page of scans. With ``--only``, it prints these row
 from __future__ import annotations
 
 import argparse
-import ast
 import importlib
-import inspect
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -39,7 +36,7 @@ from lidarops.retrieve.multiangle import (
     robust_weights,
 )
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.thresholds import THRESHOLDS, Thresholds
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import (
     _calibration,
     _outliers,
@@ -70,7 +67,7 @@ def _off(*patches: Patch) -> Callable[[], Any]:
 
 def _at(*places: Any, **changes: float) -> Callable[[], Any]:
     """Replace thresholds that modules read."""
-    changed = replace(THRESHOLDS, **changes)
+    changed = THRESHOLDS._replace(**changes)
     return _off(*((place, "THRESHOLDS", changed) for place in places))
 
 
@@ -146,27 +143,15 @@ def _modules() -> list[ModuleType]:
     return [importlib.import_module(info.name) for info in names]
 
 
-def _aliases(module: ModuleType) -> Iterator[tuple[str, str]]:
-    """Yield the constants of a module that repeat thresholds, and the names of these."""
-    for node in ast.parse(inspect.getsource(module)).body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.value, ast.Attribute):
-            place = node.value.value
-            if isinstance(place, ast.Name) and place.id == "THRESHOLDS":
-                yield ast.unparse(node.target), node.value.attr
-
-
 @contextmanager
 def _changed(name: str, value: float) -> Iterator[None]:
     """Change a threshold; modules that compile it in are compiled anew, without their caches."""
-    changed = replace(THRESHOLDS, **{name: value})
+    changed = THRESHOLDS._replace(**{name: value})
     patches: list[Patch] = []
     for module in _modules():
         if hasattr(module, "THRESHOLDS"):
             patches.append((module, "THRESHOLDS", changed))
-        aliases = [alias for alias, threshold in _aliases(module) if threshold == name]
-        patches += [(module, alias, value) for alias in aliases]
-        for function in list(vars(module).values()) if aliases else ():
-            if isinstance(function, Dispatcher):
+            for function in [f for f in vars(module).values() if isinstance(f, Dispatcher)]:
                 again = numba.njit(nogil=True, error_model="numpy")(function.py_func)
                 patches.append((module, function.py_func.__name__, again))
     with replaced(*patches):
@@ -175,11 +160,10 @@ def _changed(name: str, value: float) -> Iterator[None]:
 
 def _thresholds() -> Iterator[Guard]:
     """Yield every threshold halved and doubled."""
-    for field in fields(Thresholds):
-        value = getattr(THRESHOLDS, field.name)
+    for name, value in THRESHOLDS._asdict().items():
         for factor in (0.5, 2.0):
             other = type(value)(factor * value)
-            yield Guard(f"{field.name} = {other:g}", off=partial(_changed, field.name, other))
+            yield Guard(f"{name} = {other:g}", off=partial(_changed, name, other))
 
 
 def main() -> None:

@@ -35,7 +35,6 @@ from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
-from lidarops.retrieve.multiangle.robust_weights import FEWEST_BEAMS
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.settings import SettingsModel, quantity
 from lidarops.steps.case import ProductCase
@@ -274,8 +273,9 @@ class Robust(PartOfRetrieval):
     def decide(self, case: Case) -> Decisions:
         """Run where there are enough beams to identify an outlier."""
         count = float(beams(case).count)
-        if count < FEWEST_BEAMS:
-            reason = f"fewer than {FEWEST_BEAMS} beam directions cannot identify an outlier"
+        if count < THRESHOLDS.fewest_beams:
+            fewest = THRESHOLDS.fewest_beams
+            reason = f"fewer than {fewest} beam directions cannot identify an outlier"
             yield Leave(reason, number=count)
         else:
             reason = "decided from the data: used where a residual is too large to be chance"

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.compiled_code import summing
+from lidarops.retrieve.common.usable import HUGE
 
 Array = npt.NDArray[np.float64]
 
-HUGE: Final = 1e300
 GROUPS: Final = 16
 """Groups of neighbouring bins whose mean residuals are tested."""
 FEWEST_GROUPS: Final = 4

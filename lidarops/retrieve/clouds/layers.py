@@ -23,11 +23,6 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-_TOP: Final = THRESHOLDS.top
-_LEAST_FALL: Final = THRESHOLDS.least_fall
-_VISIBLE_FALL: Final = THRESHOLDS.visible_fall
-_BEYOND: Final = THRESHOLDS.windows_beyond
-_BELOW: Final = THRESHOLDS.windows_below
 _ROUNDING: Final = 1e-9
 """Relative rise that the rounding of sums can cause."""
 
@@ -393,7 +388,7 @@ def _end(sums: Array, base: int, length: int) -> int:
     end = base + 1
     for i in range(base + 1, bins):
         ratio, variance = _mean(sums, i, min(i + length, bins))
-        if ratio > level + _TOP * math.sqrt(variance + level_variance):
+        if ratio > level + THRESHOLDS.top * math.sqrt(variance + level_variance):
             end = i + 1
         elif not math.isnan(ratio):
             return i
@@ -434,7 +429,7 @@ def _falls(
     half = length // 2
     near, near_variance = _mean_towards(sums, i, half, side)
     far, far_variance = _mean_towards(sums, i + side * half, length - half, side)
-    return not far - near > _TOP * math.sqrt(near_variance + far_variance)
+    return not far - near > THRESHOLDS.top * math.sqrt(near_variance + far_variance)
 
 
 @_compiled
@@ -454,7 +449,7 @@ def _edge(
     The window is the shortest in which noise does not hide such a fall: a longer one would reach
     the edge of aerosol beyond the layer.
     """
-    slight = 1.0 + _LEAST_FALL * (contrast - 1.0)
+    slight = 1.0 + THRESHOLDS.least_fall * (contrast - 1.0)
     side = 1 if last >= start else -1
     for i in range(start, last, side):
         falls = False
@@ -465,7 +460,7 @@ def _edge(
                     sums, i, length, windows * length, side, slight, least, margins[k]
                 )
             level, variance = _mean_towards(sums, i + side * length, length, side)
-            if falls or _VISIBLE_FALL * (contrast - 1.0) * level > least * math.sqrt(
+            if falls or THRESHOLDS.visible_fall * (contrast - 1.0) * level > least * math.sqrt(
                 2.0 * variance
             ):
                 break
@@ -507,6 +502,7 @@ def _mark_layers(
     """
     bins = int(power.shape[1])
     sums = np.empty((4, bins + 1))
+    below, beyond = THRESHOLDS.windows_below, THRESHOLDS.windows_beyond
     for k in range(power.shape[0]):
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
         _accumulate(power[k], noise, air, sums)
@@ -518,10 +514,10 @@ def _mark_layers(
             if base < 0:
                 break
             first = _edge(
-                sums, base, end, _BELOW, lengths, contrast, certainty, limits[k], margins[k]
+                sums, base, end, below, lengths, contrast, certainty, limits[k], margins[k]
             )
             end = _end(sums, base, length)
             end = _edge(
-                sums, end, bins, _BEYOND, lengths, contrast, certainty, limits[k], margins[k]
+                sums, end, bins, beyond, lengths, contrast, certainty, limits[k], margins[k]
             )
             layers[k, first:end] = True

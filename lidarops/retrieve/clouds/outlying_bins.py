@@ -17,12 +17,6 @@ from lidarops.retrieve.common.usable import HUGE, usable
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-OUTLYING: Final = THRESHOLDS.outlying
-LEAST_CONTRAST: Final = THRESHOLDS.least_contrast
-SPREAD_BY_NOISE: Final = THRESHOLDS.spread_by_noise
-MOST_EQUAL: Final = THRESHOLDS.most_equal
-LARGEST_STEP: Final = THRESHOLDS.largest_step
-STEP_BY_NOISE: Final = THRESHOLDS.step_by_noise
 _HALF: Final = 4
 """Neighbours on either side."""
 _FARTHEST: Final = 2 * _HALF
@@ -127,7 +121,8 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
     right, right_range = right / right_count, right_range / right_count
     step = abs(right - left)
     allowed = max(
-        STEP_BY_NOISE * np.sqrt(largest_variance), LARGEST_STEP * max(abs(left), abs(right))
+        THRESHOLDS.step_by_noise * np.sqrt(largest_variance),
+        THRESHOLDS.largest_step * max(abs(left), abs(right)),
     )
     if not step <= allowed:
         return False
@@ -139,9 +134,9 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
             low, high = min(low, residual), max(high, residual)
     own_residual = q[j] - left - slope * (ranges[j] - left_range)
     beyond = max(own_residual - high, low - own_residual)
-    noise_limit = OUTLYING * np.sqrt(max(largest_variance, noise[j]))
-    spread = high - low - SPREAD_BY_NOISE * np.sqrt(largest_variance)
-    return bool(beyond > noise_limit and beyond > LEAST_CONTRAST * spread)
+    noise_limit = THRESHOLDS.outlying * np.sqrt(max(largest_variance, noise[j]))
+    spread = high - low - THRESHOLDS.spread_by_noise * np.sqrt(largest_variance)
+    return bool(beyond > noise_limit and beyond > THRESHOLDS.least_contrast * spread)
 
 
 @_compiled
@@ -178,7 +173,7 @@ def _may_hold_outliers(
         value = power[i]
         below = value - factor_below[i] * power[i - 1]
         above = value - factor_above[i] * power[i + 1]
-        peak = (below * above > 0.0) & (below * below > OUTLYING**2 * variance[i])
+        peak = (below * above > 0.0) & (below * below > THRESHOLDS.outlying**2 * variance[i])
         missing = not ((abs(value) < HUGE) & (variance[i] >= 0.0) & (variance[i] < HUGE))
         suspects += 1 if peak | missing else 0
     return suspects > 0
@@ -209,10 +204,10 @@ def _mark_outliers(
                 count += 1
         for j in range(_HALF, count - _HALF):
             below, above = q[j] - q[j - 1], q[j] - q[j + 1]
-            if below * below <= OUTLYING**2 * noise[j] or not below * above > 0.0:
+            if below * below <= THRESHOLDS.outlying**2 * noise[j] or not below * above > 0.0:
                 continue
             farthest = max(index[j + _HALF] - index[j], index[j] - index[j - _HALF])
-            if farthest > _FARTHEST or _most_equal(j, usable_power) > MOST_EQUAL:
+            if farthest > _FARTHEST or _most_equal(j, usable_power) > THRESHOLDS.most_equal:
                 continue
             if _is_outlying(j, -1, usable_range, q, noise) or _is_outlying(
                 j, _farthest(j, q), usable_range, q, noise

@@ -7,6 +7,7 @@ from typing import Final
 import numba
 
 HUGE: Final = 1e300
+"""Magnitude from which a value counts as missing: a quick test for infinity and NaN."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -16,6 +16,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.homogeneous._estimate import (
     AMPLITUDE,
     AMPLITUDE_RELATIVE_VARIANCE,
@@ -74,12 +75,9 @@ the last step left at most 1.4e-5."""
 _DETERMINED: Final = 0.3
 """Standard error of the extinction over its scale, above which only a step of `_SMALL` is the last:
 twice the limit of `POORLY_DETERMINED`."""
-HUGE: Final = 1e300
 TINY: Final = 1e-280
 _FLAT: Final = 1e-13
 """Squared share of a shape besides its mean, below which it is flat within rounding."""
-_LEAST_CURVATURE: Final = THRESHOLDS.least_curvature
-_FEWEST_BINS: Final = THRESHOLDS.fewest_solved_bins
 
 
 @compiled
@@ -215,7 +213,7 @@ def _start(g: Grid, s: ProjectionScratch, sums: Sums) -> float:
 @compiled
 def _newton(tau: float, point: Point, g: Grid) -> float:
     """Return tau after one Newton step, of at most the distance to the next node."""
-    curved = point.curvature > _LEAST_CURVATURE * point.gauss
+    curved = point.curvature > THRESHOLDS.least_curvature * point.gauss
     step = point.gradient / (point.curvature if curved else point.gauss)
     reach = g.spacing * math.sqrt(tau * tau + g.scale * g.scale)
     moved = tau + min(max(step, -reach), reach)
@@ -232,7 +230,9 @@ def _is_last(step: float, tau: float, p: Point, g: Grid, sums: Sums) -> bool:
     if abs(step) <= _SMALL * size:
         return True
     variance = p.energy / ((sums.bins - 3.0) * p.gauss)
-    if not (p.curvature > _LEAST_CURVATURE * p.gauss and variance < (_DETERMINED * size) ** 2):
+    if not (
+        p.curvature > THRESHOLDS.least_curvature * p.gauss and variance < (_DETERMINED * size) ** 2
+    ):
         return False
     return (step * step / size) ** 2 <= _NEGLIGIBLE * _NEGLIGIBLE * variance
 
@@ -334,7 +334,7 @@ def begin(
     bins, total = _load(power, reference, s)
     free = 1.0 if math.isnan(background) else 0.0
     row[BINS] = bins
-    if bins < _FEWEST_BINS:
+    if bins < THRESHOLDS.fewest_solved_bins:
         row[STATUS] = EMPTY if last < 0 else TOO_SHORT
         return reference, 1.0, Sums(bins, total, 0.0, 0.0, free)
     largest = largest_of(s.z)

@@ -23,7 +23,6 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.int32]
 
-_FALSE_ALARM: Final = THRESHOLDS.false_alarm
 _SECOND_DIFFERENCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
 _DIFFERENCE_DOF: Final = 18.0 / 35.0
@@ -36,7 +35,6 @@ _FAR: Final = 4.0
 """Standard errors beyond which the stability benchmark counts a value as false."""
 _SELECTED: Final = float(-special.ndtri(THRESHOLDS.false_curved))
 """Standard errors by which a curvature is too large at that rate."""
-_LARGEST: Final = THRESHOLDS.largest_relative_error
 _RATIO: Final = 4.611
 """Quantile of the logarithm of the ratio of two estimates of one variance from the same residuals,
 3.353 sqrt(17 / 9), times the root of the number of bins."""
@@ -180,7 +178,7 @@ def curved_widening(relative_error: Any) -> Any:
     relative_error : (...) float
         Of extinction; that of the curvature.
     """
-    relative = np.minimum(relative_error, _LARGEST)
+    relative = np.minimum(relative_error, THRESHOLDS.largest_relative_error)
     return np.maximum(_SELECTED / (_FAR * (1.0 - _SELECTED * relative)), 1.0)
 
 
@@ -204,7 +202,7 @@ def _limits_of_counts(limits: _Limits, bins: Array, counts: CountMoments, unknow
     mean 1, the variance 2 + 1/N and the third cumulant 8 + 22/N + 1/N^2 of a bin with N counts,
     and the quantile of the shifted gamma distribution with the same three.
     """
-    rate, mean = 0.5 * _FALSE_ALARM, counts.fewest
+    rate, mean = 0.5 * THRESHOLDS.false_alarm, counts.fewest
     highest = np.ceil(special.pdtrik(1.0 - rate / np.maximum(bins, 1.0), mean))
     dof = _residual_dof(bins, unknowns)
     variance = (2.0 + counts.inverse) * dof
@@ -224,9 +222,9 @@ def _outlier_limit(quantile: Array) -> Array:
 def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:
     dof = _residual_dof(bins, unknowns)
     return (
-        special.chdtri(dof, 0.5 * _FALSE_ALARM) / dof,
-        np.where(shapes > 0, special.chdtri(shapes, _FALSE_ALARM), np.inf),
-        _outlier_limit(-special.ndtri(0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
+        special.chdtri(dof, 0.5 * THRESHOLDS.false_alarm) / dof,
+        np.where(shapes > 0, special.chdtri(shapes, THRESHOLDS.false_alarm), np.inf),
+        _outlier_limit(-special.ndtri(0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0))),
         np.ones_like(bins),
         np.zeros_like(bins),
     )
@@ -250,8 +248,10 @@ def _estimated_limits(
     widening = _widening(dof)
     return (
         np.where(independent, ratio, np.inf),
-        np.where(shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - _FALSE_ALARM), np.inf),
-        _outlier_limit(-special.stdtrit(dof, 0.5 * _FALSE_ALARM / np.maximum(bins, 1.0))),
+        np.where(
+            shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - THRESHOLDS.false_alarm), np.inf
+        ),
+        _outlier_limit(-special.stdtrit(dof, 0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0))),
         widening,
         2.0 * special.stdtr(dof, -_FAR * widening),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,6 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-INDEPENDENT: Final = THRESHOLDS.independent
 _Triple = tuple[float, float, float]
 
 
@@ -149,12 +148,12 @@ def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, f
     per = (1.0 / w0, 1.0 / p.norm, 1.0 / p.slope_norm)
     norm = _remainder(t.bent_norm, t.bent, t.bent, per)
     pulled = _remainder(r.bent, t.bent, r.model, per)
-    if norm > INDEPENDENT * t.bent_norm:
+    if norm > THRESHOLDS.independent * t.bent_norm:
         energy += pulled * pulled / norm
         count += 1.0
         shared = _remainder(t.shared, t.bent, t.square, per) / norm
     norm = _remainder(t.square_norm, t.square, t.square, per) - shared * shared * norm
-    if norm > INDEPENDENT * t.square_norm:
+    if norm > THRESHOLDS.independent * t.square_norm:
         along = _remainder(r.square, t.square, r.model, per) - shared * pulled
         energy += along * along / norm
         count += 1.0

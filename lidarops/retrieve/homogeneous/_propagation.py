@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.usable import HUGE
+
 Array = npt.NDArray[np.float64]
 
-HUGE: Final = 1e300
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 

@@ -401,10 +401,7 @@ def student_factor(freedom: Array) -> Array:
 
 
 def _has_outliers(beams: BeamBlock, fit: Regression) -> bool:
-    if (
-        np.max(np.count_nonzero(beams.noise < np.inf, axis=1), initial=0)
-        < robust_weights.FEWEST_BEAMS
-    ):
+    if np.max(np.count_nonzero(beams.noise < np.inf, axis=1), initial=0) < THRESHOLDS.fewest_beams:
         return False
     largest, count = robust_weights.largest_residual(
         fit.residual, fit.leverage, beams.noise, fit.inhomogeneity

@@ -13,21 +13,14 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 Ends = npt.NDArray[np.int32]
 
-LOWEST_SNR: Final = THRESHOLDS.lowest_snr
-AROUND: Final = THRESHOLDS.around
-SWALLOWED_SNR: Final = THRESHOLDS.swallowed_snr
-AHEAD: Final = THRESHOLDS.ahead
-LEAST_NOISE: Final = THRESHOLDS.least_noise
-_FARTHEST: Final = THRESHOLDS.farthest_expected
-_HUGE: Final = 1e300
-"""Values from here on count as missing."""
-_LARGEST_RATIO: Final = 1.0 / LOWEST_SNR**2
+_LARGEST_RATIO: Final = 1.0 / THRESHOLDS.lowest_snr**2
 """Largest variance over squared signal for which the moments of the logarithm are corrected."""
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -38,7 +31,7 @@ def _clean(signal: Array, variance: Array, row: Array) -> None:
     """Fill signal, variance and 1 at altitudes with data, zeros elsewhere."""
     values, spread, count = row[0], row[1], row[2]
     for k in range(signal.size):
-        on = abs(signal[k]) < _HUGE and 0.0 <= variance[k] < _HUGE
+        on = abs(signal[k]) < HUGE and 0.0 <= variance[k] < HUGE
         values[k] = signal[k] if on else 0.0
         spread[k] = variance[k] if on else 0.0
         count[k] = 1.0 if on else 0.0
@@ -102,7 +95,7 @@ def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
     if guess == 0.0:
         guess = max(levels[k], levels[k + 3])
     own = float(row[0, k])
-    slack = _FARTHEST * math.sqrt(row[1, k])
+    slack = THRESHOLDS.farthest_expected * math.sqrt(row[1, k])
     return own if guess == 0.0 else min(max(guess, own - slack), own + slack)
 
 
@@ -133,8 +126,9 @@ def take_logarithms(
             _clean(signal[t, a], variance[t, a], row)
             end = 0
             if usable[a]:
-                end = _first_loss(row, 0, AHEAD, SWALLOWED_SNR, sums)
-                end = min(end, _first_loss(row, AROUND // 2, AROUND, LOWEST_SNR, sums))
+                end = _first_loss(row, 0, THRESHOLDS.ahead, THRESHOLDS.swallowed_snr, sums)
+                around, lowest = THRESHOLDS.around, THRESHOLDS.lowest_snr
+                end = min(end, _first_loss(row, around // 2, around, lowest, sums))
             ends[t, a] = end
             _levels(row, levels, roots)
             for k in range(altitudes):
@@ -142,7 +136,10 @@ def take_logarithms(
                 noise[t, a, k] = np.inf
                 if k < end and row[0, k] > 0.0:
                     ratio = (
-                        max(math.sqrt(row[1, k]) / _expected(row, levels, roots, k), LEAST_NOISE)
+                        max(
+                            math.sqrt(row[1, k]) / _expected(row, levels, roots, k),
+                            THRESHOLDS.least_noise,
+                        )
                         ** 2
                     )
                     # The series of the moments of the logarithm diverges for larger ratios.

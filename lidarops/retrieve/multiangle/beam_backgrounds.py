@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +12,6 @@ from lidarops.retrieve.multiangle._result import MultiAngleResult
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
-
-_COMMON: Final = THRESHOLDS.common_background
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +63,10 @@ class ScanSignals:
         dead_time_change : (time, beam, altitude) float, optional
         """
         left = np.nan_to_num(left)
-        covariance = _COMMON * left[:, :, np.newaxis] * left[:, np.newaxis]
-        covariance += (1.0 - _COMMON) * left[:, np.newaxis] ** 2 * np.eye(left.shape[1])
+        covariance = THRESHOLDS.common_background * left[:, :, np.newaxis] * left[:, np.newaxis]
+        covariance += (
+            (1.0 - THRESHOLDS.common_background) * left[:, np.newaxis] ** 2 * np.eye(left.shape[1])
+        )
         variance = noise + (left[..., np.newaxis] * response) ** 2
         return cls(signal, noise, variance, covariance, path, response, dead_time_change)
 

@@ -19,9 +19,6 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-START_WIDTH: Final = THRESHOLDS.start_width
-FEWEST_BEAMS: Final = THRESHOLDS.fewest_beams
-_CLOSEST: Final = THRESHOLDS.closest_paths
 _GAUSS: Final = 1.4826
 """Standard deviation over median absolute deviation of normal deviates."""
 
@@ -106,9 +103,11 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
                     ys[count], xs[count] = y[t, a, k], x[a, k]
                     low, high = min(low, x[a, k]), max(high, x[a, k])
                     count += 1
-            if count < FEWEST_BEAMS or not high > low:
+            if count < THRESHOLDS.fewest_beams or not high > low:
                 continue
-            slope, level = _repeated_median(ys, xs, count, _CLOSEST * (high - low), work, slopes)
+            slope, level = _repeated_median(
+                ys, xs, count, THRESHOLDS.closest_paths * (high - low), work, slopes
+            )
             for a in range(angles):
                 if noise[t, a, k] < np.inf:
                     residuals[t, a, k] = y[t, a, k] - level - slope * x[a, k]
@@ -130,7 +129,7 @@ def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float)
 def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
     """Return slope and level of the best of the zero line and the lines through two beams."""
     best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
-    closest = _CLOSEST * (np.max(x) - np.min(x))
+    closest = THRESHOLDS.closest_paths * (np.max(x) - np.min(x))
     for i in range(y.size):
         for j in range(i):
             if abs(x[i] - x[j]) > closest:
@@ -173,7 +172,7 @@ def pair_residuals(
                     beams[count] = a
                     all_y[count], all_x[count] = residuals[t, a, k], x[a, k]
                     spread = math.sqrt(noise[t, a, k] + inhomogeneity[k])
-                    all_per_width[count] = 1.0 / (START_WIDTH * spread)
+                    all_per_width[count] = 1.0 / (THRESHOLDS.start_width * spread)
                     count += 1
             if count == 0:
                 continue

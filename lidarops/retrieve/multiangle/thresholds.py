@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Thresholds:
+class Thresholds(NamedTuple):
     """Numbers of the multi-angle retrieval, dimensionless unless stated.
 
     The last words of each entry state what set the number; "assumed" where nothing is recorded.

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
@@ -29,8 +30,6 @@ MISSING: Final = 1
 NOT_POSITIVE: Final = 2
 OUTLYING: Final = 3
 """Reasons why a beam ends before its last bin."""
-_LARGEST: Final = 1e300
-"""Power beyond which squares overflow."""
 _SMALLEST_STEP: Final = 1e-12
 
 
@@ -176,7 +175,7 @@ def _take_logarithms(
     start = max(layout.limits[beam, 0], low - THRESHOLDS.margin)
     end = min(layout.limits[beam, 1], high + THRESHOLDS.margin)
     power, variance = power[:, start:end], variance[:, start:end]
-    positive = (power > 0.0) & (power < _LARGEST)
+    positive = (power > 0.0) & (power < HUGE)
     safe = np.where(positive, power, 1.0)
     noise = exponent**2 * (variance / safe**2)
     known = positive & (noise < np.inf)
@@ -184,7 +183,7 @@ def _take_logarithms(
     lost = ~known[:, low - start : high - start]
     stops = np.where(lost.any(axis=1), np.argmax(lost, axis=1) + low, high)
     at_stop = power[np.arange(len(power)), np.minimum(stops, end - 1) - start]
-    reason = np.where((at_stop <= 0.0) & (at_stop > -_LARGEST), NOT_POSITIVE, MISSING)
+    reason = np.where((at_stop <= 0.0) & (at_stop > -HUGE), NOT_POSITIVE, MISSING)
     status = np.where(stops < high, reason, 0).astype(np.uint8)
     codes = np.where(known, GOOD, LOST).astype(np.uint8)
     noise = np.where(known, noise, 0.0)

@@ -37,8 +37,6 @@ STEP: Final = 3
 """Largest change of a logarithm in the last pass."""
 COLUMNS: Final = 4
 
-_LONGEST_STEP: Final = THRESHOLDS.longest_step
-_TINIEST_PIVOT: Final = THRESHOLDS.smallest_pivot
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -55,7 +53,7 @@ def _factorise(matrix: Array, size: int) -> float:
                 total -= matrix[i, k] * matrix[j, k]
             if i != j:
                 matrix[i, j] = total / matrix[j, j]
-            elif total > _TINIEST_PIVOT * diagonal:
+            elif total > THRESHOLDS.smallest_pivot * diagonal:
                 matrix[i, i] = math.sqrt(total)
                 logarithm += math.log(total)
             else:
@@ -223,7 +221,7 @@ def _move_constants(
         step = 0.0
         for c in range(first_passage[beam], first_passage[beam] + counts[beam]):
             step += gain[c] * (y[c] - solution[crossing[c]])
-        step = min(max(step, -_LONGEST_STEP), _LONGEST_STEP)
+        step = min(max(step, -THRESHOLDS.longest_step), THRESHOLDS.longest_step)
         constants[beam] += step
         if counts[beam] > 0:
             moved = max(moved, abs(step) * first_derivative[beam])

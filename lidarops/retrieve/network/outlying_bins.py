@@ -41,15 +41,6 @@ _SMOOTH_SIDE: Final[int] = np.int64(4)  # type: ignore[assignment]
 """Neighbours on either side that decide which of several bins is the worst."""
 _SMOOTH_DEGREE: Final = 3
 _ONE_SIDED_DEGREE: Final = 2
-_OUTLIER: Final = THRESHOLDS.outlier
-_SUSPECT: Final = THRESHOLDS.suspect
-_REACH: Final = THRESHOLDS.reach
-_MARGIN: Final = THRESHOLDS.margin
-_AIR: Final = THRESHOLDS.air_deviation
-_AIR_BEYOND: Final = THRESHOLDS.air_deviation_beyond
-_STEP: Final = THRESHOLDS.step
-_EDGE_BINS: Final = THRESHOLDS.edge_bins
-_OUTLYING_SHARE: Final = THRESHOLDS.outlying_share
 _LARGEST_LOGARITHM: Final = 300.0
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -87,7 +78,7 @@ def fit_weights(grid: Array, at: int, nodes: Indices, count: int, degree: int, o
 def _good_bins(codes: Codes, at: int, way: int, most: int, nodes: Indices, count: int) -> int:
     """Append the nearest good bins on one side of a bin; return the number of all."""
     g, end = at + way, count + most
-    while count < end and 0 <= g < codes.size and abs(g - at) <= _REACH:
+    while count < end and 0 <= g < codes.size and abs(g - at) <= THRESHOLDS.reach:
         if codes[g] == GOOD:
             nodes[count] = g
             count += 1
@@ -131,10 +122,10 @@ def _predict(
         return 0, 0.0
     if count == NODES and nodes[2] == at - _SIDE and nodes[5] == at + _SIDE:
         weights[:NODES] = plan[at]
-        return count, _AIR
+        return count, THRESHOLDS.air_deviation
     degree = _ONE_SIDED_DEGREE if one_sided else count - 1 if side == _SIDE else _SMOOTH_DEGREE
     fit_weights(grid, at, nodes, count, min(degree, count - 1), weights)
-    return count, _AIR_BEYOND if one_sided else _AIR
+    return count, THRESHOLDS.air_deviation_beyond if one_sided else THRESHOLDS.air_deviation
 
 
 @_compiled
@@ -200,7 +191,7 @@ def _jumps(logs: Array, noise: Array, exponent: float, codes: Codes, at: int) ->
             spread += noise[g] / (count * count)
         if count == 0:
             return False
-    return abs(step) > max(_STEP * exponent, _OUTLIER * math.sqrt(spread))
+    return abs(step) > max(THRESHOLDS.step * exponent, THRESHOLDS.outlier * math.sqrt(spread))
 
 
 @_compiled
@@ -215,9 +206,9 @@ def _all_isolated(
     for at in range(codes.size):
         if codes[at] != BRIDGED:
             continue
-        for g in range(max(0, at - _REACH), min(codes.size, at + _REACH + 1)):
+        for g in range(max(0, at - THRESHOLDS.reach), min(codes.size, at + THRESHOLDS.reach + 1)):
             near = g != at and abs(g - at) <= _SIDE
-            if deviations[g] > _SUSPECT or (near and codes[g] == BRIDGED):
+            if deviations[g] > THRESHOLDS.suspect or (near and codes[g] == BRIDGED):
                 return False
         if _jumps(logs, noise, exponent, codes, at):
             return False
@@ -260,7 +251,7 @@ def _search_row(
     """
     size = codes.size
     deviations = np.zeros(size)
-    most, number = _EDGE_BINS + int(_OUTLYING_SHARE * np.sum(codes == GOOD)), 0
+    most, number = THRESHOLDS.edge_bins + int(THRESHOLDS.outlying_share * np.sum(codes == GOOD)), 0
     low, high = 0, size
     while True:
         for g in range(low, high):
@@ -268,17 +259,17 @@ def _search_row(
             if codes[g] == GOOD:
                 deviations[g] = _deviation(row, codes, g, _SIDE, work)
         # On most beams, no used bin is outlying.
-        if number == 0 and not np.any(deviations[used[0] : used[1]] > _OUTLIER):
+        if number == 0 and not np.any(deviations[used[0] : used[1]] > THRESHOLDS.outlier):
             return True
-        if number == 0 and np.sum(deviations > _OUTLIER) > most:
+        if number == 0 and np.sum(deviations > THRESHOLDS.outlier) > most:
             return False
         farthest = int(np.argmax(deviations))
-        if number > most or not deviations[farthest] > _OUTLIER:
+        if number > most or not deviations[farthest] > THRESHOLDS.outlier:
             break
         worst = _worst_bin(row, codes, farthest, work)
         codes[worst] = BRIDGED
         number += 1
-        low, high = max(0, worst - _REACH), min(size, worst + _REACH + 1)
+        low, high = max(0, worst - THRESHOLDS.reach), min(size, worst + THRESHOLDS.reach + 1)
     if number > most or not _all_isolated(row[0], row[1], row[2], codes, deviations):
         _keep_in_place(row[0], codes, doubt)
     return True
@@ -318,7 +309,7 @@ def search(
     plan = _adjacent_weights(grid)
     for n in range(logs.shape[0]):
         if stops[n] > low:
-            codes[n, stops[n] + _MARGIN :] = LOST
+            codes[n, stops[n] + THRESHOLDS.margin :] = LOST
             row = logs[n], noise[n], exponent, grid, plan
             if not _search_row(row, (low, stops[n]), codes[n], doubt[n], work):
                 stops[n] = low

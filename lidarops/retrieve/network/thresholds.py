@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 
-@dataclass(frozen=True, slots=True)
-class Thresholds:
+class Thresholds(NamedTuple):
     """Numbers of the retrieval, dimensionless unless stated.
 
     The last words of each entry state what set the number; "assumed" where nothing is recorded.
@@ -81,7 +79,7 @@ class Thresholds:
     # The prior: ablation
     gradient: float = 0.15
     """Standard deviation of ln extinction over the crossings by a gradient; simulations."""
-    deviations: tuple[float, ...] = tuple(float(s) for s in np.geomspace(0.01, 1.0, 9))
+    deviations: tuple[float, ...] = tuple(np.geomspace(0.01, 1.0, 9).tolist())
     """Standard deviations of ln extinction at single crossings that are tried; assumed."""
     strengths: tuple[float, ...] = (1.0, 2.0, 4.0)
     """Factors of the standard deviations that are tried before the prior is dropped; assumed."""

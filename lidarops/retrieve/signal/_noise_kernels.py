@@ -32,11 +32,6 @@ _BLOCK_ERROR: Final = 0.49
 """Standard deviation of the mean square of a block of white noise, over its mean. Simulated."""
 _FEWEST: Final = 4
 """Blocks of which a mean is taken."""
-_OUTLYING: Final = THRESHOLDS.outlying_block
-_DARKEST: Final = THRESHOLDS.darkest
-_BRIGHT: Final = THRESHOLDS.bright
-_BAND: Final = THRESHOLDS.noise_band
-_SIGNIFICANT: Final = THRESHOLDS.significant_band
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -104,7 +99,7 @@ def _clipped_mean(values: Array) -> float:
     """Return the mean without outliers; NaN of fewer than `_FEWEST` values."""
     if values.size < _FEWEST:
         return math.nan
-    limit = _OUTLYING * np.median(values)
+    limit = THRESHOLDS.outlying_block * np.median(values)
     # A quiet digitiser: few bins depart from the others by a step.
     return float(np.mean(values[values <= limit]) if limit > 0.0 else np.mean(values))
 
@@ -144,7 +139,7 @@ def _fit(light: Array, square: Array, dark: float) -> float:
     if light.size < _FEWEST:
         return 0.0
     line = dark + max(float(np.median((square - dark) / light)), 0.0) * light
-    weights = np.where(square <= _OUTLYING * line, light / (line * line), 0.0)
+    weights = np.where(square <= THRESHOLDS.outlying_block * line, light / (line * line), 0.0)
     leverage = np.sum(weights * light)
     slope = float(np.sum(weights * (square - dark)) / leverage)
     # A slope within its error would make constant noise follow the light.
@@ -155,7 +150,7 @@ def _fit(light: Array, square: Array, dark: float) -> float:
 def _line(blocks: _Blocks, dark: float, drift: float) -> _Line:
     """Return the noise as a function of light."""
     # Windows of the smoothed signal hold a block or more.
-    clear = _BRIGHT * max(drift, math.sqrt(dark / BLOCK))
+    clear = THRESHOLDS.bright * max(drift, math.sqrt(dark / BLOCK))
     bright = (blocks.light > clear) & (blocks.square < math.inf)
     known = bright & blocks.usable
     if np.sum(known) >= _FEWEST or np.sum(bright) < _FEWEST:
@@ -171,7 +166,7 @@ def _dark_noise(blocks: _Blocks, line: _Line) -> float:
     total = weights = 0.0
     for k in range(blocks.square.size):
         variance = _variance(line, blocks.light[k])
-        if blocks.usable[k] and blocks.square[k] <= _OUTLYING * variance:
+        if blocks.usable[k] and blocks.square[k] <= THRESHOLDS.outlying_block * variance:
             weight = (line.dark / variance) ** 2
             total += weight * (line.dark + blocks.square[k] - variance)
             weights += weight
@@ -183,7 +178,7 @@ def _variance(line: _Line, light: float) -> float:
     # Light is missing where no bin of its window is known.
     if math.isnan(light) or light < line.least:
         return line.dark
-    return max(line.dark + line.slope * light, _DARKEST * line.dark)
+    return max(line.dark + line.slope * light, THRESHOLDS.darkest * line.dark)
 
 
 @_compiled
@@ -195,10 +190,10 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
         ratio[k] = blocks.square[k] / _variance(line, blocks.light[k])
     centres, excesses = np.empty(count), np.empty(count)
     found, significant = 0, False
-    bands = max(count // _BAND, 1)
+    bands = max(count // THRESHOLDS.noise_band, 1)
     for band in range(bands):
-        start = band * _BAND
-        end = start + _BAND if band < bands - 1 else count
+        start = band * THRESHOLDS.noise_band
+        end = start + THRESHOLDS.noise_band if band < bands - 1 else count
         places = np.flatnonzero(blocks.usable[start:end])
         # Without noise above zero, nothing is known of the band.
         excess = _clipped_mean(ratio[start + places])
@@ -207,7 +202,7 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
             excesses[found] = math.log(excess)
             # The line rests on the blocks of the far half.
             error = _BLOCK_ERROR * math.sqrt(1.0 / places.size + 2.0 / count)
-            significant |= abs(excesses[found]) > _SIGNIFICANT * error
+            significant |= abs(excesses[found]) > THRESHOLDS.significant_band * error
             found += 1
     return centres[:found], excesses[:found], significant
 

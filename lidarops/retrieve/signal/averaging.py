@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import numba
 import numpy as np
@@ -13,11 +12,11 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.usable import HUGE
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.int64]
 
-_HUGE: Final = 1e300
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -178,14 +177,14 @@ def _add_profiles(
     """
     for t in range(values.shape[0]):
         weight, group = weights[t], groups[t]
-        if group < 0 or not 0.0 < weight < _HUGE:
+        if group < 0 or not 0.0 < weight < HUGE:
             continue
         total, value = sums[0, group], sums[1, group]
         noise, systematic, number = sums[2, group], sums[3, group], count[group]
         row, row_variance, row_shared = values[t], variance[t], shared[t]
         for i in range(row.size):
             x = row[i]
-            valid = abs(x) < _HUGE
+            valid = abs(x) < HUGE
             total[i] += weight if valid else 0.0
             value[i] += weight * x if valid else 0.0
             noise[i] += weight * weight * row_variance[i] if valid else 0.0

@@ -13,7 +13,6 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-_BLOCK: Final = THRESHOLDS.dead_time_block
 _TAIL: Final = 10
 """Part of the bins, the last ones, that hold the background."""
 _PASSES: Final = 12
@@ -87,8 +86,10 @@ def estimate_dead_time(
     rate = counts[:, :bins] / exposure[:, np.newaxis]
     sky = rate[:, tail].mean(axis=1, keepdims=True)
     skies = np.repeat(sky, bins, axis=1)
-    open_for = np.repeat(_BLOCK * exposure[:, np.newaxis], bins, axis=1)
-    cells = _Cells(*map(_blocks, (rate, signal, variance / _BLOCK, skies, open_for)))
+    open_for = np.repeat(THRESHOLDS.dead_time_block * exposure[:, np.newaxis], bins, axis=1)
+    cells = _Cells(
+        *map(_blocks, (rate, signal, variance / THRESHOLDS.dead_time_block, skies, open_for))
+    )
     whole = _fit(cells, THRESHOLDS.highest_load)
     low = _fit(cells, 0.5 * THRESHOLDS.highest_load)
     if whole is None or low is None:
@@ -112,8 +113,10 @@ class _Cells(NamedTuple):
 
 def _blocks(values: Array) -> Array:
     """Return means over `Thresholds.dead_time_block` bins."""
-    whole = values.shape[1] // _BLOCK * _BLOCK
-    return np.asarray(values[:, :whole].reshape(len(values), -1, _BLOCK).mean(axis=2))
+    whole = values.shape[1] // THRESHOLDS.dead_time_block * THRESHOLDS.dead_time_block
+    return np.asarray(
+        values[:, :whole].reshape(len(values), -1, THRESHOLDS.dead_time_block).mean(axis=2)
+    )
 
 
 def _fit(cells: _Cells, highest: float) -> tuple[float, float, float] | None:

@@ -10,19 +10,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import Any
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-_SECTIONS: Final = THRESHOLDS.noise_sections
-_HUGE: Final = 1e300
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -95,9 +94,9 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
     excess, error = np.ones(count), np.zeros(count)
     known = np.zeros(count, dtype=np.bool_)
     correlations = np.zeros((count, reach))
-    size = bins // (2 * _SECTIONS)
+    size = bins // (2 * THRESHOLDS.noise_sections)
     if size >= THRESHOLDS.fewest_noise_bins:
-        far = slice(bins - _SECTIONS * size, bins)
+        far = slice(bins - THRESHOLDS.noise_sections * size, bins)
         _estimate(
             frozen(power[:, far].astype(np.float64, copy=False)),
             frozen(variance[:, far].astype(np.float64, copy=False)),
@@ -152,8 +151,8 @@ def _load_sections(
         complete = True
         for i in range(first, first + size):
             noise += variance[i]
-            complete &= abs(power[i]) < _HUGE
-        if not complete or not 0.0 < noise < _HUGE:
+            complete &= abs(power[i]) < HUGE
+        if not complete or not 0.0 < noise < HUGE:
             continue
         _subtract_parabola(power[first : first + size], basis, residuals[kept])
         squares = fourth = 0.0

@@ -20,7 +20,6 @@ Mask = npt.NDArray[np.bool_]
 
 _SIGNS: Final = (1.0, -1.0)
 
-FEWEST_PARTS: Final = THRESHOLDS.fewest_parts
 _CONTRAST_WAVELENGTH: Final = 532e-9
 """m; wavelength of `Thresholds.cloud_contrast`."""
 
@@ -149,7 +148,7 @@ def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Mas
     """
     count, size = cells.power[:, compared].shape
     outlying = np.zeros(count, dtype=np.bool_)
-    most = count // FEWEST_PARTS
+    most = count // THRESHOLDS.fewest_parts
     if not most:
         return outlying
     excess = estimate_noise_correlation(cells.power, cells.variance).excess
@@ -171,7 +170,7 @@ def _mark_parts(
     outlying: Mask,
 ) -> None:
     """Mark the parts that exceed all others in a cell, by the test of either sign."""
-    largest = np.empty(power.shape[0] // FEWEST_PARTS + 1, dtype=np.intp)
+    largest = np.empty(power.shape[0] // THRESHOLDS.fewest_parts + 1, dtype=np.intp)
     for cell in range(power.shape[1]):
         for sign in _SIGNS:
             if not _find_largest(power, variance, cell, sign, largest):

@@ -184,7 +184,7 @@ def test_the_number_of_beams_must_match_the_network():
 def test_bins_that_are_not_used_do_not_matter(monkeypatch):
     beams = [beam(number, noise=0.01, seed=3) for number in range(3)]
     cut = solved(beams)
-    monkeypatch.setattr(labeled, "THRESHOLDS", replace(THRESHOLDS, bins_beyond=10**6))
+    monkeypatch.setattr(labeled, "THRESHOLDS", THRESHOLDS._replace(bins_beyond=10**6))
     xr.testing.assert_identical(cut, solved(beams))
     assert beams[0].averages.sizes["range"] > 700
 

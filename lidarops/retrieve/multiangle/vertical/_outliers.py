@@ -12,13 +12,8 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Array = npt.NDArray[np.float64]
 
-BISQUARE: Final = THRESHOLDS.bisquare
-LEAST_WEIGHT: Final = THRESHOLDS.least_kept
-SMALLEST_WEIGHT: Final = THRESHOLDS.smallest_kept
-USUAL_WEIGHT: Final = 1.0 - 2.0 / BISQUARE**2 + 3.0 / BISQUARE**4
+USUAL_WEIGHT: Final = 1.0 - 2.0 / THRESHOLDS.bisquare**2 + 3.0 / THRESHOLDS.bisquare**4
 """Mean of the bisquare for normal deviates, by which weights are normalised."""
-_HALF_WINDOW: Final = THRESHOLDS.half_window
-_JUMP: Final = THRESHOLDS.jump
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -28,7 +23,7 @@ def _jumps(depth: Array, information: Array, known: npt.NDArray[np.int64], count
     for i in range(1, count):
         k, before = known[i], known[i - 1]
         variance = 1.0 / information[k] + 1.0 / information[before]
-        if (depth[k] - depth[before]) ** 2 > _JUMP * _JUMP * variance:
+        if (depth[k] - depth[before]) ** 2 > THRESHOLDS.jump * THRESHOLDS.jump * variance:
             return True
     return False
 
@@ -53,7 +48,7 @@ def screen_outliers(estimates: Array, information: Array) -> Array:
     profiles, altitudes = estimates.shape
     out = information.copy()
     known = np.empty(altitudes, dtype=np.int64)
-    window = np.empty(2 * _HALF_WINDOW + 1)
+    window = np.empty(2 * THRESHOLDS.half_window + 1)
     for t in range(profiles):
         count = 0
         for k in range(altitudes):
@@ -63,15 +58,16 @@ def screen_outliers(estimates: Array, information: Array) -> Array:
         if not _jumps(estimates[t], information[t], known, count):
             continue
         for i in range(count):
-            half = min(_HALF_WINDOW, i, count - 1 - i)
+            half = min(THRESHOLDS.half_window, i, count - 1 - i)
             for j in range(2 * half + 1):
                 window[j] = estimates[t, known[i - half + j]]
             middle = np.median(window[: 2 * half + 1])
             k = known[i]
             variance = (1.0 + 0.5 * np.pi / (2 * half + 1)) / information[t, k]
-            square = (estimates[t, k] - middle) ** 2 / (BISQUARE * BISQUARE * variance)
+            width = THRESHOLDS.bisquare * THRESHOLDS.bisquare * variance
+            square = (estimates[t, k] - middle) ** 2 / width
             if square > 1.0:
-                out[t, k] *= max(LEAST_WEIGHT / square, SMALLEST_WEIGHT)
+                out[t, k] *= max(THRESHOLDS.least_kept / square, THRESHOLDS.smallest_kept)
     return out
 
 
@@ -91,17 +87,17 @@ def downweight_outliers(
     used = information > 0.0
     total = 1.0 / np.where(used, information, 1.0)
     # The fit follows an isolated estimate, whose residual is then too small to judge it.
-    left = np.maximum(total - variance, LEAST_WEIGHT * total)
+    left = np.maximum(total - variance, THRESHOLDS.least_kept * total)
     # The three-band precision describes the noise at low frequencies: the solution absorbs the
     # correlated noise, not the rest.
     left = np.maximum(left, (1.0 - share) * total)
     deviation = np.where(used, np.abs(estimates - depth) / np.sqrt(left), 0.0)
     if not np.any(deviation > THRESHOLDS.outlying_estimate):
         return None
-    square = (deviation / BISQUARE) ** 2
+    square = (deviation / THRESHOLDS.bisquare) ** 2
     weight = (1.0 - np.minimum(square, 1.0)) ** 2 / USUAL_WEIGHT
     # The influence of an estimate stays bounded, however far off it is.
-    tail = np.maximum(LEAST_WEIGHT / np.maximum(square, 1.0), SMALLEST_WEIGHT)
+    tail = np.maximum(THRESHOLDS.least_kept / np.maximum(square, 1.0), THRESHOLDS.smallest_kept)
     return reduce_information(information, information * np.maximum(weight, tail))
 
 

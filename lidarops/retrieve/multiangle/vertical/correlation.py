@@ -17,11 +17,8 @@ Integers = npt.NDArray[np.int64]
 
 LAGS: Final = 3
 """Largest distance of residuals that are multiplied, in altitudes."""
-_LINKED: Final = THRESHOLDS.linked
-_HALF_WINDOW: Final = THRESHOLDS.half_window
 _FARTHEST: Final = 2
 """Largest distance of linked altitudes."""
-_LEAST_SHARE: Final = THRESHOLDS.least_correlated
 _CANDIDATES: Final = np.arange(98) / 100.0
 """Correlations to choose from; beyond `highest_correlation` they are flagged, and 1 is excluded
 because its noise has no finite power at low frequencies (formula 1 of the page)."""
@@ -186,7 +183,7 @@ def correlated_precision(information: Array, share: Array, correlation: float) -
             if not information[t, k] > 0.0:
                 continue
             bands[0, t, k] = information[t, k]
-            if share[t, k] < _LINKED * np.max(share[t, max(k - 2, 0) : k + 3]):
+            if share[t, k] < THRESHOLDS.linked * np.max(share[t, max(k - 2, 0) : k + 3]):
                 continue
             step = k - last
             if last >= 0 and step <= 2 and joint > 0.0:
@@ -204,7 +201,7 @@ def _link(information: Array, share: Array, linked: Booleans) -> None:
     """Fill which altitudes have at least half of the correlated share of those on either side."""
     for k in range(share.size):
         most = np.max(share[max(k - 2, 0) : k + 3])
-        enough = share[k] > _LEAST_SHARE and share[k] >= _LINKED * most
+        enough = share[k] > THRESHOLDS.least_correlated and share[k] >= THRESHOLDS.linked * most
         linked[k] = information[k] > 0.0 and enough
 
 
@@ -212,7 +209,9 @@ def _link(information: Array, share: Array, linked: Booleans) -> None:
 def _own_noise(share: Array, linked: Booleans, k: int) -> float:
     """Return the mean over links around an altitude of own over correlated noise."""
     total = count = 0.0
-    for j in range(max(k - _HALF_WINDOW, 0), min(k + _HALF_WINDOW + 1, share.size)):
+    for j in range(
+        max(k - THRESHOLDS.half_window, 0), min(k + THRESHOLDS.half_window + 1, share.size)
+    ):
         if linked[j]:
             total += (1.0 - share[j]) / share[j]
             count += 1.0
@@ -235,7 +234,7 @@ def gap_precision(information: Array, share: Array, correlation: float) -> Array
         last, known = -1, 0.0
         for k in range(altitudes):
             own = information[t, k]
-            if not (own > 0.0 and share[t, k] > _LEAST_SHARE):
+            if not (own > 0.0 and share[t, k] > THRESHOLDS.least_correlated):
                 bands[0, t, k] = own
                 continue
             usual = _own_noise(share[t], linked, k)
