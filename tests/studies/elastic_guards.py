@@ -102,11 +102,12 @@ def without_rejection(bit: Rejection) -> Iterator[None]:
     def fewer_tests(*arguments: Any) -> Any:
         return tests(*arguments) & ~np.int32(bit)
 
-    def any_passing(statistics: Any, rejections: Any, level_error: Any) -> Any:
+    def any_passing(statistics: Any, rejections: Any, level_error: Any, noise: Any) -> Any:
         kept = rejections.copy()
-        index, _ = pick(statistics, kept, level_error)
+        index, *_ = pick(statistics, kept, level_error, noise)
+        none = np.zeros(index.size)
         precision = np.where(rejections == 0, statistics[..., reference_window.SCALE_ERROR], np.inf)
-        return np.where(index >= 0, np.argmin(precision, axis=-1), -1), np.zeros(index.size)
+        return np.where(index >= 0, np.argmin(precision, axis=-1), -1), none, none
 
     changes = [(reference_window, "_rejections", fewer_tests)]
     if bit is Rejection.MORE_PARTICLES:
