@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
-from lidarops.records import LeftOut, Plan, PlannedStep, Scene
-from lidarops.steps.channels import file_channels, prepared_channels
-from lidarops.steps.conditioning import PROFILES
+from lidarops.records import Plan, PlannedStep
+from lidarops.steps.channels import prepared_channels
 from lidarops.steps.data import (
     CHUNK_BYTES,
     GEOMETRY,
@@ -24,9 +22,8 @@ from lidarops.steps.data import (
     Source,
     WholeProduct,
 )
-from lidarops.steps.dependence import is_product, plan_closure
+from lidarops.steps.dependence import is_product
 from lidarops.steps.registry import carry_out, product_step
-from lidarops.steps.step import Look, Sample
 
 IN_MEMORY: Final = 2_000_000
 """Bytes of counts up to which a scene is one chunk: below, chunks cost more than they save."""
@@ -79,39 +76,6 @@ def streams_of(
         for step in steps
         if step.channel == channel and is_product(step)
     }
-
-
-def profiles_of(
-    source: Source, steps: Sequence[PlannedStep], channel: str, profiles: int
-) -> Iterator[xr.Dataset]:
-    """Yield power, variance and quality of all profiles of a source, some profiles at a time."""
-    data = channel_data(source, [step for step in steps if not step.product], channel)[""]
-    for chunk in chunks(source, file_channels(channel), (), profiles):
-        yield data[PROFILES].of(chunk.counts)
-
-
-def refined_plan(plan: Plan, scene: Scene, profiles: Sample) -> Plan:
-    """Return a plan without the parts of products in which sampled profiles show nothing.
-
-    Parameters
-    ----------
-    plan : Plan
-    scene : Scene
-        With usable granules only.
-    profiles : callable
-        Yields power, variance and quality of a channel in some granules.
-    """
-    steps: list[PlannedStep] = []
-    left_out: list[LeftOut] = list(plan.left_out)
-    for step in plan.steps:
-        if is_product(step):
-            look = Look(plan_closure(plan, [(step.name, step.channel)]), scene, profiles)
-            refined, omissions = product_step(step.product).refined(step, look)
-            steps.append(refined)
-            left_out += omissions
-        else:
-            steps.append(step)
-    return replace(plan, steps=tuple(steps), left_out=tuple(left_out))
 
 
 def loaded(archive: xr.Dataset, channels: Iterable[str], rows: slice) -> xr.Dataset:

@@ -46,7 +46,6 @@ from lidarops.steps.channels import (
     counted_channels,
     file_channels,
     member_channel,
-    prepared_channels,
 )
 from lidarops.steps.conditioning import DARK
 from lidarops.steps.data import Chunk, Data, ProductStream, Source, WholeProduct, in_one_batch
@@ -268,9 +267,6 @@ class _Instrument(_Work):
         steps = self.job.plan.steps
         channels = dict.fromkeys(step.channel for step in steps if is_product(step))
         source = self._source(self._scene, steps, read_windows(steps))
-        plan = execution.refined_plan(self.job.plan, self._scene, self._sample)
-        self.job = replace(self.job, plan=plan)
-        self._clock.lap("look")
         compared: list[Retrieved] = []
         for channel in channels:
             yield from self._channel_products(source, channel, compared)
@@ -285,16 +281,6 @@ class _Instrument(_Work):
         for product in judged:
             if self.job.writes(product.context.kind, product.context.channel):
                 yield self._written(product.context, iter([product.frame, *product.batches]))
-
-    def _sample(self, channel: str, granules: Sequence[Granule]) -> Iterator[xr.Dataset]:
-        """Yield power, variance and quality of a channel in some granules."""
-        channels = prepared_channels(self.job.plan.steps, channel)
-        steps = [step for step in self.job.plan.steps if step.channel in channels]
-        few = replace(self._scene, granules=tuple(granules))
-        # The signal is compared with bins beyond the sections.
-        source = self._source(few, steps)
-        profiles = self._chunk_profiles(source, file_channels(channel))
-        return execution.profiles_of(source, steps, channel, profiles)
 
     def _channel_products(
         self, source: Source, channel: str, compared: list[Retrieved]

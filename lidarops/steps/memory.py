@@ -67,7 +67,6 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
     ----------
     scene : Scene
     plan : Plan
-        Before it is refined in the worker.
     """
     held: defaultdict[str, float] = defaultdict(float)
     together = 1

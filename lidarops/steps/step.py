@@ -7,16 +7,14 @@ other steps and gives data to them, by name. A making step takes such data and m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
-from lidarops.records import Granule, LeftOut, Plan, PlannedStep, Role, Scene
+from lidarops.records import LeftOut, Plan, PlannedStep, Role
 from lidarops.settings import SettingsModel
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from lidarops.steps.case import ChannelCase, ProductCase
     from lidarops.steps.data import Data, ProductStream
     from lidarops.steps.workload import Workload
@@ -158,25 +156,3 @@ class ProductStep(MakingStep[R, S], Choice["ProductCase[R]", S]):
     @abstractmethod
     def stream(self, settings: S, data: Data) -> ProductStream:
         """Return the product in the making, which takes the profiles of the scene in chunks."""
-
-    def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:  # noqa: ARG002
-        """Return the planned step without the parts in which sampled profiles show nothing.
-
-        For steps whose decision needs data; `look` gives the profiles of some granules.
-        """
-        return planned, []
-
-
-Sample = Callable[[str, Sequence[Granule]], Iterator["xr.Dataset"]]
-"""Channel and granules -> power, variance and quality of their profiles, some at a time."""
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """Some profiles of a scene, for a decision that needs data."""
-
-    plan: Plan
-    """Of the product."""
-    scene: Scene
-    """With usable granules only."""
-    profiles: Sample

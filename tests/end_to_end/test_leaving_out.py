@@ -17,13 +17,11 @@ from support.oracles.angle_scenes import on_altitudes
 
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
-from lidarops.flags import Quality
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.process import execution, input_files
+from lidarops.process import execution
 from lidarops.process.job import Job
 from lidarops.process.scene import process_scene
-from lidarops.products.homogeneous.look import GAP
 from lidarops.raw.file import RawFile
 from lidarops.records import Plan, PlannedStep, ProductRecord, Role, RunRecord
 from lidarops.retrieve.multiangle import _block, slant_paths
@@ -157,7 +155,6 @@ def test_what_is_not_requested_is_left_out(name, changes):
         ("average", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
         ("molecular", ([UP], ELASTIC), ([LEVEL], {})),
         ("reference", ([UP], ELASTIC), ([LEVEL], ELASTIC)),
-        ("look", ([LEVEL], {}), ([UP], {})),
     ],
 )
 def test_a_rule_whose_question_does_not_arise_decides_nothing(rule, with_need, without_need):
@@ -373,96 +370,6 @@ def test_a_window_does_not_depend_on_other_lidars():
     assert read_windows([window, signal]) == {"photon_532o": ((0, 9),)}
 
 
-# Looks ----------------------------------------------------------------------------------------
-
-RANGE = 7.5 * (np.arange(2000) + 0.5)
-
-
-def sky(light, *, saturated=()):
-    """Return a source of profiles, with `light` as signal by minute, and the minutes it served."""
-    seen: list[float] = []
-
-    def profiles(_channel, granules):
-        minutes = [(g.start - factories.DAY).total_seconds() / 60 for g in granules]
-        seen.extend(minutes)
-        power = np.full((len(minutes), RANGE.size), 3.0)
-        power += np.array([[light(minute)] for minute in minutes]) * 1e6 / RANGE**2
-        quality = np.zeros(power.shape, np.int32)
-        quality[[minute in saturated for minute in minutes], 200] = int(Quality.SATURATED)
-        pair = ("time", "range")
-        sample = xr.Dataset(
-            {
-                "power": (pair, power),
-                "variance": (pair, np.full(power.shape, 0.01)),
-                "quality": (pair, quality),
-                "noise_correlation_length": ("time", np.ones(len(power))),
-            },
-            coords={"range": RANGE},
-        )
-        return (sample.isel(time=[place]) for place in range(len(minutes)))
-
-    return profiles, seen
-
-
-def looked(profiles, count=600):
-    granules = [factories.granule(float(k)) for k in range(count)]
-    return refined(planned(*granules, products=HOMOGENEOUS), granules, profiles)
-
-
-def refined(plan, granules, profiles):
-    (scene,) = cut_scenes(factories.campaign(products=HOMOGENEOUS), granules).scenes
-    return execution.refined_plan(plan, scene, profiles)
-
-
-def absent(plan):
-    (step,) = (step for step in plan.steps if step.name == "homogeneous")
-    return step.settings["left_out"]
-
-
-def test_sixteen_profiles_with_signal_are_enough():
-    profiles, seen = sky(lambda _: 1.0)
-    plan = looked(profiles)
-    assert absent(plan) == []
-    assert len(seen) == 16
-
-
-def test_a_dark_scene_is_left_out_with_its_number():
-    plan = looked(sky(lambda _: 0.0)[0])
-    assert absent(plan) == [[750.0, 4500.0, "LOW_SIGNAL"], [1500.0, 7500.0, "LOW_SIGNAL"]]
-    omissions = [omission for omission in plan.left_out if omission.rule == "section_dark"]
-    assert [omission.channel for omission in omissions] == ["photon_532o"] * 2
-    numbers = [omission.number for omission in omissions]
-    assert all(number is not None and number < 1e-6 for number in numbers)
-    assert "no signal" in omissions[0].reason
-
-
-@pytest.mark.parametrize("begins", [3, 101, 333, 580])
-def test_a_signal_of_ten_minutes_in_a_dark_day_is_not_lost(begins):
-    plan = looked(sky(lambda minute: float(begins <= minute <= begins + 10))[0])
-    assert absent(plan) == []
-
-
-def test_sampled_profiles_are_close_in_time():
-    profiles, seen = sky(lambda _: 0.0)
-    looked(profiles)
-    assert np.diff(sorted(seen)).max() <= GAP.total_seconds() / 60
-    assert len(seen) == len(set(seen))
-
-
-def test_sections_that_are_always_saturated_are_left_out():
-    profiles, _ = sky(lambda _: 1.0, saturated=set(range(600)))
-    # Bin 200 lies at 1504 m: in both.
-    assert [bit for *_, bit in absent(looked(profiles))] == ["SATURATED"] * 2
-    profiles, _ = sky(lambda _: 1.0, saturated=set(range(600)) - set(range(70, 81)))
-    assert absent(looked(profiles)) == []
-
-
-def test_a_refined_plan_stays_as_it_is():
-    plan = looked(sky(lambda _: 0.0)[0])
-    granules = [factories.granule(float(k)) for k in range(600)]
-    assert refined(plan, granules, sky(lambda _: 1.0)[0]) == plan
-
-
 # Files ----------------------------------------------------------------------------------------
 
 
@@ -495,7 +402,7 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
     scene = catalogued_scenes(campaign)[0]
     plan = plan_scene(scene, campaign)
     values, read = [], []
-    for dropped in (["look"], ["look", "range_window"]):
+    for dropped in ([], ["range_window"]):
         steps = tuple(step for step in plan.steps if step.name not in dropped)
         outcome = process_scene(Job(campaign, scene, replace(plan, steps=steps)))
         values.append(xr.load_dataset(campaign.products_root / outcome.products[0].path))
@@ -510,32 +417,6 @@ def test_the_window_changes_no_bit_of_a_section(tmp_path, far, offset):
         windowed, whole = (product[name].to_numpy() for product in values)
         np.testing.assert_array_equal(windowed, whole)
     assert np.isfinite(values[0]["total_extinction"]).any()
-
-
-def test_an_omitted_section_flags_profiles_without_shots(tmp_path, monkeypatch):
-    products = {"homogeneous": {"channels": ["photon_532o"], "sections": [[700, 1500]]}}
-    campaign = archive(tmp_path, products=products)
-    scene = catalogued_scenes(campaign)[0]
-    plan = plan_scene(scene, campaign)
-    absent = {"left_out": [[700.0, 1500.0, "LOW_SIGNAL"]]}
-    steps = [
-        replace(step, settings={**step.settings, **absent}) if step.name == "homogeneous" else step
-        for step in plan.steps
-        if step.name != "look"
-    ]
-    opened = input_files.open_archive
-
-    def without_shots(*files: Any, **settings: Any) -> xr.Dataset:
-        raw = opened(*files, **settings)
-        raw["photon_532o_shots"][1] = 0
-        return raw
-
-    monkeypatch.setattr(input_files, "open_archive", without_shots)
-    (product,) = process_scene(Job(campaign, scene, replace(plan, steps=tuple(steps)))).products
-    flags = xr.load_dataset(campaign.products_root / product.path)["quality_flag"].to_numpy()
-    bits = flags[:, 0] & int(Quality.LOW_SIGNAL | Quality.INPUT_MISSING)
-    low = int(Quality.LOW_SIGNAL)
-    assert bits.tolist() == [low, low | int(Quality.INPUT_MISSING), low, low]
 
 
 @pytest.mark.parametrize("bytes_at_once", [0, 10**9])
@@ -590,9 +471,8 @@ def test_headers_of_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
         made.append(reprocess(changed, options=Options(force=True)).scenes[0].products)
         return seen
 
-    # Once for the sample, which holds all files, and once for the scene.
     made: list[tuple[ProductRecord, ...]] = []
-    assert again() == ["h0", "h0"]
+    assert again() == ["h0"]
     assert [product.sha256 for product in made[0]] == [p.sha256 for p in first.products]
     assert set(again(all_steps=True)) == {"h0", "h1", "h2", "h3"}
     with Store(campaign.catalog_url, campaign.name) as store, store.transaction() as connection:

@@ -451,8 +451,7 @@ def test_an_internal_error_is_reported_apart_with_its_traceback(
     def broken(*_: object, **_settings: object) -> None:
         raise TypeError("no such thing")
 
-    # The scene shows no signal, so its section is left empty.
-    monkeypatch.setattr("lidarops.retrieve.homogeneous.labeled.empty_fit", broken)
+    monkeypatch.setattr("lidarops.retrieve.homogeneous.labeled.fit_homogeneous_path", broken)
     state = reprocess(str(campaign_file), return_state=True)
     assert (state.name, state.type) == (WITH_FAILURES, StateType.COMPLETED)
     assert state.message == "1 scenes ended with an internal error, 1 files refused"

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import xarray as xr
 from pydantic import ValidationError
 from support import factories
 
 from lidarops.kinds import Scope, kinds_of
 from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.products.homogeneous.steps import STEP as HOMOGENEOUS
-from lidarops.records import Granule, Plan, Role, Scene
+from lidarops.records import Plan, Role, Scene
 from lidarops.retrieve.signal.dark import DarkSignals
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.steps import dependence
-from lidarops.steps.step import Look
 
 
 def _scene(*granules: object) -> Scene:
@@ -46,7 +41,6 @@ def test_photon_channel() -> None:
         "dead_time",
         "noise",
         "range_window",
-        "look",
         "homogeneous",
     ]
     assert steps["dead_time"] == {
@@ -154,36 +148,6 @@ def test_the_background_of_a_moving_beam_is_that_of_the_far_range(
     (step,) = (step for step in result.steps if step.name == "homogeneous")
     assert step.settings["method"] == method
     assert ("because the beam moves" in step.reason) == (method == "known_background")
-
-
-@pytest.mark.parametrize("lit", [90.0, 60.0])
-def test_only_level_beams_tell_whether_a_section_is_dark(lit: float) -> None:
-    """Of 61 beams the first samples hold none of the two level ones."""
-    granules = [
-        factories.granule(number / 30, zenith_angle=90.0 if number in (2, 3) else 60.0)
-        for number in range(61)
-    ]
-    scene = _scene(*granules)
-    plan = plan_scene(scene, factories.campaign(facts=[{}]))
-    (planned,) = (step for step in plan.steps if step.name == "homogeneous")
-
-    def sample(channel: str, some: Sequence[Granule]) -> Iterator[xr.Dataset]:
-        distance = np.arange(37.5, 7500.0, 7.5)
-        for granule in some:
-            light = 1e6 if granule.zenith_angle == lit else 0.0
-            power = 1.0 + light / distance**2
-            yield xr.Dataset(
-                {
-                    "power": (("time", "range"), power[np.newaxis]),
-                    "quality": (("time", "range"), np.zeros((1, distance.size), np.int32)),
-                    "variance": (("time", "range"), np.full((1, distance.size), 1e-4)),
-                    CORRELATION_LENGTH: ("time", [1.0]),
-                },
-                coords={"range": distance},
-            )
-
-    _, omitted = HOMOGENEOUS.refined(planned, Look(plan, scene, sample))
-    assert [why.rule for why in omitted] == ([] if lit == 90.0 else ["section_dark"])
 
 
 def test_an_implausible_wavelength_needs_the_campaign() -> None:

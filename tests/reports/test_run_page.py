@@ -350,11 +350,11 @@ class TestDegenerateRuns:
 
 class TestDecisions:
     def test_rule_and_number_of_a_step_are_shown(self, archive, tmp_path):
-        step = PlannedStep("look", CHANNEL, {}, "sections may be dark", rule="look", number=16.0)
+        step = PlannedStep("dark", CHANNEL, {}, "16 dark files", rule="dark", number=16.0)
         plan = replace(fab.plan("one"), steps=(step,))
         scene = outcome("one", START, plan=plan, cpu_seconds=3.0)
         page = built(run_record(archive.root, [scene]), tmp_path / "report")
-        assert f"look sections may be dark look 16 {CHANNEL}" in page.text
+        assert f"dark 16 dark files dark 16 {CHANNEL}" in page.text
         assert "CPU time of scenes 3.0 s" in page.text
 
 

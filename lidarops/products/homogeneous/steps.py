@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -14,18 +13,9 @@ import xarray as xr
 
 from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.flags import Quality
-from lidarops.products.homogeneous.look import (
-    LEVEL,
-    LOOKED_AT,
-    REFINEMENTS,
-    OmittedBit,
-    climb,
-    empty_sections,
-    omitted_sections,
-)
 from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
 from lidarops.products.homogeneous.variables import LAYOUT
-from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
+from lidarops.records import DetectionMode, is_glued
 from lidarops.retrieve.air import labeled as labeled_visibility
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.homogeneous import labeled
@@ -33,7 +23,6 @@ from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import (
     CORRELATION_LENGTH,
     baseline_error,
-    channel_unit,
     counts_per_power,
 )
 from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
@@ -49,7 +38,6 @@ from lidarops.steps.step import (
     Choice,
     Decisions,
     Leave,
-    Look,
     NoSettings,
     ProductStep,
     Run,
@@ -59,6 +47,9 @@ from lidarops.steps.workload import Workload
 Case = ProductCase[HomogeneousSettings]
 
 Section = tuple[float, float]
+
+LEVEL: Final = THRESHOLDS.level * (1.0 + 1e-6)
+"""m, largest climb along a section. Headers and campaign files round angles differently."""
 
 
 def _inside(case: Case) -> list[Section]:
@@ -82,7 +73,10 @@ def _climbs(case: Case, near: float, far: float) -> list[float]:
     Infinite where the zenith angle is unknown, so that the beam does not count as level.
     """
     angles = [granule.zenith_angle for granule in case.scene.granules]
-    return [math.inf if angle is None else climb(angle, near, far) for angle in angles]
+    return [
+        math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
+        for angle in angles
+    ]
 
 
 def _steep(case: Case, near: float, far: float) -> int:
@@ -136,28 +130,6 @@ class SectionWindow(Window, Choice[Case, WindowSettings]):
         yield Run(reason, WindowSettings(bins=((0, bins),)), number=float(bins))
 
 
-class LookSettings(SettingsModel):
-    """Settings of the step ``look``."""
-
-    profiles: int
-    """Number of profiles that are sampled first."""
-
-
-class LookForSignal(Choice[Case, LookSettings]):
-    """Leave out the sections in which no sampled profile shows a signal."""
-
-    name = "look"
-    settings = LookSettings
-
-    def decide(self, case: Case) -> Decisions:
-        """Run unless all steps are requested."""
-        if case.all_steps:
-            yield Leave(ALL_STEPS)
-        else:
-            reason = "sections in which no sampled profile shows a signal are not retrieved"
-            yield Run(reason, LookSettings(profiles=LOOKED_AT), number=float(LOOKED_AT))
-
-
 class AlongPath(Choice[Case, NoSettings]):
     """Add visibility along the sections."""
 
@@ -189,16 +161,8 @@ class PathSettings(SettingsModel):
     )
     lag: int | None = quantity(None, unit=NO_UNIT, description="of `cubic`, bins")
     visibility: VisibilitySettings | None = None
-    left_out: tuple[tuple[float, float, OmittedBit], ...] = ()
-    """Sections that are not retrieved, with the quality bit that says why."""
-
-    @property
-    def omitted(self) -> dict[Section, Quality]:
-        """Sections that are not retrieved, with their quality bit."""
-        return {(near, far): Quality[bit] for near, far, bit in self.left_out}
 
 
-_LOOK: Final = LookForSignal()
 _BACKGROUNDS: Final = {
     "known_background": "comes from the far range",
     "known_extinction": "is retrieved at the extinction of the campaign",
@@ -224,7 +188,7 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
     name = "homogeneous"
     settings = PathSettings
     inputs = (PROFILES, RELATIVE_VARIANCE, OVERLAP, WAVELENGTH)
-    parts = (SectionWindow(), _LOOK, AlongPath())
+    parts = (SectionWindow(), AlongPath())
 
     def decide(self, case: Case) -> Decisions:
         """Run for the sections that lie within the bins, along a nearly level path."""
@@ -260,19 +224,6 @@ class Homogeneous(ProductStep[HomogeneousSettings, PathSettings]):
                 number=float(len(level)),
                 warning=_WARNINGS.get(settings.method, ""),
             )
-
-    def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:
-        """Return the planned step without the sections in which sampled profiles show no signal."""
-        sample = _LOOK.settings_in(look.plan)
-        if sample is None or not look.scene.granules:
-            return planned, []
-        settings = self.typed(planned)
-        omitted = omitted_sections(planned, settings, look, sample.profiles)
-        if not omitted:
-            return planned, []
-        entries = [(*section, REFINEMENTS[why.rule]) for section, why in omitted.items()]
-        refined = settings.model_copy(update={"left_out": (*settings.left_out, *entries)})
-        return _with_settings(planned, refined), list(omitted.values())
 
     def stream(self, settings: PathSettings, data: Data) -> WholeProduct:
         """Return the product, which holds the values of sections only."""
@@ -343,35 +294,18 @@ def _partly_slanted(case: Case, near: float, far: float) -> Leave:
     return Leave(reason, number=float(steep), rule="beam_level")
 
 
-def _with_settings(planned: PlannedStep, settings: SettingsModel) -> PlannedStep:
-    return replace(planned, settings=settings.model_dump(mode="json", exclude_none=True))
-
-
 class _Sections(WholeProduct):
     """Values of the sections of each profile."""
 
     def __init__(self, settings: PathSettings, data: Data) -> None:
         self._settings, self._data = settings, data
-        self._omitted = settings.omitted
-        self._kept = [section for section in settings.sections if section not in self._omitted]
         self._parts: list[xr.Dataset] = []
-
-    @property
-    def reads(self) -> bool:
-        """Whether a section is retrieved."""
-        return bool(self._kept)
 
     def add(self, chunk: Chunk) -> None:
         """Retrieve the sections of the next profiles."""
         profiles = self._data[PROFILES]
         shots = profiles.shots(chunk.counts)
-        parts = []
-        if self._kept:
-            parts.append(self._retrieved(chunk.profiles(profiles), shots))
-        if self._omitted:
-            unit = channel_unit(self._data.source.archive, self._data.channel)
-            parts.append(empty_sections(shots, unit, self._omitted))
-        sections = _in_order(parts, [*self._kept, *self._omitted], self._settings.sections)
+        sections = self._retrieved(chunk.profiles(profiles), shots)
         slanted = labeled.not_level(sections, chunk.geometry["zenith_angle"])
         sections = sections.assign(quality_flag=sections["quality_flag"] | slanted, shots=shots)
         self._parts.append(sections.assign_coords(chunk.geometry.variables))
@@ -391,7 +325,7 @@ class _Sections(WholeProduct):
         far = self._settings.background_range
         fit = partial(
             labeled.fit_homogeneous_path,
-            sections=self._kept,
+            sections=self._settings.sections,
             background_range=far,
             background=self._settings.background,
             lag=self._settings.lag,
@@ -434,18 +368,6 @@ def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:
     """Return the quality bit of bins with partial overlap."""
     bits = np.where(overlap >= THRESHOLDS.full_overlap, 0, int(Quality.INCOMPLETE_OVERLAP))
     return xr.DataArray(bits.astype(np.int32), dims="range")
-
-
-def _in_order(
-    parts: list[xr.Dataset], sections: list[Section], order: tuple[Section, ...]
-) -> xr.Dataset:
-    """Return the retrieved and the empty sections together, in the order of the request."""
-    if len(parts) == 1:
-        return parts[0]
-    joined: xr.Dataset = xr.concat(parts, dim="section")
-    number = np.arange(len(order), dtype=np.int32)
-    places = [sections.index(section) for section in order]
-    return joined.isel(section=places).assign_coords(section=("section", number))
 
 
 def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, cast
 
 import xarray as xr
@@ -13,7 +13,6 @@ from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.products.raman.settings import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
-from lidarops.records import LeftOut, PlannedStep
 from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.scattering import (
@@ -44,7 +43,7 @@ from lidarops.steps.preparation import AVERAGE, MOLECULES, Average, with_methods
 from lidarops.steps.profiles import ScreenedAverages
 from lidarops.steps.reading import WAVELENGTH
 from lidarops.steps.signal_to_noise import with_low_signal_to_noise
-from lidarops.steps.step import REQUESTED, Decisions, Leave, Look, ProductStep, Run
+from lidarops.steps.step import REQUESTED, Decisions, Leave, ProductStep, Run
 from lidarops.steps.workload import Workload
 
 Case = ProductCase[RamanProductSettings]
@@ -90,8 +89,6 @@ class RetrievalSettings(SettingsModel):
     overlap_relative_error: float
     filter_width: float | None = quantity(None, unit="m")
     least_signal_to_noise: float
-    dark: bool = False
-    """Whether a look at some profiles found no Raman signal, so that nothing is retrieved."""
 
 
 _AVERAGE: Final = Average("the noise of a single profile is too large for Raman signals")
@@ -208,39 +205,13 @@ class Raman(ProductStep[RamanProductSettings, RetrievalSettings]):
         water = settings.water_vapour
         return (settings.nitrogen,) if water is None else (settings.nitrogen, water)
 
-    def refined(self, planned: PlannedStep, look: Look) -> tuple[PlannedStep, list[LeftOut]]:
-        """Return the step that retrieves nothing, where sampled profiles have no Raman signal."""
-        settings = self.typed(planned)
-        granules = look.scene.granules
-        sample = [granules[k] for k in spaced_indices(len(granules), LOOKED_AT)]
-        seen, most = 0, 0.0
-        for profiles in look.profiles(settings.nitrogen, sample):
-            variance = (profiles["variance"] * profiles[CORRELATION_LENGTH]).to_numpy()
-            light = detect_light(
-                profiles["power"].to_numpy(),
-                variance,
-                profiles["quality"].to_numpy(),
-                profiles["range"].to_numpy(),
-                NEAREST,
-                FARTHEST,
-            )
-            seen, most = seen + light.profiles, max(most, light.significance)
-        if not seen or most >= LEAST_SIGNAL:
-            return planned, []
-        reason = (
-            f"no signal of {settings.nitrogen} from {NEAREST:g} to {FARTHEST:g} m in {seen}"
-            f" profiles looked at: at most {most:.1f} standard errors (limit {LEAST_SIGNAL:g});"
-            " nothing is retrieved"
-        )
-        left = LeftOut(
-            self.name, planned.channel, reason, rule="raman_dark", number=most, product=self.name
-        )
-        dark = settings.model_copy(update={"dark": True})
-        return replace(planned, settings=dark.model_dump(mode="json", exclude_none=True)), [left]
-
     def stream(self, settings: RetrievalSettings, data: Data) -> ProductStream:
         """Return the product, whose averages are retrieved as they become complete."""
-        return _Dark(settings, data) if settings.dark else _Retrieval(settings, data)
+        dark = _without_signal(settings, data)
+        if not dark:
+            return _Retrieval(settings, data)
+        data.notes.append(f"raman of {data.channel}: {dark}")
+        return _Dark(settings, data, dark)
 
     def held(self, settings: RetrievalSettings, work: Workload) -> float:
         """Return the bytes of the averages that are completed together, and of their solution."""
@@ -363,11 +334,32 @@ def _pointing(data: Data) -> Mapping[str, float]:
     return {name: float(geometry[name][0]) for name in names}
 
 
+def _without_signal(settings: RetrievalSettings, data: Data) -> str:
+    """Return in words that no profile that is looked at has a Raman signal; empty if one has."""
+    archive, profiles = data.source.archive, data.channels[settings.nitrogen][PROFILES]
+    places = spaced_indices(archive.sizes["time"], LOOKED_AT)
+    seen, most = 0, 0.0
+    for place in places:
+        power, variance, quality, length = (
+            profiles.of(archive.isel(time=[place]))[name].to_numpy()
+            for name in ("power", "variance", "quality", CORRELATION_LENGTH)
+        )
+        light = detect_light(power, variance * length, quality, profiles.range, NEAREST, FARTHEST)
+        seen, most = seen + light.profiles, max(most, light.significance)
+    if not seen or most >= LEAST_SIGNAL:
+        return ""
+    return (
+        f"no signal of {settings.nitrogen} from {NEAREST:g} to {FARTHEST:g} m in {seen}"
+        f" profiles looked at: at most {most:.1f} standard errors (limit {LEAST_SIGNAL:g});"
+        " nothing is retrieved"
+    )
+
+
 class _Dark(WholeProduct):
     """A product without values, whose rows are the averages of a scene without Raman signal."""
 
-    def __init__(self, settings: RetrievalSettings, data: Data) -> None:
-        self._settings, self._data = settings, data
+    def __init__(self, settings: RetrievalSettings, data: Data, reason: str) -> None:
+        self._settings, self._data, self._reason = settings, data, reason
 
     @property
     def reads(self) -> bool:
@@ -394,7 +386,7 @@ class _Dark(WholeProduct):
             assumptions=_assumptions(settings, data[WAVELENGTH], raman),
         )
         product = with_methods(empty, data[MOLECULES], known_shape=settings.known_shape)
-        return in_one_batch(product)
+        return in_one_batch(product.assign_attrs(steps=f"raman: {self._reason}"))
 
 
 STEP: Final = Raman()

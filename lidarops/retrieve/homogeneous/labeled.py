@@ -148,41 +148,6 @@ def fit_homogeneous_path(
     return _described(result, edges, power.attrs.get("units", "1"))
 
 
-def empty_fit(
-    profiles: xr.DataArray, *, unit: str, sections: Sequence[tuple[float, float]]
-) -> xr.Dataset:
-    """Return a result of `fit_homogeneous_path` without values, for scenes without power.
-
-    Parameters
-    ----------
-    profiles : xr.DataArray, (...)
-        Any array with one value per profile; its coordinates are kept.
-    unit : str
-        Unit of the power.
-    sections : sequence of (float, float)
-        m.
-
-    Returns
-    -------
-    xr.Dataset, (..., section)
-        In memory: NaN, 0 valid bins, and a ``quality_flag`` of 0, to be filled by the caller.
-
-    Raises
-    ------
-    RetrievalInputError
-        Where the sections are invalid.
-    """
-    edges = _edges(sections)
-    dims = (*profiles.dims, "section")
-    shape = (*profiles.shape, len(edges))
-    result = xr.Dataset(
-        {name: (dims, np.full(shape, np.nan)) for name in _VALUES}
-        | {name: (dims, np.zeros(shape, np.int32)) for name in _COUNTS},
-        coords=profiles.coords,
-    )
-    return _described(result, edges, unit)
-
-
 def _described(result: xr.Dataset, edges: npt.NDArray[np.float64], power_unit: str) -> xr.Dataset:
     """Return values of sections with their units and coordinates."""
     for name, pattern in _VALUES.items():

@@ -58,12 +58,6 @@ class Thresholds(NamedTuple):
     # The product
     full_overlap: float = 0.99
     """Least overlap of the bins that are used. Assumed."""
-    dark: float = 3.0
-    """Standard errors of the light in a section, below which none of the first 16 sampled profiles
-    shows a signal. Normal noise exceeds it in one of 16 in 2 % of the scenes."""
-    still_dark: float = 3.5
-    """The same for both samples together, which have more profiles and so larger maxima of noise.
-    Assumed."""
     level: float = 100.0
     """m; largest change of height along a section. Aerosol decreases with a scale height of 1 to
     2 km; a larger change mimics an extinction of more than some percent. Assumed."""
