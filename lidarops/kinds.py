@@ -1,7 +1,7 @@
 """Registry of the kinds of product, which are found by entry point.
 
 A kind of product is one package: its ``__init__`` holds a `Kind`, and its modules ``settings``,
-``steps``, ``variables``, ``flags``, ``figures`` and ``draft`` hold everything else about it.
+``retrieval``, ``variables``, ``flags``, ``figures`` and ``draft`` hold everything else about it.
 Without ``figures``, its main variable is drawn; without ``draft``, no new campaign file requests
 it. A package outside lidarops adds a kind by an entry point of the group
 ``lidarops.product_kinds``::

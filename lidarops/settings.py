@@ -217,6 +217,12 @@ class SettingsModel(BaseModel):
                 raise PydanticCustomError("no_boolean", "is a boolean", {"keys": (key,)})
         return values
 
+    @classmethod
+    def taken_from(cls, other: BaseModel, **given: Any) -> Self:
+        """Return settings with given values, and those of another model for all other fields."""
+        names = (cls.model_fields.keys() - given.keys()) & type(other).model_fields.keys()
+        return cls(**given, **{name: getattr(other, name) for name in names})
+
 
 def _holds_boolean(value: Any) -> bool:
     if isinstance(value, list | tuple):

@@ -92,7 +92,7 @@ def _plan(
     from lidarops.catalog.store import Store
     from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.selection import selects_no_scene
-    from lidarops.steps.memory import scene_memory
+    from lidarops.scene.memory import scene_memory
 
     findings = survey(settings, selection=selection, wait=wait)
     with Store(settings.catalog_url, settings.name) as store:
@@ -187,7 +187,7 @@ def _needs(plan: Plan) -> Iterator[str]:
 
     For a product, also the channels with which it is compared.
     """
-    from lidarops.steps.dependence import is_product, needed_places
+    from lidarops.scene.dependence import is_product, needed_places
 
     for step, places in zip(plan.steps, needed_places(plan), strict=True):
         others = [plan.steps[place] for place in places]
@@ -202,7 +202,7 @@ def _needs(plan: Plan) -> Iterator[str]:
 
 
 def _effect(step: PlannedStep, plan: Plan) -> str:
-    from lidarops.steps.reading import idle_window
+    from lidarops.scene.windows import idle_window
 
     idle = idle_window(step, plan.steps)
     return f"no effect: {idle}" if idle else ", ".join(_settings(step))
@@ -210,10 +210,10 @@ def _effect(step: PlannedStep, plan: Plan) -> str:
 
 def _settings(step: PlannedStep) -> Iterator[str]:
     """Yield the settings of a step with their units."""
+    from lidarops.scene.retrieval import settings_model
     from lidarops.settings import unit_of
-    from lidarops.steps.registry import definition
 
-    model = definition(step).settings
+    model = settings_model(step)
     for key, value in step.settings.items():
         number = f"{value:.6g}" if isinstance(value, float) else f"{value}"
         unit = "" if value is None else unit_of(model, key)
@@ -249,7 +249,7 @@ def _show_kept(judged: Judgement) -> None:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
-    from lidarops.steps.reading import idle_window
+    from lidarops.scene.windows import idle_window
 
     stale, frozen, kept = (
         [

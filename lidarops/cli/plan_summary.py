@@ -53,8 +53,8 @@ def show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
 
 
 def _say_steps(plan: Plan) -> None:
-    from lidarops.steps.channels import READ_STEP
-    from lidarops.steps.step import REQUEST
+    from lidarops.scene.case import REQUEST
+    from lidarops.scene.channels import READ_STEP
 
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
@@ -82,8 +82,8 @@ def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
 
     Without those of which a product is shown as left out.
     """
-    from lidarops.steps.channels import READ_STEP
-    from lidarops.steps.step import REQUEST
+    from lidarops.scene.case import REQUEST
+    from lidarops.scene.channels import READ_STEP
 
     unread = (
         left

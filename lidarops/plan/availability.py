@@ -1,71 +1,30 @@
-"""Find channels that a campaign requests or gives facts of, and that the files do not hold.
+"""Find channels that a campaign requests or gives facts of, and that no or not all files hold.
 
-`missing_channels` compares one layout of channels with the campaign, for the plan of a scene;
-`unavailable_channels` all files of an archive: a channel that no file holds is a typing error, one
-that some files lack is a lidar that was changed.
+A channel that no file holds is a typing error, one that some files lack is a changed lidar.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Final
 
-from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, channel_facts
+from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
 from lidarops.raw.recorders import label_of
 from lidarops.records import ChannelLayout, FactsNote, Holding, LeftOut, Unmet, is_glued
-from lidarops.steps.channels import LAG_STEP, READ_STEP, file_channels, glued_parts, joined_layout
+from lidarops.scene.channels import LAG_STEP, glued_parts
+from lidarops.scene.missing_channels import (
+    ABSENT,
+    UNMATCHED,
+    missing_channels,
+    named_channels,
+)
 
 FACTS: Final = "facts"
-_ABSENT: Final = "channel_present"
-_UNMATCHED: Final = "facts_fit"
-
 _FIRST: Final = datetime.min.replace(tzinfo=UTC)
 _LAST: Final = datetime.max.replace(tzinfo=UTC)
-
-
-def named_channels(instrument: Instrument) -> list[str]:
-    """Return the channels that the products of an instrument request by name, or are made of."""
-    requested = instrument.products.requested().values()
-    return list(
-        dict.fromkeys(
-            name
-            for settings in requested
-            for channel in settings.named
-            for name in (channel, *settings.companions(channel))
-        )
-    )
-
-
-def missing_channels(
-    layout: tuple[ChannelLayout, ...], instrument: Instrument, facts: InstrumentFacts
-) -> Iterator[LeftOut]:
-    """Yield the channels that a campaign requests or gives facts of, and that files lack.
-
-    Parameters
-    ----------
-    layout : tuple of ChannelLayout
-        Channels of the files.
-    instrument : Instrument
-    facts : InstrumentFacts
-        The facts about it at the time of the files.
-    """
-    present = {channel.name: channel for channel in layout}
-    glued = [channel.name for channel in joined_layout(layout, named_channels(instrument))]
-    for kind, settings in instrument.products.requested().items():
-        for name in settings.named:
-            if name not in present and name not in glued:
-                reason = _why_absent(name, present, channel_facts(facts, name).recorder)
-                yield LeftOut(kind, name, reason, rule=_ABSENT, product=kind)
-    for name, facts_of_channel in facts.channels.items():
-        if name not in present:
-            reason = f"the facts name a channel that the files lack; {_instead(name, present)}"
-            yield LeftOut(READ_STEP, name, reason, rule=_UNMATCHED)
-        elif facts_of_channel.lag is not None and not name.startswith("analog_"):
-            reason = "a lag belongs to the facts of the analog channel"
-            yield LeftOut(LAG_STEP, name, reason, rule=_UNMATCHED)
 
 
 def unused_lidar_ratios(
@@ -94,32 +53,6 @@ def _has_lidar_ratio(facts: InstrumentFacts, channel: str) -> bool:
     return given is not None and (
         given.lidar_ratio is not None or given.lidar_ratio_profile is not None
     )
-
-
-def _instead(name: str, present: Mapping[str, ChannelLayout]) -> str:
-    if is_glued(name) and set(glued_parts(name)) <= set(present):
-        analog, photon = glued_parts(name)
-        return f"give the lag to {analog}, and dead time and lidar ratio to {photon}"
-    return f"they hold {_held(name, present)}"
-
-
-def _held(missing: str, present: Mapping[str, ChannelLayout]) -> str:
-    """Return the channels of files, with the recorders of those that are like a missing one."""
-    labels = {label_of(name) for name in file_channels(missing)}
-    recorders = {n: c.recorder for n, c in present.items() if label_of(n) in labels and c.recorder}
-    return ", ".join(f"{n} (recorder {recorders[n]})" if n in recorders else n for n in present)
-
-
-def _why_absent(name: str, present: Mapping[str, ChannelLayout], recorder: str | None) -> str:
-    if is_glued(name):
-        parts = glued_parts(name)
-        if set(parts) <= set(present):
-            widths = [f"{present[part].bin_width:g} m" for part in parts]
-            return f"its analog and photon-counting channels have bins of {' and '.join(widths)}"
-        missing = [part for part in parts if part not in present]
-        return f"the files hold no {' and no '.join(missing)} to glue"
-    stated = f" of the recorder {recorder} that the facts state" if recorder else ""
-    return f"the files hold no such channel{stated}, only {_held(name, present)}"
 
 
 def validity_edges(campaign: Campaign) -> list[datetime]:
@@ -191,9 +124,9 @@ def unavailable_channels(
         )
         reasons = {}
         for omission in _lacking(holding.layout, instrument, facts):
-            if omission.rule == _ABSENT and (not kinds or omission.name in kinds):
+            if omission.rule == ABSENT and (not kinds or omission.name in kinds):
                 reasons[omission.name, omission.channel] = omission.reason
-            elif omission.rule == _UNMATCHED and touched:
+            elif omission.rule == UNMATCHED and touched:
                 reasons[period, omission.channel] = omission.reason
         for (requester, channel), reason in reasons.items():
             lacking[name, requester, channel].append((holding.files, reason))

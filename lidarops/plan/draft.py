@@ -25,8 +25,8 @@ from lidarops.raw.header import POINTING_NOTE, HeaderOrder
 from lidarops.raw.recorders import label_of
 from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.steps.channels import file_channels
-from lidarops.steps.pointing import LEAST_SPREAD
+from lidarops.scene.channels import file_channels
+from lidarops.scene.pointing import LEAST_SPREAD
 
 _NEAR: Final = 0.2
 """degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""

@@ -24,7 +24,7 @@ from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.errors import RetrievalInputError, SceneError
 from lidarops.records import ChannelLayout, FileNote, Granule, Role, Scene, Status
 from lidarops.retrieve.multiangle import scan_cycles
-from lidarops.steps.pointing import LEAST_SPREAD
+from lidarops.scene.pointing import LEAST_SPREAD
 
 DARK_REACH = timedelta(hours=24)
 """Longest time between a scene and the dark files that it uses."""

@@ -19,7 +19,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
 from lidarops.plan.scenes import DARK_REACH, window_at
 from lidarops.records import Granule, Role, Scene
-from lidarops.steps.dependence import with_unused
+from lidarops.scene.dependence import with_unused
 
 MOST_IN_DOUBT: Final = 10
 """Dark files of unknown time that a scene names; all those of an archive may be refused."""

@@ -24,7 +24,6 @@ from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import LidarOpsError
 from lidarops.plan.outlying_headers import joined_notes
-from lidarops.process.job import Job
 from lidarops.records import FileNote, Findings, Granule, RunRecord
 from lidarops.reports import run_record
 from lidarops.run.executor import (
@@ -41,6 +40,7 @@ from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
 from lidarops.run.session import Session, sweep
 from lidarops.run.staleness import REACH, DaysJudged, Judge, Judgement, Signature
+from lidarops.scene.job import Job
 from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen, prefetch_one, preload_modules
 
@@ -78,7 +78,7 @@ PAGE_LOCK: Final = ".index.lock"
 _WORKER_MODULES: Final = (
     "distributed.nanny",
     "lidarops.run.executor",
-    "lidarops.process.scene",
+    "lidarops.scene.processing",
     "lidarops.reports.gallery",
 )
 """Modules that workers need, for scenes and then for the report."""

@@ -19,11 +19,11 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
-from lidarops.process.guard import Failure, guarded
-from lidarops.process.job import Job
 from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.run import worker
 from lidarops.run.memory import fitted
+from lidarops.scene.guard import Failure, guarded
+from lidarops.scene.job import Job
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.processes import keep_memory, start_method
 
@@ -255,11 +255,11 @@ def _process_here(
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
-    """Process a scene; see `lidarops.process.scene.attempt`."""
+    """Process a scene; see `lidarops.scene.processing.attempt`."""
     # It loads the libraries of arrays and files, which a run with nothing to do does not need.
-    from lidarops.process import scene  # noqa: PLC0415
+    from lidarops.scene import processing  # noqa: PLC0415
 
-    return scene.attempt(job)
+    return processing.attempt(job)
 
 
 def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:

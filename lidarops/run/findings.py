@@ -12,10 +12,10 @@ from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, Unm
 from lidarops.run.lost_files import Lost
 from lidarops.run.selection import Selection, station_of
 from lidarops.run.staleness import Judge, Judgement
-from lidarops.steps import dependence
-from lidarops.steps.channels import READ_STEP
-from lidarops.steps.dependence import ProductKey
-from lidarops.steps.step import REQUEST
+from lidarops.scene import dependence
+from lidarops.scene.case import REQUEST
+from lidarops.scene.channels import READ_STEP
+from lidarops.scene.dependence import ProductKey
 
 _NO_OVERLAP: Final = (
     "give neither full_overlap_range nor overlap_profile: bins near the lidar are used as they are,"

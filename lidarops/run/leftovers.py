@@ -11,9 +11,9 @@ from functools import cached_property
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RecordedProduct
 from lidarops.plan.scenes import Cut, parse_scene_id
-from lidarops.process.job import nothing_to_do
 from lidarops.records import GLUED, Granule, InputRecord, LeftOut, Plan, Scene
-from lidarops.steps import dependence
+from lidarops.scene import dependence
+from lidarops.scene.job import nothing_to_do
 
 Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""

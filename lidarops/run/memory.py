@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Final
 
 from lidarops.errors import SceneError
-from lidarops.process.job import Job
-from lidarops.steps.memory import scene_memory
+from lidarops.scene.job import Job
+from lidarops.scene.memory import scene_memory
 
 USABLE: Final = 0.9
 """Share of a limit that a scene may use; dask ends a worker at 0.95."""

@@ -26,13 +26,13 @@ from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.plan.scenes import parse_scene_id
-from lidarops.process.context import recorded_settings
-from lidarops.process.job import Job
 from lidarops.records import Plan, ProductRecord, Role, SceneOutcome
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, Judgement
-from lidarops.steps import dependence
+from lidarops.scene import dependence
+from lidarops.scene.context import recorded_settings
+from lidarops.scene.job import Job
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
 

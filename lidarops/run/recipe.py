@@ -29,7 +29,7 @@ from lidarops.records import (
     Status,
     UnusedFile,
 )
-from lidarops.steps.dependence import UNUSED
+from lidarops.scene.dependence import UNUSED
 
 RAW: Final = (Role.SIGNAL, Role.DARK)
 """Roles of files in the archive; paths of other inputs start from the campaign folder."""

@@ -21,10 +21,10 @@ from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.provenance import package_versions
 from lidarops.netcdf.read import opened_product
-from lidarops.process.job import Job, Place
-from lidarops.process.scene import process_scene
 from lidarops.records import InputRecord
 from lidarops.run.recipe import RAW, Recipe, stays_inside
+from lidarops.scene.job import Job, Place
+from lidarops.scene.processing import process_scene
 from lidarops.system.code_version import code_version
 from lidarops.system.files import sha256_of
 from lidarops.system.stores import RemoteStore, is_url

@@ -30,7 +30,7 @@ from lidarops.records import (
 from lidarops.reports.run_journal import Journal
 from lidarops.reports.run_record import save_run_record
 from lidarops.run.staleness import Judge, Judgement
-from lidarops.steps.dependence import ProductKey
+from lidarops.scene.dependence import ProductKey
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.stores import without_keys
 

@@ -29,12 +29,8 @@ from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.channel_names import ChannelNames
 from lidarops.plan.outlying_headers import NEAR_DAYS, new_notes, without_outlying
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import DARK_REACH, Cut, as_recorded, cut_scenes
 from lidarops.plan.unused_files import Refused, dated, name_unused
-from lidarops.process.context import recorded_settings
-from lidarops.process.guard import Failure, guarded
-from lidarops.process.job import Job, Place
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import (
@@ -51,8 +47,12 @@ from lidarops.run import leftovers
 from lidarops.run.leftovers import Orphan
 from lidarops.run.lost_files import Lost, find_lost
 from lidarops.run.selection import Selection, requested_kinds
-from lidarops.steps import dependence
-from lidarops.steps.dependence import OPERATION, ProductKey, ancillary_files
+from lidarops.scene import dependence
+from lidarops.scene.context import recorded_settings
+from lidarops.scene.dependence import OPERATION, ProductKey, ancillary_files
+from lidarops.scene.guard import Failure, guarded
+from lidarops.scene.job import Job, Place
+from lidarops.scene.plan import plan_scene
 from lidarops.system.code_version import code_version, joint_code_version, source_version
 from lidarops.system.files import sha256_of
 
@@ -66,7 +66,7 @@ if workers process the scenes, the next group."""
 _PLANNING: Final = (
     "lidarops.plan.channel_names",
     "lidarops.plan.outlying_headers",
-    "lidarops.plan.scene_plan",
+    "lidarops.scene.plan",
     "lidarops.plan.scenes",
     "lidarops.plan.unused_files",
 )

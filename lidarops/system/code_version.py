@@ -15,14 +15,14 @@ from lidarops.registry import RAW_FORMATS
 from lidarops.system.source_closure import Sources
 
 _EVERY_PRODUCT: Final = (
-    "lidarops.process.scene",
+    "lidarops.scene.processing",
     "lidarops.netcdf.build",
     "lidarops.netcdf.write",
 )
 """Modules that every product passes through."""
 _CATALOGUES: Final = "lidarops.catalog.headers"
 """Module that makes an entry of the catalog from the header of a raw file."""
-_OF_KIND: Final = ("settings", "steps", "variables", "flags")
+_OF_KIND: Final = ("settings", "retrieval", "variables", "flags")
 """Modules of a kind that make its products, as far as it has them."""
 _PAGES: Final = "lidarops.site.build"
 """Module that makes the pages of products."""

@@ -19,13 +19,13 @@ from lidarops.campaign.ancillary_files import (
     overlap_profile,
 )
 from lidarops.errors import AncillaryError
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.steps.dependence import ancillary_files
+from lidarops.scene.dependence import ancillary_files
+from lidarops.scene.plan import plan_scene
 
 ALTITUDE = np.linspace(0.0, 20_000.0, 41)
 PRESSURE, TEMPERATURE = us_standard(ALTITUDE)

@@ -14,9 +14,9 @@ from support.archives import mixed_campaign
 from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import load_campaign
-from lidarops.process import execution
-from lidarops.process.job import Job
-from lidarops.process.scene import process_scene
+from lidarops.scene import execution
+from lidarops.scene.job import Job
+from lidarops.scene.processing import process_scene
 from lidarops.simulate.campaign import simulate_campaign
 
 PROFILES = 21
@@ -25,7 +25,7 @@ GLUED = ["photon_532o", "glued_532o"]
 
 RUN = """
 import pickle, sys
-from lidarops.process.scene import process_scene
+from lidarops.scene.processing import process_scene
 with open(sys.argv[1], "rb") as stream:
     jobs = pickle.load(stream)
 for job in jobs:

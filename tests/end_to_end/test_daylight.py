@@ -14,9 +14,9 @@ from support.archives.scene_jobs import scene_jobs
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
-from lidarops.process import execution
-from lidarops.process.job import Job
-from lidarops.process.scene import process_scene
+from lidarops.scene import execution
+from lidarops.scene.job import Job
+from lidarops.scene.processing import process_scene
 from lidarops.simulate.campaign import simulate_campaign
 
 ALONE = int(Quality.SINGLE_RECORD)

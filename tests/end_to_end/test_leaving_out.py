@@ -17,18 +17,17 @@ from support.oracles.angle_scenes import on_altitudes
 
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.process import execution
-from lidarops.process.job import Job
-from lidarops.process.scene import process_scene
 from lidarops.raw.file import RawFile
 from lidarops.records import Plan, PlannedStep, ProductRecord, Role, RunRecord
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
+from lidarops.scene import data, dependence
+from lidarops.scene.job import Job
+from lidarops.scene.plan import plan_scene
+from lidarops.scene.processing import process_scene
+from lidarops.scene.windows import idle_window, read_windows
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.steps import dependence
-from lidarops.steps.reading import idle_window, read_windows
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
 HOMOGENEOUS = {"homogeneous": SECTIONS}
@@ -427,7 +426,7 @@ def test_products_are_the_same_bits_read_at_once_and_in_chunks(
     scene = catalogued_scenes(campaign)[0]
     job = Job(campaign, scene, plan_scene(scene, campaign))
     usual = [product.sha256 for product in process_scene(job).products]
-    monkeypatch.setattr(execution, "IN_MEMORY", bytes_at_once)
+    monkeypatch.setattr(data, "IN_MEMORY", bytes_at_once)
     assert [product.sha256 for product in process_scene(job).products] == usual
 
 

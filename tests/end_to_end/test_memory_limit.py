@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 from lidarops.bench.throughput import memory as peaks
 from lidarops.cli.app import app
 from lidarops.errors import SceneError
-from lidarops.process.job import Job
 from lidarops.run.archive import Options, reprocess
 from lidarops.run.executor import local_client
 from lidarops.run.memory import USABLE, fitted
-from lidarops.steps.memory import PROCESS, SceneMemory, scene_memory
+from lidarops.scene.job import Job
+from lidarops.scene.memory import PROCESS, SceneMemory, scene_memory
 
 
 @pytest.fixture

@@ -14,9 +14,9 @@ from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import Campaign
 from lidarops.kinds import flags_of
-from lidarops.process.scene import process_scene
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.run.archive import Options, Selection, reprocess
+from lidarops.scene.processing import process_scene
 
 AIRS = {"homogeneous": made.HOMOGENEOUS, "gradient": made.GRADIENT, "plume": made.PLUME}
 

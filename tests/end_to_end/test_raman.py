@@ -18,7 +18,7 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.flags import Quality, rejecting
 from lidarops.kinds import flags_of
-from lidarops.products.raman.steps import STANDARD_SLOPE_ERROR
+from lidarops.products.raman.retrieval import STANDARD_SLOPE_ERROR
 from lidarops.records import RunRecord
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality

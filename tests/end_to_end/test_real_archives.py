@@ -14,9 +14,9 @@ from support.archives.scene_jobs import catalogued_scenes
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.records import Role, RunRecord
 from lidarops.run.archive import report_run, reprocess
+from lidarops.scene.plan import plan_scene
 
 CAMPAIGNS = Path(__file__).parent / "campaigns"
 LOW = np.int32(Quality.LOW_SIGNAL_TO_NOISE)

@@ -20,8 +20,8 @@ from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.reproduction import reproduce_product
+from lidarops.scene.dependence import plan_closure, planned_products
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.steps.dependence import plan_closure, planned_products
 from lidarops.system.files import sha256_of
 
 

@@ -15,7 +15,7 @@ from lidarops.figures.panels import Curve, Words
 from lidarops.figures.series_data import compare, join
 from lidarops.flags import Quality
 from lidarops.products.visibility.figure_data import instruments_of, read_crossings, read_map
-from lidarops.products.visibility.steps import NetworkSettings
+from lidarops.products.visibility.retrieval import NetworkSettings
 from lidarops.records import LeftOut, Plan, PlannedStep, SceneOutcome
 
 NAMES = ("lidar-0", "lidar-1", "lidar-2")

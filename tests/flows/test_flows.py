@@ -55,12 +55,12 @@ from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.cli import app as cli
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
-from lidarops.process.guard import Failure
-from lidarops.process.job import Job
 from lidarops.records import SceneOutcome
 from lidarops.run import executor
 from lidarops.run.archive import Result, Selection, bring_up_to_date, update_catalog
 from lidarops.run.clusters import Local
+from lidarops.scene.guard import Failure
+from lidarops.scene.job import Job
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,8 @@ from support.archives.scene_jobs import catalogued_scenes
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.records import Plan
+from lidarops.scene.plan import plan_scene
 from lidarops.simulate.campaign import simulate_campaign
 
 CampaignWith = Callable[[dict[str, Any], dict[str, Any]], Campaign]

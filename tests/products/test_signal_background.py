@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 from support import factories
 
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
+from lidarops.scene.plan import plan_scene
 
 
 def requested(**settings: Any) -> Any:

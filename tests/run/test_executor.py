@@ -22,8 +22,6 @@ from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
 from lidarops.errors import SceneError
-from lidarops.process.guard import Failure
-from lidarops.process.job import Job
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
 from lidarops.run.executor import (
@@ -35,6 +33,8 @@ from lidarops.run.executor import (
 )
 from lidarops.run.session import Session
 from lidarops.run.staleness import Judge
+from lidarops.scene.guard import Failure
+from lidarops.scene.job import Job
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from support.archives.small_archive import BINS, Archive
 from typer.testing import CliRunner, Result
 
 from lidarops.cli import app
-from lidarops.process.guard import Failure
-from lidarops.process.job import Job
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports.run_record import load_run_record
 from lidarops.run import executor
+from lidarops.scene.guard import Failure
+from lidarops.scene.job import Job
 
 pytestmark = pytest.mark.usefixtures("quickly")
 

@@ -15,10 +15,10 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.catalog.verify import verify_archive
 from lidarops.netcdf.comparison import compare_products
-from lidarops.process import scene
 from lidarops.records import Grade
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.session import Session
+from lidarops.scene import scene
 
 
 @pytest.fixture

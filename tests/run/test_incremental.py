@@ -25,7 +25,6 @@ from lidarops.catalog.rows import day_of
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
-from lidarops.process.job import Job
 from lidarops.records import SceneOutcome
 from lidarops.run import executor
 from lidarops.run.archive import (
@@ -37,6 +36,7 @@ from lidarops.run.archive import (
     reprocess,
 )
 from lidarops.run.staleness import DaysJudged, Judge
+from lidarops.scene.job import Job
 
 RICH = ("signal analog", "signal photon", "homogeneous photon", "elastic analog")
 

@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 from lidarops.catalog.store import Store
 from lidarops.catalog.verify import verify_archive
 from lidarops.cli import app
-from lidarops.process.scene import process_scene
 from lidarops.records import RunRecord
 from lidarops.run import staleness
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.executor import local_client
+from lidarops.scene.processing import process_scene
 
 DAY = "2026-03-02"
 SCENE = "rich_20260302T000000"

@@ -34,7 +34,7 @@ from lidarops.run.archive import (
     reprocess,
 )
 from lidarops.run.session import Session
-from lidarops.steps.dependence import plan_closure, planned_products
+from lidarops.scene.dependence import plan_closure, planned_products
 from lidarops.system.files import only_one
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)

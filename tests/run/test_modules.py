@@ -48,4 +48,4 @@ def test_a_run_with_nothing_to_do_loads_nothing_for_scenes_and_reports(archive: 
     code, modules, _ = _reprocessed(archive)
     assert code == 0
     idle = {"scipy.signal", "scipy.stats", "scipy.optimize", "scipy.spatial", "dask.array"}
-    assert not (idle | {"distributed", "netCDF4", "jinja2", "lidarops.process.scene"}) & modules
+    assert not (idle | {"distributed", "netCDF4", "jinja2", "lidarops.scene.processing"}) & modules

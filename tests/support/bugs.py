@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import xarray as xr
 
-from lidarops.products.homogeneous import steps
+from lidarops.products.homogeneous import retrieval
+from lidarops.products.homogeneous.retrieval import RETRIEVAL
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.run import executor
-from lidarops.steps.case import ChannelCase
-from lidarops.steps.step import Decisions
-from lidarops.steps.workload import Workload
+from lidarops.scene.case import ChannelCase, Entries
+from lidarops.scene.retrieval import Workload
 
 
 def insert(error: BaseException, day: str, patch: pytest.MonkeyPatch | None = None) -> None:
@@ -37,29 +38,25 @@ def insert(error: BaseException, day: str, patch: pytest.MonkeyPatch | None = No
 
 
 def insert_in_planning(error: BaseException, day: str, patch: pytest.MonkeyPatch) -> None:
-    """Make the step ``homogeneous`` raise an error when the scenes of a day are planned."""
-    decide = steps.Homogeneous.decide
+    """Raise an error when the homogeneous products of the scenes of a day are planned."""
 
-    def decide_with_a_bug(self: steps.Homogeneous, case: ChannelCase) -> Decisions:
+    def decide_with_a_bug(case: ChannelCase) -> Entries:
         if f"{case.scene.start:%Y-%m-%d}" == day:
             raise error
-        return decide(self, case)
+        return RETRIEVAL.needs(case)
 
-    patch.setattr(steps.Homogeneous, "decide", decide_with_a_bug)
+    patch.setattr(retrieval, "RETRIEVAL", replace(RETRIEVAL, needs=decide_with_a_bug))
 
 
 def insert_in_the_estimate(error: BaseException, day: str, patch: pytest.MonkeyPatch) -> None:
-    """Make the step ``homogeneous`` raise an error when the memory of scenes of a day is fitted."""
-    held = steps.Homogeneous.held
+    """Raise an error when the memory of homogeneous products of a day is estimated."""
 
-    def held_with_a_bug(
-        self: steps.Homogeneous, settings: steps.PathSettings, work: Workload
-    ) -> float:
+    def held_with_a_bug(settings: retrieval.HomogeneousPlan, work: Workload) -> float:
         if f"{work.scene.start:%Y-%m-%d}" == day:
             raise error
-        return held(self, settings, work)
+        return RETRIEVAL.held(settings, work)
 
-    patch.setattr(steps.Homogeneous, "held", held_with_a_bug)
+    patch.setattr(retrieval, "RETRIEVAL", replace(RETRIEVAL, held=held_with_a_bug))
 
 
 def insert_in_the_worker(error: BaseException, day: str) -> None:

@@ -9,18 +9,18 @@ from pathlib import Path
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
-from lidarops.process.guard import Failure
-from lidarops.process.input_files import check_files
-from lidarops.process.job import Job
 from lidarops.records import ProductRecord, SceneOutcome
-from lidarops.steps import dependence
+from lidarops.scene import dependence
+from lidarops.scene.guard import Failure
+from lidarops.scene.input_files import check_files
+from lidarops.scene.job import Job
 
 REFUSED = "\n# The stand-in refuses this file.\n"
 """End of an ancillary file that can be read, but ends the scenes that use it."""
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
-    """Stand in for `lidarops.process.scene.attempt`."""
+    """Stand in for `lidarops.scene.processing.attempt`."""
     scene, inputs, refused, _ = check_files(
         job.scene, Path(job.campaign.archive), read_all=job.campaign.all_steps
     )

@@ -72,7 +72,7 @@ def test_line_ends_change_nothing(copy: Copy):
         ("site/templates/site.css", True),
         ("figures/figure.css", True),
         ("reports/run_record.py", False),
-        ("products/raman/steps.py", False),
+        ("products/raman/retrieval.py", False),
         ("run/staleness.py", False),
         ("catalog/scan.py", False),
     ],
@@ -94,7 +94,7 @@ def test_a_change_of_what_pages_are_made_of_changes_their_version(
         ("retrieve/multiangle/vertical/smooth_profile.py", "multiangle"),
         ("retrieve/network/outlying_bins.py", "visibility"),
         *((f"products/{kind}/settings.py", kind) for kind in OWN),
-        *((f"products/{kind}/steps.py", kind) for kind in OWN),
+        *((f"products/{kind}/retrieval.py", kind) for kind in OWN),
         *((f"products/{kind}/variables.py", kind) for kind in OWN),
     ],
 )
@@ -126,7 +126,7 @@ def test_neighbours_of_what_makes_products_change_no_version(growing: Copy, modu
 
 @pytest.mark.parametrize(
     "module",
-    ["process/scene.py", "netcdf/build.py", "netcdf/write.py", "netcdf/_deflate.py",
+    ["scene/processing.py", "netcdf/build.py", "netcdf/write.py", "netcdf/_deflate.py",
      "netcdf/read.py", "netcdf/__init__.py", "raw/licel_format.py", "raw/licel.py", "records.py",
      "flags.py", "__init__.py"],
 )  # fmt: skip
@@ -227,7 +227,7 @@ def test_a_raw_format_of_another_package_counts_for_every_kind(
 def test_modules_that_are_kept_apart_are_imported(copy: Copy):
     """Otherwise they need not be named."""
     sources = Sources({"lidarops": (copy.root,)})
-    closure = sources.closure(["lidarops.process.scene"])
+    closure = sources.closure(["lidarops.scene.processing"])
     assert set(_APART) <= set(closure)
 
 
@@ -239,6 +239,6 @@ def test_joint_versions_depend_on_their_kinds(copy: Copy):
 
 
 def test_a_missing_source_of_every_product_is_an_error(copy: Copy):
-    (copy.root / "process/scene.py").unlink()
+    (copy.root / "scene/processing.py").unlink()
     with pytest.raises(LidarOpsError, match=r"lidarops\.process\.scene is missing"):
         copy.versions()

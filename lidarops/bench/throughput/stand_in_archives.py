@@ -18,7 +18,6 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import row_of
 from lidarops.catalog.scan import scan_keys
 from lidarops.catalog.store import Store
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import (
     ChannelLayout,
@@ -32,7 +31,8 @@ from lidarops.records import (
     Status,
 )
 from lidarops.run.staleness import Judge
-from lidarops.steps import dependence
+from lidarops.scene import dependence
+from lidarops.scene.plan import plan_scene
 
 FILES_PER_DAY: Final = 288
 """Files per instrument and day: one every 5 minutes."""

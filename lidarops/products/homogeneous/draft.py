@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops.catalog.folder import InstrumentHeaders
-from lidarops.steps.pointing import FIXED
+from lidarops.scene.pointing import FIXED
 
 _LEVEL: Final = 1.9
 """degree above or below the horizon, at which 3 km of path climb 100 m."""

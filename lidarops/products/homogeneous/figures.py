@@ -13,7 +13,6 @@ from lidarops.figures.series_data import Comparison, Section, compare, join
 from lidarops.figures.series_panels import Quantity, score_figures, series_figures
 from lidarops.products.homogeneous.figure_data import QUANTITIES, SECTION_VARIABLES, read_sections
 from lidarops.records import Role
-from lidarops.steps.conditioning import Dark
 
 
 def _read(product: xr.Dataset, source: ProductSource) -> list[Section] | None:
@@ -26,7 +25,7 @@ def _read(product: xr.Dataset, source: ProductSource) -> list[Section] | None:
         channel=source.channel,
         paths=[item.path for item in scene.inputs if item.role is Role.SIGNAL] if scene else (),
         dark_subtracted=any(
-            step.name == Dark.name and step.channel == source.channel for step in steps
+            step.name == "dark" and step.channel == source.channel for step in steps
         ),
     )
     return [section for section in sections if section.time.size] or None

@@ -1,4 +1,4 @@
-"""Blocked beams of the product ``multiangle``, and the step of the analog baseline they show."""
+"""Blocked beams of the product ``multiangle``, and the analog baseline that they show."""
 
 from __future__ import annotations
 
@@ -13,15 +13,10 @@ from lidarops.records import DetectionMode
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
-from lidarops.steps.case import ProductCase
-from lidarops.steps.conditioning import PROFILES
-from lidarops.steps.data import Chunk, Data, Profiles
-from lidarops.steps.preparation import BACKGROUND
-from lidarops.steps.step import Datum, Decisions, Leave, NoSettings, Run, Step
-from lidarops.steps.workload import Workload
+from lidarops.scene.case import Entry, ProductCase
+from lidarops.scene.profiles import Chunk, Profiles
+from lidarops.scene.retrieval import Workload
 
-BASELINE: Final = Datum[bool]("baseline")
-"""Whether an analog baseline is subtracted where a beam is blocked."""
 _UNKNOWN: Final = np.int32(Quality.INPUT_MISSING | Quality.SATURATED)
 """Bits of bins that show nothing; what blocks a beam may stand where the overlap is incomplete."""
 _NAMED: Final = 6
@@ -30,38 +25,30 @@ _TOGETHER: Final = 8
 """Profiles that are averaged together; the result does not depend on it."""
 
 
-class Baseline(Step[ProductCase[MultiAngleSettings], NoSettings]):
-    """Subtract the analog baseline that blocked beams show."""
+def plan_baseline(case: ProductCase[MultiAngleSettings]) -> Entry:
+    """Subtract the analog baseline that blocked beams show.
 
-    name = "baseline"
-    inputs = (PROFILES, BACKGROUND)
-    outputs = (BASELINE,)
+    For analog channels of scans with beams so low that they may be blocked.
+    """
+    if case.channel.mode is DetectionMode.PHOTON:
+        return case.leave("baseline", "photon counting has no analog baseline")
+    angles = [granule.zenith_angle for granule in case.scene.granules]
+    lowest = 90.0 - max((angle for angle in angles if angle is not None), default=0.0)
+    limit = f"{THRESHOLDS.lowest_free:g} degree above the horizon"
+    if lowest >= THRESHOLDS.lowest_free:
+        reason = f"no beam is lower than {limit}, where trees and buildings may block it"
+        return case.leave("baseline", reason, number=lowest)
+    reason = (
+        f"beams lower than {limit} may be blocked: decided from the data, from what lies"
+        " behind obstructions"
+    )
+    taken = ("noise", "glue", "background")
+    return case.run("baseline", reason, needs=taken, number=lowest)
 
-    def decide(self, case: ProductCase[MultiAngleSettings]) -> Decisions:
-        """Run for analog channels of scans with beams so low that they may be blocked."""
-        if case.channel.mode is DetectionMode.PHOTON:
-            yield Leave("photon counting has no analog baseline")
-            return
-        angles = [granule.zenith_angle for granule in case.scene.granules]
-        lowest = 90.0 - max((angle for angle in angles if angle is not None), default=0.0)
-        limit = f"{THRESHOLDS.lowest_free:g} degree above the horizon"
-        if lowest >= THRESHOLDS.lowest_free:
-            reason = f"no beam is lower than {limit}, where trees and buildings may block it"
-            yield Leave(reason, number=lowest)
-        else:
-            reason = (
-                f"beams lower than {limit} may be blocked: decided from the data, from what lies"
-                " behind obstructions"
-            )
-            yield Run(reason, number=lowest)
 
-    def carry_out(self, settings: NoSettings, data: Data) -> None:  # noqa: ARG002
-        """Request the baseline of the blocked beams that the product finds."""
-        data[BASELINE] = True
-
-    def held(self, settings: NoSettings, work: Workload) -> float:  # noqa: ARG002
-        """Return the bytes of the low beams that are averaged together."""
-        return _BYTES_OF_A_BIN * min(_TOGETHER, _low_profiles(work)) * work.bins
+def held_of_low_beams(work: Workload) -> float:
+    """Return the bytes of the low beams that are averaged together."""
+    return _BYTES_OF_A_BIN * min(_TOGETHER, _low_profiles(work)) * work.bins
 
 
 _BYTES_OF_A_BIN: Final = 90.0
@@ -72,11 +59,6 @@ def _low_profiles(work: Workload) -> int:
     """Return the number of profiles so low that they may be blocked."""
     limit = 90.0 - THRESHOLDS.lowest_free
     return sum((granule.zenith_angle or 0.0) > limit for granule in work.scene.granules)
-
-
-def blocked_beams(data: Data) -> BlockedBeams:
-    """Return the empty collection of the blocked beams of a scene."""
-    return BlockedBeams(data[PROFILES].range, data[BACKGROUND].range)
 
 
 def add_low_beams(beams: BlockedBeams, chunk: Chunk, profiles: Profiles) -> None:

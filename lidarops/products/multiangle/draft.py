@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops.catalog.folder import InstrumentHeaders
-from lidarops.steps.pointing import LEAST_SPREAD
+from lidarops.scene.pointing import LEAST_SPREAD
 
 
 def _section(headers: InstrumentHeaders) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -41,7 +41,6 @@ class MultiAngleSettings(ChannelProduct):
         " residuals not larger than the noise, at each altitude",
     )
     background: Literal["known_shape", "tail_mean"] = background_method()
-    background_range: ClassVar[None] = None
     layers: list[tuple[float, float]] = quantity(
         [],
         unit="m",

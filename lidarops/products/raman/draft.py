@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops.catalog.folder import InstrumentHeaders
-from lidarops.steps.pointing import FIXED, STEEPEST
+from lidarops.scene.pointing import FIXED, STEEPEST
 
 
 def _section(headers: InstrumentHeaders) -> tuple[str, ...]:

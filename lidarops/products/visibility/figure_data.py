@@ -18,10 +18,10 @@ from lidarops.figures.series_data import (
 )
 from lidarops.figures.time_axis import Times
 from lidarops.kinds import flags_of
-from lidarops.products.visibility.steps import STEP
+from lidarops.products.visibility.network import NAME
 from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
-from lidarops.steps.dependence import is_product
+from lidarops.scene.dependence import is_product
 
 Floats = NDArray[np.float64]
 
@@ -76,8 +76,8 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
     """Return the instrument of each beam of a scene from its plan; empty if it lists none."""
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
-        if is_product(step) and step.name == STEP.name:
-            return tuple(beam.instrument for beam in STEP.typed(step).beams)
+        if is_product(step) and step.name == NAME:
+            return tuple(beam["instrument"] for beam in step.settings["beams"])
     return ()
 
 

@@ -11,16 +11,16 @@ from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
 from lidarops.products.visibility.settings import VisibilityProductSettings
 from lidarops.records import ChannelLayout, Granule, Scene
 from lidarops.retrieve.network import geometry
-from lidarops.settings import SettingsModel
-from lidarops.steps.case import ChannelCase
-from lidarops.steps.channels import (
+from lidarops.scene.case import ChannelCase
+from lidarops.scene.channels import (
     channel_ranges,
     joined_layout,
     member_channel,
     range_channel,
     wavelength,
 )
-from lidarops.steps.reading import NO_WAVELENGTH
+from lidarops.scene.conditioning import NO_WAVELENGTH
+from lidarops.settings import SettingsModel
 
 NAME: Final = "visibility"
 SAME_POINTING: Final = 0.1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import timedelta
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -24,8 +24,6 @@ MultiplierValue = Annotated[float, Field(ge=0, le=1)] | Literal["chosen"]
 
 class VisibilityProductSettings(NetworkProduct):
     """The ``visibility`` product: extinction and visibility where beams of lidars cross."""
-
-    background: ClassVar[Literal["tail_mean"]] = "tail_mean"
 
     average: PartOfDay = Field(
         default=timedelta(minutes=10), description="interval over which signals are averaged"

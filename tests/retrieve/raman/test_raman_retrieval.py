@@ -9,7 +9,7 @@ import pytest
 from support.raman_signals import make_sky
 
 from lidarops.flags import Quality
-from lidarops.products.raman.steps import STANDARD_SLOPE_ERROR
+from lidarops.products.raman.retrieval import STANDARD_SLOPE_ERROR
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.flags import RamanQuality

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
-from lidarops.plan.scene_plan import plan_scene
 from lidarops.plan.scenes import cut_scenes
-from lidarops.process.job import Job
 from lidarops.records import Scene
 from lidarops.run.archive import update_catalog
+from lidarops.scene.job import Job
+from lidarops.scene.plan import plan_scene
 
 
 def catalogued_scenes(campaign: Campaign) -> tuple[Scene, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -12,7 +12,6 @@ from lidarops.settings import ChannelProduct, Inside, Metres, quantity
 class IntegratedSettings(ChannelProduct):
     """The ``integrated`` product: range-corrected signals, integrated over windows of range."""
 
-    background: ClassVar[Literal["tail_mean"]] = "tail_mean"
     channels: list[str] = Field(min_length=1)
     windows: list[tuple[Metres, Metres]] = quantity(unit="m", min_length=1)
     background_range: tuple[Metres, Metres] | None = quantity(

@@ -1,0 +1,211 @@
+"""The product ``elastic``: its decision, and its making."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final
+
+import xarray as xr
+
+from lidarops.campaign.model import channel_facts
+from lidarops.constants import KNOWN_SHAPE_PAPERS
+from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.products.elastic.variables import LAYOUT
+from lidarops.retrieve.clouds.labeled import Reference
+from lidarops.retrieve.elastic import labeled
+from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
+from lidarops.retrieve.signal.labeled_screening import Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.scene.case import REQUESTED, Entries, Entry, NoSettings, ProductCase
+from lidarops.scene.channels import range_channel, range_offset
+from lidarops.scene.choices import AverageSettings, average, with_low_signal_to_noise, with_methods
+from lidarops.scene.data import ChannelSignal, RowProduct, Source
+from lidarops.scene.pointing import fixed_zenith
+from lidarops.scene.profiles import Chunk, ScreenedAverages, gluing
+from lidarops.scene.retrieval import Retrieval, Workload
+from lidarops.settings import SettingsModel, quantity
+
+Case = ProductCase[ElasticSettings]
+
+
+@dataclass(frozen=True, slots=True)
+class _ReferenceLimits:
+    """Limits within which the reference window may lie, m along the beam."""
+
+    bottom: float
+    top: float
+    width: float
+    reason: str
+    """Why there can be no reference window; empty where there can."""
+
+
+def _reference_limits(case: Case) -> _ReferenceLimits:
+    zenith, reason = fixed_zenith(case)
+    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
+    window = case.request.reference
+    # A window is a set of bin centres.
+    ranged = replace(case.channel, name=range_channel(case.channel.name))
+    reach = case.last - 0.5 * case.channel.bin_width + range_offset(ranged, case.facts)
+    bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
+    if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
+        reason = (
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    return _ReferenceLimits(bottom, top, window.width * stretch, reason)
+
+
+def _known_shape(case: Case) -> Entry:
+    """Fit the background with the shape of the signal of aerosol-free air, where requested."""
+    if case.request.background == "known_shape":
+        return case.run("known_shape", "the far range is assumed to be aerosol-free, and tested")
+    return case.leave(
+        "known_shape", "the campaign requests tail_mean; signal in the far range biases it"
+    )
+
+
+class ReferenceWindowSettings(SettingsModel):
+    """Settings of the entry ``reference``."""
+
+    lowest: float = quantity(unit="m", description="along the beam")
+    highest: float = quantity(unit="m", description="along the beam")
+    width: float = quantity(unit="m", description="along the beam")
+    scattering_ratio: float
+    relative_error: float
+
+
+def _reference(case: Case, limits: _ReferenceLimits) -> Entry:
+    """State where the reference window may lie."""
+    window = case.request.reference
+    settings = ReferenceWindowSettings.taken_from(
+        window, lowest=limits.bottom, highest=limits.top, width=limits.width
+    )
+    reason = "windows within the campaign's limits are tested against the molecular profile"
+    return case.run("reference", reason, settings, number=limits.top - limits.bottom)
+
+
+def _lidar_ratio(case: Case) -> dict[str, Any]:
+    """Return the settings of the lidar ratio: facts of the channel, or the settings of the kind."""
+    facts = channel_facts(case.facts, range_channel(case.channel.name))
+    names = ("lidar_ratio", "lidar_ratio_standard_error")
+    given = {name: getattr(facts, name) for name in names}
+    return {"lidar_ratio_profile": facts.lidar_ratio_profile} | {
+        name: getattr(case.request, name) if value is None else value
+        for name, value in given.items()
+    }
+
+
+class InversionSettings(SettingsModel):
+    """Settings of the entry ``elastic``."""
+
+    lidar_ratio: float = quantity(
+        unit="sr", description="above a measured profile where one is given"
+    )
+    lidar_ratio_standard_error: float = quantity(unit="sr", description="of lidar_ratio")
+    lidar_ratio_profile: str | None = None
+    """Ancillary file of both over altitude."""
+    molecular_relative_error: float
+    least_signal_to_noise: float
+
+
+class ElasticPlan(SettingsModel):
+    """What a plan states of a product."""
+
+    average: AverageSettings
+    known_shape: NoSettings | None = None
+    reference: ReferenceWindowSettings
+    elastic: InversionSettings
+
+
+def _needs(case: Case) -> Entries:
+    """Invert the averaged elastic signals, where a fixed beam reaches aerosol-free air."""
+    limits, request = _reference_limits(case), case.request
+    if limits.reason:
+        yield case.leave("elastic", limits.reason)
+        return
+    reason = "the noise of a single profile is too large for the inversion"
+    yield average(case, request.average, reason)
+    yield _known_shape(case)
+    yield _reference(case, limits)
+    settings = InversionSettings.taken_from(request, **_lidar_ratio(case))
+    taken = (
+        "read", "overlap", "noise", "glue", "molecular", "average", "known_shape", "reference"
+    )  # fmt: skip
+    yield case.run("elastic", REQUESTED, settings, needs=taken)
+
+
+def _held(settings: ElasticPlan, work: Workload) -> float:
+    """Return the bytes of the averages that are completed together, and of their inversion."""
+    together = min(work.intervals(settings.average.seconds), MEANS_TOGETHER)
+    return (_BYTES_OF_A_BIN * together + _BYTES_OF_PARTS) * work.bins
+
+
+_BYTES_OF_PARTS: Final = 1500.0
+"""Bytes per bin of the parts of the open average: 44 each of two records that are glued."""
+_BYTES_OF_A_BIN: Final = 240.0
+"""Bytes per bin of an average that is open or being inverted, from ``lidarops bench throughput
+--case memory``."""
+
+
+class _Inversion(RowProduct):
+    """Averages of the profiles of a scene, and their inversion."""
+
+    def __init__(self, settings: ElasticPlan, signal: ChannelSignal) -> None:
+        self._settings, self._signal = settings.elastic, signal
+        self._known_shape = settings.known_shape is not None
+        self._reference = Reference(**dict(settings.reference))
+        self._averages = ScreenedAverages(
+            [signal.profiles],
+            signal.source.geometry,
+            signal.shots,
+            settings.average.seconds,
+            Screening(cloud_contrast(signal.wavelength), self._reference.highest),
+        )
+        self._begun = False
+        self._lidar_ratio = _ratio_at(settings.elastic, signal.source)
+
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Add the next profiles to their averages, and yield those that are complete, inverted."""
+        self._averages.add(chunk)
+        for (averages,) in self._averages.completed():
+            rows = self._inverted(averages)
+            if not self._begun:
+                self._begun = True
+                yield rows.drop_dims("time").assign_coords(self._averages.times.coords)
+            yield rows
+
+    def _inverted(self, averages: xr.Dataset) -> xr.Dataset:
+        signal, settings = self._signal, self._settings
+        inverted = labeled.invert_elastic(
+            averages.assign_coords(signal.source.pointing),
+            molecules=signal.molecules,
+            wavelength=signal.wavelength,
+            station_altitude=signal.source.station_altitude,
+            lidar_ratio=self._lidar_ratio,
+            molecular_relative_error=settings.molecular_relative_error,
+            reference=self._reference,
+            known_shape=self._known_shape,
+            overlap=signal.overlap_at(averages["range"].to_numpy()),
+            overlap_is_stated=signal.full_overlap_range is not None,
+        )
+        if self._known_shape:
+            inverted = inverted.assign_attrs(references=KNOWN_SHAPE_PAPERS)
+        least = settings.least_signal_to_noise
+        flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
+        glued = flagged.assign(gluing(averages))
+        return with_methods(glued, signal.molecules, known_shape=self._known_shape)
+
+
+def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:
+    """Return the function of altitude that gives the lidar ratio and its standard error."""
+    constant = settings.lidar_ratio, settings.lidar_ratio_standard_error
+    name = settings.lidar_ratio_profile
+    if name is None:
+        return labeled.constant_ratio(*constant)
+    return partial(source.ancillaries.lidar_ratios[name].at, beyond=constant)
+
+
+RETRIEVAL: Final = Retrieval(settings=ElasticPlan, needs=_needs, stream=_Inversion, held=_held)

@@ -1,0 +1,367 @@
+"""The product ``homogeneous``: its decision, and its making."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
+from lidarops.flags import Quality
+from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
+from lidarops.products.homogeneous.variables import LAYOUT
+from lidarops.records import DetectionMode, is_glued
+from lidarops.retrieve.air import labeled as labeled_visibility
+from lidarops.retrieve.air.labeled import VisibilityDefinition
+from lidarops.retrieve.homogeneous import labeled
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.labeled import (
+    CORRELATION_LENGTH,
+    baseline_error,
+    counts_per_power,
+)
+from lidarops.scene.case import ALL_STEPS, REQUESTED, Entries, Entry, NoSettings, ProductCase
+from lidarops.scene.choices import FEWEST_BINS, tail
+from lidarops.scene.data import ChannelSignal, WholeProduct, in_one_batch
+from lidarops.scene.pointing import moves
+from lidarops.scene.profiles import Chunk
+from lidarops.scene.retrieval import Retrieval, Workload
+from lidarops.scene.windows import ANALOG_NOISE, WINDOW, WindowSettings, bins_with_noise
+from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
+
+Case = ProductCase[HomogeneousSettings]
+
+Section = tuple[float, float]
+
+LEVEL: Final = THRESHOLDS.level * (1.0 + 1e-6)
+"""m, largest climb along a section. Headers and campaign files round angles differently."""
+
+
+def _inside(case: Case) -> list[Section]:
+    """Return the requested sections that lie within the bins."""
+    width = case.channel.bin_width
+    return [
+        (near, far)
+        for near, far in case.request.sections
+        if far <= case.last and (far - near) / width >= _fewest_bins(case.request)
+    ]
+
+
+def _fewest_bins(request: HomogeneousSettings) -> int:
+    """Return the fewest bins of a section: those that a fit needs, and a triple of the cubic."""
+    return FEWEST_BINS if request.lag is None else max(FEWEST_BINS, 2 * request.lag + 1)
+
+
+def _climbs(case: Case, near: float, far: float) -> list[float]:
+    """Return the climb of the beam of each file of a scene along a section, m.
+
+    Infinite where the zenith angle is unknown, so that the beam does not count as level.
+    """
+    angles = [granule.zenith_angle for granule in case.scene.granules]
+    return [
+        math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
+        for angle in angles
+    ]
+
+
+def _steep(case: Case, near: float, far: float) -> int:
+    """Return how many files of a scene have a beam that is not level along a section."""
+    return sum(height > LEVEL for height in _climbs(case, near, far))
+
+
+def _level(case: Case) -> list[Section]:
+    """Return the sections that are retrieved: within the bins, along a nearly level path."""
+    files = len(case.scene.granules)
+    return [
+        (near, far)
+        for near, far in _inside(case)
+        if case.all_steps or _steep(case, near, far) < files
+    ]
+
+
+def _method(case: Case) -> Method:
+    """Return the method that runs: `auto` is the direct fit, or of a moving beam the far range.
+
+    A beam of a scan has few shots, and a section cannot tell its background from its extinction.
+    Bins of the far range are no part of a section.
+    """
+    if case.request.method != "auto":
+        return case.request.method
+    start = tail(case, None)[0]
+    apart = all(far <= start for _, far in _level(case))
+    return "known_background" if apart and moves(case) else "direct"
+
+
+def _window(case: Case) -> Entry:
+    """Read only the bins that the sections of a photon-counting channel need."""
+    if case.channel.mode is not DetectionMode.PHOTON:
+        return case.leave(WINDOW, ANALOG_NOISE)
+    if case.all_steps:
+        return case.leave(WINDOW, ALL_STEPS)
+    if _method(case) == "known_background" and not case.request.background:
+        return case.leave(WINDOW, "the background is that of the far range")
+    farthest = max(far for _, far in _level(case))
+    bins = bins_with_noise(0.0, farthest, case)[1]
+    if not 0 < bins < case.channel.bins:
+        reason = "a section extends to the last bin"
+        return case.leave(WINDOW, reason, number=float(case.channel.bins))
+    reason = "neither homogeneous sections nor the noise of their counts need farther bins"
+    return case.run(WINDOW, reason, WindowSettings(bins=((0, bins),)), number=float(bins))
+
+
+def _along_path(case: Case) -> Entry:
+    """Add visibility along the sections where the campaign requests it."""
+    definition = case.request.visibility
+    if definition is None:
+        return case.leave("along_path", "the campaign requests no visibility along the sections")
+    reason = "the campaign requests visibility along the sections"
+    return case.run("along_path", reason, number=definition.threshold)
+
+
+class PathSettings(SettingsModel):
+    """Settings of the entry ``homogeneous``."""
+
+    method: Method
+    extinction: float | None = quantity(
+        None, unit="m-1", description="of `linearized` and `known_extinction`"
+    )
+    sections: tuple[Section, ...] = quantity(unit="m")
+    background_range: tuple[float, float] | None = quantity(
+        None, unit="m", description="far range of `known_background`"
+    )
+    background: tuple[float, float] | None = quantity(
+        None, unit="MHz or mV", description="given one of `known_background`, and its error"
+    )
+    lag: int | None = quantity(None, unit=NO_UNIT, description="of `cubic`, bins")
+    visibility: VisibilitySettings | None = None
+
+
+class HomogeneousPlan(SettingsModel):
+    """What a plan states of a product."""
+
+    range_window: WindowSettings | None = None
+    along_path: NoSettings | None = None
+    homogeneous: PathSettings
+
+
+_BACKGROUNDS: Final = {
+    "known_background": "comes from the far range",
+    "known_extinction": "is retrieved at the extinction of the campaign",
+    "cubic": "is that of the cubic",
+}
+"""Where the background comes from, by method, unless from the section with extinction."""
+_PAPERS: Final = {
+    "cubic": CUBIC_PAPER,
+    **dict.fromkeys(("linearized", "known_background", "known_extinction"), LEAST_SQUARES_PAPER),
+}
+"""Papers of the methods that have one."""
+_WARNINGS: Final = {
+    # `test_the_cubic_needs_a_strong_signal`
+    "cubic": "the cubic rejects all values where the signal of the first bin of a section is less"
+    " than 30 times its noise, and some up to 300 times",
+}
+"""What `lidarops plan` warns of, by method."""
+
+
+def _needs(case: Case) -> Entries:
+    """Retrieve background, amplitude and extinction of range sections.
+
+    Of those that lie within the bins, along a nearly level path.
+    """
+    if is_glued(case.channel.name):
+        reason = "not made of glued channels: each record is fitted with its own background"
+        yield case.leave("homogeneous", reason, rule="channel_present")
+        return
+    inside, level = _inside(case), _level(case)
+    if level:
+        yield _window(case)
+        yield _along_path(case)
+    for near, far in case.request.sections:
+        if (near, far) not in inside:
+            yield _outside(case, near, far)
+    for near, far in inside:
+        if (near, far) not in level:
+            yield _slanted(case, near, far)
+        elif _steep(case, near, far):
+            yield _partly_slanted(case, near, far)
+    if level:
+        yield _retrieved(case, level)
+
+
+def _retrieved(case: Case, level: list[Section]) -> Entry:
+    settings, method = case.request, _method(case)
+    definition = settings.visibility
+    given = (settings.background or {}).get(case.channel.name)
+    far = method == "known_background" and given is None
+    return case.run(
+        "homogeneous",
+        f"{REQUESTED}; background {_whence(settings, method)}",
+        PathSettings.taken_from(
+            settings,
+            method=method,
+            sections=tuple(level),
+            background_range=tail(case, settings.background_range) if far else None,
+            background=given,
+            visibility=definition and definition.resolved,
+        ),
+        needs=("read", "overlap", "noise", WINDOW, "along_path"),
+        number=float(len(level)),
+        warning=_WARNINGS.get(settings.method, ""),
+    )
+
+
+def _held(settings: HomogeneousPlan, work: Workload) -> float:
+    """Return the bytes of the values of all sections."""
+    return _BYTES_OF_A_SECTION * work.profiles * len(settings.homogeneous.sections)
+
+
+_BYTES_OF_A_SECTION: Final = 400.0
+"""Bytes per section of a profile: about 25 variables, and copies while they are written. 30,000
+more sections raised the measured peak by 1 MB only: this is an upper bound."""
+
+_PARTS: Final = 64
+"""Number of chunks whose sections are joined: a Dataset takes more than the few values in it."""
+
+
+def _whence(settings: HomogeneousSettings, method: Method) -> str:
+    """Return in words where the background comes from."""
+    if settings.background:
+        return "is given by the campaign"
+    whence = _BACKGROUNDS.get(method, "is retrieved together with extinction")
+    if method == "known_background" and settings.method == "auto":
+        return f"{whence}, because the beam moves and the sections end before it"
+    return whence if settings.lag is None else f"{whence} with a lag of {settings.lag} bins"
+
+
+def _outside(case: Case, near: float, far: float) -> Entry:
+    bins = (min(far, case.last) - near) / case.channel.bin_width
+    reason = (
+        f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
+        f" holds fewer than {_fewest_bins(case.request)} bins"
+    )
+    fewest = _fewest_bins(case.request)
+    if fewest > FEWEST_BINS and far <= case.last:
+        reason = (
+            f"section {near:g}-{far:g} m holds {bins:.0f}, fewer than {fewest} bins, which the"
+            f" cubic needs for lag: {case.request.lag}"
+        )
+    return case.leave("homogeneous", reason, number=bins, rule="section_inside")
+
+
+def _slanted(case: Case, near: float, far: float) -> Entry:
+    least = min(_climbs(case, near, far))
+    slope = (
+        "neither headers nor campaign give the zenith angle"
+        if math.isinf(least)
+        else f"the beam climbs {least:.0f} m (limit {THRESHOLDS.level:g} m)"
+    )
+    reason = f"section {near:g}-{far:g} m: {slope}; a vertical gradient would mimic extinction"
+    number = None if math.isinf(least) else least
+    return case.leave("homogeneous", reason, number=number, rule="section_level")
+
+
+def _partly_slanted(case: Case, near: float, far: float) -> Entry:
+    steep = _steep(case, near, far)
+    reason = (
+        f"section {near:g}-{far:g} m: values of {steep} of {len(case.scene.granules)} files are"
+        f" rejected, whose beams climb more than {THRESHOLDS.level:g} m; a vertical gradient would"
+        " mimic extinction"
+    )
+    return case.leave("homogeneous", reason, number=float(steep), rule="beam_level")
+
+
+class _Sections(WholeProduct):
+    """Values of the sections of each profile."""
+
+    def __init__(self, settings: HomogeneousPlan, signal: ChannelSignal) -> None:
+        self._settings, self._signal = settings.homogeneous, signal
+        self._parts: list[xr.Dataset] = []
+
+    def add(self, chunk: Chunk) -> None:
+        """Retrieve the sections of the next profiles."""
+        profiles = self._signal.profiles
+        shots = profiles.shots(chunk.counts)
+        sections = self._retrieved(chunk.profiles(profiles), shots)
+        slanted = labeled.not_level(sections, chunk.geometry["zenith_angle"])
+        sections = sections.assign(quality_flag=sections["quality_flag"] | slanted, shots=shots)
+        self._parts.append(sections.assign_coords(chunk.geometry.variables))
+        if len(self._parts) == _PARTS:
+            self._parts = [self._joined()]
+
+    def _retrieved(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.Dataset:
+        settings, quality = self._settings, conditioned["quality"]
+        overlap = self._signal.overlap_at(conditioned["range"].to_numpy())
+        if overlap is not None:
+            # The signal still holds its background, so it cannot be divided by the overlap: bins
+            # with partial overlap are excluded.
+            quality = quality | _partial(overlap)
+        # An estimated variance scatters, which must not count as misfit.
+        estimated = self._signal.relative_variance
+        counts = None if estimated else counts_per_power(conditioned, shots, glued=True)
+        fit = partial(
+            labeled.fit_homogeneous_path,
+            sections=settings.sections,
+            background_range=settings.background_range,
+            background=settings.background,
+            lag=settings.lag,
+            variance=conditioned["variance"],
+            quality=quality,
+            method=settings.method,
+            extinction=settings.extinction,
+            relative_variance=estimated,
+            noise_correlation_length=conditioned[CORRELATION_LENGTH],
+            exposure=None if counts is None else xr.DataArray(counts, dims="time"),
+        )
+        fitted = fit(conditioned["power"])
+        error = baseline_error(conditioned, decaying=True)
+        if error is None:
+            return fitted
+        power = conditioned["power"]
+        moved = fit((power + error).assign_attrs(power.attrs))
+        name = "total_extinction"
+        return fitted.assign({f"{name}_baseline_error": np.abs(moved[name] - fitted[name])})
+
+    def _joined(self) -> xr.Dataset:
+        joined: xr.Dataset = xr.concat(
+            self._parts, dim="time", data_vars="minimal", coords="minimal"
+        )
+        return joined
+
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield all profiles, with visibility along the sections where it is requested."""
+        sections, requested = self._joined(), self._settings.visibility
+        if requested is not None:
+            definition = VisibilityDefinition(self._signal.wavelength, **dict(requested))
+            sections = _with_visibility(sections, definition)
+        method = self._settings.method
+        stated = sections.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
+        paper = _PAPERS.get(method)
+        return in_one_batch(stated.assign_attrs(references=paper) if paper else stated)
+
+
+def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:
+    """Return the quality bit of bins with partial overlap."""
+    bits = np.where(overlap >= THRESHOLDS.full_overlap, 0, int(Quality.INCOMPLETE_OVERLAP))
+    return xr.DataArray(bits.astype(np.int32), dims="range")
+
+
+def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:
+    systematic = sections["total_extinction_model_error"]
+    if "total_extinction_baseline_error" in sections:
+        of_baseline = sections["total_extinction_baseline_error"].fillna(0.0)
+        systematic = (systematic**2 + of_baseline**2) ** 0.5
+    visibility = labeled_visibility.visibility_of_extinction(
+        sections["total_extinction"],
+        sections["total_extinction_standard_error"],
+        systematic,
+        definition,
+    )
+    return sections.assign(visibility.data_vars).assign_attrs(steps=definition.words)
+
+
+RETRIEVAL: Final = Retrieval(settings=HomogeneousPlan, needs=_needs, stream=_Sections, held=_held)

@@ -1,0 +1,462 @@
+"""The product ``multiangle``: its decision, which follows from the pointing, and its making.
+
+What the retrieval decides from the data is planned where the beams permit it. The attribute
+``lidarops_steps`` of the product states what was decided.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.constants import KNOWN_SHAPE_PAPERS, MULTIANGLE_PAPER
+from lidarops.errors import RetrievalInputError
+from lidarops.netcdf.variables import BACKGROUND_METHOD
+from lidarops.products.multiangle.baseline import (
+    add_low_beams,
+    blocked_in_words,
+    held_of_low_beams,
+    plan_baseline,
+    with_baseline,
+)
+from lidarops.products.multiangle.settings import Method, MultiAngleSettings
+from lidarops.products.multiangle.variables import LAYOUT
+from lidarops.records import Granule
+from lidarops.retrieve.common.azimuths import widest_azimuth_gap
+from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
+from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
+from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+from lidarops.scene.case import REQUESTED, Entries, Entry, NoSettings, ProductCase
+from lidarops.scene.choices import BackgroundSettings, background, with_low_signal_to_noise
+from lidarops.scene.data import ChannelSignal, WholeProduct, in_one_batch
+from lidarops.scene.pointing import no_scan
+from lidarops.scene.profiles import Chunk, Indices
+from lidarops.scene.retrieval import Retrieval, Workload
+from lidarops.settings import SettingsModel, quantity
+
+Array = npt.NDArray[np.float64]
+Case = ProductCase[MultiAngleSettings]
+Numbers = tuple[tuple[float, ...], ...]
+"""Angles, or bounds of time, of each granule."""
+_HALF_TURN: Final = 180.0
+_FEWEST_DIRECTIONS: Final = 2
+"""Two paths define a slope."""
+LOWEST_ELEVATION: Final = math.degrees(math.asin(1.0 / THRESHOLDS.longest_path))
+"""degree; lower beams are longer than the longest path, but for the curvature of the Earth."""
+_SIMPLE: Final = frozenset({"kano_hamilton", "two_angle", "mld", "mld_prior"})
+"""Methods that treat each altitude independently."""
+_BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
+"""Methods that cannot fit a horizontal gradient."""
+_DIFFERENTIATING: Final = frozenset({"mld", "mld_prior"})
+"""Methods of Gobrusenko and Ivanenko."""
+
+
+def altitude_steps(step: float, highest: float) -> Array:
+    """Return the altitudes of a multi-angle product, m above the station."""
+    return np.arange(step, highest + 1e-6, step)
+
+
+@dataclass(frozen=True, slots=True)
+class Beams:
+    """The beam directions of a scan that the retrieval uses."""
+
+    count: int
+    low: int
+    """Number of directions that are left out, because their path is too long or they do not rise.
+    """
+    sides_known: bool
+    """Whether any azimuth is known."""
+    free: float
+    """degree, the largest azimuth sector without beams."""
+    surround: bool
+    """Whether no half turn is free of beams, so that a horizontal gradient can be estimated."""
+    span: float = 0.0
+    """Largest minus smallest slant path over the vertical one."""
+    pattern: str = ""
+    """Such as a volume of 6 vertical planes."""
+    cycles: int = 0
+    largest: int = 0
+    """Number of directions of the cycle that has most."""
+    single: tuple[int, ...] = ()
+    """The first granule of each cycle of one direction, which has no value."""
+
+
+def beams(case: Case) -> Beams:
+    """Return the beam directions that the retrieval will use from the files of a scan."""
+    settings = case.request
+    side = case.facts.azimuth
+    pointings = tuple(
+        (_number(granule.zenith_angle), _number(granule.azimuth if side is None else side))
+        for granule in case.scene.granules
+    )
+    return _beams(pointings, _bounds(case.scene.granules), settings.step, settings.highest)
+
+
+def _bounds(granules: Iterable[Granule]) -> Numbers:
+    """Return start and end of each granule, s."""
+    return tuple(
+        tuple(moment.timestamp() for moment in (granule.start, granule.stop) if moment)
+        for granule in granules
+    )
+
+
+def _number(angle: float | None) -> float:
+    return math.nan if angle is None else angle
+
+
+# All channels of a scene have the same beams.
+@lru_cache(maxsize=1)
+def _beams(pointings: Numbers, bounds: Numbers, step: float, highest: float) -> Beams:
+    zenith_angle, azimuth = np.array(pointings).T
+    sides_known = bool(np.isfinite(azimuth).any())
+    try:
+        directions = scan_cycles.directions(zenith_angle, azimuth)
+        cycle = scan_cycles.cycles(zenith_angle, azimuth, bounds)
+    except RetrievalInputError:
+        # The retrieval raises the same error with its message.
+        return Beams(0, 0, sides_known, 2 * _HALF_TURN, surround=False)
+    altitude = altitude_steps(step, highest)
+    up = slant_paths.rising_beams(directions.zenith_angle, altitude)
+    low = directions.zenith_angle.size - up.size
+    if up.size == 0:
+        return Beams(0, low, sides_known, 2 * _HALF_TURN, surround=False)
+    scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
+    tilted = scan.tilted_azimuths
+    free = math.degrees(widest_azimuth_gap(tilted))
+    angles = directions.zenith_angle[up]
+    profiles = np.flatnonzero(np.isin(directions.index, up))
+    seen = np.unique(np.stack([cycle[profiles], directions.index[profiles]]), axis=1)[0]
+    numbers, counts = np.unique(seen, return_counts=True)
+    single = numbers[counts < _FEWEST_DIRECTIONS]
+    return Beams(
+        up.size,
+        low,
+        sides_known,
+        free,
+        slant_paths.surrounds_zenith(tilted),
+        float(np.ptp(scan.path[:, 0])),
+        _pattern(angles, directions.azimuth[up]) if sides_known else f"{up.size} zenith angles",
+        counts.size,
+        int(counts.max()),
+        tuple(int(row) for row in np.searchsorted(cycle, single)),
+    )
+
+
+def _pattern(zenith_angle: Array, azimuth: Array) -> str:
+    """Return the name of the pattern of a scan of known azimuths."""
+    planes = scan_cycles.vertical_planes(zenith_angle, azimuth)
+    if len(planes) != 1:
+        return f"a volume of {len(planes)} vertical planes, {azimuth.size} directions"
+    lowest = azimuth[np.argmax(zenith_angle)]
+    return f"a range-height scan (RHI) at azimuth {lowest:.0f} degree, {azimuth.size} directions"
+
+
+def _low_beams(directions: Beams) -> str:
+    """Return the warning of beams that are left out as too low; empty where there are none."""
+    if not directions.low:
+        return ""
+    count = directions.low + directions.count
+    return (
+        f"beam directions less than {LOWEST_ELEVATION:.1f} degree above the horizon, left out:"
+        f" {directions.low} of {count} ({directions.low / count:.0%})"
+    )
+
+
+def _without_leverage(directions: Beams) -> str:
+    """Return why slant paths do not differ enough for an optical depth; empty where they do."""
+    if directions.span >= THRESHOLDS.least_span or not directions.low + directions.count:
+        return ""
+    if directions.count < _FEWEST_DIRECTIONS:
+        return f"beam directions: {directions.count}, which give no leverage"
+    return (
+        f"slant paths differ by {directions.span:.2g} vertical paths, less than"
+        f" {THRESHOLDS.least_span:g}, which give no leverage"
+    )
+
+
+def _single_beams(case: Case, directions: Beams) -> str:
+    """Return the warning of cycles of one beam; empty where there are none."""
+    if not directions.single:
+        return ""
+    granules = [case.scene.granules[row] for row in directions.single]
+    limit = 90.0 - THRESHOLDS.lowest_free
+    steep = [granule.path for granule in granules if abs(granule.zenith_angle or 0.0) <= limit]
+    advice = (
+        f": leave their files out of `files` (first: {steep[0]})"
+        if steep
+        else "; where the beam is blocked, it shows the analog baseline of other cycles"
+    )
+    return (
+        f"cycles of one beam only: {len(granules)} of {directions.cycles}. All their values are"
+        f" rejected{advice}"
+    )
+
+
+def _gradient(case: Case, directions: Beams) -> Entry:
+    """Include a horizontal gradient of backscatter in the error, unless that is excluded."""
+    largest = case.request.largest_gradient
+    if largest <= 0:
+        reason = "largest_gradient of the campaign is 0: only what the residuals show is included"
+        return case.leave("gradient", reason, number=0.0)
+    blind = case.request.method in _BLIND
+    use = "part of the error" if blind else "retrieved, or part of the error"
+    reason = f"backscatter may vary horizontally: {use}"
+    if directions.surround and directions.pattern.startswith("a volume"):
+        reason += (
+            "; of vertical planes, from the scatter between them, pooled over all cycles of"
+            f" the scene and {THRESHOLDS.pooled} altitudes"
+        )
+    return case.run("gradient", reason, number=largest)
+
+
+def _gradient_regressor(case: Case, directions: Beams) -> Entry:
+    """Fit a horizontal gradient where beams point to all sides."""
+    name, method = "gradient_regressor", case.request.method
+    if method in _BLIND:
+        return case.leave(name, f"method {method} fits no horizontal gradient")
+    if not directions.sides_known:
+        reason = "headers give no azimuths: all beams are assumed to point to one side"
+        return case.leave(name, reason)
+    if not directions.surround:
+        sector = f"an azimuth sector of {directions.free:g} degree"
+        reason = f"{sector}, more than a half turn, has no beams"
+        return case.leave(name, reason, number=directions.free)
+    reason = (
+        "beams point to all sides, so a horizontal gradient can be estimated; decided from"
+        " the data, at altitudes with signal"
+    )
+    return case.run(name, reason, number=directions.free)
+
+
+def _robust(case: Case, directions: Beams) -> Entry:
+    """Give outlying beams less weight where there are enough beams to identify them."""
+    count = float(directions.count)
+    fewest = THRESHOLDS.fewest_beams
+    if count < fewest:
+        reason = f"fewer than {fewest} beam directions cannot identify an outlier"
+        return case.leave("robust", reason, number=count)
+    reason = "decided from the data: used where a residual is too large to be chance"
+    return case.run("robust", reason, number=count)
+
+
+def _vertical(case: Case, directions: Beams) -> Entry:
+    """Regularise the profile along altitude where the method treats altitudes together."""
+    settings, count = case.request, directions.count
+    if settings.method in _SIMPLE:
+        reason = f"method {settings.method} treats each altitude independently"
+        return case.leave("vertical", reason)
+    if settings.method == "auto" and count <= 2:
+        reason = "two beam directions give one difference at each altitude, used without smoothing"
+        return case.leave("vertical", reason, number=float(count))
+    reason = "decided from the data: the smoothing increases with the noise of single altitudes"
+    return case.run("vertical", reason, number=float(round(settings.highest / settings.step)))
+
+
+def _correlation(case: Case, directions: Beams) -> Entry:
+    """Include the correlation of errors along altitude where redundant beams can show it."""
+    spare, method = float(directions.count - 2), case.request.method
+    if method in _DIFFERENTIATING:
+        reason = f"method {method} assumes independent errors at different altitudes"
+        return case.leave("correlation", reason)
+    if spare <= 0:
+        reason = "no beam direction is redundant: residuals show no correlation along altitude"
+        return case.leave("correlation", reason, number=spare)
+    reason = "decided from the data: AR(1) along altitude, from residuals of redundant beams"
+    return case.run("correlation", reason, number=spare)
+
+
+def _layers(case: Case) -> Entry:
+    """Give the optical depth of layers where the campaign requests it."""
+    number = float(len(case.request.layers))
+    if number:
+        reason = "the campaign requests the optical depth of layers"
+        return case.run("layers", reason, number=number)
+    return case.leave("layers", "the campaign requests no layers", number=number)
+
+
+class ScanSettings(SettingsModel):
+    """Settings of the entry ``multiangle``."""
+
+    highest: float = quantity(unit="m", description="above the station")
+    step: float = quantity(unit="m")
+    method: Method
+    regularisation: float | None = quantity(
+        None, unit="1", description="of `mld` and `mld_prior`; chosen from the noise if none"
+    )
+    largest_gradient: float = quantity(unit="m-1")
+    layers: tuple[tuple[float, float], ...] = quantity(unit="m", description="above the station")
+    least_signal_to_noise: float
+
+
+class MultiAnglePlan(SettingsModel):
+    """What a plan states of a product; the retrieval decides the rest from the data."""
+
+    background: BackgroundSettings
+    baseline: NoSettings | None = None
+    gradient: NoSettings | None = None
+    gradient_regressor: NoSettings | None = None
+    robust: NoSettings | None = None
+    vertical: NoSettings | None = None
+    correlation: NoSettings | None = None
+    layers: NoSettings | None = None
+    multiangle: ScanSettings
+
+
+def _needs(case: Case) -> Entries:
+    """Retrieve optical depth and extinction from the beams of each cycle, where the beam scans."""
+    reason = no_scan(case)
+    if reason:
+        yield case.leave("multiangle", reason)
+        return
+    directions = beams(case)
+    without_leverage = _without_leverage(directions)
+    if without_leverage:
+        reason = "; ".join(filter(None, (_low_beams(directions), without_leverage)))
+        yield case.leave("multiangle", reason, number=float(directions.count))
+        return
+    yield background(case, case.request.background)
+    yield plan_baseline(case)
+    yield _gradient(case, directions)
+    yield _gradient_regressor(case, directions)
+    yield _robust(case, directions)
+    yield _vertical(case, directions)
+    yield _correlation(case, directions)
+    yield _layers(case)
+    yield _retrieved(case, directions)
+
+
+def _retrieved(case: Case, directions: Beams) -> Entry:
+    settings = case.request
+    words = f"{REQUESTED}, and the beam scans"
+    if directions.pattern:
+        words += f": {directions.pattern}"
+    if directions.cycles > 1:
+        words += f", in {directions.cycles} cycles of at most {directions.largest}"
+    return case.run(
+        "multiangle",
+        words,
+        ScanSettings.taken_from(settings),
+        needs=(
+            "read", "overlap", "noise", "glue", "molecular", "background", "baseline", "gradient",
+            "gradient_regressor", "robust", "vertical", "correlation", "layers",
+        ),
+        warning="; ".join(filter(None, (_single_beams(case, directions), _low_beams(directions)))),
+    )  # fmt: skip
+
+
+def _together(settings: MultiAnglePlan, work: Workload) -> int:  # noqa: ARG001
+    """Return the number of profiles of the longest batch of cycles."""
+    granules = work.scene.granules
+    zenith_angle, azimuth = (
+        [_number(getattr(granule, name)) for granule in granules]
+        for name in ("zenith_angle", "azimuth")
+    )
+    numbers = scan_cycles.cycles(zenith_angle, azimuth, _bounds(granules))
+    return max(BATCH, int(np.bincount(numbers[numbers >= 0]).max(initial=1)))
+
+
+def _held(settings: MultiAnglePlan, work: Workload) -> float:
+    """Return the bytes of the cycles, of low beams, and of what is retrieved from them."""
+    scan = settings.multiangle
+    low = 0.0 if settings.baseline is None else held_of_low_beams(work)
+    return low + _BYTES_OF_AN_ALTITUDE * work.profiles * scan.highest / scan.step
+
+
+_BYTES_OF_AN_ALTITUDE: Final = 430.0
+"""Bytes per altitude of a beam of a cycle at the peak of the retrieval, as ``lidarops bench
+throughput --case memory`` measures."""
+
+
+class _Scans(WholeProduct):
+    """Scan cycles in altitude cells, and their optical depth."""
+
+    def __init__(self, settings: MultiAnglePlan, signal: ChannelSignal) -> None:
+        self._settings, self._station = settings.multiangle, signal.source.station_altitude
+        self._signal, self._background = signal, settings.background
+        self._known_shape = self._background.method == "known_shape"
+        self._shows_baseline = settings.baseline is not None
+        self._blocked = BlockedBeams(signal.profiles.range, self._background.range)
+        self._cycles = self._empty_cycles()
+        self.notes: list[str] = []
+
+    def _empty_cycles(self, baseline: AnalogBaseline | None = None) -> AltitudeCycles:
+        signal, settings = self._signal, self._settings
+        geometry, distance = signal.source.geometry, signal.profiles.range
+        return AltitudeCycles(
+            distance,
+            zenith_angle=geometry["zenith_angle"].to_numpy(),
+            azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
+            time_bnds=geometry["time_bnds"].to_numpy(),
+            shots=signal.shots.to_numpy(),
+            altitude_grid=self._station + altitude_steps(settings.step, settings.highest),
+            station_altitude=self._station,
+            background_range=self._background.range,
+            molecules=signal.molecules if self._known_shape else None,
+            wavelength=signal.wavelength,
+            overlap=signal.overlap_at(distance),
+            baseline=baseline,
+            shapes=signal.source.shared,
+        )
+
+    def ends(self) -> Indices:
+        """Return the rows before which a chunk may end: those that begin a cycle."""
+        return self._cycles.ends()
+
+    def add(self, chunk: Chunk) -> None:
+        """Average the cycles of the next profiles over altitude cells."""
+        profiles = self._signal.profiles
+        add_low_beams(self._blocked, chunk, profiles)
+        self._cycles.add(chunk.profiles(profiles), chunk.rows.start)
+
+    def _without_baseline(self, baseline: AnalogBaseline) -> AltitudeCycles:
+        """Return the cycles of all profiles, read again, from which a baseline is subtracted."""
+        archive, cycles = self._signal.source.archive, self._empty_cycles(baseline)
+        for first, past in itertools.pairwise([0, *cycles.ends(), archive.sizes["time"]]):
+            cycles.add(self._signal.profiles.of(archive.isel(time=slice(first, past))), first)
+        return cycles
+
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield the optical depth of all cycles."""
+        settings = self._settings
+        baseline = self._blocked.baseline() if self._shows_baseline else None
+        cycles = self._cycles if baseline is None else self._without_baseline(baseline)
+        optical_depth = labeled.retrieve_optical_depth(
+            cycles.result(self._blocked.obstructions()),
+            station_altitude=self._station,
+            method=settings.method,
+            regularisation=settings.regularisation,
+            largest_gradient=settings.largest_gradient,
+            layers=[(low + self._station, high + self._station) for low, high in settings.layers],
+        )
+        self.notes += blocked_in_words(optical_depth)
+        optical_depth = optical_depth.assign(
+            retrieval_method=LAYOUT.row("retrieval_method").code(optical_depth.attrs["method"]),
+            background_method=BACKGROUND_METHOD.code(self._background.method),
+        )
+        papers = self._papers()
+        if papers:
+            optical_depth = optical_depth.assign_attrs(references="\n".join(papers))
+        if baseline is not None:
+            optical_depth = with_baseline(optical_depth, baseline, self._signal.source.geometry)
+        least = settings.least_signal_to_noise
+        return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
+
+    def _papers(self) -> list[str]:
+        """Return the papers of what runs, beside those of all methods."""
+        differentiates = self._settings.method in _DIFFERENTIATING
+        of_method = [MULTIANGLE_PAPER] if differentiates else []
+        return of_method + ([KNOWN_SHAPE_PAPERS] if self._known_shape else [])
+
+
+RETRIEVAL: Final = Retrieval(
+    settings=MultiAnglePlan, needs=_needs, stream=_Scans, held=_held, together=_together
+)

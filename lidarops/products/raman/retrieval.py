@@ -1,0 +1,362 @@
+"""The product ``raman``: its decision, and its making."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, cast
+
+import xarray as xr
+
+from lidarops.campaign.model import channel_facts
+from lidarops.constants import KNOWN_SHAPE_PAPERS
+from lidarops.products.raman.settings import RamanProductSettings
+from lidarops.products.raman.variables import LAYOUT
+from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
+from lidarops.retrieve.raman import labeled
+from lidarops.retrieve.raman.scattering import (
+    NITROGEN_SHIFT,
+    WATER_SHIFT,
+    is_raman_line,
+    raman_wavelength,
+)
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
+from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
+from lidarops.retrieve.signal.labeled_screening import Screening
+from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.scene.case import REQUESTED, Entries, ProductCase
+from lidarops.scene.channels import file_channels, member_channel, range_channel, wavelength
+from lidarops.scene.choices import AverageSettings, average, with_low_signal_to_noise, with_methods
+from lidarops.scene.data import ChannelSignal, ProductStream, RowProduct, WholeProduct, in_one_batch
+from lidarops.scene.pointing import fixed_zenith
+from lidarops.scene.profiles import Averages, Chunk, ScreenedAverages
+from lidarops.scene.retrieval import Retrieval, Workload
+from lidarops.settings import SettingsModel, quantity
+
+Case = ProductCase[RamanProductSettings]
+
+LOOKED_AT: Final = 64
+"""Profiles of a scene that are looked at for a Raman signal."""
+NEAREST: Final = 500.0
+FARTHEST: Final = 3000.0
+"""m; where the Raman signal is looked for: beyond most overlap, before it gets weak."""
+LEAST_SIGNAL: Final = 4.0
+"""Standard errors of the signal of a profile. In 64 profiles of noise, the largest exceeds this in
+0.2 % of scenes."""
+
+
+STANDARD_SLOPE_ERROR: Final = 1.6e-5
+"""m-1, of the derivative of the logarithm of the density of the standard atmosphere: root mean
+square from 0.1 to 12 km of its deviation from the sounding of Manaus
+(`tests/end_to_end/test_raman.py`), 16 K warmer."""
+SOUNDING_SLOPE_ERROR: Final = 2e-6
+"""m-1, the same of a sounding or model: 0.5 K over 1 km. Assumed."""
+
+
+class RetrievalSettings(SettingsModel):
+    """Settings of the entry ``raman``; lengths are along the beam."""
+
+    nitrogen: str
+    water_vapour: str | None = None
+    calibration: float | None = None
+    """kg kg-1 per ratio of the signals of water vapour and nitrogen."""
+    calibration_standard_error: float | None = None
+    lowest: float = quantity(unit="m", description="of the reference window")
+    highest: float = quantity(unit="m", description="of the reference window")
+    width: float = quantity(unit="m", description="of the reference window")
+    scattering_ratio: float
+    reference_relative_error: float
+    cell: float = quantity(unit="m")
+    farthest: float = quantity(unit="m")
+    known_shape: bool
+    angstrom_exponent: float
+    angstrom_standard_error: float
+    molecular_relative_error: float
+    molecular_slope_error: float = quantity(unit="m-1", description="along the beam")
+    overlap_relative_error: float
+    filter_width: float | None = quantity(None, unit="m")
+    least_signal_to_noise: float
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The Raman channels."""
+        water = self.water_vapour
+        return (self.nitrogen,) if water is None else (self.nitrogen, water)
+
+
+class RamanPlan(SettingsModel):
+    """What a plan states of a product."""
+
+    average: AverageSettings
+    raman: RetrievalSettings
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Stretch of ranges along the beam, and why there is none."""
+
+    stretch: float
+    reach: float
+    reason: str
+
+
+def _limits(case: Case) -> _Limits:
+    zenith, reason = fixed_zenith(case)
+    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
+    reach = case.last - 0.5 * case.channel.bin_width
+    window = case.request.reference
+    if (
+        not reason
+        and min(window.highest * stretch, reach) < (window.lowest + window.width) * stretch
+    ):
+        reason = (
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    return _Limits(stretch, reach, reason)
+
+
+def _slope_error(case: Case) -> float:
+    """Return the error of the derivative of the logarithm of the density of air, m-1 of height."""
+    stated = case.request.molecular_slope_error
+    if stated is not None:
+        return stated
+    return SOUNDING_SLOPE_ERROR if case.facts.molecular_profile else STANDARD_SLOPE_ERROR
+
+
+def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
+    """Return why a Raman channel of a gas cannot be used; empty where it can."""
+    layout = case.scene.layout
+    try:
+        found = member_channel(layout, channel)
+    except StopIteration:
+        held = ", ".join(known.name for known in layout)
+        return f"the files hold no channel {channel}, only {held}"
+    if found.bin_width != case.channel.bin_width:
+        return (
+            f"{channel} has bins of {found.bin_width:g} m, {case.channel.bin_width:g} m are needed"
+        )
+    length = wavelength(found, channel_facts(case.facts, range_channel(channel)))
+    own = wavelength(case.channel, channel_facts(case.facts, range_channel(case.channel.name)))
+    if not is_raman_line(length, own, shift):
+        return (
+            f"{channel} measures {length * 1e9:g} nm, but the Raman line of {gas} for"
+            f" {own * 1e9:g} nm is at {raman_wavelength(own, shift) * 1e9:.1f} nm: name the channel"
+            " of that line, or correct wavelength in the facts"
+        )
+    return ""
+
+
+def _needs(case: Case) -> Entries:
+    """Retrieve extinction, backscatter and lidar ratio from averaged signals.
+
+    Where a fixed beam reaches the reference window, and the files hold the channels.
+    """
+    request, name = case.request, case.channel.name
+    limits = _limits(case)
+    nitrogen, water = request.nitrogen[name], request.water_vapour.get(name)
+    reason = limits.reason or _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
+    if reason:
+        yield case.leave("raman", reason)
+        return
+    facts = None if water is None else channel_facts(case.facts, range_channel(water))
+    absent = "" if water is None else _absent(case, water, "water vapour", WATER_SHIFT)
+    if facts is not None and not absent and facts.water_vapour_calibration is None:
+        absent = f"the facts of {water} give no water_vapour_calibration"
+    if facts is None or absent:
+        water, facts = None, None
+    yield average(
+        case, request.average, "the noise of a single profile is too large for Raman signals"
+    )
+    if absent:
+        yield case.leave("raman", f"no water vapour: {absent}")
+    window = request.reference
+    settings = RetrievalSettings.taken_from(
+        request,
+        nitrogen=nitrogen,
+        water_vapour=water,
+        calibration=facts.water_vapour_calibration if facts else None,
+        calibration_standard_error=facts.water_vapour_calibration_error if facts else None,
+        lowest=window.lowest * limits.stretch,
+        highest=min(window.highest * limits.stretch, limits.reach),
+        width=window.width * limits.stretch,
+        scattering_ratio=window.scattering_ratio,
+        reference_relative_error=window.relative_error,
+        farthest=min(request.highest * limits.stretch, limits.reach),
+        known_shape=request.background == "known_shape",
+        molecular_slope_error=_slope_error(case) / limits.stretch,
+    )
+    taken = ["read", "overlap", "noise", "glue", "molecular", "average"]
+    taken += [f"{raman}/{stage}" for raman in settings.channels for stage in _FROM_COMPANIONS]
+    yield case.run("raman", REQUESTED, settings, needs=taken)
+
+
+_FROM_COMPANIONS: Final = ("read", "noise", "glue")
+
+
+def _stream(settings: RamanPlan, signal: ChannelSignal) -> ProductStream:
+    """Return the product, whose averages are retrieved as they become complete."""
+    dark = _without_signal(settings.raman, signal)
+    return _Dark(settings, signal, dark) if dark else _Retrieval(settings, signal)
+
+
+def _held(settings: RamanPlan, work: Workload) -> float:
+    """Return the bytes of the averages that are completed together, and of their solution."""
+    names = (work.channel, *settings.raman.channels)
+    records = sum(len(file_channels(name)) for name in names)
+    together = min(work.intervals(settings.average.seconds), MEANS_TOGETHER)
+    cells = settings.raman.farthest / settings.raman.cell
+    return bytes_held(records, together, work.bins, cells)
+
+
+def bytes_held(records: int, means: int, bins: int, cells: float) -> float:
+    """Return the bytes of means of some records that are completed and solved together."""
+    of_means = records * (_BYTES_OF_A_BIN * means + _BYTES_OF_PARTS) * bins
+    return of_means + (_BYTES_OF_A_PROFILE * means + _BYTES_OF_A_SOLUTION) * cells**2
+
+
+_BYTES_OF_PARTS: Final = 500.0
+"""Bytes per bin of the parts of the open average of a record, of which glued channels have two."""
+_BYTES_OF_A_BIN: Final = 205.0
+"""Bytes per bin of a complete average of a record. Both are measured
+(`tests/products/test_raman_memory.py`), as are those of the solution."""
+_BYTES_OF_A_PROFILE: Final = 33.0
+"""Bytes per pair of cells of each fitted profile: four matrices, kept until all are solved."""
+_BYTES_OF_A_SOLUTION: Final = 80.0
+"""Bytes per pair of cells of the profile that is being solved."""
+
+
+def _assumptions(settings: RetrievalSettings, signal: ChannelSignal) -> labeled.Assumptions:
+    return labeled.Assumptions(
+        RamanSettings(
+            wavelength=signal.wavelength,
+            raman_wavelength=signal.channels[settings.nitrogen].wavelength,
+            angstrom_exponent=settings.angstrom_exponent,
+            angstrom_standard_error=settings.angstrom_standard_error,
+            lowest=settings.lowest,
+            highest=settings.highest,
+            width=settings.width,
+            scattering_ratio=settings.scattering_ratio,
+            reference_relative_error=settings.reference_relative_error,
+            molecular_relative_error=settings.molecular_relative_error,
+            overlap_relative_error=settings.overlap_relative_error,
+            molecular_slope_error=settings.molecular_slope_error,
+        ),
+        cell=settings.cell,
+        highest=settings.farthest,
+        known_shape=settings.known_shape,
+        filter_width=settings.filter_width,
+    )
+
+
+class _Retrieval(RowProduct):
+    """Averages of the profiles of all channels, and their retrieval."""
+
+    def __init__(self, settings: RamanPlan, signal: ChannelSignal) -> None:
+        self._settings, self._signal = settings.raman, signal
+        self._begun = False
+        names = [signal.channel, *settings.raman.channels]
+        self._averages = ScreenedAverages(
+            [signal.channels[name].profiles for name in names],
+            signal.source.geometry,
+            signal.shots,
+            settings.average.seconds,
+            Screening(cloud_contrast(signal.wavelength), settings.raman.highest),
+        )
+
+    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+        """Add the next profiles to their averages, and yield those that are complete."""
+        self._averages.add(chunk)
+        for means in self._averages.completed():
+            rows = self._retrieved(*means)
+            if not self._begun:
+                self._begun = True
+                yield rows.drop_dims("time").assign_coords(self._averages.times.coords)
+            yield rows
+
+    def _retrieved(
+        self, elastic: xr.Dataset, nitrogen: xr.Dataset, water: xr.Dataset | None = None
+    ) -> xr.Dataset:
+        signal, settings = self._signal, self._settings
+        retrieved = labeled.retrieve(
+            elastic.assign_coords(signal.source.pointing),
+            nitrogen,
+            molecules=signal.molecules,
+            station_altitude=signal.source.station_altitude,
+            assumptions=_assumptions(settings, signal),
+            water=None if water is None else self._water(water),
+            overlap=signal.overlap_at(elastic["range"].to_numpy()),
+            overlap_is_stated=signal.full_overlap_range is not None,
+        )
+        if settings.known_shape:
+            retrieved = retrieved.assign_attrs(references=KNOWN_SHAPE_PAPERS)
+        weighed = [name for name in LAYOUT.weighed if name in retrieved]
+        flagged = with_low_signal_to_noise(retrieved, weighed, settings.least_signal_to_noise)
+        return with_methods(flagged, signal.molecules, known_shape=settings.known_shape)
+
+    def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
+        settings = self._settings
+        # `_needs` names the channel only with its calibration.
+        name = cast("str", settings.water_vapour)
+        constant = cast("float", settings.calibration)
+        error = cast("float", settings.calibration_standard_error)
+        metres = self._signal.channels[name].wavelength
+        return labeled.WaterVapour(averages, metres, constant, error)
+
+
+def _without_signal(settings: RetrievalSettings, signal: ChannelSignal) -> str:
+    """Return in words that no profile that is looked at has a Raman signal; empty if one has."""
+    archive, profiles = signal.source.archive, signal.channels[settings.nitrogen].profiles
+    places = spaced_indices(archive.sizes["time"], LOOKED_AT)
+    seen, most = 0, 0.0
+    for place in places:
+        power, variance, quality, length = (
+            profiles.of(archive.isel(time=[place]))[name].to_numpy()
+            for name in ("power", "variance", "quality", CORRELATION_LENGTH)
+        )
+        light = detect_light(power, variance * length, quality, profiles.range, NEAREST, FARTHEST)
+        seen, most = seen + light.profiles, max(most, light.significance)
+    if not seen or most >= LEAST_SIGNAL:
+        return ""
+    return (
+        f"no signal of {settings.nitrogen} from {NEAREST:g} to {FARTHEST:g} m in {seen}"
+        f" profiles looked at: at most {most:.1f} standard errors (limit {LEAST_SIGNAL:g});"
+        " nothing is retrieved"
+    )
+
+
+class _Dark(WholeProduct):
+    """A product without values, whose rows are the averages of a scene without Raman signal."""
+
+    def __init__(self, settings: RamanPlan, signal: ChannelSignal, reason: str) -> None:
+        self._settings, self._signal, self._reason = settings, signal, reason
+        self.notes = [f"raman of {signal.channel}: {reason}"]
+
+    @property
+    def reads(self) -> bool:
+        """Nothing is read."""
+        return False
+
+    def add(self, chunk: Chunk) -> None:
+        """Take nothing of the profiles."""
+
+    def results(self) -> Iterator[xr.Dataset]:
+        """Yield the empty product."""
+        signal, settings = self._signal, self._settings
+        geometry, seconds = signal.source.geometry, settings.average.seconds
+        empty = labeled.without_signal(
+            Averages(signal.profiles, geometry, signal.shots, seconds).times,
+            signal.shots.compute(),
+            signal.profiles.range,
+            signal.source.pointing,
+            molecules=signal.molecules,
+            station_altitude=signal.source.station_altitude,
+            assumptions=_assumptions(settings.raman, signal),
+        )
+        product = with_methods(empty, signal.molecules, known_shape=settings.raman.known_shape)
+        return in_one_batch(product.assign_attrs(steps=f"raman: {self._reason}"))
+
+
+RETRIEVAL: Final = Retrieval(settings=RamanPlan, needs=_needs, stream=_stream, held=_held)

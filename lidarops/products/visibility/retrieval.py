@@ -1,0 +1,463 @@
+"""The product ``visibility`` of a network: its decision, and its making."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from lidarops.campaign.model import ChannelFacts, InstrumentFacts
+from lidarops.flags import Quality
+from lidarops.products.visibility.network import (
+    NAME,
+    SAME_POINTING,
+    BeamPlan,
+    MemberCase,
+    angle_between,
+    crossings,
+)
+from lidarops.products.visibility.settings import (
+    MultiplierValue,
+    PriorName,
+    VisibilityProductSettings,
+)
+from lidarops.products.visibility.variables import LAYOUT
+from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, is_glued
+from lidarops.retrieve.air.labeled import VisibilityDefinition
+from lidarops.retrieve.background.left_signal import window_before
+from lidarops.retrieve.network import geometry, labeled
+from lidarops.retrieve.network.labeled import BeamAverages
+from lidarops.retrieve.network.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.labeled_averaging import joined
+from lidarops.scene.case import ALL_STEPS, ChannelCase, Entries, Entry, NoSettings, ProductCase
+from lidarops.scene.channels import READ_STEP, file_channels, member_channel
+from lidarops.scene.choices import (
+    AverageSettings,
+    BackgroundSettings,
+    average,
+    background,
+    tail,
+)
+from lidarops.scene.pipe import plan_stages
+from lidarops.scene.profiles import Averages, Chunk, Indices
+from lidarops.scene.retrieval import Member, NetworkCase, NetworkRetrieval, NetworkStream, Workload
+from lidarops.scene.windows import (
+    ANALOG_NOISE,
+    WINDOW,
+    WindowSettings,
+    bins_with_noise,
+    bins_within,
+    merged,
+)
+from lidarops.settings import SettingsModel, VisibilitySettings
+
+Case = ProductCase[VisibilityProductSettings]
+
+_SAME_WAVELENGTH: Final = 1e-9
+"""m; largest difference between equal wavelengths of instruments."""
+_EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+
+
+def _window(case: Case, farthest: float) -> Entry:
+    """Return the bins that the crossings of an instrument and its background need.
+
+    Some bins are not needed in photon counting beyond the farthest crossing, given in m.
+    """
+    rule, channel = "member_window", case.channel
+    if is_glued(channel.name) or channel.mode is not DetectionMode.PHOTON:
+        return case.leave(WINDOW, ANALOG_NOISE, rule=rule)
+    if case.all_steps:
+        return case.leave(WINDOW, ALL_STEPS, rule=rule)
+    width, (start, stop) = channel.bin_width, tail(case, case.request.background_range)
+    low, high = window_before(start + width)
+    near = bins_with_noise(0.0, farthest + THRESHOLDS.bins_beyond * width, case)
+    far = (bins_within(low - width, high, case), bins_within(start, stop, case))
+    kept = merged((first, min(past, channel.bins)) for first, past in (near, *far))
+    number = float(sum(past - first for first, past in kept))
+    if len(kept) == 1 and number == channel.bins:
+        reason = "crossings and background need all bins"
+        return case.leave(WINDOW, reason, number=number, rule=rule)
+    reason = "bins between the farthest crossing and the background range are not needed"
+    settings = WindowSettings(bins=tuple(kept))
+    return case.run(WINDOW, reason, settings, number=number, rule=rule)
+
+
+def _prior(case: Case) -> Entry:
+    """Use a prior that the profiles of a block share, unless the campaign requests none."""
+    settings = case.request
+    if settings.multiplier is not None:
+        reason = "a multiplier is requested: triangles of beams are solved without prior"
+        return case.leave("prior", reason)
+    if settings.prior == "none":
+        reason = "the campaign requests no prior: gradients along beams mimic attenuation"
+        return case.leave("prior", reason)
+    reason = (
+        "decided from the data: the strongest prior about a linear field in a block that"
+        " agrees with its beams"
+    )
+    return case.run("prior", reason, number=settings.block / settings.average)
+
+
+class NetworkSettings(VisibilitySettings):
+    """Settings of the entry ``visibility``."""
+
+    beams: tuple[BeamPlan, ...]
+    wavelength: float
+    """m."""
+    block_seconds: float
+    prior: PriorName
+    multiplier: MultiplierValue | None = None
+    """Of triangles of beams, instead of all beams together."""
+    tolerance: float
+    """m."""
+    smallest_angle: float
+    """degree."""
+    exponent_relative_error: float
+    lidar_ratio_relative_error: float
+    overlap_relative_error: float
+
+    @property
+    def definition(self) -> VisibilityDefinition:
+        """Definition of visibility."""
+        values = {name: getattr(self, name) for name in VisibilitySettings.model_fields}
+        return VisibilityDefinition(self.wavelength, **values)
+
+
+class VisibilityPlan(SettingsModel):
+    """What a plan states of a product for the whole network."""
+
+    average: AverageSettings
+    prior: NoSettings | None = None
+    visibility: NetworkSettings
+
+
+class MemberPlan(SettingsModel):
+    """What a plan states of a product for one instrument."""
+
+    background: BackgroundSettings
+    range_window: WindowSettings | None = None
+
+
+def _needs(case: NetworkCase[VisibilityProductSettings]) -> Entries:
+    """Retrieve extinction and visibility where the beams of a network cross."""
+    return _NetworkPlan(case).entries()
+
+
+def _held(settings: VisibilityPlan, work: Workload) -> float:
+    """Return the bytes of the averages of all beams."""
+    bins = max(channel.bins for member in work.scene.members for channel in member.layout)
+    seconds, beams = settings.average.seconds, settings.visibility.beams
+    averages = sum(work.intervals(seconds, beam.instrument) for beam in beams)
+    return _BYTES_OF_A_BIN * bins * averages
+
+
+_BYTES_OF_A_BIN: Final = 60.0
+"""Bytes per bin of an average of a beam: power, variance and quality, and copies; assumed, not
+measured."""
+
+
+class _NetworkPlan:
+    """The plan of a scene of a network."""
+
+    def __init__(self, case: NetworkCase[VisibilityProductSettings]) -> None:
+        self._scene, self._campaign, self._settings = case.scene, case.campaign, case.request
+        self._members = [
+            MemberCase(member, case.campaign, case.request) for member in case.scene.members
+        ]
+
+    def entries(self) -> Entries:
+        """Yield the entries of the members that take part, then those of the whole network."""
+        yield from self._absent()
+        able = []
+        for member in self._members:
+            why, number = member.why_not()
+            if why:
+                yield self._left(member.scene.instrument, why, number, "member")
+            else:
+                able.append(member)
+        prepared = [entry for member in able for entry in self._prepared(member)]
+        yield from (entry for entry in prepared if isinstance(entry, LeftOut))
+        wavelengths = [
+            step.settings["wavelength"]
+            for step in prepared
+            if isinstance(step, PlannedStep) and step.name == READ_STEP
+        ]
+        beams = [beam for member in able for beam in member.pointings()]
+        reason = self._why_none(beams, wavelengths)
+        kept: list[BeamPlan] = []
+        if reason is None:
+            kept = beams
+            yield from self._without_lonely_beams(kept)
+            reason = self._why_no_crossing(kept)
+        if reason is not None:
+            yield reason
+            return
+        used = {beam.instrument for beam in kept}
+        yield from (
+            step for step in prepared if isinstance(step, PlannedStep) and step.instrument in used
+        )
+        yield from self._joint(kept, min(wavelengths))
+
+    def _absent(self) -> Entries:
+        present = {member.instrument for member in self._scene.members}
+        for name in self._campaign.networks[self._scene.instrument].instruments:
+            if name not in present:
+                yield self._left(name, "no granule in the window", 0.0, "member_present")
+
+    def _left(self, member: str, reason: str, number: float | None, rule: str) -> Entry:
+        case = replace(self._joint_case, member=member)
+        return case.leave(NAME, reason, number=number, rule=rule)
+
+    def _prepared(self, member: MemberCase) -> Entries:
+        """Yield the steps from the counts of an instrument to its signal."""
+        name = self._settings.channel
+        for channel in dict.fromkeys((*file_channels(name), name)):
+            case = member.channel_case(member_channel(member.scene.layout, channel))
+            yield from plan_stages(case)
+        of_product = self._of_product(case)
+        yield background(of_product, "tail_mean", self._settings.background_range)
+
+    def _of_product(self, case: ChannelCase) -> Case:
+        return case.of_product(NAME, self._settings)
+
+    @property
+    def _joint_case(self) -> Case:
+        """The case of the steps of the whole network."""
+        channel = ChannelLayout(
+            self._settings.channel, DetectionMode.PHOTON, math.nan, 0, math.nan, 0
+        )
+        return self._of_product(
+            ChannelCase(self._scene, channel, InstrumentFacts(), ChannelFacts())
+        )
+
+    def _why_none(self, beams: Sequence[BeamPlan], wavelengths: Sequence[float]) -> Entry | None:
+        """Return why there can be no network, whatever the crossings."""
+        if wavelengths and max(wavelengths) - min(wavelengths) > _SAME_WAVELENGTH:
+            listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
+            reason = f"the instruments have different wavelengths: {listed} nm"
+            number = max(wavelengths) - min(wavelengths)
+            return self._joint_case.leave(NAME, reason, number=number, rule="one_wavelength")
+        if len(beams) > THRESHOLDS.most_beams:
+            reason = f"{len(beams)} beams exceed the limit of {THRESHOLDS.most_beams}"
+            number = float(len(beams))
+            return self._joint_case.leave(NAME, reason, number=number, rule="few_beams")
+        return None
+
+    def _crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
+        return crossings(beams, self._scene, self._campaign, self._settings)
+
+    def _without_lonely_beams(self, beams: list[BeamPlan]) -> Entries:
+        """Take out beams with fewer than two crossings, until all remaining beams have two."""
+        while beams:
+            network = self._crossings(beams)
+            counts = {beam: int(network.on_beam(n)[0].size) for n, beam in enumerate(beams)}
+            lonely = [beam for beam in beams if counts[beam] < 2]
+            for beam in lonely:
+                pointing = f"zenith angle {beam.zenith_angle:g} and azimuth {beam.azimuth:g} degree"
+                reason = f"the beam at {pointing} has fewer than two crossings with other beams"
+                yield self._left(beam.instrument, reason, float(counts[beam]), "beams_meet")
+                beams.remove(beam)
+            if not lonely:
+                return
+
+    def _why_no_crossing(self, beams: Sequence[BeamPlan]) -> Entry | None:
+        """Return why the remaining beams form no network."""
+        if not beams:
+            reason = "no beam has two crossings with other beams, between which it is attenuated"
+            return self._joint_case.leave(NAME, reason, number=0.0, rule="some_meet")
+        return None
+
+    def _joint(self, beams: Sequence[BeamPlan], wavelength: float) -> Entries:
+        """Yield the read windows of the instruments, and the steps of the whole network."""
+        network = self._crossings(beams)
+        for member in self._members:
+            name = member.scene.instrument
+            numbers = [n for n, beam in enumerate(beams) if beam.instrument == name]
+            if numbers:
+                farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
+                case = self._of_product(member.channel_case(member.channel))
+                yield _window(case, farthest)
+        case = self._joint_case
+        reason = "signals are averaged before the retrieval: noise biases means of retrieved values"
+        yield average(case, self._settings.average, reason)
+        yield _prior(case)
+        yield self._visibility(beams, network, wavelength)
+
+    def _visibility(
+        self, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
+    ) -> Entry:
+        settings = self._settings
+        by_triangles = (
+            ""
+            if settings.multiplier is None
+            else f"; solved by triangles with the multiplier {settings.multiplier}"
+        )
+        return self._joint_case.run(
+            NAME,
+            f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
+            f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones"
+            f"{by_triangles}",
+            NetworkSettings.taken_from(
+                settings,
+                beams=tuple(beams),
+                wavelength=wavelength,
+                block_seconds=settings.block.total_seconds(),
+                **dict(settings.visibility.resolved),
+            ),
+            needs=(
+                "read", "overlap", "noise", "glue", "background", WINDOW, "average", "prior"
+            ),
+            number=float(network.crossings),
+        )  # fmt: skip
+
+
+class _NetworkStream(NetworkStream):
+    """Averages of all beams of a network, and what is retrieved from them."""
+
+    def __init__(self, settings: VisibilityPlan, members: Sequence[Member[MemberPlan]]) -> None:
+        self._settings, self._seconds = settings.visibility, settings.average.seconds
+        self.wavelength = self._settings.wavelength
+        by_name = {member.instrument: member for member in members}
+        self._beams = [
+            _Beam(by_name[beam.instrument], beam, self._seconds) for beam in self._settings.beams
+        ]
+
+    def add(self, member: Member[MemberPlan], chunk: Chunk) -> None:
+        """Add profiles of an instrument to the averages of its beams."""
+        for beam in self._beams:
+            if beam.member is member:
+                beam.add(chunk)
+
+    def result(self) -> xr.Dataset:
+        """Return the variables of the product."""
+        settings = self._settings
+        signals = [beam.signals() for beam in self._beams]
+        retrieved = labeled.retrieve_network(
+            signals,
+            self._network(signals),
+            labeled.NetworkSettings(
+                block_intervals=round(settings.block_seconds / self._seconds),
+                visibility=settings.definition,
+                prior=settings.prior,
+                multiplier=settings.multiplier,
+                exponent_relative_error=settings.exponent_relative_error,
+                lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
+                overlap_relative_error=settings.overlap_relative_error,
+            ),
+        )
+        method = "beams_with_prior" if settings.prior == "block" else "beams_without_prior"
+        if settings.multiplier is not None:
+            method = "triangles"
+        return retrieved.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
+
+    def _network(self, signals: Sequence[BeamAverages]) -> geometry.Network:
+        settings = self._settings
+        return geometry.build_network(
+            [
+                geometry.Beam(
+                    *beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle
+                )
+                for beam in signals
+            ],
+            tolerance=settings.tolerance,
+            nearest=[beam.nearest for beam in settings.beams],
+            farthest=[beam.farthest for beam in settings.beams],
+            smallest_angle=settings.smallest_angle,
+        )
+
+
+class _Beam:
+    """One beam of a member: the averaged profiles of its pointing."""
+
+    def __init__(self, member: Member[MemberPlan], planned: BeamPlan, seconds: float) -> None:
+        self.member, self._planned = member, planned
+        self._averages: Averages | None = None
+        self._interval: Indices = np.zeros(0, dtype=np.int64)
+        self._profiles: Indices = np.zeros(0, dtype=np.int64)
+        signal = member.signal
+        if signal is None:
+            return
+        geometry_of_all = signal.source.geometry
+        self._profiles = _profiles_of(geometry_of_all, planned)
+        if self._profiles.size:
+            of_beam = geometry_of_all.isel(time=self._profiles)
+            shots = signal.shots.isel(time=self._profiles)
+            self._averages = Averages(signal.profiles, of_beam, shots, seconds)
+            self._interval = _intervals(of_beam["time"].to_numpy(), seconds)
+
+    def add(self, chunk: Chunk) -> None:
+        """Add the profiles of a chunk that have the pointing of the beam."""
+        inside = (self._profiles >= chunk.rows.start) & (self._profiles < chunk.rows.stop)
+        if self._averages is not None and inside.any():
+            self._averages.add(chunk, self._profiles[inside] - chunk.rows.start)
+
+    def signals(self) -> BeamAverages:
+        """Return the averages with the geometry and settings of the beam."""
+        member, planned, signal = self.member, self._planned, self.member.signal
+        averages = (
+            _no_averages(member.range)
+            if self._averages is None
+            else joined(self._averages.completed())
+        )
+        distance = averages["range"].to_numpy().astype(np.float64)
+        limits = (distance[0], np.inf) if signal is None else member.settings.background.range
+        return BeamAverages(
+            averages=averages,
+            interval=self._interval,
+            instrument=member.instrument,
+            station=(member.station.latitude, member.station.longitude, member.station.altitude),
+            background_range=limits,
+            nearest=planned.nearest,
+            overlap=None if signal is None else signal.overlap_at(distance),
+            exponent=planned.exponent,
+            zenith_angle=planned.zenith_angle,
+            azimuth=planned.azimuth,
+        )
+
+
+def _profiles_of(geometry_of_all: xr.Dataset, beam: BeamPlan) -> Indices:
+    """Return the numbers of the profiles of a beam."""
+    planned = (beam.zenith_angle, beam.azimuth)
+    angles = (geometry_of_all[name].to_numpy() for name in ("zenith_angle", "azimuth"))
+    return np.array(
+        [
+            number
+            for number, pointing in enumerate(zip(*angles, strict=True))
+            if angle_between(pointing, planned) <= SAME_POINTING
+        ],
+        dtype=np.int64,
+    )
+
+
+def _intervals(moments: npt.NDArray[np.datetime64], seconds: float) -> Indices:
+    """Return the numbers of the clock intervals that hold profiles, each once."""
+    length = np.timedelta64(round(seconds * 1e9), "ns")
+    return np.unique((moments.astype("datetime64[ns]") - _EPOCH) // length).astype(np.int64)
+
+
+def _no_averages(distance: npt.NDArray[np.float64]) -> xr.Dataset:
+    """Return averages of a beam without profiles."""
+    empty = np.zeros((0, distance.size))
+    pair = ("time", "range")
+    return xr.Dataset(
+        {
+            "power": (pair, empty),
+            "variance": (pair, empty),
+            "quality": (pair, np.full(empty.shape, int(Quality.INPUT_MISSING), dtype=np.int32)),
+            "shots": ("time", np.zeros(0, dtype=np.int32)),
+        },
+        coords={
+            "range": distance,
+            "time_bnds": (("time", "nv"), np.zeros((0, 2), dtype="datetime64[ns]")),
+        },
+    )
+
+
+RETRIEVAL: Final = NetworkRetrieval(
+    settings=VisibilityPlan, member=MemberPlan, needs=_needs, stream=_NetworkStream, held=_held
+)

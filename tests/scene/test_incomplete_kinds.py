@@ -1,0 +1,64 @@
+"""A package that adds a kind of product is refused where it is incomplete, and its bugs show."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lidarops import kinds as all_kinds
+from lidarops.errors import LidarOpsError
+from lidarops.kinds import Kind
+from lidarops.products.signal.settings import SignalSettings
+from lidarops.scene.pipe import PIPE
+from lidarops.scene.retrieval import made
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package of a kind ``odd`` without modules."""
+    folder = tmp_path / "odd_kind"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    kind = Kind("odd", "Odd", "odd_kind", SignalSettings, rank=99)
+    known = {**all_kinds.kinds(), "odd": kind}
+    monkeypatch.setattr(all_kinds, "kinds", lambda: known)
+    yield folder
+    for name in [name for name in sys.modules if name.startswith("odd_kind")]:
+        del sys.modules[name]
+
+
+def test_a_kind_without_steps_is_incomplete(package: Path) -> None:
+    with pytest.raises(LidarOpsError, match=r"incomplete: odd_kind\.retrieval has no RETRIEVAL"):
+        made("odd")
+    (package / "retrieval.py").write_text("OTHER = 1\n")
+    with pytest.raises(LidarOpsError, match="incomplete"):
+        made("odd")
+
+
+def test_an_error_in_a_module_of_a_kind_is_not_hidden(package: Path) -> None:
+    (package / "retrieval.py").write_text("import no_such_package\n")
+    with pytest.raises(ModuleNotFoundError, match="no_such_package"):
+        made("odd")
+
+
+def test_the_settings_of_a_kind_have_its_name(package: Path) -> None:
+    words = "from lidarops.products.signal.retrieval import RETRIEVAL\n"
+    (package / "retrieval.py").write_text(words)
+    with pytest.raises(LidarOpsError, match="'odd'"):
+        made("odd")
+
+
+def test_a_kind_of_channels_is_no_kind_of_networks(package: Path) -> None:
+    words = "from lidarops.products.visibility.retrieval import RETRIEVAL\n"
+    (package / "retrieval.py").write_text(words)
+    with pytest.raises(LidarOpsError, match="is no Retrieval"):
+        made("odd")
+
+
+@pytest.mark.parametrize("kind", all_kinds.kinds())
+def test_entries_of_a_kind_have_names_of_their_own(kind: str) -> None:
+    assert not set(made(kind).settings.model_fields) & set(PIPE)

@@ -1,0 +1,134 @@
+"""What a plan states: a product depends on what stands before it, and on no other product."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import factories
+from support.archives.network_plans import campaign as network_campaign
+from support.archives.network_plans import granules as network_granules
+
+from lidarops.plan.scenes import cut_scenes
+from lidarops.records import Plan, PlannedStep, Role
+from lidarops.scene import dependence
+from lidarops.scene.plan import plan_scene
+from lidarops.scene.retrieval import settings_model
+
+CHANNELS = ["photon_532o", "analog_532o", "glued_532o"]
+REQUESTS: dict[str, dict[str, Any]] = {
+    "signal": {"channels": CHANNELS},
+    "homogeneous": {"channels": CHANNELS[:2], "sections": [[750, 4500]], "visibility": {}},
+    "elastic": {"channels": CHANNELS},
+    "multiangle": {"channels": CHANNELS, "layers": [[600, 1200]]},
+}
+FACTS = {"channels": {"photon_532o": {"dead_time": 4e-9}, "analog_532o": {"lag": 3}}}
+DARK = [factories.granule(-30.0 - k, path=f"dark/{k}", role=Role.DARK) for k in range(2)]
+LEVEL = [factories.granule(0), *DARK]
+UP = [factories.granule(0, zenith_angle=0.0), *DARK]
+SCAN = [
+    *(factories.granule(k, zenith_angle=15.0 * k, azimuth=90.0) for k in range(6)),
+    *DARK,
+]
+SCENES = {"level": LEVEL, "up": UP, "scan": SCAN}
+
+
+def planned(scene: str, kinds: Any = REQUESTS) -> Plan:
+    products = {kind: REQUESTS[kind] for kind in kinds}
+    campaign = factories.campaign(products=products, facts=[FACTS])
+    return plan_scene(cut_scenes(campaign, SCENES[scene]).scenes[0], campaign)
+
+
+def network() -> Plan:
+    campaign = network_campaign()
+    (scene,) = (s for s in cut_scenes(campaign, network_granules()).scenes if s.members)
+    return plan_scene(scene, campaign)
+
+
+PLANS = {**{name: planned(name) for name in SCENES}, "network": network()}
+
+
+def test_settings_of_one_kind_concern_no_other_product_of_the_network() -> None:
+    (scene,) = (s for s in cut_scenes(network_campaign(), network_granules()).scenes if s.members)
+    changed = network_campaign({"average": "30min"})
+    before, after = (
+        [
+            dependence.Settings(campaign).of(scene, PLANS["network"], (kind, "photon_532o"))
+            for kind in ("visibility", "of_another_package")
+        ]
+        for campaign in (network_campaign(), changed)
+    )
+    assert before[0] != after[0]
+    assert before[1] == after[1]
+
+
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_the_places_of_needed_steps_are_those_that_the_plan_names(plan: Plan) -> None:
+    for step, places in zip(plan.steps, dependence.needed_places(plan), strict=True):
+        taken = [plan.steps[place] for place in places]
+        names = {
+            other.name if other.channel == step.channel else f"{other.channel}/{other.name}"
+            for other in taken
+        }
+        assert names <= set(step.needs)
+        left_out = {omission.name for omission in plan.left_out}
+        assert {need.rpartition("/")[2] for need in set(step.needs) - names} <= left_out
+        assert all(other.product in ("", step.product) for other in taken)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(sorted(SCENES)), st.sets(st.sampled_from(sorted(REQUESTS)), min_size=1))
+def test_the_plan_of_a_product_does_not_depend_on_other_products(scene, kinds):
+    plan = planned(scene, kinds)
+    products = dependence.planned_products(plan)
+    of_all = dependence.planned_products(PLANS[scene])
+    assert set(products) == {product for product in of_all if product[0] in kinds}
+    for product in products:
+        alone = dependence.plan_closure(plan, [product])
+        assert alone == dependence.plan_closure(PLANS[scene], [product])
+        assert alone == dependence.plan_closure(alone, [product])
+
+
+def test_the_scenes_give_products_of_all_kinds():
+    """Otherwise the tests of this module say little."""
+    kinds = {kind for plan in PLANS.values() for kind, _ in dependence.planned_products(plan)}
+    assert kinds == {*REQUESTS, "visibility"}
+    assert ("elastic", "glued_532o") in dependence.planned_products(PLANS["up"])
+
+
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_steps_need_entries_of_the_plan_only(plan):
+    entries = {(entry.channel, entry.name) for entry in (*plan.steps, *plan.left_out)}
+    for step in plan.steps:
+        assert len(set(step.needs)) == len(step.needs)
+        for need in step.needs:
+            channel, _, name = need.rpartition("/")
+            assert (channel or step.channel, name) in entries, f"{step.name} needs {need}"
+
+
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_a_step_runs_after_those_that_it_needs(plan):
+    places = [(step.channel, step.instrument, step.name) for step in plan.steps]
+    for number, step in enumerate(plan.steps):
+        for need in step.needs:
+            channel, _, name = need.rpartition("/")
+            # A glued channel is prepared after its parts, whatever their order in the plan.
+            if not channel:
+                place = (step.channel, step.instrument, name)
+                assert place not in places or places.index(place) < number
+
+
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_settings_survive_json(plan):
+    for fields, step in zip(
+        json.loads(json.dumps(plan.as_dict()))["steps"], plan.steps, strict=True
+    ):
+        again = PlannedStep(**fields)
+        assert again.as_dict() == step.as_dict()
+        model = settings_model(step)
+        typed = model.model_validate(dict(again.settings))
+        assert typed == model.model_validate(dict(step.settings))
+        assert typed.model_dump(mode="json", exclude_none=True) == dict(step.settings)
