@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final, TypedDict
 
 import numpy as np
@@ -117,23 +116,14 @@ class FileProfiles:
         return Record(self.means(geometry, shots, seconds, parts), self._range, lag)
 
     @property
-    def recorded(self) -> tuple[LaggedProfiles, ...]:
-        """The channel itself."""
-        return (LaggedProfiles(self, 0),)
+    def recorded(self) -> tuple[tuple[FileProfiles, int], ...]:
+        """The channel itself, with its lag of no bins."""
+        return ((self, 0),)
 
     def joined(self, *means: xr.Dataset, cells: bool = False) -> xr.Dataset:  # noqa: ARG002
         """Return the means of the channel from that of its one record."""
         (own,) = means
         return own
-
-
-@dataclass(frozen=True, slots=True)
-class LaggedProfiles:
-    """A channel of the files of which profiles are made."""
-
-    profiles: FileProfiles
-    lag: int
-    """Bins by which it lags behind the profiles."""
 
 
 class GluedProfiles:
@@ -172,9 +162,12 @@ class GluedProfiles:
         return labeled_gluing.glue(*records, self._lag, self._slope())
 
     @property
-    def recorded(self) -> tuple[LaggedProfiles, ...]:
-        """Both parts; the photon-counting one comes last, whose bins are those of the channel."""
-        return LaggedProfiles(self._analog, round(self._lag.bins)), LaggedProfiles(self._photon, 0)
+    def recorded(self) -> tuple[tuple[FileProfiles, int], ...]:
+        """Both parts, with the bins by which they lag behind the channel.
+
+        The photon-counting one comes last, whose bins are those of the channel.
+        """
+        return (self._analog, round(self._lag.bins)), (self._photon, 0)
 
     def joined(self, *means: xr.Dataset, cells: bool = False) -> xr.Dataset:
         """Return the glued means of both records, with those of cells where these are screened."""
@@ -207,7 +200,7 @@ class Averages:
         self, channel: Profiles, geometry: xr.Dataset, shots: xr.DataArray, seconds: float
     ) -> None:
         self._channel = channel
-        self._recorded = [lagged.profiles for lagged in channel.recorded]
+        self._recorded = [record for record, _ in channel.recorded]
         self._means = [record.means(geometry, shots, seconds) for record in self._recorded]
 
     def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
@@ -255,18 +248,18 @@ class ScreenedAverages:
         screening: Screening,
     ) -> None:
         self._channels = channels
-        self._recorded = [lagged.profiles for channel in channels for lagged in channel.recorded]
+        self._recorded = [record for channel in channels for record, _ in channel.recorded]
         first = channels[-1].range
         width = float(np.median(np.diff(first))) if first.size > 1 else 1.0
         records = [
-            lagged.profiles.record(
+            record.record(
                 geometry,
                 shots,
                 seconds,
-                lagged.lag + round((first[0] - channel.range[0]) / width),
+                lag + round((first[0] - channel.range[0]) / width),
             )
             for channel in channels
-            for lagged in channel.recorded
+            for record, lag in channel.recorded
         ]
         self._means = ScreenedAverage(records, screening)
 

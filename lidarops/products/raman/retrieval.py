@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final, cast
 
 import xarray as xr
@@ -93,16 +92,8 @@ class RamanPlan(SettingsModel):
     raman: RetrievalSettings
 
 
-@dataclass(frozen=True, slots=True)
-class _Limits:
-    """Stretch of ranges along the beam, and why there is none."""
-
-    stretch: float
-    reach: float
-    reason: str
-
-
-def _limits(case: Case) -> _Limits:
+def _limits(case: Case) -> tuple[float, float, str]:
+    """Return stretch and reach of ranges along the beam, m, and why there are none."""
     zenith, reason = fixed_zenith(case)
     stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
     reach = case.last - 0.5 * case.channel.bin_width
@@ -115,7 +106,7 @@ def _limits(case: Case) -> _Limits:
             f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
             f" above {window.lowest:g} m"
         )
-    return _Limits(stretch, reach, reason)
+    return stretch, reach, reason
 
 
 def _slope_error(case: Case) -> float:
@@ -155,9 +146,9 @@ def _needs(case: Case) -> Entries:
     Where a fixed beam reaches the reference window, and the files hold the channels.
     """
     request, name = case.request, case.channel.name
-    limits = _limits(case)
+    stretch, reach, reason = _limits(case)
     nitrogen, water = request.nitrogen[name], request.water_vapour.get(name)
-    reason = limits.reason or _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
+    reason = reason or _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
     if reason:
         yield case.leave("raman", reason)
         return
@@ -179,14 +170,14 @@ def _needs(case: Case) -> Entries:
         water_vapour=water,
         calibration=facts.water_vapour_calibration if facts else None,
         calibration_standard_error=facts.water_vapour_calibration_error if facts else None,
-        lowest=window.lowest * limits.stretch,
-        highest=min(window.highest * limits.stretch, limits.reach),
-        width=window.width * limits.stretch,
+        lowest=window.lowest * stretch,
+        highest=min(window.highest * stretch, reach),
+        width=window.width * stretch,
         scattering_ratio=window.scattering_ratio,
         reference_relative_error=window.relative_error,
-        farthest=min(request.highest * limits.stretch, limits.reach),
+        farthest=min(request.highest * stretch, reach),
         known_shape=request.background == "known_shape",
-        molecular_slope_error=_slope_error(case) / limits.stretch,
+        molecular_slope_error=_slope_error(case) / stretch,
     )
     taken = ["read", "overlap", "noise", "glue", "molecular", "average"]
     taken += [f"{raman}/{stage}" for raman in settings.channels for stage in _FROM_COMPANIONS]
