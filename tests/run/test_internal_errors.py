@@ -185,7 +185,7 @@ def test_bugs_on_a_worker_come_back_with_the_traceback_of_the_worker(
         result = bring_up_to_date(archive.write(), client=client)
     assert _made_in(result.record) >= {"rich_20260301T000000", "rich_20260304T000000"}
     assert set(result.internal) == {SCENE, "rich_20260303T000000"}
-    for scene, module in ((SCENE, "scene.py"), ("rich_20260303T000000", "executor.py")):
+    for scene, module in ((SCENE, "processing.py"), ("rich_20260303T000000", "executor.py")):
         assert "internal error: KeyError: 'no such thing'" in result.internal_errors[scene]
         assert "_with_a_bug" in result.internal[scene]
         assert module in result.internal[scene]
