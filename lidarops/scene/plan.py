@@ -24,7 +24,7 @@ from lidarops.scene.channels import (
 from lidarops.scene.dependence import is_product
 from lidarops.scene.missing_channels import missing_channels, named_channels
 from lidarops.scene.pipe import AIR, PIPE, plan_stages
-from lidarops.scene.retrieval import NetworkCase, made
+from lidarops.scene.retrieval import NetworkCase, making
 from lidarops.settings import ChannelProduct
 
 
@@ -54,7 +54,7 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
 
 def _network_entries(scene: Scene, campaign: Campaign) -> Entries:
     for kind, request in campaign.networks[scene.instrument].requested().items():
-        yield from made(kind).needs(NetworkCase(scene, campaign, request))
+        yield from making(kind).needs(NetworkCase(scene, campaign, request))
 
 
 def _entries(scene: Scene, campaign: Campaign) -> Entries:
@@ -133,7 +133,7 @@ def _product_entries(case: ChannelCase, kind: str) -> list[Entry]:
     request = case.requests.get(kind)
     if request is None:
         return [replace(case, product=kind).leave(kind, NOT_REQUESTED, rule=REQUEST)]
-    return list(made(kind).needs(case.of_product(kind, request)))
+    return list(making(kind).needs(case.of_product(kind, request)))
 
 
 def _linked(entries: Sequence[Entry]) -> Iterator[Entry]:

@@ -72,7 +72,7 @@ def any_profiles(settings: Any, work: Workload) -> int:  # noqa: ARG001
 
 # No slots: typing sets an attribute of generic instances, where it can.
 @dataclass(frozen=True, kw_only=True)
-class Made(Generic[S]):
+class Making(Generic[S]):
     """What kinds of one channel and of a network have in common."""
 
     settings: type[S]
@@ -87,7 +87,7 @@ class Made(Generic[S]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retrieval(Made[S]):
+class Retrieval(Making[S]):
     """How the products of a kind come about, each from one channel: `needs` of a `ProductCase`."""
 
     stream: Callable[[S, ChannelSignal], ProductStream]
@@ -134,7 +134,7 @@ class NetworkStream(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkRetrieval(Made[S]):
+class NetworkRetrieval(Making[S]):
     """How the products of a kind come about, each from a network: `needs` of a `NetworkCase`."""
 
     member: type[SettingsModel]
@@ -143,7 +143,7 @@ class NetworkRetrieval(Made[S]):
     """Returns the product in the making, which takes the profiles of all instruments."""
 
 
-def made(kind: str) -> Made[Any]:
+def making(kind: str) -> Making[Any]:
     """Return how the products of a kind come about.
 
     Raises
@@ -152,7 +152,7 @@ def made(kind: str) -> Made[Any]:
         If there is no such kind, its package is incomplete, or another scope than its settings.
     """
     known = kind_of(kind)
-    found: Made[Any] = known.part("retrieval", "RETRIEVAL")
+    found: Making[Any] = known.part("retrieval", "RETRIEVAL")
     expected = NetworkRetrieval if known.scope is Scope.NETWORK else Retrieval
     if not isinstance(found, expected) or kind not in found.settings.model_fields:
         raise LidarOpsError(
@@ -164,13 +164,13 @@ def made(kind: str) -> Made[Any]:
 
 
 def retrieval(kind: str) -> Retrieval[Any]:
-    """Return how the products of a kind of one channel come about, as `made`."""
+    """Return how the products of a kind of one channel come about, as `making`."""
     found: Retrieval[Any] = kind_of(kind).part("retrieval", "RETRIEVAL")
     return found
 
 
 def network_retrieval(kind: str) -> NetworkRetrieval[Any]:
-    """Return how the products of a kind of networks come about, as `made`."""
+    """Return how the products of a kind of networks come about, as `making`."""
     found: NetworkRetrieval[Any] = kind_of(kind).part("retrieval", "RETRIEVAL")
     return found
 
@@ -179,7 +179,7 @@ def product_settings(
     steps: Iterable[PlannedStep], kind: str, channel: str, member: str = ""
 ) -> SettingsModel:
     """Return what a plan states of a product, or of one instrument of its network."""
-    model = network_retrieval(kind).member if member else made(kind).settings
+    model = network_retrieval(kind).member if member else making(kind).settings
     return model.model_validate(
         {
             step.name: dict(step.settings)
@@ -205,7 +205,7 @@ def settings_model(step: PlannedStep) -> type[BaseModel]:
     """Return the model of the settings of an entry of a plan."""
     if not step.product:
         return PIPE[step.name].settings
-    known = made(step.product)
+    known = making(step.product)
     fields = known.settings.model_fields | (
         known.member.model_fields if isinstance(known, NetworkRetrieval) else {}
     )

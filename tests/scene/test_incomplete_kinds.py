@@ -13,7 +13,7 @@ from lidarops.errors import LidarOpsError
 from lidarops.kinds import Kind
 from lidarops.products.signal.settings import SignalSettings
 from lidarops.scene.pipe import PIPE
-from lidarops.scene.retrieval import made
+from lidarops.scene.retrieval import making
 
 
 @pytest.fixture
@@ -33,32 +33,32 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_a_kind_without_steps_is_incomplete(package: Path) -> None:
     with pytest.raises(LidarOpsError, match=r"incomplete: odd_kind\.retrieval has no RETRIEVAL"):
-        made("odd")
+        making("odd")
     (package / "retrieval.py").write_text("OTHER = 1\n")
     with pytest.raises(LidarOpsError, match="incomplete"):
-        made("odd")
+        making("odd")
 
 
 def test_an_error_in_a_module_of_a_kind_is_not_hidden(package: Path) -> None:
     (package / "retrieval.py").write_text("import no_such_package\n")
     with pytest.raises(ModuleNotFoundError, match="no_such_package"):
-        made("odd")
+        making("odd")
 
 
 def test_the_settings_of_a_kind_have_its_name(package: Path) -> None:
     words = "from lidarops.products.signal.retrieval import RETRIEVAL\n"
     (package / "retrieval.py").write_text(words)
     with pytest.raises(LidarOpsError, match="'odd'"):
-        made("odd")
+        making("odd")
 
 
 def test_a_kind_of_channels_is_no_kind_of_networks(package: Path) -> None:
     words = "from lidarops.products.visibility.retrieval import RETRIEVAL\n"
     (package / "retrieval.py").write_text(words)
     with pytest.raises(LidarOpsError, match="is no Retrieval"):
-        made("odd")
+        making("odd")
 
 
 @pytest.mark.parametrize("kind", all_kinds.kinds())
 def test_entries_of_a_kind_have_names_of_their_own(kind: str) -> None:
-    assert not set(made(kind).settings.model_fields) & set(PIPE)
+    assert not set(making(kind).settings.model_fields) & set(PIPE)
