@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 90_550,
-    "lines of code alone": 59_750,
-    "lines without bench": 80_750,
-    "modules": 458,
-    "dataclasses": 407,
+    "lines": 89_550,
+    "lines of code alone": 59_100,
+    "lines without bench": 79_700,
+    "modules": 453,
+    "dataclasses": 405,
     "lines of dataclasses": 9_730,
     "tuning numbers": 256,
     "tuning numbers that are assumed": 87,
@@ -29,7 +29,7 @@ MOST = {
     "lines of the largest package": 9_900,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 106, "functions": 945, "changes": 715},
+    "homogeneous": {"modules": 103, "functions": 890, "changes": 490},
     "elastic": {"modules": 110, "functions": 1_030, "changes": 740},
 }
 
