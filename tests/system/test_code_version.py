@@ -181,7 +181,7 @@ def test_a_kind_of_another_package_counts_its_own_modules(copy: Copy, tmp_path: 
         "unused.py": "",
         "optics.py": "from lidarops.retrieve.elastic import inversion\n",
         "clouds/__init__.py": "",
-        "clouds/steps.py": "from .. import optics\nfrom .heights import top\n",
+        "clouds/retrieval.py": "from .. import optics\nfrom .heights import top\n",
         "clouds/heights.py": "top = 1\n",
         "clouds/figures.py": "",
         "clouds/tables/base.csv": "1",
@@ -240,5 +240,5 @@ def test_joint_versions_depend_on_their_kinds(copy: Copy):
 
 def test_a_missing_source_of_every_product_is_an_error(copy: Copy):
     (copy.root / "scene/processing.py").unlink()
-    with pytest.raises(LidarOpsError, match=r"lidarops\.process\.scene is missing"):
+    with pytest.raises(LidarOpsError, match=r"lidarops\.scene\.processing is missing"):
         copy.versions()
