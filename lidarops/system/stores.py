@@ -212,14 +212,11 @@ class RemoteStore:
                 yield name, self._fs.info(name)
             except FileNotFoundError as error:
                 # Drivers of the web raise this whatever the server answers.
-                if error.__cause__ is None or _status(error) in _ABSENT:
-                    _LOG.warning("%s lists %r, which it does not have", self.url, path)
-                elif self._is_of_one_object(error, name):
-                    # Whoever reads the file learns of it.
-                    yield name, info
-                else:
+                if not self._is_of_one_object(error, name):
                     problem = f"the size of {path} is not given: {error.__cause__!r}"
                     raise OSError(errno.EIO, problem) from error
+                # Whoever reads the file learns of it.
+                yield name, info
 
     def _path(self, name: str) -> str:
         return name.removeprefix(self._prefix).removeprefix("/")
@@ -431,10 +428,12 @@ class RemoteStore:
             ):
                 raise
             status = _status(cause)
-            if status is None:
+            # Drivers of the web do not state this one.
+            absent = isinstance(cause, FileNotFoundError) if status is None else status in _ABSENT
+            if status is None and not absent:
                 raise cause from None
-            kind = FileNotFoundError if status in _ABSENT else OSError
-            raise kind(errno.EIO, f"the server answers {status}") from error
+            kind = FileNotFoundError if absent else OSError
+            raise kind(errno.EIO, f"the server answers {status or 404}") from error
 
     def _is_of_one_object(self, error: Exception, name: str = "") -> bool:
         """Return whether an error concerns one object, so that the store gives others."""

@@ -70,10 +70,8 @@ def test_an_answer_about_one_file_costs_this_file_alone(
         scan_archive(campaign, store)
         good = [granule.path for granule in store.granules(status=Status.GOOD)]
         assert good == ["coast/h0", "coast/h2", "coast/h3"]
-        # The index of a web server names what it does not have.
-        dead_link = scheme == "http" and status in {404, 410}
-        reasons = [granule.reason for granule in store.refused()]
-        assert reasons == ([] if dead_link else [f"cannot be read: the server answers {status}"])
+        (refused,) = store.refused()
+        assert refused.reason == f"cannot be read: the server answers {status}"
         stand_in.statuses.clear()
         scan_archive(campaign, store)
         assert len(store.granules(status=Status.GOOD)) == FILES
