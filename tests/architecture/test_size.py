@@ -29,7 +29,7 @@ MOST = {
     "lines of the largest package": 9_900,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 103, "functions": 890, "changes": 490},
+    "homogeneous": {"modules": 96, "functions": 862, "changes": 470},
     "elastic": {"modules": 110, "functions": 1_030, "changes": 740},
 }
 
