@@ -1,6 +1,6 @@
 """Test on a few profiles of a scene whether a stretch of range holds any backscatter.
 
-The plan skips what this test excludes. It never yields a result.
+Raman products retrieve nothing where this test finds none. It never yields a result.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ class LightDetection:
     """Profiles tested that have values there, saturated ones included."""
     significance: float
     """Largest backscatter of a profile over its standard error; 0 where there is none."""
-    unsaturated: int
-    """Profiles without a saturated bin there."""
 
 
 def spaced_indices(count: int, most: int) -> npt.NDArray[np.int64]:
@@ -94,13 +92,11 @@ def detect_light(
     seen = ((measured | saturated) & inside).sum(axis=1) >= THRESHOLDS.fewest_bins
     fitted = measured & (inside | tail)
     significance = _significance(power, variance, fitted, r)
-    clipped = np.any(saturated & inside, axis=1)
     testable = (measured & inside).sum(axis=1) >= THRESHOLDS.fewest_bins
     significances = significance[testable & np.isfinite(significance)]
     return LightDetection(
         profiles=int(seen.sum()),
         significance=max(float(significances.max()), 0.0) if significances.size else 0.0,
-        unsaturated=int(np.sum(seen & ~clipped)),
     )
 
 

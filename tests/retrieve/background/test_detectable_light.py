@@ -41,15 +41,7 @@ def test_significance_is_that_of_least_squares():
     design = np.stack([np.ones(inside.sum()), RANGE[inside] ** -2.0], axis=1)
     error = np.sqrt(np.linalg.inv(design.T @ design / 0.01)[1, 1])
     assert detection.significance == pytest.approx(amplitude / error, rel=1e-6)
-    assert (detection.profiles, detection.unsaturated) == (20, 20)
-
-
-def test_saturated_profiles_are_counted_inside_the_stretch_only():
-    quality = flags()
-    quality[:5, 100] = int(Quality.SATURATED)
-    variance = np.full(SHAPE, 0.01)
-    assert detect_light(noise(), variance, quality, RANGE, 500.0, 4000.0).unsaturated == 15
-    assert detect_light(noise(), variance, quality, RANGE, 2000.0, 4000.0).unsaturated == 20
+    assert detection.profiles == 20
 
 
 def test_missing_profiles_do_not_count():
@@ -59,7 +51,7 @@ def test_missing_profiles_do_not_count():
     variance = np.full(SHAPE, 0.01)
     assert detect_light(power, variance, quality, RANGE, 500.0, 4000.0).profiles == 14
     empty = detect_light(np.full(SHAPE, np.nan), variance, flags(), RANGE, 500.0, 4000.0)
-    assert (empty.profiles, empty.significance, empty.unsaturated) == (0, 0.0, 0)
+    assert (empty.profiles, empty.significance) == (0, 0.0)
     assert detect_light(power, variance, quality, RANGE, 9e5, 1e6).profiles == 0
 
 
@@ -85,7 +77,7 @@ def test_saturated_bins_count_though_they_have_no_values():
     power[:, 100:500] = np.nan
     quality[:, 100:500] = int(Quality.SATURATED | Quality.INPUT_MISSING)
     detection = detect_light(power, np.full(SHAPE, 0.01), quality, RANGE, 1000.0, 3000.0)
-    assert (detection.profiles, detection.unsaturated, detection.significance) == (20, 0, 0.0)
+    assert (detection.profiles, detection.significance) == (20, 0.0)
 
 
 def test_bins_between_the_stretch_and_the_tail_are_not_used():
