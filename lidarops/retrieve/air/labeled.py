@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.retrieve.air import visibility
-
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array, Block
 
 NAMES: Final = (
     "visibility_in_air",
@@ -84,9 +82,9 @@ def visibility_of_extinction(
 
 
 def _visibility(
-    extinction: npt.NDArray[Any],
-    standard_error: npt.NDArray[Any],
-    systematic_error: npt.NDArray[Any],
+    extinction: Block,
+    standard_error: Block,
+    systematic_error: Block,
     definition: VisibilityDefinition,
 ) -> tuple[Array, ...]:
     total_error = np.hypot(standard_error.astype(np.float64), systematic_error)
@@ -107,8 +105,8 @@ def _visibility(
 
 
 def _at_550_nm(
-    extinction: npt.NDArray[Any],
-    error: npt.NDArray[Any],
+    extinction: Block,
+    error: Block,
     spread: float,
     definition: VisibilityDefinition,
 ) -> visibility.VisibilityResult:

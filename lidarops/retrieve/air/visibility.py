@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array
 
 MOR_CONTRAST: Final = 0.05
 """Contrast threshold of the meteorological optical range (`wmo8`): V = ln 20 / extinction."""

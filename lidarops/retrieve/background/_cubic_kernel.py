@@ -13,16 +13,14 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import compiled
 
 HUGE: Final = 1e150
 """Larger powers count as not finite: the quartic needs their fourth power."""
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 # Status of a profile.
 SOLVED: Final = 0
@@ -70,7 +68,7 @@ def make_triples(range_: Array, lag: int) -> Triples:
     return Triples(lag, (r0 * r2) ** 2, r1**4, a)
 
 
-@_compiled
+@compiled
 def _coefficients(p: Array, v: Array, t: Triples) -> _Coefficients:
     """Sum the coefficients over the triples, less the expectation of their noise."""
     s3 = s2 = s1 = s0 = noise = moved = 0.0
@@ -91,7 +89,7 @@ def _coefficients(p: Array, v: Array, t: Triples) -> _Coefficients:
     return _Coefficients(2.0 * s3, 3.0 * s2, s1 - noise, s0, noise, moved)
 
 
-@_compiled
+@compiled
 def largest_root(a: float, b: float, c: float) -> float:
     """Return the largest real root of ``x^3 + a x^2 + b x + c``."""
     p = b - a * a / 3.0
@@ -110,7 +108,7 @@ def largest_root(a: float, b: float, c: float) -> float:
     return big + small - a / 3.0
 
 
-@_compiled
+@compiled
 def _load(power: Array, p: Array) -> bool:
     """Copy one profile; return whether all bins are usable."""
     whole = True
@@ -120,7 +118,7 @@ def _load(power: Array, p: Array) -> bool:
     return whole
 
 
-@_compiled
+@compiled
 def _difference_variance(p: Array, relative: Array) -> float:
     """Estimate the variance of unit relative variance from fourth differences along range."""
     total = norm = 0.0
@@ -132,7 +130,7 @@ def _difference_variance(p: Array, relative: Array) -> float:
     return total / norm
 
 
-@_compiled
+@compiled
 def _curved_share(p: Array) -> float:
     """Return the share of the squared fourth differences that is signal, not noise.
 
@@ -149,7 +147,7 @@ def _curved_share(p: Array) -> float:
     return share if share > 0.0 else 0.0
 
 
-@_compiled
+@compiled
 def _all_finite(values: Array) -> bool:
     finite = True
     for i in range(values.size):
@@ -157,7 +155,7 @@ def _all_finite(values: Array) -> bool:
     return finite
 
 
-@_compiled
+@compiled
 def _gradient(p: Array, v: Array, t: Triples, out: Array) -> None:
     """Fill the derivatives of the constant coefficient with respect to the power of each bin."""
     for i in range(out.size):
@@ -173,7 +171,7 @@ def _gradient(p: Array, v: Array, t: Triples, out: Array) -> None:
         out[j] += 2.0 * w * (b * p[j] - c) + 6.0 * w * w * v[j]
 
 
-@_compiled
+@compiled
 def _centre(p: Array) -> float:
     half = p.size // 2
     total = 0.0
@@ -182,7 +180,7 @@ def _centre(p: Array) -> float:
     return total / (p.size - half)
 
 
-@_compiled
+@compiled
 def _spread(p: Array, centre: float) -> float:
     largest = 0.0
     for i in range(p.size):
@@ -190,13 +188,13 @@ def _spread(p: Array, centre: float) -> float:
     return largest
 
 
-@_compiled
+@compiled
 def _coarse(value: float, step: float) -> float:
     """Round to a multiple of `step`, a power of two, so that subtracting it is exact."""
     return math.floor(value / step + 0.5) * step
 
 
-@_compiled
+@compiled
 def _solve_profile(
     p: Array, v: Array, t: Triples, curved: float, gradient: Array, row: Array
 ) -> None:
@@ -229,7 +227,7 @@ def _solve_profile(
     row[CURVATURE_SHIFT] = curved * abs(s.moved / s.linear) / math.sqrt(variance)
 
 
-@_compiled
+@compiled
 def _all_alike(variance: Array) -> bool:
     """Return whether all variances are positive, or all 0; a 0 among others is not usable."""
     noisy = variance[0] > 0.0
@@ -239,7 +237,7 @@ def _all_alike(variance: Array) -> bool:
     return True
 
 
-@_compiled
+@compiled
 def solve_cubic_profiles(
     power: Array,
     variance: Array,

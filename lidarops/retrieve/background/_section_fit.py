@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array
 
 _STEPS: Final = 4
 _STEEPEST: Final = 100.0

@@ -11,12 +11,10 @@ from typing import Any, Final, NamedTuple
 
 import numba
 import numpy as np
-import numpy.typing as npt
 
-from lidarops.retrieve.common.compiled_code import summing
+from lidarops.retrieve.common.arrays import Array, Indices
+from lidarops.retrieve.common.compiled_code import compiled, summing
 from lidarops.retrieve.common.usable import HUGE
-
-Array = npt.NDArray[np.float64]
 
 GROUPS: Final = 16
 """Groups of neighbouring bins whose mean residuals are tested."""
@@ -59,7 +57,6 @@ class Limits(NamedTuple):
     """Odds that the next shorter window is the first one without aerosol."""
 
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 # What calls a sum is inlined too: see `compiled_code.summing`.
 _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
@@ -188,7 +185,7 @@ def _count(usable: Array) -> int:
     return bins
 
 
-@_compiled
+@compiled
 def _is_constant(values: Array, usable: Array) -> bool:
     first = -1
     for i in range(values.size):
@@ -237,12 +234,12 @@ def _fit(
     _test_residuals(residuals, phi, lever, weights, sums, row)
 
 
-@_compiled
+@compiled
 def _passes(row: Array, limits: Limits) -> bool:
     return bool(abs(row[CURVATURE]) <= limits.deviation and row[WAVES] <= limits.waves)
 
 
-@_compiled
+@compiled
 def _choose(rows: Array, limits: Limits) -> int:
     """Return the longest window that passes and agrees with all shorter ones, else the shortest."""
     shortest = rows.shape[0] - 1
@@ -283,7 +280,7 @@ def _relative_odds(rows: Array, chosen: int, limits: Limits, odds: Array) -> Non
             odds[k] = limits.aerosol**k * math.exp(-0.5 * misfit)
 
 
-@_compiled
+@compiled
 def _include_choice(rows: Array, chosen: int, limits: Limits, odds: Array, row: Array) -> None:
     """Fill the fit of the chosen window; the variance of its background includes the choice.
 
@@ -330,14 +327,14 @@ def _prepare(
     return unit
 
 
-@_compiled
+@compiled
 def _tilt(range_: Array, lever: Array) -> None:
     for i in range(range_.size):
         lever[i] = range_[i] - range_[0]
 
 
-@_compiled
-def fill_pasts(power: Array, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
+@compiled
+def fill_pasts(power: Array, mask: Array, pasts: Indices) -> None:
     """Lower the end of each window to the bin past its last usable bin.
 
     Parameters
@@ -354,15 +351,15 @@ def fill_pasts(power: Array, mask: Array, pasts: npt.NDArray[np.intp]) -> None:
         pasts[k] = past
 
 
-@_compiled
+@compiled
 def fit_shape(
     power: Array,
     shape: Array,
     range_: Array,
     mask: Array,
     noise: ShapeNoise,
-    firsts: npt.NDArray[np.intp],
-    pasts: npt.NDArray[np.intp],
+    firsts: Indices,
+    pasts: Indices,
     limits: Limits,
     out: Array,
 ) -> None:

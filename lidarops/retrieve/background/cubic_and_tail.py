@@ -14,10 +14,8 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import _cubic_kernel
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Flags, Floats, Indices
 from lidarops.retrieve.common.frozen_arrays import frozen
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
 
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid, over the last range: rounding of float32 ranges."""
@@ -111,7 +109,7 @@ def cubic(
 
 
 def solve_cubic(
-    power: inputs.Floats,
+    power: Floats,
     range_: Array,
     lag: int | None,
     variance: Array,
@@ -253,7 +251,7 @@ def selection_bias(share: npt.ArrayLike) -> Array:
         return np.asarray(density / left)
 
 
-def _tail_quality(bins: npt.NDArray[np.intp]) -> Flags:
+def _tail_quality(bins: Indices) -> Flags:
     quality = np.zeros(bins.shape, dtype=np.int32)
     quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
     quality[(bins > 0) & (bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background.thresholds import THRESHOLDS
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ class LightDetection:
     """Largest backscatter of a profile over its standard error; 0 where there is none."""
 
 
-def spaced_indices(count: int, most: int) -> npt.NDArray[np.int64]:
+def spaced_indices(count: int, most: int) -> Integers:
     """Return the indices of at most `most` of `count` profiles, evenly spaced, ends included.
 
     Parameters
@@ -101,11 +102,11 @@ def detect_light(
 
 
 def _significance(
-    power: npt.NDArray[np.float64],
-    variance: npt.NDArray[np.float64],
-    fitted: npt.NDArray[np.bool_],
-    r: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
+    power: Array,
+    variance: Array,
+    fitted: Booleans,
+    r: Array,
+) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         weight = np.where(fitted, 1.0 / variance, 0.0)
         shape = r**-2.0

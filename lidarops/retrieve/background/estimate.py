@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
 from lidarops.errors import RetrievalInputError
@@ -23,11 +22,7 @@ from lidarops.retrieve.background._section_fit import fit_section, groups
 from lidarops.retrieve.background.left_signal import LeftSignal, left_in_tail, shifts
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
-Counts = npt.NDArray[np.intp]
-Flags = npt.NDArray[np.int32]
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +87,7 @@ def from_tail(
     return _judged(value, error, left, np.isnan(left.most) | selected, missing)
 
 
-def _selected(known: Counts, bins: Counts) -> Booleans:
+def _selected(known: Indices, bins: Indices) -> Booleans:
     """Return where the choice of the known bins may shift their mean beyond its error."""
     with np.errstate(invalid="ignore"):
         bias = cubic_and_tail.selection_bias(known / bins)
@@ -123,7 +118,7 @@ def from_known_shape(
     mask : (..., range) bool, optional
         True where a bin may be fitted.
     exposure : (...) float, optional
-        Counts per unit of power, for photon counting. The fit then takes its variances from the
+        Indices per unit of power, for photon counting. The fit then takes its variances from the
         fitted counts: those of few counts follow their noise, which makes the background too low.
 
     Raises

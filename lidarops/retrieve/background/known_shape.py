@@ -13,11 +13,8 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import _shape_fit
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
 from lidarops.retrieve.common.frozen_arrays import frozen
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Booleans = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +31,7 @@ class KnownShapeResult:
     """Of random noise."""
     chi2: Array
     """Sum of the squared residuals over their variances."""
-    degrees_of_freedom: npt.NDArray[np.int64]
+    degrees_of_freedom: Integers
     """Bins less 2, at least 0."""
     condition: Array
     """Standard error of the background over that of the mean of the same bins: 1 where the shape
@@ -233,7 +230,7 @@ def _pasts(
     stop: npt.ArrayLike | None,
     range_: Array,
     leading: tuple[int, ...],
-) -> npt.NDArray[np.intp]:
+) -> Indices:
     """Return the bin past the window of each profile: past its last usable bin, or its stop."""
     pasts = np.full(len(rows), range_.size, dtype=np.intp)
     stops = inputs.profile_values(stop, "stop", leading)
@@ -245,10 +242,10 @@ def _pasts(
 
 def _firsts(
     start: npt.ArrayLike | None,
-    pasts: npt.NDArray[np.intp],
+    pasts: Indices,
     range_: Array,
     leading: tuple[int, ...],
-) -> npt.NDArray[np.intp]:
+) -> Indices:
     """Return the first bins of the windows, (profile or 1, window)."""
     starts = inputs.profile_values(start, "start", leading)
     if starts is not None:
@@ -273,8 +270,8 @@ def _limits(false_alarm: float) -> _shape_fit.Limits:
 def _result(
     out: Array,
     range_: Array,
-    first: npt.NDArray[np.intp],
-    pasts: npt.NDArray[np.intp],
+    first: Indices,
+    pasts: Indices,
     leading: tuple[int, ...],
 ) -> KnownShapeResult:
     bins = out[:, _shape_fit.BINS].astype(np.int64)

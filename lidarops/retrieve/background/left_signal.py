@@ -10,12 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.retrieve.background.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
+from lidarops.retrieve.common.arrays import Array, Booleans
 
 
 @dataclass(frozen=True, slots=True)

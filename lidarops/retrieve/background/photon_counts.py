@@ -8,8 +8,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array
 
 
 def mean_profile_variance(power: npt.ArrayLike, shots: npt.ArrayLike = 1.0) -> Array:

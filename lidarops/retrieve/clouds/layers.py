@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
@@ -14,22 +13,19 @@ from scipy.special import ndtri
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.common.usable import HUGE, usable
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.screening import skewness_margin
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
 _ROUNDING: Final = 1e-9
 """Relative rise that the rounding of sums can cause."""
 
 # Rows of the sums.
 POWER, SHAPE, VARIANCE, COUNT = 0, 1, 2, 3
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +34,14 @@ class Layers:
 
     cloud_base_range: Array
     """m, of the first bin of the lowest layer; NaN where there is none."""
-    mask: Mask
+    mask: Booleans
     """(..., range): bins of all layers, from base to apparent top, the last bin before the signal
     is back at its level below the base and falls no more. Below the true top where a layer hides
     its upper part in noise."""
-    cloudy: Mask
+    cloudy: Booleans
 
     @classmethod
-    def of(cls, mask: Mask, distance: Array) -> Layers:
+    def of(cls, mask: Booleans, distance: Array) -> Layers:
         """Return the layers that a mask marks, (..., range), along an ascending distance in m."""
         cloudy = np.asarray(mask.any(axis=-1))
         return cls(np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan), mask, cloudy)
@@ -144,11 +140,11 @@ def find_visible_air(
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     variance: npt.ArrayLike,
     *,
-    cloudy: Mask,
+    cloudy: Booleans,
     molecular_attenuated: npt.ArrayLike,
     contrast: float = SIGNAL_THRESHOLDS.cloud_contrast,
     quantum: npt.ArrayLike = 0.0,
-) -> Mask:
+) -> Booleans:
     r"""Return the bins in which noise would not hide a layer, (..., range).
 
     The layer is 480 m deep, with twice the least excess over the air around it: a ratio of
@@ -217,7 +213,7 @@ class _Tests:
     """(profile or 1, bin)."""
     shape: Array
     """(profile or 1, bin)."""
-    lengths: npt.NDArray[np.int64]
+    lengths: Integers
     """Bins of the windows, ascending."""
     certainty: float
     """Share of `limits` by which the rise exceeds the contrast."""
@@ -270,7 +266,7 @@ def _excess_noise(power: Array, variance: Array, lengths: Array) -> Array:
     return np.asarray(np.sqrt(of_means * (1.0 + 3.0 * noise.relative_error[:, np.newaxis])))
 
 
-@_compiled
+@compiled
 def _accumulate(power: Array, variance: Array, shape: Array, sums: Array) -> None:
     """Sum from the far end, so that sums over far bins keep their digits."""
     signal = air = noise = count = 0.0
@@ -290,7 +286,7 @@ def _accumulate(power: Array, variance: Array, shape: Array, sums: Array) -> Non
         )
 
 
-@_compiled
+@compiled
 def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
     """Return the mean ratio to air and its variance; NaN with data in less than half the bins."""
     if first < 0 or stop >= sums.shape[1]:
@@ -303,7 +299,7 @@ def _mean(sums: Array, first: int, stop: int) -> tuple[float, float]:
     return ratio, (sums[VARIANCE, first] - sums[VARIANCE, stop]) / (shape * shape)
 
 
-@_compiled
+@compiled
 def _rise(
     sums: Array, i: int, length: int, contrast: float, certainty: float, limit: float, margin: float
 ) -> float:
@@ -334,12 +330,12 @@ def _rise(
     return excess / error if error > 0.0 else HUGE
 
 
-@_compiled
+@compiled
 def _steepest(
     sums: Array,
     start: int,
     reach: int,
-    lengths: npt.NDArray[np.int64],
+    lengths: Integers,
     contrast: float,
     certainty: float,
     limits: Array,
@@ -358,11 +354,11 @@ def _steepest(
     return best, length
 
 
-@_compiled
+@compiled
 def _next_base(
     sums: Array,
     start: int,
-    lengths: npt.NDArray[np.int64],
+    lengths: Integers,
     contrast: float,
     certainty: float,
     limits: Array,
@@ -376,7 +372,7 @@ def _next_base(
     return -1, 0
 
 
-@_compiled
+@compiled
 def _end(sums: Array, base: int, length: int) -> int:
     """Return the first bin from which the ratio to air is back at its level below the base.
 
@@ -395,14 +391,14 @@ def _end(sums: Array, base: int, length: int) -> int:
     return end
 
 
-@_compiled
+@compiled
 def _mean_towards(sums: Array, i: int, length: int, side: int) -> tuple[float, float]:
     """Return the mean ratio to air and its variance above (`side` 1) or below (-1) a bin's edge."""
     first = i if side > 0 else i - length
     return _mean(sums, first, first + length)
 
 
-@_compiled
+@compiled
 def _falls(
     sums: Array,
     i: int,
@@ -432,13 +428,13 @@ def _falls(
     return not far - near > THRESHOLDS.top * math.sqrt(near_variance + far_variance)
 
 
-@_compiled
+@compiled
 def _edge(
     sums: Array,
     start: int,
     last: int,
     beyond: int,
-    lengths: npt.NDArray[np.int64],
+    lengths: Integers,
     contrast: float,
     certainty: float,
     limits: Array,
@@ -469,17 +465,17 @@ def _edge(
     return last
 
 
-@_compiled
+@compiled
 def _mark_layers(
     power: Array,
     variance: Array,
     shape: Array,
-    lengths: npt.NDArray[np.int64],
+    lengths: Integers,
     contrast: float,
     certainty: float,
     limits: Array,
     margins: Array,
-    layers: Mask,
+    layers: Booleans,
 ) -> None:
     """Mark the bins between base and top of all layers of each profile.
 

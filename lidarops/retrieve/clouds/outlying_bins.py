@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.common.usable import HUGE, usable
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _HALF: Final = 4
 """Neighbours on either side."""
@@ -27,8 +25,6 @@ the sum of the three is then right: 9/4 of the sum of the two."""
 _ROUNDING: Final = 1e-12
 """Relative deviation that rounding can cause where the noise is stated as 0."""
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
 
 @dataclass(frozen=True, slots=True)
 class BridgedProfiles:
@@ -36,7 +32,7 @@ class BridgedProfiles:
 
     power: Array
     variance: Array
-    outlying: Mask
+    outlying: Booleans
     """The bins that were replaced, with the shape of the power."""
 
 
@@ -104,7 +100,7 @@ def bridge_outliers(
     return BridgedProfiles(*(grid.turn(a.reshape(shape)) for a in (rows, noise, outlying)))
 
 
-@_compiled
+@compiled
 def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -> bool:
     """Return whether a bin is outlying, with one neighbour left out of the test (-1: none)."""
     left = right = left_range = right_range = largest_variance = 0.0
@@ -139,7 +135,7 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
     return bool(beyond > noise_limit and beyond > THRESHOLDS.least_contrast * spread)
 
 
-@_compiled
+@compiled
 def _farthest(j: int, q: Array) -> int:
     """Return the non-adjacent neighbour that is farthest from the mean of the adjacent ones."""
     middle = 0.5 * (q[j - 1] + q[j + 1])
@@ -150,7 +146,7 @@ def _farthest(j: int, q: Array) -> int:
     return farthest
 
 
-@_compiled
+@compiled
 def _most_equal(j: int, power: Array) -> int:
     """Return the largest number of neighbours that have the same power."""
     largest_count = 0
@@ -163,7 +159,7 @@ def _most_equal(j: int, power: Array) -> int:
     return largest_count
 
 
-@_compiled
+@compiled
 def _may_hold_outliers(
     power: Array, variance: Array, factor_below: Array, factor_above: Array
 ) -> bool:
@@ -179,9 +175,9 @@ def _may_hold_outliers(
     return suspects > 0
 
 
-@_compiled
+@compiled
 def _mark_outliers(
-    power: Array, variance: Array, range_: Array, work: Array, outlying: Mask
+    power: Array, variance: Array, range_: Array, work: Array, outlying: Booleans
 ) -> None:
     """Mark the outlying bins of all profiles."""
     bins = range_.size
@@ -215,8 +211,8 @@ def _mark_outliers(
                 outlying[p, int(index[j])] = True
 
 
-@_compiled
-def _fill(power: Array, variance: Array, range_: Array, outlying: Mask) -> None:
+@compiled
+def _fill(power: Array, variance: Array, range_: Array, outlying: Booleans) -> None:
     """Interpolate the outlying bins between the nearest usable bins."""
     for p in range(power.shape[0]):
         before = -1

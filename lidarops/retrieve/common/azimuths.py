@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
+
+from lidarops.retrieve.common.arrays import Array
 
 
-def widest_azimuth_gap(azimuth: npt.NDArray[np.float64]) -> float:
+def widest_azimuth_gap(azimuth: Array) -> float:
     """Return the widest range of azimuths without a beam, radian.
 
     Parameters

@@ -17,6 +17,7 @@ _SOURCES: Final = Path(__file__).parents[1]
 _CONSTANTS: Final = ("constants.py", "flags.py")
 """Modules of lidarops beside the sources whose constants are compiled in."""
 
+compiled: Final = numba.njit(cache=True, nogil=True, error_model="numpy")
 summing: Final = numba.njit(
     cache=True,
     nogil=True,

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-_Array = TypeVar("_Array", bound=npt.NDArray[Any])
+from lidarops.retrieve.common.arrays import Block
+
+_Array = TypeVar("_Array", bound=Block)
 
 
 def frozen(values: _Array) -> _Array:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.arrays import Array, Block, Floats
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
 SHORTEST_REACH = 100.0
@@ -32,7 +31,7 @@ class RangeGrid:
         """Number of bins."""
         return int(self.values.size)
 
-    def turn(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def turn(self, values: Block) -> Block:
         """Return `values` with the last axis ascending in range."""
         return values[..., ::-1] if self.descending and values.shape[-1] > 1 else values
 

@@ -13,15 +13,11 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Codes
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.usable import usable
-
-Array = npt.NDArray[np.float64]
-Codes = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
 
 # Rows that `_trace_path` writes.
 GAIN, RATIO, AIR, SHAPE = 0, 1, 2, 3
@@ -48,10 +44,8 @@ WORK_ROWS: Final = 9
 # The state of a bin.
 MISSING, VALID, UNSTABLE = 0, 1, 2
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _trace_path(
     range_: Array,
     backscatter: Array,
@@ -104,8 +98,8 @@ def _trace_path(
         path[RATIO_ERROR, i], path[AIR_ERROR, i] = ratio_error[i], air_error[i]
 
 
-@_compiled
-def _calibrate(power: Array, variance: Array, window: Mask, path: Array, out: Array) -> int:
+@compiled
+def _calibrate(power: Array, variance: Array, window: Booleans, path: Array, out: Array) -> int:
     """Calibrate with the summed power of the window over that expected for its scattering ratio.
 
     Returns
@@ -146,11 +140,11 @@ def _calibrate(power: Array, variance: Array, window: Mask, path: Array, out: Ar
     return centre
 
 
-@_compiled
+@compiled
 def _integrate(
     power: Array,
     variance: Array,
-    window: Mask,
+    window: Booleans,
     range_: Array,
     path: Array,
     start: int,
@@ -213,7 +207,7 @@ def _integrate(
         )
 
 
-@_compiled
+@compiled
 def _divide(power: Array, gain: Array, air: Array, work: Array, out: Array) -> None:
     d, inverse, total = work[DENOMINATOR], work[INVERSE], work[TOTAL]
     for i in range(out.size):
@@ -222,7 +216,7 @@ def _divide(power: Array, gain: Array, air: Array, work: Array, out: Array) -> N
         out[i] = total[i] - air[i]
 
 
-@_compiled
+@compiled
 def _propagate_noise(variance: Array, gain: Array, work: Array, out: Array) -> None:
     inverse, total, share, other_variance = (
         work[INVERSE],
@@ -236,21 +230,21 @@ def _propagate_noise(variance: Array, gain: Array, work: Array, out: Array) -> N
         out[i] = math.sqrt(square) * inverse[i]
 
 
-@_compiled
+@compiled
 def _propagate_offset(offset: float, gain: Array, work: Array, out: Array) -> None:
     inverse, total, change = work[INVERSE], work[TOTAL], work[BY_OFFSET]
     for i in range(out.size):
         out[i] = offset * (gain[i] - total[i] * change[i]) * inverse[i]
 
 
-@_compiled
+@compiled
 def _propagate_reference(change: float, work: Array, out: Array) -> None:
     inverse, total = work[INVERSE], work[TOTAL]
     for i in range(out.size):
         out[i] = -total[i] * change * inverse[i]
 
 
-@_compiled
+@compiled
 def _propagate_path(gain: Array, change: Array, work: Array, out: Array) -> None:
     """Propagate an error that changes the relative gain of a bin and the denominator."""
     inverse, total = work[INVERSE], work[TOTAL]
@@ -258,7 +252,7 @@ def _propagate_path(gain: Array, change: Array, work: Array, out: Array) -> None
         out[i] = total[i] * (gain[i] - change[i] * inverse[i])
 
 
-@_compiled
+@compiled
 def _measure_certainty(
     variance: Array,
     by_reference: float,
@@ -293,7 +287,7 @@ def _measure_certainty(
         noise_error[i] *= max(1.0, 0.98 + skewed * math.sqrt(skewed))
 
 
-@_compiled
+@compiled
 def _solve_bins(
     power: Array,
     variance: Array,
@@ -319,7 +313,7 @@ def _solve_bins(
         molecular[i] -= own_air[i]
 
 
-@_compiled
+@compiled
 def _mark_unstable(start: int, least: float, work: Array, state: Codes) -> int:
     """Mark uncertain bins, and all farther than one beyond `start`; return the first valid bin."""
     stable_so_far, first = True, -1
@@ -337,7 +331,7 @@ def _mark_unstable(start: int, least: float, work: Array, state: Codes) -> int:
     return first
 
 
-@_compiled
+@compiled
 def _scale(
     i: int,
     variance: Array,
@@ -369,7 +363,7 @@ def _scale(
     return constant, noise, background, math.sqrt(reference**2 + ratio**2 + air**2)
 
 
-@_compiled
+@compiled
 def _attenuate(
     power: Array,
     variance: Array,
@@ -390,7 +384,7 @@ def _attenuate(
         errors[i] = math.sqrt(square + common * common)
 
 
-@_compiled
+@compiled
 def _withhold(
     power: Array, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
 ) -> None:
@@ -409,11 +403,11 @@ def _withhold(
             out[ATTENUATED, k, i] = out[ATTENUATED_ERROR, k, i] = np.nan
 
 
-@_compiled
+@compiled
 def invert_fernald(
     power: Array,
     variance: Array,
-    window: Mask,
+    window: Booleans,
     range_: Array,
     air: tuple[Array, Array, Array],
     scattering_ratio: Array,

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import WITHHELD, Quality
@@ -26,15 +25,13 @@ from lidarops.retrieve.clouds.labeled import (
     signal_and_clouds,
     with_margin,
 )
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import systematic_changes, without_analog_background
 from lidarops.retrieve.signal.screening import cloud_contrast
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 RatioAt = Callable[[Array], tuple[Array, Array]]
 """Altitudes in m -> lidar ratio and its standard error, sr."""
 
@@ -206,7 +203,7 @@ def _solution_flags(
     return bits
 
 
-def _negative(solution: _elastic.ElasticResult) -> Mask:
+def _negative(solution: _elastic.ElasticResult) -> Booleans:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
     error: Array = solution.budget.total
     low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
@@ -220,7 +217,7 @@ def _negative(solution: _elastic.ElasticResult) -> Mask:
     return negative
 
 
-def _with_beyond(mask: Mask, distance: Array, window: _reference.ReferenceWindow) -> Mask:
+def _with_beyond(mask: Booleans, distance: Array, window: _reference.ReferenceWindow) -> Booleans:
     """Return the bins of a mask, and those beyond one as seen from the reference window.
 
     The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol

@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.homogeneous._estimate import (
     AMPLITUDE,
@@ -50,9 +50,9 @@ from lidarops.retrieve.homogeneous._projection import (
     Point,
     ProjectionScratch,
     Sums,
-    compiled,
     evaluate,
     fusing,
+    inlined,
     largest_of,
     make_scratch,
     power_of_two,
@@ -62,8 +62,6 @@ from lidarops.retrieve.homogeneous._projection import (
     total_of,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _MOST_STEPS: Final = 12
 """Newton steps; most profiles need two."""
@@ -80,7 +78,7 @@ _FLAT: Final = 1e-13
 """Squared share of a shape besides its mean, below which it is flat within rounding."""
 
 
-@compiled
+@inlined
 def weigh(noise: Array, is_variance: bool, s: ProjectionScratch) -> float:
     """Fill the weights of a row of noise, and return their unit, a power of two."""
     for i in range(noise.size):
@@ -91,7 +89,7 @@ def weigh(noise: Array, is_variance: bool, s: ProjectionScratch) -> float:
     return unit
 
 
-@compiled
+@inlined
 def _last_valid(power: Any, s: ProjectionScratch) -> int:
     for i in range(power.size - 1, -1, -1):
         if abs(np.float64(power[i])) < HUGE and s.given[i] > 0.0:
@@ -126,7 +124,7 @@ def _scale(s: ProjectionScratch, factor: float) -> tuple[float, float]:
     return total, squares
 
 
-@compiled
+@inlined
 def _fold(values: Array, out: Array) -> None:
     """Fill the sums over the groups of bins, of which the first `BLOCK` are single bins."""
     for i in range(BLOCK):
@@ -147,7 +145,7 @@ def _multiply(values: Array, shapes: Array, out: Array) -> None:
             out[j] += value * shapes[i, j]
 
 
-@compiled
+@inlined
 def _multiply_all(rows: Array, shapes: Array, out: Array) -> None:
     """Fill the products of weights and values with the shapes of all nodes, and their squares."""
     _multiply(rows[0], shapes[0], out[0])
@@ -155,7 +153,7 @@ def _multiply_all(rows: Array, shapes: Array, out: Array) -> None:
     _multiply(rows[0], shapes[1], out[2])
 
 
-@compiled
+@inlined
 def _take_lengths(s: ProjectionScratch, sums: Sums) -> None:
     """Overwrite the first products by the signed lengths of the profile along the shapes.
 
@@ -171,7 +169,7 @@ def _take_lengths(s: ProjectionScratch, sums: Sums) -> None:
         lengths[j] = along / math.sqrt(norm if informed else 1.0) if informed else 0.0
 
 
-@compiled
+@inlined
 def _peak(f: Array, middle: int) -> float:
     """Return the offset of the extremum of a quartic through five values from the middle one.
 
@@ -185,7 +183,7 @@ def _peak(f: Array, middle: int) -> float:
     return float(offset - slope / (second + offset * (third + 0.5 * offset * fourth)))
 
 
-@compiled
+@inlined
 def _start(g: Grid, s: ProjectionScratch, sums: Sums) -> float:
     """Return tau at the largest of the projections on the nodes, interpolated."""
     # Opaque shapes differ in their first bins only, which groups cannot resolve.
@@ -210,7 +208,7 @@ def _start(g: Grid, s: ProjectionScratch, sums: Sums) -> float:
     return float(min(max(tau, g.nodes[0]), g.nodes[-1]))
 
 
-@compiled
+@inlined
 def _newton(tau: float, point: Point, g: Grid) -> float:
     """Return tau after one Newton step, of at most the distance to the next node."""
     curved = point.curvature > THRESHOLDS.least_curvature * point.gauss
@@ -220,7 +218,7 @@ def _newton(tau: float, point: Point, g: Grid) -> float:
     return float(min(max(moved, g.nodes[0]), g.nodes[-1])) if math.isfinite(step) else tau
 
 
-@compiled
+@inlined
 def _is_last(step: float, tau: float, p: Point, g: Grid, sums: Sums) -> bool:
     """Return whether what a step leaves is negligible: about its square, by a Newton step.
 
@@ -237,7 +235,7 @@ def _is_last(step: float, tau: float, p: Point, g: Grid, sums: Sums) -> bool:
     return (step * step / size) ** 2 <= _NEGLIGIBLE * _NEGLIGIBLE * variance
 
 
-@compiled
+@inlined
 def find_extinction(g: Grid, s: ProjectionScratch, sums: Sums) -> tuple[float, Point]:
     """Return the best extinction of a loaded profile, and the linear fit there."""
     following, settled = _start(g, s, sums), False
@@ -251,7 +249,7 @@ def find_extinction(g: Grid, s: ProjectionScratch, sums: Sums) -> tuple[float, P
     return tau, p
 
 
-@compiled
+@inlined
 def describe(
     g: Grid,
     s: ProjectionScratch,
@@ -280,7 +278,7 @@ def describe(
     row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
 
 
-@compiled
+@inlined
 def _polish(p: Point, w0: float, left: tuple[float, float, float], row: Array) -> None:
     """Take the step that the residuals leave, which in thin sections moments are too coarse for."""
     level, shape, slope = left[0] / w0, left[1] / p.norm, left[2] / p.slope_norm
@@ -290,7 +288,7 @@ def _polish(p: Point, w0: float, left: tuple[float, float, float], row: Array) -
     row[MISFIT] -= left[0] * level + left[1] * shape + left[2] * slope
 
 
-@compiled
+@inlined
 def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> None:
     """Convert a row from scaled variables to SI units; noise terms to units of the noise."""
     energy = scale * (scale * unit)
@@ -313,7 +311,7 @@ def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> 
     row[MEAN_RANGE] = g.start + g.length * row[MEAN_RANGE]
 
 
-@compiled
+@inlined
 def begin(
     power: Any, mode: tuple[float, float, float], s: ProjectionScratch, row: Array
 ) -> tuple[float, float, Sums]:
@@ -350,7 +348,7 @@ def begin(
     return reference, scale, Sums(bins, total, value, square, free)
 
 
-@compiled
+@inlined
 def _solve(
     power: Any,
     noise: Array,
@@ -379,7 +377,7 @@ def _solve(
             unscale(g, reference, scale, unit, row)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def solve_direct(
     power: Any,
     noise: Array,

@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array
 
 # Status of a profile.
 FITTED: Final = 0

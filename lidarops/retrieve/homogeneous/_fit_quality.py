@@ -11,17 +11,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
 from lidarops.flags import Quality
+from lidarops.retrieve.common.arrays import Array, Flags
 from lidarops.retrieve.homogeneous import _estimate
 from lidarops.retrieve.homogeneous._estimate import PathEstimate
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
 
 _SECOND_DIFFERENCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""

@@ -6,10 +6,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
-import numpy as np
-import numpy.typing as npt
-
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.homogeneous._direct import (
     begin,
     describe,
@@ -34,15 +32,13 @@ from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
     ProjectionScratch,
-    compiled,
     evaluate,
+    inlined,
     make_scratch,
 )
 
-Array = npt.NDArray[np.float64]
 
-
-@compiled
+@inlined
 def _describe_given(p: Point, w0: float, row: Array) -> None:
     """Overwrite the variances for a given extinction, whose variance is 0."""
     row[EXTINCTION_VARIANCE] = 0.0
@@ -52,7 +48,7 @@ def _describe_given(p: Point, w0: float, row: Array) -> None:
     row[BOUNDED] = 0.0
 
 
-@compiled
+@inlined
 def _step(g: Grid, p: Point, tau: float, row: Array) -> None:
     """Write the linear step from a prior, with errors to first order in the two coefficients.
 
@@ -69,7 +65,7 @@ def _step(g: Grid, p: Point, tau: float, row: Array) -> None:
     row[AMPLITUDE] = p.b * math.exp(2.0 * step * p.centroid)
 
 
-@compiled
+@inlined
 def _moved(p: Point, row: Array) -> Point:
     """Return the point with the background and amplitude of a row."""
     return Point(
@@ -87,7 +83,7 @@ def _moved(p: Point, row: Array) -> Point:
     )
 
 
-@compiled
+@inlined
 def _solve_from(
     power: Any,
     noise: Array,
@@ -122,7 +118,7 @@ def _solve_from(
             unscale(g, reference, scale, unit, row)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def solve_from(
     power: Any,
     noise: Array,

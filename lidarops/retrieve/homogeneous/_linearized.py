@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarops.retrieve.homogeneous._problem import Array, PathProblem
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.homogeneous._problem import PathProblem
 
 
 def neglected_shifts(

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Final, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Integers
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.homogeneous import _direct, _given, _linearized, _propagation
 from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
@@ -19,7 +19,7 @@ from lidarops.retrieve.homogeneous._fit_quality import (
     curved_widening,
     judge_fit,
 )
-from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
+from lidarops.retrieve.homogeneous._problem import PathProblem, PathSolution
 from lidarops.retrieve.homogeneous._projection import make_grid
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL
 
@@ -132,7 +132,7 @@ def _estimate(
     return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
 
 
-def _noise_spacing(problem: PathProblem) -> npt.NDArray[np.int64]:
+def _noise_spacing(problem: PathProblem) -> Integers:
     """Return the bins from one to the next of a second difference, (profile or 1,).
 
     Differences over more than a twentieth of a section would hold its misfit.
@@ -193,7 +193,7 @@ def _solution(
         )
         amplitude_error = np.abs(fit.amplitude) * relative_error
 
-    def masked(values: Array, valid: npt.NDArray[np.bool_]) -> Array:
+    def masked(values: Array, valid: Booleans) -> Array:
         return np.where(valid, values, np.nan)
 
     known = constant & problem.known_variance

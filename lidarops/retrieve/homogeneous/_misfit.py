@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.homogeneous._estimate import (
     BACKGROUND_BEND,
     DIFFERENCE_COUNT,
@@ -23,14 +21,12 @@ from lidarops.retrieve.homogeneous._projection import (
     Point,
     ProjectionScratch,
     Sums,
-    compiled,
     evaluate,
+    inlined,
     largest_of,
     summing,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _Triple = tuple[float, float, float]
 
@@ -106,7 +102,7 @@ def _sum_residuals(g: Grid, s: ProjectionScratch, fit: Point, p: Point) -> _Resi
     return _Residuals(energy, model, bent, square)
 
 
-@compiled
+@inlined
 def _fill_residuals(s: ProjectionScratch, fit: Point) -> None:
     """Fill the residuals in units of the noise."""
     above = fit.mean_z - fit.b * fit.mean_phi
@@ -129,7 +125,7 @@ def _second_differences(s: ProjectionScratch, spacing: int) -> tuple[float, floa
     return total, terms
 
 
-@compiled
+@inlined
 def _remainder(product: float, a: _Triple, b: _Triple, per: _Triple) -> float:
     """Return the part of the product of two vectors that is orthogonal to the model.
 
@@ -138,7 +134,7 @@ def _remainder(product: float, a: _Triple, b: _Triple, per: _Triple) -> float:
     return product - (a[0] * b[0] * per[0] + a[1] * b[1] * per[1] + a[2] * b[2] * per[2])
 
 
-@compiled
+@inlined
 def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, float]:
     """Return the energy of the residuals in the two test shapes, and their number.
 
@@ -160,7 +156,7 @@ def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, f
     return energy, count
 
 
-@compiled
+@inlined
 def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Array) -> None:
     """Write the effect of a bent signal on the fit, relative to the amplitude.
 
@@ -173,7 +169,7 @@ def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Array)
     row[EXTINCTION_BEND] = across + 0.5 - p.centroid
 
 
-@compiled
+@inlined
 def describe_bend_given(p: Point, row: Array) -> None:
     """Overwrite the same for a given extinction, which absorbs neither bend nor slope.
 
@@ -184,7 +180,7 @@ def describe_bend_given(p: Point, row: Array) -> None:
     row[EXTINCTION_BEND] = 0.0
 
 
-@compiled
+@inlined
 def judge_residuals(
     g: Grid,
     s: ProjectionScratch,

@@ -5,12 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from lidarops.retrieve.common.inputs import Floats
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
+from lidarops.retrieve.common.arrays import Array, Flags, Floats
 
 
 @dataclass(frozen=True, slots=True)

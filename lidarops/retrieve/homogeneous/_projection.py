@@ -15,11 +15,9 @@ from typing import Any, Final, NamedTuple
 
 import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Integers
 from lidarops.retrieve.common.frozen_arrays import frozen
-
-Array = npt.NDArray[np.float64]
 
 NODES: Final = 24
 _WIDEST_SCALE: Final = 0.3
@@ -43,7 +41,7 @@ _INLINED: Final[dict[str, Any]] = {
 }
 _BARE: Final[dict[str, Any]] = {**_INLINED, "_nrt": False}
 allocating = numba.njit(**_INLINED)
-compiled = numba.njit(**_BARE)
+inlined = numba.njit(**_BARE)
 fusing = numba.njit(**_BARE, fastmath={"contract"})
 """Compile a sum in the order of its terms, each added by one fused multiplication."""
 summing = numba.njit(**_BARE, fastmath=_SUMS)
@@ -71,7 +69,7 @@ class Grid(NamedTuple):
     """R_0, m."""
     length: float
     """L, m."""
-    noise_spacing: npt.NDArray[np.int64]
+    noise_spacing: Integers
     """(profile or 1,): bins from one to the next of a second difference, which gives the noise."""
 
 
@@ -138,7 +136,7 @@ _NEIGHBOURS: Final = np.ones(1, np.int64)
 def make_grid(
     range_: Array,
     bounds: tuple[float, float],
-    noise_spacing: npt.NDArray[np.int64] = _NEIGHBOURS,
+    noise_spacing: Integers = _NEIGHBOURS,
 ) -> Grid:
     """Return the tables common to the profiles of a call.
 
@@ -222,12 +220,12 @@ def largest_of(values: Array) -> float:
     return max(a, b, c, d)
 
 
-@compiled
+@inlined
 def power_of_two(value: float) -> float:
     return math.ldexp(1.0, math.frexp(value)[1])
 
 
-@compiled
+@inlined
 def scale_in_place(values: Array, factor: float) -> None:
     for i in range(values.size):
         values[i] *= factor
@@ -249,7 +247,7 @@ def total_of(values: Array) -> float:
     return total
 
 
-@compiled
+@inlined
 def _fill_shape(tau: float, g: Grid, phi: Array) -> None:
     """Fill the shape of a tau, over blocks of an even spacing by the decay within a block."""
     if g.step == 0.0:
@@ -287,7 +285,7 @@ def _in_lanes(a: Array, b: Array) -> float:
     return ((s0 + s4) + (s2 + s6)) + ((s1 + s5) + (s3 + s7))
 
 
-@compiled
+@inlined
 def _moments(term: Array, g: Grid, s: ProjectionScratch) -> tuple[float, float, float]:
     """Return the sums of an array, times 1, x and x^2."""
     for i in range(term.size):
@@ -295,7 +293,7 @@ def _moments(term: Array, g: Grid, s: ProjectionScratch) -> tuple[float, float, 
     return _in_lanes(term, s.ones), _in_lanes(s.lever, s.ones), _in_lanes(s.lever, g.x)
 
 
-@compiled
+@inlined
 def evaluate(tau: float, g: Grid, s: ProjectionScratch, sums: Sums) -> Point:
     """Return the linear fit at one extinction, from one pass over the bins."""
     w0, wz, free = sums.weight, sums.value, sums.free

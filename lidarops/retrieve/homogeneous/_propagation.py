@@ -6,19 +6,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.usable import HUGE
 
-Array = npt.NDArray[np.float64]
 
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_compiled
+@compiled
 def fill_linear_weights(power: Any, noise: Array, is_variance: bool, weights: Array) -> None:
     for i in range(weights.size):
         weight = 1.0 / noise[i] if is_variance else noise[i]
@@ -26,7 +21,7 @@ def fill_linear_weights(power: Any, noise: Array, is_variance: bool, weights: Ar
         weights[i] = weight if usable else 0.0
 
 
-@_compiled
+@compiled
 def _propagate_profile(
     b: float,
     phi: Array,
@@ -66,7 +61,7 @@ def _propagate_profile(
         row[2] += extinction_gradient * extinction_gradient / weights[i]
 
 
-@_compiled
+@compiled
 def propagate(
     power: Any,
     noise: Array,

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background.estimate import from_bounded_tail
+from lidarops.retrieve.common.arrays import Array, Block
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -34,8 +34,6 @@ _VALUES: Final = {
 }
 """Variables and their units, in terms of the unit of the power."""
 _COUNTS: Final = ("valid_bins", "quality_flag")
-
-_Block = npt.NDArray[Any]
 
 
 def fit_homogeneous_path(
@@ -148,7 +146,7 @@ def fit_homogeneous_path(
     return _described(result, edges, power.attrs.get("units", "1"))
 
 
-def _described(result: xr.Dataset, edges: npt.NDArray[np.float64], power_unit: str) -> xr.Dataset:
+def _described(result: xr.Dataset, edges: Array, power_unit: str) -> xr.Dataset:
     """Return values of sections with their units and coordinates."""
     for name, pattern in _VALUES.items():
         result[name].attrs["units"] = pattern.format(power_unit).removeprefix("1 ")
@@ -225,7 +223,7 @@ def _given_background(
 
 def _far_background(
     inputs: Mapping[str, xr.DataArray],
-    distance: npt.NDArray[np.float64],
+    distance: Array,
     background_range: tuple[float, float],
 ) -> dict[str, xr.DataArray]:
     """Return the mean of the far range, its standard error, and whether that is uncertain."""
@@ -234,8 +232,8 @@ def _far_background(
     front = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
 
     def mean(
-        power: _Block, variance: _Block, quality: _Block, length: _Block
-    ) -> tuple[_Block, _Block, _Block]:
+        power: Block, variance: Block, quality: Block, length: Block
+    ) -> tuple[Block, Block, Block]:
         values = np.where((quality & EXCLUDED) != 0, np.nan, power)[..., front]
         noise = np.broadcast_to(variance * length, power.shape)[..., front]
         sky = from_bounded_tail(values, distance[front], noise, None, background_range)
@@ -260,7 +258,7 @@ def _far_background(
     return dict(zip(("background", "background_error", "background_bits"), outputs, strict=True))
 
 
-def _bins(distance: npt.NDArray[np.float64], near: float, far: float) -> slice:
+def _bins(distance: Array, near: float, far: float) -> slice:
     inside = np.flatnonzero((distance >= near) & (distance < far))
     fewest = THRESHOLDS.fewest_solved_bins
     if inside.size < fewest:
@@ -274,14 +272,14 @@ def _bins(distance: npt.NDArray[np.float64], near: float, far: float) -> slice:
 
 
 def _solve(
-    *blocks: _Block,
+    *blocks: Block,
     ranged: Mapping[str, bool],
-    range: _Block,  # noqa: A002 - the field's word
+    range: Block,  # noqa: A002 - the field's word
     sections: Sequence[slice],
     method: str,
     relative: bool,
     lag: int | None,
-) -> tuple[_Block, ...]:
+) -> tuple[Block, ...]:
     """Return the values of all sections, stacked along a last axis."""
     # Values of whole profiles broadcast along range.
     arrays = {
@@ -302,21 +300,21 @@ def _solve(
 
 
 def _solve_section(
-    power: _Block,
-    variance: _Block | None = None,
-    quality: _Block | None = None,
-    correlation_length: _Block | None = None,
-    background: _Block | None = None,
-    background_error: _Block | None = None,
-    background_bits: _Block | None = None,
-    extinction: _Block | None = None,
-    exposure: _Block | None = None,
+    power: Block,
+    variance: Block | None = None,
+    quality: Block | None = None,
+    correlation_length: Block | None = None,
+    background: Block | None = None,
+    background_error: Block | None = None,
+    background_bits: Block | None = None,
+    extinction: Block | None = None,
+    exposure: Block | None = None,
     *,
-    range: _Block,  # noqa: A002 - the field's word
+    range: Block,  # noqa: A002 - the field's word
     method: str,
     relative: bool,
     lag: int | None,
-) -> tuple[_Block, ...]:
+) -> tuple[Block, ...]:
     carried = np.int32(0)
     if quality is not None:
         power = np.where((quality & EXCLUDED) != 0, np.nan, power)
@@ -350,7 +348,7 @@ def _solve_section(
     return (*values, fit.valid_bins, bits if doubt is None else bits | doubt)
 
 
-def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:
+def _distance(power: xr.DataArray) -> Array:
     """Return the range coordinate, in m and monotonic."""
     if "range" not in power.dims or "range" not in power.coords:
         raise RetrievalInputError(
@@ -372,7 +370,7 @@ def _distance(power: xr.DataArray) -> npt.NDArray[np.float64]:
     return distance
 
 
-def _edges(sections: Sequence[tuple[float, float]]) -> npt.NDArray[np.float64]:
+def _edges(sections: Sequence[tuple[float, float]]) -> Array:
     try:
         edges = np.asarray(sections, dtype=np.float64)
     except (TypeError, ValueError):

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Flags
 from lidarops.retrieve.homogeneous import _methods
-from lidarops.retrieve.homogeneous._problem import Array, Flags, PathProblem, PathSolution
+from lidarops.retrieve.homogeneous._problem import PathProblem, PathSolution
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 

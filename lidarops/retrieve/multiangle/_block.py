@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import ndtri, stdtrit
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle import _sample_mask, robust_weights
 from lidarops.retrieve.multiangle.slant_paths import Scan, surrounds_zenith
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _UNKNOWNS: Final = 3
 """Constant, optical depth and a gradient."""
@@ -38,13 +36,13 @@ class BeamBlock:
     design: Array
     """(3, angle, altitude), finite: horizontal distance over altitude, eastward and northward, and
     slant path."""
-    alive: npt.NDArray[np.intp]
+    alive: Indices
     """(profile, altitude): number of beams not yet lost in noise."""
     sides: bool
     """Whether beams point to all sides."""
     needed: int
     """Beams that an altitude needs to be within the reach."""
-    gaps: npt.NDArray[np.bool_]
+    gaps: Booleans
     """(profile,): whether samples are missing between others."""
     dead_time_change: Array | None = None
     """(profile, angle, altitude): of the signal, with one standard error of the dead time."""

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.flags import Quality
+from lidarops.retrieve.common.arrays import Array, Flags
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.frozen_arrays import frozen
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-
 _MISSING = int(Quality.INPUT_MISSING)
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class CellMeans(NamedTuple):
@@ -92,7 +87,7 @@ def at_centres(signal: Array, variance: Array) -> tuple[Array, Array]:
     return signal * ratio, variance * ratio**2
 
 
-@_compiled
+@compiled
 def _add_integral(place: float, sign: float, bins: int, weights: Array) -> None:
     """Add the weights of the part of a bin up to a place, to those of the whole bins before."""
     last = min(int(place), bins - 1)
@@ -104,7 +99,7 @@ def _add_integral(place: float, sign: float, bins: int, weights: Array) -> None:
         weights[last - 1] -= slope
 
 
-@_compiled
+@compiled
 def _average(
     power: Array,
     variance: Array,

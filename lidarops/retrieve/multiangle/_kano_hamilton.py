@@ -10,11 +10,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.compiled_code import compiled
 
 TAU: Final = 0
 INFORMATION: Final = 1
@@ -49,10 +48,8 @@ which it depends on them."""
 _OPPOSITE: Final = 1e-6
 """radian, rounding by which the gap between opposite azimuths may exceed half a turn."""
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _surrounds_zenith(weights: Array, design: Array, k: int) -> bool:
     """Return whether every half turn around the zenith has a beam with weight at an altitude."""
     tilted = 0
@@ -70,7 +67,7 @@ def _surrounds_zenith(weights: Array, design: Array, k: int) -> bool:
     return bool(widest <= math.pi + _OPPOSITE)
 
 
-@_compiled
+@compiled
 def _around(weights: Array, design: Array, around: Array) -> None:
     """Fill 1 at the altitudes where the beams with weight surround the zenith, else 0."""
     for k in range(around.size):
@@ -83,7 +80,7 @@ def _around(weights: Array, design: Array, around: Array) -> None:
             around[k] = around[k - 1]
 
 
-@_compiled
+@compiled
 def _sums(weights: Array, first: Array, second: Array, out: Array) -> None:
     """Fill the weighted sums over beams of products."""
     out[:] = 0.0
@@ -92,21 +89,21 @@ def _sums(weights: Array, first: Array, second: Array, out: Array) -> None:
             out[k] += weights[a, k] * first[a, k] * second[a, k]
 
 
-@_compiled
+@compiled
 def _ratio(over: Array, under: Array) -> None:
     """Divide in place; 0 where the divisor is not positive."""
     for k in range(over.size):
         over[k] = over[k] / under[k] if under[k] > 0.0 else 0.0
 
 
-@_compiled
+@compiled
 def _subtract(values: Array, share: Array, column: Array) -> None:
     for a in range(values.shape[0]):
         for k in range(share.size):
             values[a, k] -= share[k] * column[a, k]
 
 
-@_compiled
+@compiled
 def _orthogonal_columns(
     weights: Array, design: Array, least: Array, q: Array, norm: Array, mean: Array, c: int
 ) -> None:
@@ -147,8 +144,8 @@ def _orthogonal_columns(
     _leave_out(norm[c] > least, q, norm, mean, c)
 
 
-@_compiled
-def _leave_out(kept: npt.NDArray[np.bool_], q: Array, norm: Array, mean: Array, c: int) -> None:
+@compiled
+def _leave_out(kept: Booleans, q: Array, norm: Array, mean: Array, c: int) -> None:
     """Set a column to 0 where it is not kept."""
     for k in range(kept.size):
         if not kept[k]:
@@ -157,7 +154,7 @@ def _leave_out(kept: npt.NDArray[np.bool_], q: Array, norm: Array, mean: Array, 
                 q[c, a, k] = 0.0
 
 
-@_compiled
+@compiled
 def _gradients(
     weights: Array, design: Array, beams: Array, q: Array, norm: Array, mean: Array, sides: Array
 ) -> None:
@@ -180,7 +177,7 @@ def _gradients(
         sides[k] = sides[k] if spare[k] else 0.0
 
 
-@_compiled
+@compiled
 def _fill_precision(
     weights: Array, design: Array, whole: Array, q: Array, norm: Array, mean: Array, out: Array
 ) -> None:
@@ -211,7 +208,7 @@ def _fill_precision(
         out[SLOPE_NORTH, k] = -0.5 * out[SLOPE_NORTH, k] / norm[2, k] if known else 0.0
 
 
-@_compiled
+@compiled
 def _fill_fit(
     y: Array, weights: Array, whole: Array, q: Array, norm: Array, mean: Array,
     residual: Array, hat: Array, out: Array,
@@ -241,7 +238,7 @@ def _fill_fit(
                 hat[a, k] += lever / norm[c, k] if norm[c, k] > 0.0 else 0.0
 
 
-@_compiled
+@compiled
 def _fill_scatter(
     weights: Array, keep: Array, beams: Array, residual: Array, hat: Array, out: Array
 ) -> None:
@@ -259,7 +256,7 @@ def _fill_scatter(
                 out[CHI2, k] += weights[a, k] * residual[a, k] * residual[a, k]
 
 
-@_compiled
+@compiled
 def _empty(fitted: Array, residual: Array, hat: Array, out: Array) -> None:
     """Mark the altitudes where the slant paths do not differ."""
     for k in range(fitted.size):
@@ -272,7 +269,7 @@ def _empty(fitted: Array, residual: Array, hat: Array, out: Array) -> None:
             hat[:, k] = 1.0
 
 
-@_compiled
+@compiled
 def _fill_weights(
     noise: Array, keep: Array, inhomogeneity: Array, weights: Array, whole: Array, beams: Array
 ) -> None:
@@ -288,7 +285,7 @@ def _fill_weights(
             beams[k] += 1.0 if weights[a, k] > 0.0 else 0.0
 
 
-@_compiled
+@compiled
 def fit_levels(
     y: Array,
     noise: Array,

@@ -8,8 +8,8 @@ from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.multiangle import _block, _path_variation, mld
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
@@ -22,9 +22,6 @@ from lidarops.retrieve.multiangle.vertical.correlation import (
     residual_moments,
 )
 from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
 """Methods that do not use the horizontal gradient that the regression fits."""
@@ -293,7 +290,7 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     return profiles
 
 
-def _withhold_extinction(profiles: MultiAngleResult, where: Mask) -> None:
+def _withhold_extinction(profiles: MultiAngleResult, where: Booleans) -> None:
     for values in (
         profiles.extinction,
         profiles.extinction_standard_error,

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Block
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _BEHIND: Final = 4
 """Blocks behind an obstruction that must be dark, after one that may hold its edge."""
@@ -43,7 +41,7 @@ def obstruction_range(power: Array, variance: Array, distance: Array) -> Array:
     known = np.isfinite(power) & np.isfinite(variance)
     square = distance[: count * bins].reshape(shape) ** 2
 
-    def blocks(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def blocks(array: Block) -> Block:
         return array[:, : count * bins].reshape(-1, *shape)
 
     inside = np.count_nonzero(blocks(known), axis=2)

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import polygamma
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import (
     BeamBlock,
@@ -17,9 +17,6 @@ from lidarops.retrieve.multiangle._block import (
     sum_over_beams,
 )
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 
 def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
@@ -55,7 +52,7 @@ class _Means:
     freedom: Array
     """(profile,)"""
 
-    def select(self, profiles: npt.NDArray[np.bool_]) -> _Means:
+    def select(self, profiles: Booleans) -> _Means:
         """Return the means of some profiles."""
         return _Means(self.value[profiles], self.freedom[profiles])
 

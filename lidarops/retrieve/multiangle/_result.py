@@ -9,42 +9,41 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from lidarops.retrieve.common.arrays import Array, Booleans
 
 
 @dataclass(frozen=True, slots=True)
 class MultiAngleFlags:
     """Reasons to reject a value or to doubt its uncertainty; each (..., altitude)."""
 
-    no_data: Mask
+    no_data: Booleans
     """At no altitude do two different angles have a signal."""
-    extrapolated: Mask
+    extrapolated: Booleans
     """Beyond the reach: fewer beams than the method needs are left. Values are withheld."""
-    interpolated: Mask
+    interpolated: Booleans
     """No estimate at this altitude; interpolated from those around."""
-    no_residual: Mask
+    no_residual: Booleans
     """As many unknowns as beams in all profiles of the block, at all altitudes around: the model
     cannot be checked, and the inhomogeneity cannot be estimated."""
-    low_leverage: Mask
+    low_leverage: Booleans
     """The slant paths differ by less than a tenth of the vertical path."""
-    poor_stratification: Mask
+    poor_stratification: Booleans
     """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
     explain, as when extinction varies along the horizontal; or the residuals show a gradient that
     is too large for air. Extinction is withheld."""
-    prior_dominated: Mask
+    prior_dominated: Booleans
     """The best fit is little more than a straight line; the data share of "joint" is below 0.9 or
     above 1.1; or that of "mld" and "mld_prior" is below 0.9, and extinction is withheld."""
-    undersmoothed: Mask
+    undersmoothed: Booleans
     """More than 10 degrees of freedom and more than 0.4 per altitude, which fit better than a
     smoother profile: the standard error may be too small."""
-    high_correlation: Mask
+    high_correlation: Booleans
     """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
     small."""
-    outlier: Mask
+    outlier: Booleans
     """At least one beam or estimate got less weight as an outlier."""
 
-    def doubtful(self) -> Mask:
+    def doubtful(self) -> Booleans:
         """Return where the stated uncertainty may be too small."""
         return np.asarray(
             self.no_residual | self.undersmoothed | self.high_correlation | self.poor_stratification

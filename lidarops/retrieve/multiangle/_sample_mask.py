@@ -9,24 +9,21 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
 Ends = npt.NDArray[np.int32]
 
 _LARGEST_RATIO: Final = 1.0 / THRESHOLDS.lowest_snr**2
 """Largest variance over squared signal for which the moments of the logarithm are corrected."""
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _clean(signal: Array, variance: Array, row: Array) -> None:
     """Fill signal, variance and 1 at altitudes with data, zeros elsewhere."""
     values, spread, count = row[0], row[1], row[2]
@@ -37,7 +34,7 @@ def _clean(signal: Array, variance: Array, row: Array) -> None:
         count[k] = 1.0 if on else 0.0
 
 
-@_compiled
+@compiled
 def _window_sums(row: Array, size: int, sums: Array) -> None:
     """Fill the sums of rows over windows, by the altitude at which a window starts."""
     starts = row.shape[1] - size + 1
@@ -50,7 +47,7 @@ def _window_sums(row: Array, size: int, sums: Array) -> None:
                 total[k] += values[k]
 
 
-@_compiled
+@compiled
 def _first_loss(row: Array, before: int, size: int, lowest: float, sums: Array) -> int:
     """Return the first altitude where the mean signal of the window is below `lowest` times noise.
 
@@ -67,7 +64,7 @@ def _first_loss(row: Array, before: int, size: int, lowest: float, sums: Array) 
     return int(altitudes)
 
 
-@_compiled
+@compiled
 def _levels(row: Array, levels: Array, roots: Array) -> None:
     """Fill the means of neighbours and their square roots, 0 where not positive.
 
@@ -85,7 +82,7 @@ def _levels(row: Array, levels: Array, roots: Array) -> None:
         roots[j] = math.sqrt(levels[j])
 
 
-@_compiled
+@compiled
 def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
     """Return the signal expected from the neighbours, within 3 standard deviations of the sample.
 
@@ -99,7 +96,7 @@ def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
     return own if guess == 0.0 else min(max(guess, own - slack), own + slack)
 
 
-@_compiled
+@compiled
 def take_logarithms(
     signal: Array, variance: Array, usable: Booleans, logarithm: Array, noise: Array, ends: Ends
 ) -> None:

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
 from lidarops.retrieve.multiangle._obstructions import obstruction_range
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +22,7 @@ class AnalogBaseline:
     """(block,) mV."""
     standard_error: Array
     """(block,) mV: of noise, and of the scatter between beams."""
-    profile: npt.NDArray[np.int64]
+    profile: Integers
     """(blocked,) numbers of the profiles in the scene."""
     obstruction: Array
     """(blocked,) m, range from which each of them is blocked."""
@@ -97,7 +95,7 @@ class BlockedBeams:
         self._places = np.searchsorted(self._distance, self._edges)
         self._profiles: list[_Profile] = []
 
-    def add(self, power: Array, variance: Array, profile: npt.NDArray[np.int64]) -> None:
+    def add(self, power: Array, variance: Array, profile: Integers) -> None:
         """Take profiles.
 
         Parameters
@@ -208,9 +206,7 @@ def _never_lit(profile: _Profile, light: Array) -> bool:
     return bool((np.abs(profile.mean[1 : known[0] + 1]) < faint).all())
 
 
-def _means(
-    values: Array, variance: Array, places: npt.NDArray[np.intp]
-) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+def _means(values: Array, variance: Array, places: Indices) -> tuple[Array, Array, Booleans]:
     """Return means over blocks that begin at places, their variances, and which are complete."""
     known = np.isfinite(values) & np.isfinite(variance)
     sums = [

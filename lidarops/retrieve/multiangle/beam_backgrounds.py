@@ -6,12 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.multiangle._result import MultiAngleResult
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +68,7 @@ class ScanSignals:
         variance = noise + (left[..., np.newaxis] * response) ** 2
         return cls(signal, noise, variance, covariance, path, response, dead_time_change)
 
-    def of_beams(self, beams: npt.NDArray[np.int64]) -> Self:
+    def of_beams(self, beams: Integers) -> Self:
         """Return the signals of some beams."""
         change = self.dead_time_change
         return replace(
@@ -168,7 +166,7 @@ class ScanSignals:
         )
         return weight, change, residual
 
-    def _expected(self, seen: npt.NDArray[np.bool_], optical_depth: Array, scatter: Array) -> Array:
+    def _expected(self, seen: Booleans, optical_depth: Array, scatter: Array) -> Array:
         """Return the signals that fit best to the optical depths; NaN where there are none.
 
         The intercepts of single altitudes do not belong to the optical depths of a profile: where

@@ -7,10 +7,10 @@ from dataclasses import fields, replace
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import WITHHELD, Quality
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
 from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
@@ -24,8 +24,6 @@ from lidarops.retrieve.multiangle.vertical.monotone import project as monotone
 
 __all__ = ["retrieve_optical_depth"]
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
 
 QUALITY_OF_FLAG: Final = {
     "no_data": MultiAngleQuality.NO_LEVERAGE,
@@ -259,7 +257,7 @@ def _systematic_variables(
 
 def _planes_with_leverage(
     signals: ScanSignals, zenith_angle: Array, azimuth: Array
-) -> list[npt.NDArray[np.int64]]:
+) -> list[Integers]:
     """Return the beams of the vertical planes of which three or more see different paths."""
     lowest = signals.path[:, 0]
     return [
@@ -269,13 +267,13 @@ def _planes_with_leverage(
     ]
 
 
-def _azimuth_of_plane(azimuth: Array, zenith_angle: Array, members: npt.NDArray[np.int64]) -> float:
+def _azimuth_of_plane(azimuth: Array, zenith_angle: Array, members: Integers) -> float:
     """Return the azimuth of the lowest beam of a plane, degree."""
     return float(azimuth[members][np.argmax(zenith_angle[members])])
 
 
 def _layer_variables(
-    retrieval: MultiAngleResult, quality: Flags, levels: npt.NDArray[np.intp], bounds: Array
+    retrieval: MultiAngleResult, quality: Flags, levels: Indices, bounds: Array
 ) -> dict[str, xr.Variable]:
     """Return the variables of layers; NaN where a flag rejects the value at a bound."""
     rejected = (quality & np.int32(REJECTING)) != 0
@@ -297,7 +295,7 @@ def _solve_all(
     beams: ScanSignals,
     zenith_angle: Array,
     altitude: Array,
-    levels: npt.NDArray[np.intp],
+    levels: Indices,
     **settings: Any,
 ) -> MultiAngleResult:
     """Return the result of the method, with errors by what the backgrounds may hold."""
@@ -333,7 +331,7 @@ def _step_texts(retrieval: MultiAngleResult) -> str:
     )
 
 
-def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[np.intp]) -> Flags:
+def _quality(retrieval: MultiAngleResult, carried: Flags, samples: Indices) -> Flags:
     """Return the quality bits of each value; a missing value has at least one.
 
     Parameters
@@ -378,7 +376,7 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: npt.NDArray[n
     )
 
 
-def _below_others(depth: Array, error: Array, good: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def _below_others(depth: Array, error: Array, good: Booleans) -> Booleans:
     """Return the values below a good one under them, by the error of the difference."""
     below = np.zeros(depth.shape, dtype=np.bool_)
     for k in range(depth.shape[-1]):
@@ -392,7 +390,7 @@ def _with_background_errors(
     retrieval: MultiAngleResult,
     beams: ScanSignals,
     thickness: Array,
-    levels: npt.NDArray[np.intp],
+    levels: Indices,
 ) -> MultiAngleResult:
     """Return the result with standard errors that include signal in the background of all beams.
 

@@ -14,6 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air.molecular import MolecularProfile, molecular_lidar_ratio
 from lidarops.retrieve.background import estimate, known_shape
+from lidarops.retrieve.common.arrays import Array, Block, Flags, Indices, Integers
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
 from lidarops.retrieve.multiangle._obstructions import obstruction_range
@@ -25,11 +26,6 @@ from lidarops.retrieve.signal.labeled import (
     baseline_error,
     dead_time_change,
 )
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Integers = npt.NDArray[np.int64]
-_Block = npt.NDArray[Any]
 
 CARE: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
 """Bits that a bin passes on to every result that uses it."""
@@ -146,7 +142,7 @@ class AltitudeCycles:
             azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any()
         )
         self._batches = list(_batches(order))
-        self._pieces: list[dict[str, _Block]] = []
+        self._pieces: list[dict[str, Block]] = []
 
     def ends(self) -> Integers:
         """Return the profiles before which a chunk may end: those that begin a cycle."""
@@ -251,7 +247,7 @@ class AltitudeCycles:
             coords=coordinates,
         )
 
-    def _end_beams(self, cycles: Mapping[str, _Block], obstructions: Mapping[int, float]) -> None:
+    def _end_beams(self, cycles: Mapping[str, Block], obstructions: Mapping[int, float]) -> None:
         """Remove the cells of beams behind obstructions, in place."""
         order = self._order
         ends = np.array([obstructions.get(int(number), np.inf) for number in order.profile])
@@ -376,14 +372,14 @@ def _batches(order: _Order) -> Iterator[slice]:
 
 
 def _batch_on_altitudes(
-    profiles: tuple[_Block, ...],
-    systematic: tuple[tuple[_Block, float] | None, Array | None],
+    profiles: tuple[Block, ...],
+    systematic: tuple[tuple[Block, float] | None, Array | None],
     rows: Integers,
     shots: Array,
     cycle: Integers,
     beam: Integers,
     settings: _Settings,
-) -> dict[str, _Block]:
+) -> dict[str, Block]:
     """Return the arrays of the cycles of a batch by name.
 
     `systematic` holds the change of the power by the dead time with that of the background over its
@@ -392,7 +388,7 @@ def _batch_on_altitudes(
     """
     beams = len(settings.slant_edges)
     shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
-    cycles: dict[str, _Block] = {
+    cycles: dict[str, Block] = {
         "signal": np.full(shape, np.nan),
         "variance": np.full(shape, np.nan),
         "quality": np.zeros((shape[0], shape[2]), dtype=np.int32),
@@ -434,7 +430,7 @@ def _few_visits(first: Integers, profiles: int) -> Iterator[tuple[slice, Integer
 
 
 def _fill_cells(
-    cycles: dict[str, _Block], bins: _Bins, cycle: Integers, beam: Integers, settings: _Settings
+    cycles: dict[str, Block], bins: _Bins, cycle: Integers, beam: Integers, settings: _Settings
 ) -> None:
     """Average the bins of visits over the cells of their beams, in place."""
     cycles["left"][cycle, beam] = bins.left
@@ -478,10 +474,10 @@ class _Bins(NamedTuple):
 
 
 def _net_bins(
-    power: _Block,
-    variance: _Block,
-    quality: _Block,
-    length: _Block,
+    power: Block,
+    variance: Block,
+    quality: Block,
+    length: Block,
     beam: Integers,
     settings: _Settings,
 ) -> _Bins:
@@ -556,7 +552,7 @@ def _shapes(
     return shapes[place]
 
 
-def _visit_means(bins: _Bins, shots: Array, first: npt.NDArray[np.intp]) -> _Bins:
+def _visit_means(bins: _Bins, shots: Array, first: Indices) -> _Bins:
     """Average the profiles of each visit of a direction, weighted by shots."""
     group = np.zeros(shots.size, dtype=np.int64)
     group[first[1:]] = 1

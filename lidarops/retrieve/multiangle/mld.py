@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.multiangle._block import BeamBlock
-
-Array = npt.NDArray[np.float64]
 
 STRENGTHS: Final[Array] = 10.0 ** np.linspace(-6.0, 6.0, 97)
 """Strengths of the penalty to choose from; dimensionless, for paths scaled to a span of 1."""

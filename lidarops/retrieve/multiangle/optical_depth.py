@@ -12,12 +12,11 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.multiangle import _methods, slant_paths
 from lidarops.retrieve.multiangle._methods import BlockSettings
 from lidarops.retrieve.multiangle._result import MultiAngleFlags, MultiAngleResult, StepRecord
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
-
-Array = npt.NDArray[np.float64]
 
 LARGEST_GRADIENT: Final = 5e-5
 """m-1, default horizontal gradient of ln backscatter covered by the gradient errors."""
@@ -264,7 +263,7 @@ def _regularisation(strength: float | None, method: MultiAngleMethod) -> float |
     return _positive(strength, "regularisation")
 
 
-def _quality(profiles: MultiAngleResult, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+def _quality(profiles: MultiAngleResult, observed: Booleans) -> npt.NDArray[np.int32]:
     """Return the common quality bits; each missing optical depth has a rejecting bit.
 
     Parameters

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.multiangle._block import windowed
-
-Array = npt.NDArray[np.float64]
 
 
 def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: Array) -> Array:

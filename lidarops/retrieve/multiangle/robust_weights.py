@@ -10,19 +10,14 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-from lidarops.retrieve.common.compiled_code import summing
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import compiled, summing
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _GAUSS: Final = 1.4826
 """Standard deviation over median absolute deviation of normal deviates."""
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 def clean_moments(width: float) -> tuple[float, float]:
@@ -41,7 +36,7 @@ def clean_moments(width: float) -> tuple[float, float]:
     return square / weight, square**2 / psi / weight
 
 
-@_compiled
+@compiled
 def _median(values: Array, count: int) -> float:
     """Return the median of the first `count` values and sort these (insertion: they are few)."""
     for i in range(1, count):
@@ -55,7 +50,7 @@ def _median(values: Array, count: int) -> float:
     return float(values[half] if count % 2 else 0.5 * (values[half - 1] + values[half]))
 
 
-@_compiled
+@compiled
 def _repeated_median(
     y: Array, x: Array, count: int, closest: float, work: Array, slopes: Array
 ) -> tuple[float, float]:
@@ -78,7 +73,7 @@ def _repeated_median(
     return slope, _median(work, count)
 
 
-@_compiled
+@compiled
 def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
     """Fill the residuals from the lines of repeated medians.
 
@@ -125,7 +120,7 @@ def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float)
     return total
 
 
-@_compiled
+@compiled
 def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
     """Return slope and level of the best of the zero line and the lines through two beams."""
     best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
@@ -140,7 +135,7 @@ def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
     return slope, level
 
 
-@_compiled
+@compiled
 def pair_residuals(
     y: Array, noise: Array, x: Array, inhomogeneity: Array, residuals: Array
 ) -> None:

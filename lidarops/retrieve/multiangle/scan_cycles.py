@@ -11,12 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 _UNKNOWN: Final = -1
 
@@ -156,7 +154,7 @@ def cycles(
     return np.append(numbers, 0)[np.maximum(previous, 0)] if known.size else np.zeros_like(index)
 
 
-def _tilted(angle: Array) -> npt.NDArray[np.bool_]:
+def _tilted(angle: Array) -> Booleans:
     """Return whether zenith angles (degree, 0 to 180) are not along the vertical."""
     return np.asarray(np.minimum(angle, 180.0 - angle) >= 0.5 * THRESHOLDS.same_direction)
 
@@ -219,7 +217,7 @@ def _mean_bearings(bearing: Array, label: Integers) -> Array:
     return np.asarray((first + np.bincount(label, weights=off) / np.bincount(label)) % 360.0)
 
 
-def _planes(bearing: Array, tilted: npt.NDArray[np.bool_]) -> tuple[Integers, Integers]:
+def _planes(bearing: Array, tilted: Booleans) -> tuple[Integers, Integers]:
     """Return the vertical plane of each direction, and its side: 1 at the plane's azimuth, or -1.
 
     Directions that are not tilted are in the first plane.

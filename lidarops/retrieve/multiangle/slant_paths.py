@@ -10,13 +10,10 @@ import numpy.typing as npt
 
 from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.common.azimuths import widest_azimuth_gap
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
 
 _UPRIGHT: Final = 1e-9
 """Horizontal distance over altitude up to which a beam is vertical and has no azimuth."""
@@ -36,7 +33,7 @@ class Scan:
     """(angle, altitude): the same along azimuth 0."""
     azimuth: Array
     """(angle,) radian; a beam with a negative zenith angle points opposite to its azimuth."""
-    usable: Mask
+    usable: Booleans
     """(angle,): false for beams less than 3 degrees above the horizon."""
 
     @property

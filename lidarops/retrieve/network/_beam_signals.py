@@ -10,15 +10,12 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network import _condensed_signals, _fit_layout
 from lidarops.retrieve.network._condensed_signals import NOT_POSITIVE, CondensedSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Booleans = npt.NDArray[np.bool_]
 
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""

@@ -13,14 +13,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.network._condensed_signals import CondensedSignals
 from lidarops.retrieve.network._empirical_prior import BlockSolution, median
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
 
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""

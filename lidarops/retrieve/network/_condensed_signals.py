@@ -13,18 +13,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Codes, Indices
 from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Codes = npt.NDArray[np.uint8]
-Booleans = npt.NDArray[np.bool_]
 
 MISSING: Final = 1
 NOT_POSITIVE: Final = 2

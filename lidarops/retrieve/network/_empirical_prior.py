@@ -15,17 +15,13 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network import _joint_solution
 from lidarops.retrieve.network._condensed_signals import CondensedSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Booleans = npt.NDArray[np.bool_]
 
 _UNDETERMINED_COST: Final = 1e3
 """-2 ln likelihood of a profile that is not determined."""

@@ -17,15 +17,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Booleans = npt.NDArray[np.bool_]
 
 CHI_SQUARE: Final = 0
 """Column of a summary: chi-square of the beams alone, at their best solution."""
@@ -38,10 +34,7 @@ STEP: Final = 3
 COLUMNS: Final = 4
 
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_compiled
+@compiled
 def _factorise(matrix: Array, size: int) -> float:
     """Overwrite the lower triangle by its Cholesky factor; return ln determinant, NaN if none."""
     logarithm = 0.0
@@ -61,7 +54,7 @@ def _factorise(matrix: Array, size: int) -> float:
     return logarithm
 
 
-@_compiled
+@compiled
 def _substitute(factor: Array, size: int, side: Array) -> None:
     """Overwrite the right side by the solution of the factorised system."""
     for i in range(size):
@@ -76,7 +69,7 @@ def _substitute(factor: Array, size: int, side: Array) -> None:
         side[i] = total / factor[i, i]
 
 
-@_compiled
+@compiled
 def _invert(factor: Array, size: int, out: Array) -> None:
     """Fill the inverse of a factorised system."""
     for v in range(size):
@@ -86,7 +79,7 @@ def _invert(factor: Array, size: int, out: Array) -> None:
         _substitute(factor, size, out[v])
 
 
-@_compiled
+@compiled
 def _fill_covariance(
     packed: Array, count: int, quantities: int, weights: Array, half: Array, out: Array
 ) -> None:
@@ -106,7 +99,7 @@ def _fill_covariance(
             out[i, j] = half[i, j] - total / weights[j]
 
 
-@_compiled
+@compiled
 def _linearise(
     values: Array,
     integrals: Array,
@@ -156,7 +149,7 @@ def _linearise(
     return logarithm + math.log(known), end / weights[0]
 
 
-@_compiled
+@compiled
 def _assemble(
     data: tuple[Array, Array, Array],
     geometry: tuple[Indices, Indices, Indices],
@@ -205,7 +198,7 @@ def _assemble(
     return square, determinants, level / passages if passages > 0 else math.nan
 
 
-@_compiled
+@compiled
 def _move_constants(
     geometry: tuple[Indices, Indices, Indices],
     counts: Indices,
@@ -228,7 +221,7 @@ def _move_constants(
     return moved
 
 
-@_compiled
+@compiled
 def _least_chi_square(matrix: Array, side: Array, seen: Booleans, square: float) -> float:
     """Return the smallest chi-square of the beams alone, at the constants found with the prior."""
     for v in range(side.size):
@@ -242,7 +235,7 @@ def _least_chi_square(matrix: Array, side: Array, seen: Booleans, square: float)
     return square
 
 
-@_compiled
+@compiled
 def _carry(
     inverse: Array,
     information: Array,
@@ -261,7 +254,7 @@ def _carry(
                     out[v, first + k] += inverse[v, crossing[first + i]] * information[beam, i, k]
 
 
-@_compiled
+@compiled
 def solve_joint(
     values: Array,
     integrals: Array,

@@ -30,6 +30,7 @@ from scipy import special
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network import _beam_signals, _block_errors
 from lidarops.retrieve.network._beam_signals import BeamSignals
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
@@ -37,11 +38,6 @@ from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Problem, solve_
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.network.triangles import CHOSEN, solve_triangles
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Booleans = npt.NDArray[np.bool_]
-
 
 _HARMLESS: Final = frozenset({"weak_signal", "bridged"})
 """Flags that do not reject a value."""

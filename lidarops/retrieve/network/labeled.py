@@ -16,16 +16,13 @@ from lidarops.retrieve.air import labeled
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.estimate import from_tail
 from lidarops.retrieve.background.left_signal import shifts
+from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Integers = npt.NDArray[np.int64]
 
 _UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
 """Bits of a bin that is not used. Bins before full overlap are excluded by range."""
@@ -457,7 +454,7 @@ def _coordinates(
     beams: Sequence[BeamAverages],
     intervals: Integers,
     network: Network,
-    near: npt.NDArray[np.intp],
+    near: Indices,
 ) -> dict[str, Any]:
     if network.geodetic is None:
         raise RetrievalInputError(

@@ -16,15 +16,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Codes, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Codes = npt.NDArray[np.uint8]
 
 GOOD: Final = 0
 LOST: Final = 1
@@ -43,10 +39,8 @@ _SMOOTH_DEGREE: Final = 3
 _ONE_SIDED_DEGREE: Final = 2
 _LARGEST_LOGARITHM: Final = 300.0
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
+@compiled
 def fit_weights(grid: Array, at: int, nodes: Indices, count: int, degree: int, out: Array) -> None:
     """Fill the weights of bins in a least-squares polynomial at another bin.
 
@@ -74,7 +68,7 @@ def fit_weights(grid: Array, at: int, nodes: Indices, count: int, degree: int, o
         norm_before = norm
 
 
-@_compiled
+@compiled
 def _good_bins(codes: Codes, at: int, way: int, most: int, nodes: Indices, count: int) -> int:
     """Append the nearest good bins on one side of a bin; return the number of all."""
     g, end = at + way, count + most
@@ -86,7 +80,7 @@ def _good_bins(codes: Codes, at: int, way: int, most: int, nodes: Indices, count
     return count
 
 
-@_compiled
+@compiled
 def _adjacent_weights(grid: Array) -> Array:
     """Return (bin, NODES) weights where all neighbours are good: the usual case."""
     out, nodes = np.zeros((grid.size, NODES)), np.zeros(NODES, dtype=np.intp)
@@ -97,7 +91,7 @@ def _adjacent_weights(grid: Array) -> Array:
     return out
 
 
-@_compiled
+@compiled
 def _predict(
     grid: Array, plan: Array, codes: Codes, at: int, side: int, nodes: Indices, weights: Array
 ) -> tuple[int, float]:
@@ -128,7 +122,7 @@ def _predict(
     return count, THRESHOLDS.air_deviation_beyond if one_sided else THRESHOLDS.air_deviation
 
 
-@_compiled
+@compiled
 def _deviation(
     row: tuple[Array, Array, float, Array, Array],
     codes: Codes,
@@ -156,7 +150,7 @@ def _deviation(
     return size / math.sqrt(spread) if size > 0.0 and spread > 0.0 else 0.0
 
 
-@_compiled
+@compiled
 def _worst_bin(
     row: tuple[Array, Array, float, Array, Array],
     codes: Codes,
@@ -176,7 +170,7 @@ def _worst_bin(
     return worst
 
 
-@_compiled
+@compiled
 def _jumps(logs: Array, noise: Array, exponent: float, codes: Codes, at: int) -> bool:
     """Return whether the signal jumps at a bin by more than the slope of air.
 
@@ -194,7 +188,7 @@ def _jumps(logs: Array, noise: Array, exponent: float, codes: Codes, at: int) ->
     return abs(step) > max(THRESHOLDS.step * exponent, THRESHOLDS.outlier * math.sqrt(spread))
 
 
-@_compiled
+@compiled
 def _all_isolated(
     logs: Array, noise: Array, exponent: float, codes: Codes, deviations: Array
 ) -> bool:
@@ -215,7 +209,7 @@ def _all_isolated(
     return True
 
 
-@_compiled
+@compiled
 def _keep_in_place(logs: Array, codes: Codes, doubt: Array) -> None:
     """Fill the deviations of outlying bins from lines between good ones."""
     for at in range(codes.size):
@@ -237,7 +231,7 @@ def _keep_in_place(logs: Array, codes: Codes, doubt: Array) -> None:
             codes[at] = KEPT
 
 
-@_compiled
+@compiled
 def _search_row(
     row: tuple[Array, Array, float, Array, Array],
     used: tuple[int, int],
@@ -275,7 +269,7 @@ def _search_row(
     return True
 
 
-@_compiled
+@compiled
 def search(
     logs: Array,
     noise: Array,
@@ -315,7 +309,7 @@ def search(
                 stops[n] = low
 
 
-@_compiled
+@compiled
 def find_neighbours(
     grid: Array, codes: Codes, rows: Indices, bins: Indices, nodes: Indices, weights: Array
 ) -> None:

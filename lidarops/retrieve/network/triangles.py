@@ -24,12 +24,9 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network._beam_signals import BeamSignals
 from lidarops.retrieve.network._fit_layout import FitLayout
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Booleans = npt.NDArray[np.bool_]
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def falling(
     depth: Array,
     covariance: Array,
     effects: Array,
-    usable: npt.NDArray[np.int64],
+    usable: Integers,
     least: float,
-) -> npt.NDArray[np.bool_]:
+) -> Booleans:
     """Return the cells from which the depth falls to any other beyond, by more than its error.
 
     Parameters

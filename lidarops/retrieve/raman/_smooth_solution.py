@@ -9,16 +9,13 @@ result do not depend on the library of linear algebra.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import compiled
 
 
-@_compiled
+@compiled
 def _triangle(rows: Array) -> None:
     """Rotate rows in place until those below the diagonal are 0 in all columns but the last."""
     count, columns = rows.shape
@@ -35,7 +32,7 @@ def _triangle(rows: Array) -> None:
             rows[i, j] = 0.0
 
 
-@_compiled
+@compiled
 def factor(
     information: Array, weight: float, response: Array
 ) -> tuple[Array, Array, Array, Array, float]:
@@ -79,7 +76,7 @@ def factor(
     return pivot, near, far, target, misfit
 
 
-@_compiled
+@compiled
 def least_sum(information: Array, weight: float, response: Array) -> Array:
     """Return the solution of the least sum of squares, (cell,)."""
     _, near, far, solved, _ = factor(information, weight, response)
@@ -90,7 +87,7 @@ def least_sum(information: Array, weight: float, response: Array) -> Array:
     return solved
 
 
-@_compiled
+@compiled
 def _forward(near: Array, far: Array, right: Array) -> None:
     """Replace right-hand sides (cell, side) by the solutions of L."""
     cells, sides = right.shape
@@ -102,7 +99,7 @@ def _forward(near: Array, far: Array, right: Array) -> None:
                 right[i, k] -= far[i - 2] * right[i - 2, k]
 
 
-@_compiled
+@compiled
 def _backward(pivot: Array, near: Array, far: Array, right: Array) -> None:
     """Replace right-hand sides (cell, side) by the solutions of d and the transposed L."""
     cells, sides = right.shape
@@ -117,14 +114,14 @@ def _backward(pivot: Array, near: Array, far: Array, right: Array) -> None:
                 right[i, k] -= far[i] * right[i + 2, k]
 
 
-@_compiled
+@compiled
 def _substitute(pivot: Array, near: Array, far: Array, right: Array) -> None:
     """Replace right-hand sides (cell, side) by their solutions."""
     _forward(near, far, right)
     _backward(pivot, near, far, right)
 
 
-@_compiled
+@compiled
 def solve(information: Array, weight: float, right: Array) -> Array:
     """Return the solutions of right-hand sides (cell, side), refined once.
 
@@ -148,7 +145,7 @@ def solve(information: Array, weight: float, right: Array) -> Array:
     return np.asarray(solved + left)
 
 
-@_compiled
+@compiled
 def restricted_scores(information: Array, response: Array, weights: Array) -> Array:
     """Return minus twice the logarithm of the restricted likelihood of weights, up to a constant.
 

@@ -15,12 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import erfcx
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.depth_fit import SignalNoise
-
-Array = npt.NDArray[np.float64]
 
 
 def inverse_mean(signal: Array, relative_variance: Array) -> Array:
@@ -181,7 +179,7 @@ def calibrated(
     noise: SignalNoise,
     depth_noise: Array,
     reference: Array,
-    window: npt.NDArray[np.bool_],
+    window: Booleans,
 ) -> Backscatter | None:
     """Return total backscatter from a ratio and the backscatter in the reference window.
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.arrays import Array
 
-Array = npt.NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.cells import Cells
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 States = npt.NDArray[np.int8]
 
 
@@ -33,7 +32,7 @@ def largest_of_cells(values: Array, cells: Cells) -> Array:
     return np.where(np.isneginf(largest), np.nan, largest)
 
 
-def touched(mask: Mask, resolution: Array, step: float) -> Mask:
+def touched(mask: Booleans, resolution: Array, step: float) -> Booleans:
     """Return the cells in whose values a marked cell takes part.
 
     Parameters

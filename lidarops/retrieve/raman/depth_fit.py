@@ -17,12 +17,10 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman._smooth_solution import least_sum, restricted_scores, solve
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _LEAST_WEIGHT: Final = 1e-2
 """Weight of smoothness over the mean information of a cell: a length of 0.3 cells."""
@@ -141,7 +139,7 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
     return DepthFit.of(used, information, inverse, walk * mean)
 
 
-def _level(signal: Array, noise: SignalNoise, known: npt.NDArray[np.bool_]) -> float:
+def _level(signal: Array, noise: SignalNoise, known: Booleans) -> float:
     """Return the mean signal, weighted by the information of a signal of a first mean."""
     variance = np.where(known, np.where(known, noise.fixed, 1.0) + noise.per_signal, 1.0)
     weight = np.where(known, 1.0 / variance, 0.0)

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter
 from lidarops.retrieve.raman.cells import Cells
 from lidarops.retrieve.raman.depth_fit import DepthFit
 from lidarops.retrieve.raman.extinction import Extinction, slope
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import AirColumn, CellSignal
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 EXTINCTION_CAUSES: Final = (
     "noise", "resolution", "background", "dead_time", "baseline", "angstrom", "molecular",
@@ -97,7 +94,7 @@ class Effects:
     step: float
     """m, length of a cell."""
     settings: RamanSettings
-    partial: Mask
+    partial: Booleans
 
     def causes(self) -> Iterator[Cause]:
         """Yield the effect of one standard error of each cause."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.raman.depth_fit import DepthFit, root_of_squares
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

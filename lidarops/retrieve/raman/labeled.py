@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.background import estimate
 from lidarops.retrieve.clouds import labeled as _clouds
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.raman.cells import Cells, make_cells
 from lidarops.retrieve.raman.cloud_cells import largest_of_cells, state_of_cells, touched
 from lidarops.retrieve.raman.flags import RamanQuality
@@ -37,10 +37,6 @@ from lidarops.retrieve.signal.labeled import (
     without_analog_background,
 )
 from lidarops.retrieve.signal.screening import cloud_contrast
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Booleans = npt.NDArray[np.bool_]
 
 _WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
 _DOUBTED: Final = _WITHHELD | int(Quality.PILE_UP)

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter, inverse_of_weak
 from lidarops.retrieve.raman.depth_fit import root_of_squares
 from lidarops.retrieve.raman.errors import RANDOM, Cause
 from lidarops.retrieve.raman.extinction import Extinction
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _MOST_UNKNOWN: Final = 0.05
 """Weight of cells without backscatter in the lidar ratio of a cell."""
@@ -41,7 +38,7 @@ def lidar_ratio_of(
     value: Array,
     noise: Array,
     causes: Sequence[Cause],
-    usable: Mask,
+    usable: Booleans,
 ) -> LidarRatio:
     r"""Return the lidar ratio, from equally smoothed extinction and backscatter.
 
@@ -135,7 +132,7 @@ def _chances(extinction: Array, backscatter: Array, random: Array) -> tuple[Arra
     return ratio, chance / chance.sum(axis=0)
 
 
-def _likely(extinction: Extinction, backscatter: Array, error: Array, known: Mask) -> Array:
+def _likely(extinction: Extinction, backscatter: Array, error: Array, known: Booleans) -> Array:
     """Return the weighted mean of backscatter and of what extinction lets expect, m-1 sr-1.
 
     With weights by the lidar ratio of all `known` cells together, its noise and that of the lidar

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lidarops.retrieve.common.arrays import Array, Booleans
 
 _ABOVE: Final = 1000.0
 """m above full overlap, in which the lidar ratio is averaged. Assumed."""
@@ -29,7 +28,7 @@ def overlap_of(
     depth: Array,
     backscatter: Array,
     lidar_ratio: tuple[Array, Array],
-    partial: npt.NDArray[np.bool_],
+    partial: Booleans,
     step: float,
     ratio: float,
 ) -> OverlapProfile:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.raman import backscatter as _backscatter
 from lidarops.retrieve.raman._negative_depth import falling
 from lidarops.retrieve.raman.cells import Cells
@@ -30,10 +30,6 @@ from lidarops.retrieve.raman.reference import choose_window
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import AirColumn, CellSignal, ChannelSignal, cell_signals
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +139,7 @@ def retrieve_raman(
 
 
 def _profile(
-    raman: CellSignal, elastic: CellSignal, cells: Cells, settings: RamanSettings, partial: Mask
+    raman: CellSignal, elastic: CellSignal, cells: Cells, settings: RamanSettings, partial: Booleans
 ) -> Profile | None:
     """Return the fitted profile; None where there is no Raman signal."""
     noise = SignalNoise(raman.noise.per_signal, np.where(partial, np.inf, raman.noise.fixed))
@@ -163,7 +159,7 @@ class _Solution:
     backscatter: Array
     backscatter_budget: dict[str, Array]
     lidar_ratio: LidarRatio
-    negative: Mask
+    negative: Booleans
     """Cells beyond which the Raman signal falls by less than in clean air."""
 
     @classmethod
@@ -173,7 +169,7 @@ class _Solution:
         air: AirCells,
         cells: Cells,
         settings: RamanSettings,
-        partial: Mask,
+        partial: Booleans,
         window: Array,
         number: int,
     ) -> Self:
@@ -211,7 +207,7 @@ class _Solution:
         return cls(number, profile, budget, value, of_backscatter, ratios, negative)
 
 
-def _ratio(profile: Profile, partial: Mask, ratio: float) -> _backscatter.Ratio:
+def _ratio(profile: Profile, partial: Booleans, ratio: float) -> _backscatter.Ratio:
     """Return the ratio of the signals: to the smooth Raman signal, but in partial overlap."""
     fit, elastic, raman = profile.fit, profile.elastic, profile.raman
     smooth = _backscatter.smooth_ratio(
@@ -228,7 +224,7 @@ def _ratio(profile: Profile, partial: Mask, ratio: float) -> _backscatter.Ratio:
     )
 
 
-def _negative(fit: DepthFit, effects: Sequence[Array], usable: Mask) -> Mask:
+def _negative(fit: DepthFit, effects: Sequence[Array], usable: Booleans) -> Booleans:
     """Return the cells from which on extinction is negative in total, by more than its error.
 
     The total is from a cell to any other beyond. Air without particles has none, so that overlap
@@ -246,7 +242,7 @@ def _joined(
     """Return the profiles together, NaN where a bit rejects them."""
     numbers = [one.number for one in solved]
 
-    def stacked(rows: Iterable[Array], hidden: Mask) -> Array:
+    def stacked(rows: Iterable[Array], hidden: Booleans) -> Array:
         values = np.full(quality.shape, np.nan)
         for number, row in zip(numbers, rows, strict=True):
             values[number] = row
@@ -288,7 +284,11 @@ def _joined(
 
 
 def _flags(
-    solved: Sequence[_Solution], quality: Flags, weak: Mask, no_ratio: Mask, chosen: Mask
+    solved: Sequence[_Solution],
+    quality: Flags,
+    weak: Booleans,
+    no_ratio: Booleans,
+    chosen: Booleans,
 ) -> Flags:
     """Return the quality with the bits of the retrieval."""
     flags = quality.copy()

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.raman.cells import Cells
 from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 
 def _nothing() -> Array:

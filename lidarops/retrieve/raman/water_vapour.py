@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import inverse_mean
 from lidarops.retrieve.raman.scattering import particle_ratio
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import CellSignal
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,7 @@ def mixing_ratio(
     water: CellSignal,
     nitrogen: CellSignal,
     fit: tuple[Array, Array],
-    partial: npt.NDArray[np.bool_],
+    partial: Booleans,
     *,
     constant: float,
     particles: ParticleTransmission,

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 
 HUGE: Final = 1e150
 PASSES: Final = 4
@@ -26,10 +24,8 @@ CHI2: Final = 5
 POINTS: Final = 6
 COLUMNS: Final = 7
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
+@compiled
 def running_means(values: Array, half: int, out: Array) -> None:
     """Average over windows of 2 half + 1 bins, shorter at the ends, skipping non-finite values.
 
@@ -53,8 +49,8 @@ def running_means(values: Array, half: int, out: Array) -> None:
                 out[k, i] = total / count if count > 0 else math.nan
 
 
-@_compiled
-def longest_runs(valid: npt.NDArray[np.bool_], first: Indices, past: Indices) -> None:
+@compiled
+def longest_runs(valid: Booleans, first: Indices, past: Indices) -> None:
     """Write the longest run of true bins of each row, the first of equals; (0, 0) for none."""
     for k in range(valid.shape[0]):
         start = best = 0
@@ -67,13 +63,13 @@ def longest_runs(valid: npt.NDArray[np.bool_], first: Indices, past: Indices) ->
                 first[k], past[k] = start, i + 1
 
 
-@_compiled
+@compiled
 def _usable(x: float, y: float, x_variance: float, y_variance: float) -> bool:
     finite = abs(x) < HUGE and abs(y) < HUGE
     return finite and 0.0 < x_variance < HUGE and 0.0 < y_variance < HUGE
 
 
-@_compiled
+@compiled
 def _centroid(x: Array, y: Array, xv: Array, yv: Array, slope: float) -> Any:
     """Return the sum of the weights, the weighted means, and the number of points."""
     total = x_mean = y_mean = 0.0
@@ -88,7 +84,7 @@ def _centroid(x: Array, y: Array, xv: Array, yv: Array, slope: float) -> Any:
     return total, x_mean / total, y_mean / total, points
 
 
-@_compiled
+@compiled
 def _moments(
     x: Array, y: Array, xv: Array, yv: Array, slope: float, x_mean: float, y_mean: float
 ) -> Any:
@@ -108,7 +104,7 @@ def _moments(
     return y_sum, x_sum, shift, square, chi2
 
 
-@_compiled
+@compiled
 def _first_slope(x: Array, y: Array, xv: Array, yv: Array) -> float:
     """Return the ratio of the spreads of y and x, which depends little on noise in either."""
     points, x_mean, y_mean = 0, 0.0, 0.0
@@ -125,7 +121,7 @@ def _first_slope(x: Array, y: Array, xv: Array, yv: Array) -> float:
     return math.sqrt(rise / spread)
 
 
-@_compiled
+@compiled
 def fit_lines(
     x: Array,
     y: Array,

@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 DISTANCE: Final = 4
 """Bins between the values of a third difference. The electronics correlate neighbouring bins by
@@ -32,8 +30,6 @@ _BLOCK_ERROR: Final = 0.49
 """Standard deviation of the mean square of a block of white noise, over its mean. Simulated."""
 _FEWEST: Final = 4
 """Blocks of which a mean is taken."""
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class NoiseModel(NamedTuple):
@@ -52,7 +48,7 @@ class _Blocks(NamedTuple):
     """Mean square, scaled to the variance of white noise; NaN where bins are missing."""
     light: Array
     """Signal over its level in the far half."""
-    usable: npt.NDArray[np.bool_]
+    usable: Booleans
     """Whether all bins are known, and the fall of the signal is negligible."""
 
 
@@ -72,7 +68,7 @@ def block_count(bins: int) -> int:
     return max(bins - _REACH, 0) // BLOCK
 
 
-@_compiled
+@compiled
 def _mean_square(power: Array, first: int, count: int, distance: int) -> float:
     total = 0.0
     for i in range(first, first + count):
@@ -82,7 +78,7 @@ def _mean_square(power: Array, first: int, count: int, distance: int) -> float:
     return total / (20.0 * count)
 
 
-@_compiled
+@compiled
 def _constant(power: Array) -> float:
     """Return the mean square of third differences of neighbours; NaN without any."""
     total, count = 0.0, 0
@@ -94,7 +90,7 @@ def _constant(power: Array) -> float:
     return total / count
 
 
-@_compiled
+@compiled
 def _clipped_mean(values: Array) -> float:
     """Return the mean without outliers; NaN of fewer than `_FEWEST` values."""
     if values.size < _FEWEST:
@@ -104,7 +100,7 @@ def _clipped_mean(values: Array) -> float:
     return float(np.mean(values[values <= limit]) if limit > 0.0 else np.mean(values))
 
 
-@_compiled
+@compiled
 def _far_level(mean: Array, far: int) -> tuple[float, float]:
     """Return the level of the signal in the far half, and how far its baseline departs from it."""
     levels = mean[far::BLOCK]
@@ -114,7 +110,7 @@ def _far_level(mean: Array, far: int) -> tuple[float, float]:
     return level, departures[int(0.9 * departures.size)] if departures.size else math.nan
 
 
-@_compiled
+@compiled
 def _squares(power: Array, count: int) -> Array:
     squares = np.empty(count)
     for k in range(count):
@@ -122,7 +118,7 @@ def _squares(power: Array, count: int) -> Array:
     return squares
 
 
-@_compiled
+@compiled
 def _blocks(squares: Array, mean: Array, level: float, fall: Array, dark: float) -> _Blocks:
     light, usable = np.empty(squares.size), np.empty(squares.size, dtype=np.bool_)
     for k in range(squares.size):
@@ -133,7 +129,7 @@ def _blocks(squares: Array, mean: Array, level: float, fall: Array, dark: float)
     return _Blocks(squares, light, usable)
 
 
-@_compiled
+@compiled
 def _fit(light: Array, square: Array, dark: float) -> float:
     """Return the noise variance per unit of light; 0 within its standard error."""
     if light.size < _FEWEST:
@@ -146,7 +142,7 @@ def _fit(light: Array, square: Array, dark: float) -> float:
     return slope if slope > _BLOCK_ERROR / math.sqrt(leverage) else 0.0
 
 
-@_compiled
+@compiled
 def _line(blocks: _Blocks, dark: float, drift: float) -> _Line:
     """Return the noise as a function of light."""
     # Windows of the smoothed signal hold a block or more.
@@ -160,7 +156,7 @@ def _line(blocks: _Blocks, dark: float, drift: float) -> _Line:
     return _Line(dark, _fit(blocks.light[bright], blocks.square[bright], dark), clear)
 
 
-@_compiled
+@compiled
 def _dark_noise(blocks: _Blocks, line: _Line) -> float:
     """Return the noise in the far half, from all blocks."""
     total = weights = 0.0
@@ -173,7 +169,7 @@ def _dark_noise(blocks: _Blocks, line: _Line) -> float:
     return total / weights if total > 0.0 else line.dark
 
 
-@_compiled
+@compiled
 def _variance(line: _Line, light: float) -> float:
     # Light is missing where no bin of its window is known.
     if math.isnan(light) or light < line.least:
@@ -181,7 +177,7 @@ def _variance(line: _Line, light: float) -> float:
     return max(line.dark + line.slope * light, THRESHOLDS.darkest * line.dark)
 
 
-@_compiled
+@compiled
 def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
     """Return centres of bands, logarithms of their noise over the line, and their significance."""
     count = blocks.square.size
@@ -207,7 +203,7 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
     return centres[:found], excesses[:found], significant
 
 
-@_compiled
+@compiled
 def _estimate(power: Array, noise: NoiseModel, s: kernels.SignalScratch, out: Array) -> None:
     complete = kernels.load_values(power, s.sums)
     kernels.write_averages(s.sums, noise.narrow, complete, s.mean)
@@ -228,7 +224,7 @@ def _estimate(power: Array, noise: NoiseModel, s: kernels.SignalScratch, out: Ar
         out *= np.exp(np.interp(np.arange(power.size), centres, excesses))
 
 
-@_compiled
+@compiled
 def noise_profiles(power: Array, noise: NoiseModel, s: kernels.SignalScratch, out: Array) -> None:
     """Estimate the noise variance of each profile from third differences.
 

@@ -19,15 +19,13 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.flags import Quality
+from lidarops.retrieve.common.arrays import Array, Flags, Integers, Singles
+from lidarops.retrieve.common.compiled_code import compiled
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Singles = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.uint32]
 
 BLOCK: Final = 16
@@ -40,8 +38,6 @@ _FLAT: Final = 1e-12
 _MISSING: Final = int(Quality.INPUT_MISSING)
 _SATURATED: Final = int(Quality.SATURATED)
 _PILE_UP: Final = int(Quality.PILE_UP)
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Windows(NamedTuple):
@@ -66,9 +62,9 @@ class _Sums(NamedTuple):
     """Sum over the blocks before this one."""
     low: Array
     """Rounding error of `high`."""
-    finite: npt.NDArray[np.int64]
+    finite: Integers
     """1 where `values` is valid."""
-    counts: npt.NDArray[np.int64]
+    counts: Integers
     """Number of photons, or of finite values, before the bin."""
     bins: Array
     """Number of finite values in the window, where the profile has gaps."""
@@ -99,7 +95,7 @@ def scratch(bins: int) -> SignalScratch:
     return SignalScratch(sums, np.zeros(bins), np.zeros(bins))
 
 
-@_compiled
+@compiled
 def load_values(values: Array, s: _Sums) -> bool:
     """Load the finite values of a profile; return whether all are finite."""
     count = 0
@@ -111,7 +107,7 @@ def load_values(values: Array, s: _Sums) -> bool:
     return bool(count == values.size)
 
 
-@_compiled
+@compiled
 def _accumulate(s: _Sums) -> None:
     """Fill the running sums."""
     high = low = 0.0
@@ -133,7 +129,7 @@ def _accumulate(s: _Sums) -> None:
     s.high[-1], s.low[-1] = high, low
 
 
-@_compiled
+@compiled
 def _count_finite(s: _Sums) -> None:
     before = 0
     for i in range(s.finite.size):
@@ -142,20 +138,20 @@ def _count_finite(s: _Sums) -> None:
     s.counts[-1] = before
 
 
-@_compiled
-def _window_counts(counts: npt.NDArray[np.int64], windows: Windows, out: Array) -> None:
+@compiled
+def _window_counts(counts: Integers, windows: Windows, out: Array) -> None:
     for i in range(out.size):
         out[i] = np.float64(counts[windows.past[i]] - counts[windows.first[i]])
 
 
-@_compiled
+@compiled
 def _window_sum(s: _Sums, first: np.uint32, past: np.uint32) -> float:
     after, last = first // np.uint32(BLOCK) + np.uint32(1), past // np.uint32(BLOCK)
     whole_blocks = (s.high[last] - s.high[after]) + (s.low[last] - s.low[after])
     return float((s.tail[first] + s.head[past]) + whole_blocks)
 
 
-@_compiled
+@compiled
 def write_averages(s: _Sums, windows: Windows, complete: bool, out: Array) -> None:
     """Write averages of the loaded values over windows."""
     _accumulate(s)
@@ -169,7 +165,7 @@ def write_averages(s: _Sums, windows: Windows, complete: bool, out: Array) -> No
         out[i] = _window_sum(s, first, past) / np.float64(s.counts[past] - s.counts[first])
 
 
-@_compiled
+@compiled
 def _bins(s: _Sums, windows: Windows, complete: bool) -> Array:
     """Return the number of finite values in each window."""
     if complete:
@@ -179,7 +175,7 @@ def _bins(s: _Sums, windows: Windows, complete: bool) -> Array:
     return s.bins
 
 
-@_compiled
+@compiled
 def _is_off(counts: npt.NDArray[np.int32]) -> bool:
     """Return whether all counts are zero, as those of a recorder that is off."""
     bits = np.int32(0)
@@ -188,7 +184,7 @@ def _is_off(counts: npt.NDArray[np.int32]) -> bool:
     return bool(bits == 0)
 
 
-@_compiled
+@compiled
 def _voltage(
     counts: npt.NDArray[np.int32],
     missing: bool,
@@ -209,7 +205,7 @@ def _voltage(
         quality[i] = overlap[i] | (_MISSING if unusable else 0) | (_SATURATED if saturated else 0)
 
 
-@_compiled
+@compiled
 def voltage_profiles(
     counts: npt.NDArray[np.int32],
     shots: Array,
@@ -257,7 +253,7 @@ class Counter(NamedTuple):
     """Standard deviations about `largest_load` within which the mean decides."""
 
 
-@_compiled
+@compiled
 def _rate(
     counts: npt.NDArray[np.int32],
     missing: bool,
@@ -288,7 +284,7 @@ def _rate(
     return bool(valid_bins == counts.size)
 
 
-@_compiled
+@compiled
 def _photons(counts: npt.NDArray[np.int32], windows: Windows, s: _Sums, out: Array) -> None:
     """Count the photons of valid bins in each window, in exact integer sums."""
     before = 0
@@ -300,7 +296,7 @@ def _photons(counts: npt.NDArray[np.int32], windows: Windows, s: _Sums, out: Arr
     _window_counts(s.counts, windows, out)
 
 
-@_compiled
+@compiled
 def _photon_variance(
     exposure: float, counter: Counter, photons: Array, bins: Array, mean: Array, out: Array
 ) -> None:
@@ -315,7 +311,7 @@ def _photon_variance(
         out[i] = expected / exposure * (1.0 / live if corrected else live * live)
 
 
-@_compiled
+@compiled
 def _reject_overloaded(
     counts: npt.NDArray[np.int32],
     exposure: float,
@@ -338,7 +334,7 @@ def _reject_overloaded(
             quality[i] |= _SATURATED
 
 
-@_compiled
+@compiled
 def photon_profiles(
     counts: npt.NDArray[np.int32],
     shots: Array,
@@ -380,7 +376,7 @@ def photon_profiles(
             _reject_overloaded(counts[k], exposure[k], counter, s.local, bins, power[k], quality[k])
 
 
-@_compiled
+@compiled
 def range_corrected_profiles(
     power: Array,
     variance: Array,

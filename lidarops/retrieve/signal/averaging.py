@@ -5,20 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.common.usable import HUGE
-
-Array = npt.NDArray[np.float64]
-Counts = npt.NDArray[np.int64]
-
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +26,7 @@ class Averages:
     """Variance of the mean by noise that is independent from profile to profile."""
     shared_variance: Array
     """Variance of the mean by errors that all averaged profiles have in common."""
-    count: Counts
+    count: Integers
     """Number of finite values in each mean."""
 
 
@@ -104,7 +99,7 @@ class RunningMean:
         del self._sums
         return _averages(sums, self._count)
 
-    def joined(self, groups: npt.NDArray[np.bool_]) -> Averages:
+    def joined(self, groups: Booleans) -> Averages:
         """Return the means of all values of some groups, (1, range), from their sums."""
         sums, count = self._sums, self._count
         if not groups.all():
@@ -117,7 +112,7 @@ class RunningMean:
         return self._sums
 
 
-def _averages(sums: Array, count: Counts) -> Averages:
+def _averages(sums: Array, count: Integers) -> Averages:
     """Return the means that follow from sums, in whose memory they come to lie."""
     total, value, noise, systematic = sums
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -149,15 +144,15 @@ def _positive(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array
     return array
 
 
-@_compiled
+@compiled
 def _add_profiles(
     values: Array,
     variance: Array,
     shared: Array,
     weights: Array,
-    groups: npt.NDArray[np.intp],
+    groups: Indices,
     sums: Array,
-    count: Counts,
+    count: Integers,
 ) -> None:
     """Add each profile to the sums of its group.
 
@@ -192,10 +187,10 @@ def _add_profiles(
             number[i] += 1 if valid else 0
 
 
-@_compiled
+@compiled
 def join_bits(
     quality: npt.NDArray[np.int32],
-    groups: npt.NDArray[np.intp],
+    groups: Indices,
     passed: int,
     bits: npt.NDArray[np.int32],
 ) -> None:

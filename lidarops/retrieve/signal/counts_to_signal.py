@@ -25,15 +25,12 @@ from lidarops.constants import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Singles
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal import _noise_kernels as noise_kernels
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Singles = npt.NDArray[np.float32]
 
 MIN_NOISE_BINS = kernels.BLOCK
 """Smallest half-width of such a window in bins: 16."""
@@ -207,9 +204,7 @@ def _add_rounding(variance: Array, scale: _Scale, relative_error: float = 0.0) -
     return raised_variance
 
 
-def _flag_clipped(
-    power: Array, quality: Flags, scale: _Scale, variance: Array
-) -> npt.NDArray[np.intp]:
+def _flag_clipped(power: Array, quality: Flags, scale: _Scale, variance: Array) -> Indices:
     """Mark bins in which single shots were clipped although their mean is below full scale.
 
     Returns
@@ -463,8 +458,8 @@ def _windows(grid: Array, window: float) -> kernels.Windows:
 
 
 def _gap_free_stretch(
-    gaps: npt.NDArray[np.bool_],
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    gaps: Booleans,
+) -> tuple[Indices, Indices]:
     """Return the first and past-the-last bin of the stretch without a gap that holds each bin.
 
     A gap is where bins were not read. No window may extend across it.

@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Indices, Integers
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 _SECOND_DIFFERENCE_VARIANCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
@@ -158,14 +157,14 @@ def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Ar
     return dark_seconds, seconds
 
 
-def _sessions(dark_seconds: Array) -> list[npt.NDArray[np.intp]]:
+def _sessions(dark_seconds: Array) -> list[Indices]:
     """Return the indices of the dark files of each session, in time order."""
     order = np.argsort(dark_seconds, kind="stable")
     breaks = np.flatnonzero(np.diff(dark_seconds[order]) > THRESHOLDS.session_gap) + 1
     return [np.sort(files) for files in np.split(order, breaks)]
 
 
-def _means(signals: Array, sessions: list[npt.NDArray[np.intp]]) -> tuple[Array, Array]:
+def _means(signals: Array, sessions: list[Indices]) -> tuple[Array, Array]:
     """Return mean and variance of the mean of each session, (..., session, range)."""
     means, counts, squares, freedoms = [], [], [], []
     for files in sessions:
@@ -217,7 +216,7 @@ def _far_variance(signals: Array) -> Array:
     return _ratio(total, finite.sum(axis=(-2, -1), keepdims=True))
 
 
-def _ratio(total: Array, count: npt.NDArray[np.int64] | Array) -> Array:
+def _ratio(total: Array, count: Integers | Array) -> Array:
     """Return the ratio, NaN where the count is not positive."""
     counted = np.where(count > 0, count, np.nan)
     return np.asarray(total / counted, dtype=np.float64)
@@ -234,7 +233,7 @@ def _window_sum(values: Array) -> Array:
 
 
 def _shares(
-    dark_seconds: Array, sessions: list[npt.NDArray[np.intp]], seconds: Array, method: _DarkMethod
+    dark_seconds: Array, sessions: list[Indices], seconds: Array, method: _DarkMethod
 ) -> Array:
     """Return the weight of each session at each time, (time, session)."""
     middles = np.array([dark_seconds[files].mean() for files in sessions])

@@ -11,13 +11,10 @@ from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal import _line_fit
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
-Indices = npt.NDArray[np.intp]
 
 _VARIANCES: Final = [_line_fit.SLOPE_VARIANCE, _line_fit.CENTRE_VARIANCE]
 
@@ -42,7 +39,7 @@ class GluedSignal:
     intercept_standard_error: Array
     chi2: Array
     """(...), of the line."""
-    degrees_of_freedom: npt.NDArray[np.int64]
+    degrees_of_freedom: Integers
     start: Array
     """(...), m: first bin of the window; NaN where there is none."""
     stop: Array
@@ -59,9 +56,7 @@ class GluedSignal:
     """(...): a poor fit by chi-square, and with `photon_change` too: one channel is wrong."""
 
 
-def lit_bins(
-    power: Array, variance: Array, highest: npt.ArrayLike = np.inf
-) -> npt.NDArray[np.int64]:
+def lit_bins(power: Array, variance: Array, highest: npt.ArrayLike = np.inf) -> Integers:
     """Return the number of bins, (...), whose smoothed signal is `Thresholds.least_snr` of noise.
 
     `power` and `variance` are (..., range); signals above `highest`, (...), do not count.
@@ -254,7 +249,7 @@ def _misfits(lines: Array) -> Booleans:
         return np.asarray(lines[:, _line_fit.CHI2] > largest)
 
 
-def _degrees_of_freedom(lines: Array) -> npt.NDArray[np.int64]:
+def _degrees_of_freedom(lines: Array) -> Integers:
     return np.maximum(np.nan_to_num(lines[:, _line_fit.POINTS]).astype(np.int64) - 2, 0)
 
 

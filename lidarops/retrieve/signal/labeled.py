@@ -18,12 +18,11 @@ from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECON
 from lidarops.records import DetectionMode
 from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Block
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-_Block = npt.NDArray[Any]
 
 DEAD_TIME_ERROR: Final = "dead_time_standard_error"
 """Attribute of the power of photon counting, s."""
@@ -248,7 +247,7 @@ def dead_time_error(profiles: xr.Dataset, background: xr.DataArray) -> xr.DataAr
     return error
 
 
-def dead_time_change(profiles: xr.Dataset) -> tuple[_Block, float] | None:
+def dead_time_change(profiles: xr.Dataset) -> tuple[Block, float] | None:
     """Return the change of power with one standard error of the dead time, and a factor.
 
     That of a background is the factor times its square (`dead_time_error`); None for analog.
@@ -342,14 +341,14 @@ class ActualNoise(NamedTuple):
     See `lidarops.retrieve.signal.noise_correlation`.
     """
 
-    variance: _Block
+    variance: Block
     """(..., range): raised where the noise exceeds it; of glued channels from the middle of the
     gluing window on, because before it the noise is that of the analog channel."""
-    excess: _Block
+    excess: Block
     """(...), the factor."""
-    correlation_length: _Block
+    correlation_length: Block
     """(...), bins; of glued channels at least that of the analog part. 1 where not `known`."""
-    known: _Block
+    known: Block
     """(...), False where too few bins are complete to tell excess and correlation."""
 
 
@@ -369,7 +368,7 @@ def actual_noise(profiles: xr.Dataset) -> ActualNoise:
 
 def counts_per_power(
     profiles: xr.Dataset, shots: npt.ArrayLike, *, glued: bool = False
-) -> _Block | None:
+) -> Block | None:
     """Return the counts of a bin per MHz of power, (time,); None but for photon counting.
 
     Parameters
@@ -426,11 +425,11 @@ def _stated_length(profiles: xr.Dataset) -> xr.DataArray:
 
 
 def _actual_noise(
-    power: _Block,
-    variance: _Block,
-    glued_until: _Block,
-    stated_length: _Block,
-    distance: _Block,
+    power: Block,
+    variance: Block,
+    glued_until: Block,
+    stated_length: Block,
+    distance: Block,
 ) -> ActualNoise:
     rows = (-1, distance.size)
     noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
@@ -485,23 +484,23 @@ _DARK_TOGETHER: Final = 32
 """Dark files that are converted together, which bounds the memory of the conversion."""
 
 
-def _photons(counts: _Block, shots: _Block, **settings: Any) -> tuple[_Block, ...]:
+def _photons(counts: Block, shots: Block, **settings: Any) -> tuple[Block, ...]:
     return _parts(counts_to_signal.photon_signal(counts, shots, **settings))
 
 
-def _parts(signal: counts_to_signal.Signal) -> tuple[_Block, ...]:
+def _parts(signal: counts_to_signal.Signal) -> tuple[Block, ...]:
     return signal.power, signal.variance, signal.quality, signal.correlation_length
 
 
 def _analog(
-    counts: _Block,
-    shots: _Block,
-    input_range: _Block,
-    times: _Block | None = None,
+    counts: Block,
+    shots: Block,
+    input_range: Block,
+    times: Block | None = None,
     *,
     dark: DarkSignals | None = None,
     **settings: Any,
-) -> tuple[_Block, ...]:
+) -> tuple[Block, ...]:
     if dark is not None and times is not None:
         at_times = dark.at(times.astype("datetime64[ns]"))
         settings |= {"dark": at_times.dark, "dark_variance": at_times.variance}
@@ -511,16 +510,16 @@ def _analog(
 
 
 def _corrected(
-    power: _Block,
-    variance: _Block,
-    quality: _Block,
-    glued_until: _Block,
-    stated_length: _Block,
+    power: Block,
+    variance: Block,
+    quality: Block,
+    glued_until: Block,
+    stated_length: Block,
     *,
-    range: _Block,  # noqa: A002
+    range: Block,  # noqa: A002
     background_range: tuple[float, float],
     estimate: Callable[..., Background],
-) -> tuple[_Block, ...]:
+) -> tuple[Block, ...]:
     noise = _actual_noise(power, variance, glued_until, stated_length, range)
     length = noise.correlation_length
     sky = estimate(power, range, noise.variance * length[..., np.newaxis], background_range)

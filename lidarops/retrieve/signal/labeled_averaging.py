@@ -12,6 +12,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
+from lidarops.retrieve.common.arrays import Array, Flags
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal.averaging import Averages, RunningMean, join_bits
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
@@ -22,9 +23,7 @@ MEANS_TOGETHER: Final = 16
 """Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
-Shared = Callable[[npt.NDArray[np.datetime64]], npt.NDArray[np.float64]]
-Array = npt.NDArray[np.float64]
-Bits = npt.NDArray[np.int32]
+Shared = Callable[[npt.NDArray[np.datetime64]], Array]
 Units = dict[str, dict[str, Any]]
 
 
@@ -34,11 +33,11 @@ class PartSums:
 
     sums: RunningMean
     lengths: RunningMean
-    quality: Bits
+    quality: Flags
     """(part, range), without INPUT_MISSING."""
-    profiles: Bits
+    profiles: Flags
     """(part,), their numbers."""
-    shots: Bits
+    shots: Flags
     units: Units
     """Attributes of power, variance and range."""
 
@@ -219,10 +218,10 @@ class ClockAverage:
         self,
         means: slice,
         values: Averages,
-        quality: Bits,
+        quality: Flags,
         length: Array,
-        profiles: Bits,
-        shots: Bits,
+        profiles: Flags,
+        shots: Flags,
         units: Units,
     ) -> xr.Dataset:
         """Return means with their coordinates, as `completed` yields them.

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
+from lidarops.retrieve.common.arrays import Array, Block
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
 from lidarops.retrieve.signal.labeled import (
@@ -24,10 +24,8 @@ from lidarops.retrieve.signal.labeled import (
 )
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
-Array = npt.NDArray[np.float64]
 Slope = tuple[float, float]
 """MHz mV-1, and its standard error."""
-_Block = npt.NDArray[Any]
 
 UNKNOWN_SLOPE: Final[Slope] = (math.nan, math.nan)
 
@@ -218,19 +216,19 @@ def _whole_profiles(array: xr.DataArray) -> xr.DataArray:
 
 
 def _glue(
-    analog: _Block,
-    analog_variance: _Block,
-    analog_quality: _Block,
-    photon: _Block,
-    photon_variance: _Block,
-    photon_quality: _Block,
-    correlation_length: _Block,
+    analog: Block,
+    analog_variance: Block,
+    analog_quality: Block,
+    photon: Block,
+    photon_variance: Block,
+    photon_quality: Block,
+    correlation_length: Block,
     *,
     lag: float,
-    distance: npt.NDArray[np.float64],
+    distance: Array,
     dead_time_error: float,
     slope: Slope | None,
-) -> tuple[_Block, ...]:
+) -> tuple[Block, ...]:
     # Bins at negative ranges hold no light and are not glued.
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
     r = distance[ahead]
@@ -266,7 +264,7 @@ def _glue(
     alone &= np.maximum(by_analog, by_photons) >= THRESHOLDS.fewest_glued_bins
     records = line, alone & (by_analog >= by_photons), alone & (by_analog < by_photons)
 
-    def of_records(*values: _Block) -> _Block:
+    def of_records(*values: Block) -> Block:
         """Return those of the line, of analog or of photon counting alone, (..., range)."""
         joined = np.full(photon.shape, np.nan)
         joined[..., ahead] = np.select([r[..., np.newaxis] for r in records], values, np.nan)
@@ -291,12 +289,12 @@ def _glue(
     return power, variance, quality.astype(np.int32), change, *slopes, *window
 
 
-def _unsaturated(power: _Block, quality: _Block) -> _Block:
+def _unsaturated(power: Block, quality: Block) -> Block:
     """Return power without bins that were saturated in some profiles of a mean."""
     return np.where((quality & np.int32(Quality.SATURATED)) != 0, np.nan, power)
 
 
-def _shifted_quality(quality: _Block, lag: float) -> _Block:
+def _shifted_quality(quality: Block, lag: float) -> Block:
     """Return the bits of the two bins from which a shifted bin is interpolated."""
     index = np.arange(quality.shape[-1])
     shifted = np.zeros_like(quality)

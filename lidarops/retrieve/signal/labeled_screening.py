@@ -12,6 +12,7 @@ import xarray as xr
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.flags import WITHHELD
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.signal.averaging import Averages
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, ClockAverage, PartSums
@@ -22,9 +23,6 @@ from lidarops.retrieve.signal.screening import (
     tail_of_cells,
 )
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +195,7 @@ class ScreenedAverage:
         )
 
 
-def _mean(sums: PartSums, cells: PartCells, kept: Mask) -> _Mean:
+def _mean(sums: PartSums, cells: PartCells, kept: Booleans) -> _Mean:
     """Return the mean of the parts that are kept."""
     parts = THRESHOLDS.most_parts
     shape = parts, cells.power.shape[1]

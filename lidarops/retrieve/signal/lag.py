@@ -8,19 +8,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.compiled_code import summing
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
+from lidarops.retrieve.common.compiled_code import compiled, summing
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
 
 _PARTS: Final = 16
 """Parts of the range in the jackknife estimate of the standard error."""
@@ -48,7 +45,7 @@ class LagEstimate:
     """(...): the confidence is at least 99.9 %, and the peak is not at the largest lag."""
     correlation: Array
     """(..., lag): correlation of the noise of both at each of `lags`."""
-    lags: npt.NDArray[np.int64]
+    lags: Integers
     """(lag,), bins."""
 
 
@@ -219,12 +216,12 @@ def _product(first: Any, second: Any) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _add_products(
     first: Array,
     second: Array,
     reach: int,
-    edges: npt.NDArray[np.intp],
+    edges: Indices,
     sums: Array,
 ) -> None:
     """Add the products of `second` and of `first` shifted by each lag, by parts of the range.
@@ -249,11 +246,11 @@ def _add_products(
                     sums[c, p, j] += _product(x[start : start + segment.size], segment)
 
 
-def _peak(total: Array, lags: npt.NDArray[np.int64]) -> tuple[Array, Array, Booleans]:
+def _peak(total: Array, lags: Integers) -> tuple[Array, Array, Booleans]:
     """Return the lag, its distance to the centroid of four bins, and whether it is the largest."""
     index = np.argmax(total[..., _MARGIN:-_MARGIN], axis=-1) + _MARGIN
 
-    def at(shift: int | npt.NDArray[np.int64]) -> Array:
+    def at(shift: int | Integers) -> Array:
         return np.take_along_axis(total, np.asarray(index + shift)[..., np.newaxis], -1)[..., 0]
 
     side = np.where(at(1) >= at(-1), 1, -1)
@@ -284,7 +281,7 @@ def _correct_for_high_pass(peak: Array, beside: Array) -> tuple[Array, Array]:
     )
 
 
-def _jackknife(sums: Array, lags: npt.NDArray[np.int64]) -> Array:
+def _jackknife(sums: Array, lags: Integers) -> Array:
     """Return the jackknife standard error of the lag over the parts of the range."""
     without = sums.sum(axis=-2, keepdims=True) - sums
     estimates = _peak(without, lags)[0]
@@ -293,7 +290,7 @@ def _jackknife(sums: Array, lags: npt.NDArray[np.int64]) -> Array:
     return scatter
 
 
-def _confidence(total: Array, lags: npt.NDArray[np.int64], lag: Array) -> Array:
+def _confidence(total: Array, lags: Integers, lag: Array) -> Array:
     """Return the probability that the highest of as many random correlations is lower."""
     far = np.abs(lags - lag[..., np.newaxis]) > THRESHOLDS.peak_width
     tried = lags.size - 2 * _MARGIN

@@ -12,18 +12,14 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +33,7 @@ class NoiseCorrelation:
     within its error."""
     relative_error: Array
     """(profile,): standard error of `length` over its value; 0 where bins are independent."""
-    known: npt.NDArray[np.bool_]
+    known: Booleans
     """(profile,); elsewhere independent noise of the stated variance is assumed."""
 
     @property
@@ -117,7 +113,7 @@ def _polynomials(size: int) -> Array:
     return np.linalg.qr(np.stack([place**0, place, place**2], axis=-1))[0].T
 
 
-@_compiled
+@compiled
 def _subtract_parabola(values: Any, basis: Array, residual: Array) -> None:
     residual[:] = values
     for j in range(basis.shape[0]):
@@ -128,7 +124,7 @@ def _subtract_parabola(values: Any, basis: Array, residual: Array) -> None:
             residual[i] -= product * basis[j, i]
 
 
-@_compiled
+@compiled
 def _product(residual: Array, distance: int) -> float:
     total = 0.0
     for i in range(residual.size - distance):
@@ -136,7 +132,7 @@ def _product(residual: Array, distance: int) -> float:
     return total
 
 
-@_compiled
+@compiled
 def _load_sections(
     power: Array, variance: Array, basis: Array, residuals: Array, moments: Array
 ) -> int:
@@ -167,7 +163,7 @@ def _load_sections(
     return kept
 
 
-@_compiled
+@compiled
 def _correlate(
     residuals: Array, squares: Array, fitted: int, limit: float, correlations: Array
 ) -> int:
@@ -187,7 +183,7 @@ def _correlate(
     return correlations.size
 
 
-@_compiled
+@compiled
 def _estimate(
     power: Array,
     variance: Array,

@@ -6,24 +6,19 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtri
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _SIGNS: Final = (1.0, -1.0)
 
 _CONTRAST_WAVELENGTH: Final = 532e-9
 """m; wavelength of `Thresholds.cloud_contrast`."""
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +56,7 @@ def skewness_margin(quantile: Array | float) -> Array:
 
 
 def cells_of_parts(
-    sums: Array, usable: Mask, first: int, past: int, bins: int
+    sums: Array, usable: Booleans, first: int, past: int, bins: int
 ) -> tuple[Array, Array]:
     """Return power and variance of means over cells of a number of bins, (part, cell).
 
@@ -92,9 +87,9 @@ def tail_of_cells(power: Array, variance: Array) -> tuple[Array, Array]:
     return mean, np.sqrt(noise) / count
 
 
-@_compiled
+@compiled
 def _fill_cells(
-    sums: Array, usable: Mask, first: int, bins: int, power: Array, variance: Array
+    sums: Array, usable: Booleans, first: int, bins: int, power: Array, variance: Array
 ) -> None:
     for part in range(power.shape[0]):
         for cell in range(power.shape[1]):
@@ -114,7 +109,7 @@ def _fill_cells(
             variance[part, cell] = noise / (count * count) if known else np.nan
 
 
-def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Mask:
+def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Booleans:
     r"""Return the parts in which a cell exceeds that cell in all other parts by more than a factor.
 
     Let :math:`x_1 \ge x_2 \ge \dots` be the signals of one cell in the :math:`n` parts. The first
@@ -159,7 +154,7 @@ def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Mas
     return outlying if outlying.sum() <= most else np.zeros_like(outlying)
 
 
-@_compiled
+@compiled
 def _mark_parts(
     power: Array,
     variance: Array,
@@ -167,7 +162,7 @@ def _mark_parts(
     margin: Array,
     contrast: float,
     least: float,
-    outlying: Mask,
+    outlying: Booleans,
 ) -> None:
     """Mark the parts that exceed all others in a cell, by the test of either sign."""
     largest = np.empty(power.shape[0] // THRESHOLDS.fewest_parts + 1, dtype=np.intp)
@@ -186,10 +181,8 @@ def _mark_parts(
                     break
 
 
-@_compiled
-def _find_largest(
-    power: Array, variance: Array, cell: int, sign: float, largest: npt.NDArray[np.intp]
-) -> bool:
+@compiled
+def _find_largest(power: Array, variance: Array, cell: int, sign: float, largest: Indices) -> bool:
     """Find the parts with the largest power in a cell, descending; False where one is missing."""
     filled = 0
     for part in range(power.shape[0]):

@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
+from lidarops.retrieve.common.arrays import Array, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 
 LANES: Final = 16
 """Systems solved at a time, one in each lane of the vector registers."""
@@ -22,8 +20,6 @@ PAD: Final = 2
 """Rows of zeros at either end, in place of values outside the grid."""
 _LOGARITHM_EVERY: Final = 4
 """Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 def penalty(altitude: Array) -> Array:
@@ -73,7 +69,7 @@ def multiply_rows(bands: Array, rows: Array) -> Array:
     return out
 
 
-@_compiled
+@compiled
 def _load(rows: Array, profile: Integers, first: int, work: Array) -> None:
     """Transpose the rows of 16 systems into lanes; the last system fills unused lanes."""
     chosen = np.empty(LANES, dtype=np.int64)
@@ -85,7 +81,7 @@ def _load(rows: Array, profile: Integers, first: int, work: Array) -> None:
             lanes[j] = rows[chosen[j], k]
 
 
-@_compiled
+@compiled
 def _store(work: Array, first: int, out: Array) -> None:
     used = min(LANES, out.shape[0] - first)
     rows = out[first : first + used]
@@ -95,7 +91,7 @@ def _store(work: Array, first: int, out: Array) -> None:
             rows[j, k] = lanes[j]
 
 
-@_compiled
+@compiled
 def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
     """Factor the systems as L D L' and substitute forward.
 
@@ -133,7 +129,7 @@ def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
             far[j] = beyond
 
 
-@_compiled
+@compiled
 def _sweep_up(f: Array, c: Array) -> None:
     """Substitute back, and invert within the bands (Takahashi's recursion, `takahashi1973`).
 
@@ -159,7 +155,7 @@ def _sweep_up(f: Array, c: Array) -> None:
             c0[j] = d[j] - a * first - b * second
 
 
-@_compiled
+@compiled
 def _work(altitudes: int) -> tuple[Array, Array, Array, Array]:
     rows = altitudes + 2 * PAD
     return (
@@ -170,7 +166,7 @@ def _work(altitudes: int) -> tuple[Array, Array, Array, Array]:
     )
 
 
-@_compiled
+@compiled
 def solve_banded(
     bands: Array, right: Array, stiffness: Array, profile: Integers, lam: Array, out: Array
 ) -> None:
@@ -201,7 +197,7 @@ def solve_banded(
             _store(c[band], first, out[band + 1])
 
 
-@_compiled
+@compiled
 def _load_system(
     bands: Array, right: Array, profile: Integers, lam: Array, first: int,
     o: Array, b: Array, lams: Array,
@@ -213,7 +209,7 @@ def _load_system(
         lams[j] = lam[min(first + j, lam.size - 1)]
 
 
-@_compiled
+@compiled
 def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> None:
     """Fill the (4, lane) sums over altitudes of `banded_scores`, 16 systems at a time."""
     total[:] = 0.0
@@ -237,7 +233,7 @@ def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> 
         total[3, j] -= math.log(product[j])
 
 
-@_compiled
+@compiled
 def banded_scores(
     bands: Array,
     right: Array,

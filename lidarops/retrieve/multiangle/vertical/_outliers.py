@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
 
 USUAL_WEIGHT: Final = 1.0 - 2.0 / THRESHOLDS.bisquare**2 + 3.0 / THRESHOLDS.bisquare**4
 """Mean of the bisquare for normal deviates, by which weights are normalised."""
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-
-@_compiled
-def _jumps(depth: Array, information: Array, known: npt.NDArray[np.int64], count: int) -> bool:
+@compiled
+def _jumps(depth: Array, information: Array, known: Integers, count: int) -> bool:
     for i in range(1, count):
         k, before = known[i], known[i - 1]
         variance = 1.0 / information[k] + 1.0 / information[before]
@@ -28,7 +24,7 @@ def _jumps(depth: Array, information: Array, known: npt.NDArray[np.int64], count
     return False
 
 
-@_compiled
+@compiled
 def screen_outliers(estimates: Array, information: Array) -> Array:
     """Return the information with less weight for estimates that are far from their neighbours.
 

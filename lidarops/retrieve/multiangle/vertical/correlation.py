@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Final
 
-import numba
 import numpy as np
-import numpy.typing as npt
 
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
 
 LAGS: Final = 3
 """Largest distance of residuals that are multiplied, in altitudes."""
@@ -22,8 +18,6 @@ _FARTHEST: Final = 2
 _CANDIDATES: Final = np.arange(98) / 100.0
 """Correlations to choose from; beyond `highest_correlation` they are flagged, and 1 is excluded
 because its noise has no finite power at low frequencies (formula 1 of the page)."""
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +45,7 @@ class ResidualMoments:
         return ResidualMoments(*(getattr(self, field.name)[profiles] for field in fields(self)))
 
 
-@_compiled
+@compiled
 def _lag_sums(
     residual: Array, weight: Array, leverage: Array, variance: Array
 ) -> tuple[Array, Array, Array]:
@@ -149,7 +143,7 @@ def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
     return (float(_CANDIDATES[best]), float(amplitude[best])) if best > 0 else (0.0, 1.0)
 
 
-@_compiled
+@compiled
 def correlated_precision(information: Array, share: Array, correlation: float) -> Array:
     """Return the precision of the estimates as an autoregressive process along altitude.
 
@@ -196,7 +190,7 @@ def correlated_precision(information: Array, share: Array, correlation: float) -
     return bands
 
 
-@_compiled
+@compiled
 def _link(information: Array, share: Array, linked: Booleans) -> None:
     """Fill which altitudes have at least half of the correlated share of those on either side."""
     for k in range(share.size):
@@ -205,7 +199,7 @@ def _link(information: Array, share: Array, linked: Booleans) -> None:
         linked[k] = information[k] > 0.0 and enough
 
 
-@_compiled
+@compiled
 def _own_noise(share: Array, linked: Booleans, k: int) -> float:
     """Return the mean over links around an altitude of own over correlated noise."""
     total = count = 0.0
@@ -218,7 +212,7 @@ def _own_noise(share: Array, linked: Booleans, k: int) -> float:
     return total / count if count > 0.0 else 0.0
 
 
-@_compiled
+@compiled
 def gap_precision(information: Array, share: Array, correlation: float) -> Array:
     """Return the precision of estimates whose neighbours come from different beams.
 

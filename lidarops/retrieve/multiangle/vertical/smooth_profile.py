@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle.vertical import (
     _banded,
@@ -23,10 +23,6 @@ from lidarops.retrieve.multiangle.vertical import (
 )
 from lidarops.retrieve.multiangle.vertical import correlation as air_correlation
 from lidarops.retrieve.multiangle.vertical.correlation import ResidualMoments
-
-Array = npt.NDArray[np.float64]
-Booleans = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
 
 _UNIFORM: Final = 1e-3
 """Largest relative deviation of a step from the mean step; allows for rounded altitudes."""
