@@ -17,30 +17,7 @@ import numpy as np
 from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.usable import HUGE
-from lidarops.retrieve.homogeneous._estimate import (
-    AMPLITUDE,
-    AMPLITUDE_RELATIVE_VARIANCE,
-    BACKGROUND,
-    BACKGROUND_BEND,
-    BACKGROUND_SLOPE_VARIANCE,
-    BACKGROUND_VARIANCE,
-    BINS,
-    BOUNDED,
-    CONSTANT,
-    EMPTY,
-    EXTINCTION,
-    EXTINCTION_VARIANCE,
-    FITTED,
-    LARGEST,
-    MEAN_RANGE,
-    MISFIT,
-    ROUNDING,
-    SECOND_DIFFERENCES,
-    SIGNAL_ENERGY,
-    STATUS,
-    TOO_SHORT,
-    TREND,
-)
+from lidarops.retrieve.homogeneous._estimate import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._misfit import judge_residuals
 from lidarops.retrieve.homogeneous._projection import (
     BLOCK,
@@ -256,64 +233,64 @@ def describe(
     p: Point,
     tau: float,
     sums: Sums,
-    row: Array,
+    row: Any,
 ) -> None:
     """Write parameters and variances of a least-squares fit, in the scaled variables."""
     w0, free = sums.weight, sums.free
-    row[BACKGROUND] = p.mean_z - p.b * p.mean_phi
-    row[AMPLITUDE] = p.b
-    row[EXTINCTION] = tau
-    row[SIGNAL_ENERGY] = p.b * p.b * p.norm
-    row[EXTINCTION_VARIANCE] = 1.0 / (p.b * p.b * p.slope_norm)
-    row[BACKGROUND_SLOPE_VARIANCE] = p.mean_t * p.mean_t / p.slope_norm
-    row[BACKGROUND_VARIANCE] = (
-        free / w0 + p.mean_phi * p.mean_phi / p.norm + row[BACKGROUND_SLOPE_VARIANCE]
+    row.background = p.mean_z - p.b * p.mean_phi
+    row.amplitude = p.b
+    row.extinction = tau
+    row.signal_energy = p.b * p.b * p.norm
+    row.extinction_variance = 1.0 / (p.b * p.b * p.slope_norm)
+    row.background_slope_variance = p.mean_t * p.mean_t / p.slope_norm
+    row.background_variance = (
+        free / w0 + p.mean_phi * p.mean_phi / p.norm + row.background_slope_variance
     )
     # Extinction moves the logarithm of B by twice the range of the centroid.
     lever = 2.0 * (g.start / g.length + p.centroid)
-    row[AMPLITUDE_RELATIVE_VARIANCE] = (
-        1.0 / row[SIGNAL_ENERGY] + lever * lever * row[EXTINCTION_VARIANCE]
+    row.amplitude_relative_variance = (
+        1.0 / row.signal_energy + lever * lever * row.extinction_variance
     )
-    row[MEAN_RANGE] = product(s.w, g.x) / w0
-    row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
+    row.mean_range = product(s.w, g.x) / w0
+    row.bounded = tau <= g.nodes[0] or tau >= g.nodes[-1]
 
 
 @inlined
-def _polish(p: Point, w0: float, left: tuple[float, float, float], row: Array) -> None:
+def _polish(p: Point, w0: float, left: tuple[float, float, float], row: Any) -> None:
     """Take the step that the residuals leave, which in thin sections moments are too coarse for."""
     level, shape, slope = left[0] / w0, left[1] / p.norm, left[2] / p.slope_norm
-    row[BACKGROUND] += level - shape * p.mean_phi - slope * p.mean_t
-    row[AMPLITUDE] += shape + 2.0 * p.centroid * slope
-    row[EXTINCTION] += slope / p.b
-    row[MISFIT] -= left[0] * level + left[1] * shape + left[2] * slope
+    row.background += level - shape * p.mean_phi - slope * p.mean_t
+    row.amplitude += shape + 2.0 * p.centroid * slope
+    row.extinction += slope / p.b
+    row.misfit -= left[0] * level + left[1] * shape + left[2] * slope
 
 
 @inlined
-def unscale(g: Any, reference: float, scale: float, unit: float, row: Array) -> None:
+def unscale(g: Any, reference: float, scale: float, unit: float, row: Any) -> None:
     """Convert a row from scaled variables to SI units; noise terms to units of the noise."""
     energy = scale * (scale * unit)
-    sign = math.copysign(1.0, row[AMPLITUDE])
-    logarithm = math.log(abs(row[AMPLITUDE])) + math.log(scale)
-    logarithm += 2.0 * math.log(g.start) + 2.0 * row[EXTINCTION] * g.start / g.length
-    row[BACKGROUND_BEND] *= scale * row[AMPLITUDE] * g.length
-    row[BACKGROUND] = reference + scale * row[BACKGROUND]
-    row[AMPLITUDE] = sign * math.exp(logarithm)
-    row[EXTINCTION] /= g.length
-    row[BACKGROUND_VARIANCE] /= unit
-    row[BACKGROUND_SLOPE_VARIANCE] /= unit
-    row[AMPLITUDE_RELATIVE_VARIANCE] /= energy
-    row[EXTINCTION_VARIANCE] /= energy * g.length * g.length
-    row[SIGNAL_ENERGY] *= energy
-    row[MISFIT] *= energy
-    row[SECOND_DIFFERENCES] *= energy
-    row[TREND] *= energy
-    row[LARGEST] *= math.sqrt(energy)
-    row[MEAN_RANGE] = g.start + g.length * row[MEAN_RANGE]
+    sign = math.copysign(1.0, row.amplitude)
+    logarithm = math.log(abs(row.amplitude)) + math.log(scale)
+    logarithm += 2.0 * math.log(g.start) + 2.0 * row.extinction * g.start / g.length
+    row.background_bend *= scale * row.amplitude * g.length
+    row.background = reference + scale * row.background
+    row.amplitude = sign * math.exp(logarithm)
+    row.extinction /= g.length
+    row.background_variance /= unit
+    row.background_slope_variance /= unit
+    row.amplitude_relative_variance /= energy
+    row.extinction_variance /= energy * g.length * g.length
+    row.signal_energy *= energy
+    row.misfit *= energy
+    row.second_differences *= energy
+    row.trend *= energy
+    row.largest *= math.sqrt(energy)
+    row.mean_range = g.start + g.length * row.mean_range
 
 
 @inlined
 def begin(
-    power: Any, mode: tuple[float, float, float], s: ProjectionScratch, row: Array
+    power: Any, mode: tuple[float, float, float], s: ProjectionScratch, row: Any
 ) -> tuple[float, float, Sums]:
     """Load a profile and write its status; return its reference, scale and sums.
 
@@ -324,25 +301,25 @@ def begin(
         The unit of the weights that `weigh` filled; the relative rounding error of the power; the
         given background, or NaN.
     s : ProjectionScratch
-    row : (column,) float64
+    row : `ROW`
     """
     unit, rounding, background = mode
     last = _last_valid(power, s)
     reference = np.float64(power[last]) if math.isnan(background) else background
     bins, total = _load(power, reference, s)
     free = 1.0 if math.isnan(background) else 0.0
-    row[BINS] = bins
+    row.bins = bins
     if bins < THRESHOLDS.fewest_solved_bins:
-        row[STATUS] = EMPTY if last < 0 else TOO_SHORT
+        row.status = EMPTY if last < 0 else TOO_SHORT
         return reference, 1.0, Sums(bins, total, 0.0, 0.0, free)
     largest = largest_of(s.z)
-    row[ROUNDING] = (rounding * (abs(reference) + largest)) ** 2 * unit * total / bins
+    row.rounding = (rounding * (abs(reference) + largest)) ** 2 * unit * total / bins
     if largest < TINY:
-        row[STATUS] = CONSTANT
-        row[BACKGROUND] = reference
-        row[BACKGROUND_VARIANCE] = 1.0 / (total * unit)
+        row.status = CONSTANT
+        row.background = reference
+        row.background_variance = 1.0 / (total * unit)
         return reference, 1.0, Sums(bins, total, 0.0, 0.0, free)
-    row[STATUS] = FITTED
+    row.status = FITTED
     scale = power_of_two(largest)
     value, square = _scale(s, 1.0 / scale)
     return reference, scale, Sums(bins, total, value, square, free)
@@ -357,7 +334,7 @@ def _solve(
     background: Array,
     g: Grid,
     s: ProjectionScratch,
-    out: Array,
+    out: Any,
 ) -> None:
     unit = 1.0
     for k in range(power.shape[0]):
@@ -367,12 +344,12 @@ def _solve(
         row = out[k]
         mode = (unit, rounding, background[k % background.size])
         reference, scale, sums = begin(power[k], mode, s, row)
-        if row[STATUS] == FITTED:
+        if row.status == FITTED:
             tau, p = find_extinction(g, s, sums)
             describe(g, s, p, tau, sums, row)
             spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
             left = judge_residuals(g, s, p, tau, sums, spacing, row)
-            if sums.free > 0.0 and row[BOUNDED] == 0.0:
+            if sums.free > 0.0 and row.bounded == 0.0:
                 _polish(p, sums.weight, left, row)
             unscale(g, reference, scale, unit, row)
 
@@ -385,7 +362,7 @@ def solve_direct(
     rounding: float,
     background: Array,
     g: Grid,
-    out: Array,
+    out: Any,
 ) -> None:
     """Fit every profile of a batch.
 
@@ -401,7 +378,7 @@ def solve_direct(
         Given ones, or NaN where they are to be fitted.
     g : Grid
         Of `make_grid`.
-    out : (profile, column) float64
-        Filled with NaN; receives the columns of `lidarops.retrieve.homogeneous._estimate`.
+    out : (profile,) `ROW`
+        Filled with NaN; receives the fields of `lidarops.retrieve.homogeneous._estimate`.
     """
     _solve(power, noise, is_variance, rounding, background, g, make_scratch(g), out)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Final
 
+import numpy as np
+
 from lidarops.retrieve.common.arrays import Array
 
 # Status of a profile.
@@ -61,27 +63,6 @@ class PathEstimate:
 
 
 COLUMNS: Final = tuple(field.name for field in fields(PathEstimate))
-"""Fields of `PathEstimate`: the columns of the table that a kernel fills."""
-(
-    STATUS,
-    BINS,
-    BACKGROUND,
-    AMPLITUDE,
-    EXTINCTION,
-    BACKGROUND_VARIANCE,
-    BACKGROUND_SLOPE_VARIANCE,
-    AMPLITUDE_RELATIVE_VARIANCE,
-    EXTINCTION_VARIANCE,
-    SIGNAL_ENERGY,
-    MISFIT,
-    SECOND_DIFFERENCES,
-    DIFFERENCE_COUNT,
-    LARGEST,
-    TREND,
-    TREND_COUNT,
-    ROUNDING,
-    MEAN_RANGE,
-    BOUNDED,
-    BACKGROUND_BEND,
-    EXTINCTION_BEND,
-) = range(len(COLUMNS))
+"""Fields of `PathEstimate`."""
+ROW: Final = np.dtype([(name, np.float64) for name in COLUMNS])
+"""Type of the record of a profile that a kernel fills."""

@@ -14,19 +14,7 @@ from lidarops.retrieve.homogeneous._direct import (
     unscale,
     weigh,
 )
-from lidarops.retrieve.homogeneous._estimate import (
-    AMPLITUDE,
-    AMPLITUDE_RELATIVE_VARIANCE,
-    BACKGROUND,
-    BACKGROUND_SLOPE_VARIANCE,
-    BACKGROUND_VARIANCE,
-    BOUNDED,
-    EXTINCTION,
-    EXTINCTION_VARIANCE,
-    FITTED,
-    SIGNAL_ENERGY,
-    STATUS,
-)
+from lidarops.retrieve.homogeneous._estimate import FITTED
 from lidarops.retrieve.homogeneous._misfit import describe_bend_given, judge_residuals
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
@@ -39,17 +27,17 @@ from lidarops.retrieve.homogeneous._projection import (
 
 
 @inlined
-def _describe_given(p: Point, w0: float, row: Array) -> None:
+def _describe_given(p: Point, w0: float, row: Any) -> None:
     """Overwrite the variances for a given extinction, whose variance is 0."""
-    row[EXTINCTION_VARIANCE] = 0.0
-    row[BACKGROUND_SLOPE_VARIANCE] = 0.0
-    row[BACKGROUND_VARIANCE] = 1.0 / w0 + p.mean_phi * p.mean_phi / p.norm
-    row[AMPLITUDE_RELATIVE_VARIANCE] = 1.0 / row[SIGNAL_ENERGY]
-    row[BOUNDED] = 0.0
+    row.extinction_variance = 0.0
+    row.background_slope_variance = 0.0
+    row.background_variance = 1.0 / w0 + p.mean_phi * p.mean_phi / p.norm
+    row.amplitude_relative_variance = 1.0 / row.signal_energy
+    row.bounded = 0.0
 
 
 @inlined
-def _step(g: Grid, p: Point, tau: float, row: Array) -> None:
+def _step(g: Grid, p: Point, tau: float, row: Any) -> None:
     """Write the linear step from a prior, with errors to first order in the two coefficients.
 
     About the centroid, the coefficients of shape and slope are independent.
@@ -57,20 +45,20 @@ def _step(g: Grid, p: Point, tau: float, row: Array) -> None:
     slope = p.gradient / (p.b * p.slope_norm)
     step, lever = slope / p.b, 2.0 * (g.start / g.length + p.centroid)
     by_slope, by_shape = 1.0 / p.b, -step / p.b
-    row[EXTINCTION_VARIANCE] = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
+    row.extinction_variance = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
     by_slope, by_shape = lever * by_slope, 1.0 / p.b + lever * by_shape
-    row[AMPLITUDE_RELATIVE_VARIANCE] = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
-    row[BACKGROUND] -= slope * p.mean_t
-    row[EXTINCTION] = tau + step
-    row[AMPLITUDE] = p.b * math.exp(2.0 * step * p.centroid)
+    row.amplitude_relative_variance = by_slope**2 / p.slope_norm + by_shape**2 / p.norm
+    row.background -= slope * p.mean_t
+    row.extinction = tau + step
+    row.amplitude = p.b * math.exp(2.0 * step * p.centroid)
 
 
 @inlined
-def _moved(p: Point, row: Array) -> Point:
+def _moved(p: Point, row: Any) -> Point:
     """Return the point with the background and amplitude of a row."""
     return Point(
-        row[AMPLITUDE],
-        row[BACKGROUND] + row[AMPLITUDE] * p.mean_phi,
+        row.amplitude,
+        row.background + row.amplitude * p.mean_phi,
         p.mean_phi,
         p.mean_t,
         p.centroid,
@@ -92,7 +80,7 @@ def _solve_from(
     extinction: Array,
     g: Grid,
     s: ProjectionScratch,
-    out: Array,
+    out: Any,
     is_prior: bool,
 ) -> None:
     unit = 1.0
@@ -101,14 +89,14 @@ def _solve_from(
             unit = weigh(noise[k], is_variance, s)
         row = out[k]
         reference, scale, sums = begin(power[k], (unit, rounding, math.nan), s, row)
-        if row[STATUS] == FITTED:
+        if row.status == FITTED:
             tau = g.length * extinction[k % extinction.size]
             p = evaluate(tau, g, s, sums)
             describe(g, s, p, tau, sums, row)
             if is_prior:
                 _step(g, p, tau, row)
-                tau = row[EXTINCTION]
-                row[BOUNDED] = tau <= g.nodes[0] or tau >= g.nodes[-1]
+                tau = row.extinction
+                row.bounded = tau <= g.nodes[0] or tau >= g.nodes[-1]
                 p = _moved(evaluate(tau, g, s, sums), row)
             spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
             judge_residuals(g, s, p, tau, sums, spacing, row)
@@ -126,7 +114,7 @@ def solve_from(
     rounding: float,
     extinction: Array,
     g: Grid,
-    out: Array,
+    out: Any,
     is_prior: bool,
 ) -> None:
     """Fit background and amplitude at extinctions, (profile or 1,), m-1: given ones, or priors.

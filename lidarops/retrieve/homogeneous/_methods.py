@@ -10,17 +10,18 @@ from typing import Final, cast
 import numpy as np
 
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Integers
+from lidarops.retrieve.common.arrays import Array, Block, Booleans, Flags, Integers
 from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.homogeneous import _direct, _given, _linearized, _propagation
-from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, PathEstimate
+from lidarops.retrieve.homogeneous._estimate import COLUMNS, CONSTANT, FITTED, ROW, PathEstimate
 from lidarops.retrieve.homogeneous._fit_quality import (
     CountMoments,
     curved_widening,
     judge_fit,
 )
-from lidarops.retrieve.homogeneous._problem import PathProblem, PathSolution
+from lidarops.retrieve.homogeneous._problem import HomogeneousResult, PathProblem
 from lidarops.retrieve.homogeneous._projection import make_grid
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
@@ -36,12 +37,12 @@ class _AddedVariances:
     extinction: Array
 
 
-def solve_by_direct_fit(problem: PathProblem) -> PathSolution:
+def solve_by_direct_fit(problem: PathProblem) -> HomogeneousResult:
     """Solve by least squares for all three unknowns."""
     return _solution(_estimate(problem, _direct.solve_direct, _FITTED_BACKGROUND), problem)
 
 
-def solve_by_linearization(problem: PathProblem) -> PathSolution:
+def solve_by_linearization(problem: PathProblem) -> HomogeneousResult:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
     fit = _estimate(problem, _given.solve_from, prior, is_prior=True)
@@ -51,7 +52,7 @@ def solve_by_linearization(problem: PathProblem) -> PathSolution:
     return _solution(fit, problem, added=added)
 
 
-def solve_with_known_extinction(problem: PathProblem) -> PathSolution:
+def solve_with_known_extinction(problem: PathProblem) -> HomogeneousResult:
     """Solve for background and amplitude at the given extinction."""
     # `fit_homogeneous_path` has checked that it is given.
     extinction = cast("Array", problem.extinction)
@@ -59,7 +60,7 @@ def solve_with_known_extinction(problem: PathProblem) -> PathSolution:
     return _solution(fit, problem, unknowns=2)
 
 
-def solve_with_known_background(problem: PathProblem) -> PathSolution:
+def solve_with_known_background(problem: PathProblem) -> HomogeneousResult:
     """Solve for amplitude and extinction above the given background."""
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
@@ -67,12 +68,14 @@ def solve_with_known_background(problem: PathProblem) -> PathSolution:
     spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
         added = _AddedVariances(
-            variance, variance * spread[:, 3] ** 2, variance * spread[:, 4] ** 2
+            variance,
+            variance * spread["amplitude_slope"] ** 2,
+            variance * spread["extinction_slope"] ** 2,
         )
     return _solution(fit, problem, unknowns=2, added=added)
 
 
-def solve_by_cubic(problem: PathProblem) -> PathSolution:
+def solve_by_cubic(problem: PathProblem) -> HomogeneousResult:
     """Take the background from the cubic and propagate its error into the other parameters."""
     with np.errstate(divide="ignore"):
         variance = problem.noise if problem.known_variance else 1.0 / problem.noise
@@ -87,7 +90,9 @@ def solve_by_cubic(problem: PathProblem) -> PathSolution:
     return _fit_above(problem, estimate, gradients)
 
 
-def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Array) -> PathSolution:
+def _fit_above(
+    problem: PathProblem, estimate: BackgroundResult, gradients: Array
+) -> HomogeneousResult:
     """Fit amplitude and extinction above a background that depends on the same power."""
     background = estimate.background
     fit = _estimate(problem, _direct.solve_direct, background)
@@ -96,18 +101,19 @@ def _fit_above(problem: PathProblem, estimate: BackgroundResult, gradients: Arra
         fit,
         status=np.where(np.isnan(background), np.nan, fit.status),
         background=background,
-        background_variance=spread[:, 0],
+        background_variance=spread["background_variance"],
         background_slope_variance=np.zeros(1),
-        amplitude_relative_variance=spread[:, 1],
-        extinction_variance=spread[:, 2],
-        background_bend=spread[:, 5],
-        extinction_bend=fit.extinction_bend + spread[:, 4] * spread[:, 5],
+        amplitude_relative_variance=spread["amplitude_relative_variance"],
+        extinction_variance=spread["extinction_variance"],
+        background_bend=spread["background_bend"],
+        extinction_bend=fit.extinction_bend
+        + spread["extinction_slope"] * spread["background_bend"],
     )
     return _solution(fit, problem, quality=estimate.quality)
 
 
-def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Array:
-    out = np.empty((fit.extinction.size, 6))
+def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Block:
+    out = np.zeros(fit.extinction.size, _propagation.PROPAGATED)
     _propagation.propagate(
         frozen(problem.power),
         frozen(problem.noise),
@@ -125,11 +131,11 @@ def _estimate(
     problem: PathProblem, solve: Callable[..., None], *given: Array, **choice: bool
 ) -> PathEstimate:
     """Run a kernel with what is given beside the profiles."""
-    table = np.full((problem.power.shape[0], len(COLUMNS)), np.nan)
+    table = np.full(problem.power.shape[0], np.nan, ROW)
     grid = make_grid(problem.range, problem.bounds, _noise_spacing(problem))
     noise = (frozen(problem.noise), problem.known_variance, problem.rounding)
     solve(frozen(problem.power), *noise, *map(frozen, given), grid, table, **choice)
-    return PathEstimate(**dict(zip(COLUMNS, table.T, strict=True)))
+    return PathEstimate(**{name: table[name] for name in COLUMNS})
 
 
 def _noise_spacing(problem: PathProblem) -> Integers:
@@ -164,7 +170,7 @@ def _solution(
     unknowns: int = 3,
     quality: Flags = _NOTHING,
     added: _AddedVariances | None = None,
-) -> PathSolution:
+) -> HomogeneousResult:
     """Judge an estimate and return the solution."""
     if added is None:
         added = _AddedVariances(np.zeros(1), np.zeros(1), np.zeros(1))
@@ -197,18 +203,21 @@ def _solution(
         return np.where(valid, values, np.nan)
 
     known = constant & problem.known_variance
-    return PathSolution(
+    departure = THRESHOLDS.model_error * (np.abs(fit.extinction) + 1.0 / fit.mean_range)
+    # A signal bent by c (x - 1/2)^2 has slopes of -c and c over the length at its ends.
+    background_model = 2.0 * departure * np.abs(fit.background_bend)
+    extinction_model = departure * np.hypot(1.0, 2.0 * np.abs(fit.extinction_bend))
+    return HomogeneousResult(
         background=masked(fit.background, fitted | constant),
         background_standard_error=masked(background_error, fitted | known),
+        background_model_error=masked(background_model, fitted),
         amplitude=np.where(constant, 0.0, masked(fit.amplitude, fitted)),
         amplitude_standard_error=masked(amplitude_error, fitted),
         extinction=masked(fit.extinction, fitted),
         extinction_standard_error=masked(extinction_error, fitted),
+        extinction_model_error=masked(extinction_model, fitted),
         signal_to_noise=masked(signal_to_noise, fitted),
         reduced_chi2=masked(verdict.reduced_chi2, fitted),
-        mean_range=masked(fit.mean_range, fitted),
-        background_bend=masked(fit.background_bend, fitted),
-        extinction_bend=masked(fit.extinction_bend, fitted),
         valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
         quality=verdict.quality | quality,
     )

@@ -3,19 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lidarops.retrieve.common.arrays import Array
-from lidarops.retrieve.homogeneous._estimate import (
-    BACKGROUND_BEND,
-    DIFFERENCE_COUNT,
-    EXTINCTION_BEND,
-    LARGEST,
-    MISFIT,
-    SECOND_DIFFERENCES,
-    TREND,
-    TREND_COUNT,
-)
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
@@ -157,7 +147,7 @@ def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, f
 
 
 @inlined
-def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Array) -> None:
+def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Any) -> None:
     """Write the effect of a bent signal on the fit, relative to the amplitude.
 
     Parabolas about different ranges differ by shapes of the model only: the background is the
@@ -165,19 +155,19 @@ def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Array)
     """
     level, shape, slope = t.bent
     across = slope / p.slope_norm
-    row[BACKGROUND_BEND] = free * level / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
-    row[EXTINCTION_BEND] = across + 0.5 - p.centroid
+    row.background_bend = free * level / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
+    row.extinction_bend = across + 0.5 - p.centroid
 
 
 @inlined
-def describe_bend_given(p: Point, row: Array) -> None:
+def describe_bend_given(p: Point, row: Any) -> None:
     """Overwrite the same for a given extinction, which absorbs neither bend nor slope.
 
     The slope is as large as that of the bend at either end, and independent of it.
     """
-    bent = row[BACKGROUND_BEND] + row[EXTINCTION_BEND] * p.mean_t
-    row[BACKGROUND_BEND] = math.hypot(bent, 0.5 * p.mean_t)
-    row[EXTINCTION_BEND] = 0.0
+    bent = row.background_bend + row.extinction_bend * p.mean_t
+    row.background_bend = math.hypot(bent, 0.5 * p.mean_t)
+    row.extinction_bend = 0.0
 
 
 @inlined
@@ -188,7 +178,7 @@ def judge_residuals(
     tau: float,
     sums: Sums,
     noise_spacing: int,
-    row: Array,
+    row: Any,
 ) -> _Triple:
     """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal.
 
@@ -204,11 +194,11 @@ def judge_residuals(
         full = evaluate(tau, g, s, Sums(sums.bins, w0, sums.value, sums.square, 1.0))
         shapes = _sum_test_shapes(g.x, s.w, s.phi, full)
     residuals: _Residuals = _sum_residuals(g, s, p, full)
-    row[MISFIT] = residuals.energy
-    row[LARGEST] = math.sqrt(largest_of(s.residual))
-    row[TREND], row[TREND_COUNT] = _trend(shapes, residuals, full, w0)
-    row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = 0.0, 0.0
+    row.misfit = residuals.energy
+    row.largest = math.sqrt(largest_of(s.residual))
+    row.trend, row.trend_count = _trend(shapes, residuals, full, w0)
+    row.second_differences, row.difference_count = 0.0, 0.0
     if noise_spacing > 0:
         _fill_residuals(s, p)
-        row[SECOND_DIFFERENCES], row[DIFFERENCE_COUNT] = _second_differences(s, noise_spacing)
+        row.second_differences, row.difference_count = _second_differences(s, noise_spacing)
     return residuals.model

@@ -54,24 +54,45 @@ class PathProblem:
 
 
 @dataclass(frozen=True, slots=True)
-class PathSolution:
-    """Solution of a batch, (profile,) each; see `path_fit.HomogeneousResult` for the fields."""
+class HomogeneousResult:
+    """Parameters of a homogeneous path, with the leading axes of the power.
+
+    Standard errors are conditional on the model. A change of the profile along the model's own
+    shapes leaves no trace in the residuals: backscatter that decreases along the path as
+    ``exp(-R / H)`` mimics an extinction of 1 / (2 H), on a vertical path as on any other.
+    `extinction_model_error` and `background_model_error` allow for that, separately from the
+    random error; they are not bounds. ``lidarops bench stability`` gives the share of false values
+    for every kind of violation.
+    """
 
     background: Array
+    """P*, in the unit of the power."""
     background_standard_error: Array
+    """In the unit of the power; random error only."""
+    background_model_error: Array
+    """In the unit of the power: first-order change of the background by a signal whose logarithmic
+    slope departs from the model at both ends of the section, with opposite signs, as where
+    backscatter bends along the path. The departure is `Thresholds.model_error` times the slope at
+    mean range, 2 (absolute extinction + 1 / mean range)."""
     amplitude: Array
+    """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in the unit of the power times m2."""
     amplitude_standard_error: Array
+    """To first order. B is extrapolated to range zero: above some 30 percent, the interval holds
+    for the logarithm of B rather than for B."""
     extinction: Array
+    """m-1."""
     extinction_standard_error: Array
+    """m-1; random error only."""
+    extinction_model_error: Array
+    """m-1; `Thresholds.model_error` times (absolute extinction + 1 / mean range), for the departure
+    of the slope of `background_model_error` all along the section, and, in quadrature, the
+    first-order change of extinction by the bend there. The second term dominates where extinction
+    and background are hard to separate."""
     signal_to_noise: Array
     """Amplitude over its standard error at known extinction, with the sign of the amplitude."""
     reduced_chi2: Array
-    mean_range: Array
-    """m, weighted over the bins used; NaN where nothing was fitted."""
-    background_bend: Array
-    """Change of the background by a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1
-    along the section, times the length of the section; NaN where nothing was fitted."""
-    extinction_bend: Array
-    """The same for the extinction."""
+    """1 where the residuals are noise; relative to the estimated noise without a variance."""
     valid_bins: Flags
+    """Bins used."""
     quality: Flags
+    """Bits of `lidarops.flags.Quality`; 0 where no test failed."""

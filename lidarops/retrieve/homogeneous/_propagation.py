@@ -4,13 +4,27 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.common.usable import HUGE
+
+PROPAGATED: Final = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "background_variance",
+            "amplitude_relative_variance",
+            "extinction_variance",
+            "amplitude_slope",
+            "extinction_slope",
+            "background_bend",
+        )
+    ]
+)
 
 
 @compiled
@@ -28,7 +42,7 @@ def _propagate_profile(
     range_: Array,
     weights: Array,
     gradient: Array,
-    row: Array,
+    row: Any,
 ) -> None:
     """Fill the random variances of one profile, and its derivatives by the background."""
     norm = moment = 0.0
@@ -42,23 +56,22 @@ def _propagate_profile(
         slope += lever * lever * phi[i] * phi[i] * weights[i]
         whole += phi[i] * weights[i]
         tilted += lever * phi[i] * weights[i]
-    row[:] = 0.0
-    row[4] = -tilted / (b * slope)
-    row[3] = -whole / (b * norm) + 2.0 * centroid * row[4]
+    row.extinction_slope = -tilted / (b * slope)
+    row.amplitude_slope = -whole / (b * norm) + 2.0 * centroid * row.extinction_slope
     length, middle = range_[-1] - range_[0], 0.5 * (range_[0] + range_[-1])
     for i in range(phi.size):
         if weights[i] == 0.0:
             continue
-        row[5] += gradient[i] * b * phi[i] * (range_[i] - middle) ** 2 / length
+        row.background_bend += gradient[i] * b * phi[i] * (range_[i] - middle) ** 2 / length
         weighted = phi[i] * weights[i]
         lever = -2.0 * (range_[i] - centroid)
         extinction_gradient = lever * weighted / (b * slope)
         logarithm_gradient = weighted / (b * norm) + 2.0 * centroid * extinction_gradient
-        extinction_gradient += row[4] * gradient[i]
-        logarithm_gradient += row[3] * gradient[i]
-        row[0] += gradient[i] * gradient[i] / weights[i]
-        row[1] += logarithm_gradient * logarithm_gradient / weights[i]
-        row[2] += extinction_gradient * extinction_gradient / weights[i]
+        extinction_gradient += row.extinction_slope * gradient[i]
+        logarithm_gradient += row.amplitude_slope * gradient[i]
+        row.background_variance += gradient[i] * gradient[i] / weights[i]
+        row.amplitude_relative_variance += logarithm_gradient * logarithm_gradient / weights[i]
+        row.extinction_variance += extinction_gradient * extinction_gradient / weights[i]
 
 
 @compiled
@@ -70,7 +83,7 @@ def propagate(
     amplitude: Array,
     range_: Array,
     gradients: Array,
-    out: Array,
+    out: Any,
 ) -> None:
     """Propagate noise to first order, through a background that depends on the power too.
 
@@ -86,9 +99,8 @@ def propagate(
         m.
     gradients : (profile or 1, bin) float64
         Derivatives of the background with respect to the power.
-    out : (profile, 6) float64
-        Receives the variance of the background, the relative variance of the amplitude and the
-        variance of the extinction; the derivatives of the logarithm of the amplitude and of the
+    out : (profile,) `PROPAGATED`
+        In: 0. Receives variances; the derivatives of the logarithm of the amplitude and of the
         extinction with respect to the background; and the change of the background by a signal
         bent by ``(x - 1/2)^2``, times the length of the section.
     """

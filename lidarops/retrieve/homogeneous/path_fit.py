@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from enum import StrEnum
 from typing import Final
 
@@ -12,10 +12,12 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Flags
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.homogeneous import _methods
-from lidarops.retrieve.homogeneous._problem import PathProblem, PathSolution
+from lidarops.retrieve.homogeneous._problem import HomogeneousResult, PathProblem
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+
+__all__ = ["HomogeneousMethod", "HomogeneousResult", "fit_homogeneous_path"]
 
 
 class HomogeneousMethod(StrEnum):
@@ -28,7 +30,7 @@ class HomogeneousMethod(StrEnum):
     KNOWN_EXTINCTION = "known_extinction"
 
 
-_SOLVERS: Final[dict[HomogeneousMethod, Callable[[PathProblem], PathSolution]]] = {
+_SOLVERS: Final[dict[HomogeneousMethod, Callable[[PathProblem], HomogeneousResult]]] = {
     HomogeneousMethod.DIRECT: _methods.solve_by_direct_fit,
     HomogeneousMethod.CUBIC: _methods.solve_by_cubic,
     HomogeneousMethod.LINEARIZED: _methods.solve_by_linearization,
@@ -46,51 +48,6 @@ _TAKES: Final = {
     "lag": {HomogeneousMethod.CUBIC},
 }
 """Arguments that only these methods accept."""
-
-
-@dataclass(frozen=True, slots=True)
-class HomogeneousResult:
-    """Parameters of a homogeneous path, with the leading axes of the power.
-
-    Standard errors are conditional on the model. A change of the profile along the model's own
-    shapes leaves no trace in the residuals: backscatter that decreases along the path as
-    ``exp(-R / H)`` mimics an extinction of 1 / (2 H), on a vertical path as on any other.
-    `extinction_model_error` and `background_model_error` allow for that, separately from the
-    random error; they are not bounds. ``lidarops bench stability`` gives the share of false values
-    for every kind of violation.
-    """
-
-    background: Array
-    """P*, in the unit of the power."""
-    background_standard_error: Array
-    """In the unit of the power; random error only."""
-    background_model_error: Array
-    """In the unit of the power: first-order change of the background by a signal whose logarithmic
-    slope departs from the model at both ends of the section, with opposite signs, as where
-    backscatter bends along the path. The departure is `Thresholds.model_error` times the slope at
-    mean range, 2 (absolute extinction + 1 / mean range)."""
-    amplitude: Array
-    """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in the unit of the power times m2."""
-    amplitude_standard_error: Array
-    """To first order. B is extrapolated to range zero: above some 30 percent, the interval holds
-    for the logarithm of B rather than for B."""
-    extinction: Array
-    """m-1."""
-    extinction_standard_error: Array
-    """m-1; random error only."""
-    extinction_model_error: Array
-    """m-1; `Thresholds.model_error` times (absolute extinction + 1 / mean range), for the departure
-    of the slope of `background_model_error` all along the section, and, in quadrature, the
-    first-order change of extinction by the bend there. The second term dominates where extinction
-    and background are hard to separate."""
-    signal_to_noise: Array
-    """Amplitude over its standard error at known extinction, with the sign of the amplitude."""
-    reduced_chi2: Array
-    """1 where the residuals are noise; relative to the estimated noise without a variance."""
-    valid_bins: Flags
-    """Bins used."""
-    quality: Flags
-    """Bits of `lidarops.flags.Quality`; 0 where no test failed."""
 
 
 def fit_homogeneous_path(
@@ -257,7 +214,9 @@ def fit_homogeneous_path(
         exposure=counted,
         lag=lag,
     )
-    return _result(_SOLVERS[chosen_method](problem), leading)
+    solved = _SOLVERS[chosen_method](problem)
+    values = {field.name: getattr(solved, field.name) for field in fields(HomogeneousResult)}
+    return HomogeneousResult(**{name: array.reshape(leading) for name, array in values.items()})
 
 
 def _noise(
@@ -301,18 +260,3 @@ def _check_arguments(method: HomogeneousMethod, given: Mapping[str, object]) -> 
             )
         if value is None and name in _NEEDS and method in methods:
             raise RetrievalInputError(f"is required by the method {str(method)!r}", field=name)
-
-
-def _result(solution: PathSolution, shape: tuple[int, ...]) -> HomogeneousResult:
-    columns = {
-        field.name: getattr(solution, field.name).reshape(shape) for field in fields(PathSolution)
-    }
-    slope = np.abs(columns["extinction"]) + 1.0 / columns.pop("mean_range")
-    departure = THRESHOLDS.model_error * slope
-    bend = {name: np.abs(columns.pop(f"{name}_bend")) for name in ("background", "extinction")}
-    return HomogeneousResult(
-        **columns,
-        # A signal bent by c (x - 1/2)^2 has slopes of -c and c over the length at its ends.
-        background_model_error=2.0 * departure * bend["background"],
-        extinction_model_error=departure * np.hypot(1.0, 2.0 * bend["extinction"]),
-    )
