@@ -14,7 +14,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import frozen
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

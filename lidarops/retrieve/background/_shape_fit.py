@@ -12,9 +12,8 @@ from typing import Any, Final, NamedTuple
 import numba
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Indices
+from lidarops.retrieve.common.arrays import HUGE, Array, Indices
 from lidarops.retrieve.common.compiled_code import compiled, summing
-from lidarops.retrieve.common.usable import HUGE
 
 GROUPS: Final = 16
 """Groups of neighbouring bins whose mean residuals are tested."""

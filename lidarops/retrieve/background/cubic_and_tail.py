@@ -14,8 +14,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import _cubic_kernel
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Flags, Floats, Indices
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Flags, Floats, Indices, frozen
 
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid, over the last range: rounding of float32 ranges."""

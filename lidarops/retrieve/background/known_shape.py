@@ -13,8 +13,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import _shape_fit
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers, frozen
 
 
 @dataclass(frozen=True, slots=True)

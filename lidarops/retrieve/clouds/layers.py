@@ -13,10 +13,8 @@ from scipy.special import ndtri
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Integers, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.common.usable import HUGE, usable
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.screening import skewness_margin
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS

@@ -10,10 +10,8 @@ import numpy.typing as npt
 
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.common.usable import HUGE, usable
 
 _HALF: Final = 4
 """Neighbours on either side."""

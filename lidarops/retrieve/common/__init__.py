@@ -1,7 +1,7 @@
 """Shared by all retrievals: input checks, array layout and the cache of compiled code.
 
 `inputs` turns arguments into contiguous (profile, bin) arrays or raises `RetrievalInputError`.
-`frozen_arrays.frozen` gives compiled functions arrays of one type. `compiled_code.keep_apart`
+`arrays.frozen` gives compiled functions arrays of one type. `compiled_code.keep_apart`
 gives every state of the sources its own cache of compiled code; importing `lidarops.retrieve`
 calls it once. `azimuths` are those of several beams.
 """

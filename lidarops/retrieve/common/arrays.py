@@ -1,11 +1,13 @@
-"""Types of arrays that retrievals take and return."""
+"""Types of arrays that retrievals take and return, and tests of single values."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+
+from lidarops.retrieve.common.compiled_code import compiled
 
 Array = npt.NDArray[np.float64]
 Block = npt.NDArray[Any]
@@ -17,3 +19,24 @@ Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.int32]
 """Quality bits."""
 Codes = npt.NDArray[np.uint8]
+_Array = TypeVar("_Array", bound=Block)
+
+HUGE: Final = 1e300
+"""Magnitude from which a value counts as missing: a quick test for infinity and NaN."""
+
+
+def frozen(values: _Array) -> _Array:
+    """Return a contiguous read-only view; copy only where necessary.
+
+    Numba treats writable and read-only arrays as different types, and would compile a function
+    again for every combination of them.
+    """
+    view: Any = np.ascontiguousarray(values).view()
+    view.flags.writeable = False
+    return view  # type: ignore[no-any-return]
+
+
+@compiled
+def usable(power: float, variance: float) -> bool:
+    """Return whether a power and its variance are finite, and the variance not negative."""
+    return abs(power) < HUGE and 0.0 <= variance < HUGE

@@ -15,9 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Codes
+from lidarops.retrieve.common.arrays import Array, Booleans, Codes, usable
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.usable import usable
 
 # Rows that `_trace_path` writes.
 GAIN, RATIO, AIR, SHAPE = 0, 1, 2, 3

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import frozen
 from lidarops.retrieve.elastic import _fernald
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 

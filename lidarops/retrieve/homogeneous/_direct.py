@@ -14,11 +14,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.arrays import HUGE, Array
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.usable import HUGE
-from lidarops.retrieve.homogeneous._estimate import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._misfit import judge_residuals
+from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._projection import (
     BLOCK,
     GROUPED,
@@ -379,6 +378,6 @@ def solve_direct(
     g : Grid
         Of `make_grid`.
     out : (profile,) `ROW`
-        Filled with NaN; receives the fields of `lidarops.retrieve.homogeneous._estimate`.
+        Filled with NaN; receives the fields of `PathEstimate`.
     """
     _solve(power, noise, is_variance, rounding, background, g, make_scratch(g), out)

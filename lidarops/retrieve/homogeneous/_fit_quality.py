@@ -15,8 +15,7 @@ from scipy import special
 
 from lidarops.flags import Quality
 from lidarops.retrieve.common.arrays import Array, Flags
-from lidarops.retrieve.homogeneous import _estimate
-from lidarops.retrieve.homogeneous._estimate import PathEstimate
+from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, PathEstimate
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -133,11 +132,11 @@ def judge_fit(
         )
         # Test for a pass, not for a failure: a comparison with NaN does not pass.
         quality = np.zeros(fit.status.shape, dtype=np.int32)
-        fitted = fit.status == _estimate.FITTED
+        fitted = fit.status == FITTED
         for bit, passed in tests:
             quality[fitted & ~passed] |= np.int32(bit)
-    quality[fit.status == _estimate.CONSTANT] |= np.int32(Quality.NO_SIGNAL)
-    quality[fit.status == _estimate.EMPTY] |= np.int32(Quality.INPUT_MISSING)
+    quality[fit.status == CONSTANT] |= np.int32(Quality.NO_SIGNAL)
+    quality[fit.status == EMPTY] |= np.int32(Quality.INPUT_MISSING)
     quality[(fit.bins > 0) & (fit.bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
     return Verdict(noise, limits.widening, relative_error, reduced, quality)
 

@@ -14,8 +14,8 @@ from lidarops.retrieve.homogeneous._direct import (
     unscale,
     weigh,
 )
-from lidarops.retrieve.homogeneous._estimate import FITTED
 from lidarops.retrieve.homogeneous._misfit import describe_bend_given, judge_residuals
+from lidarops.retrieve.homogeneous._problem import FITTED
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,

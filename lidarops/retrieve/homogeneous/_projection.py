@@ -16,8 +16,7 @@ from typing import Any, Final, NamedTuple
 import numba
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Integers
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Integers, frozen
 
 NODES: Final = 24
 _WIDEST_SCALE: Final = 0.3

@@ -8,9 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.arrays import HUGE, Array
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.usable import HUGE
 
 PROPAGATED: Final = np.dtype(
     [

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarops.flags import Quality
-from lidarops.retrieve.common.arrays import Array, Flags
+from lidarops.retrieve.common.arrays import Array, Flags, frozen
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.frozen_arrays import frozen
 
 _MISSING = int(Quality.INPUT_MISSING)
 

@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 Ends = npt.NDArray[np.int32]

@@ -12,15 +12,15 @@ import xarray as xr
 from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
 from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
+from lidarops.retrieve.multiangle._path_variation import gradient_scale
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
 )
-from lidarops.retrieve.multiangle.plane_gradients import gradient_scale
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical.monotone import project as monotone
+from lidarops.retrieve.multiangle.vertical.smooth_profile import nearest_rising
 
 __all__ = ["retrieve_optical_depth"]
 
@@ -135,7 +135,7 @@ def retrieve_optical_depth(
         _variable(name): (("time", "altitude"), getattr(retrieval, name))
         for name in (*_PER_ALTITUDE, *(_OF_PENALTY if method in optical_depth.REGULARISED else ()))
     }
-    depth = monotone(retrieval.optical_depth)
+    depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
     quality = _quality(retrieval, beams["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
     product = xr.Dataset(

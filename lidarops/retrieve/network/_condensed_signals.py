@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Codes, Indices
-from lidarops.retrieve.common.usable import HUGE
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Codes, Indices
 from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network._fit_layout import FitLayout
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST

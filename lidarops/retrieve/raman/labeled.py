@@ -19,8 +19,13 @@ from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.background import estimate
 from lidarops.retrieve.clouds import labeled as _clouds
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
-from lidarops.retrieve.raman.cells import Cells, make_cells
-from lidarops.retrieve.raman.cloud_cells import largest_of_cells, state_of_cells, touched
+from lidarops.retrieve.raman.cells import (
+    Cells,
+    largest_of_cells,
+    make_cells,
+    state_of_cells,
+    touched,
+)
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.overlap import overlap_of
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman

@@ -10,10 +10,8 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.common.usable import HUGE
 
 
 @dataclass(frozen=True, slots=True)

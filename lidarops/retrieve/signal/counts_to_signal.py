@@ -25,8 +25,7 @@ from lidarops.constants import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Singles
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Singles, frozen
 from lidarops.retrieve.signal import _noise_kernels as noise_kernels
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation

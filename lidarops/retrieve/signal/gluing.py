@@ -11,8 +11,7 @@ from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.signal import _line_fit
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 

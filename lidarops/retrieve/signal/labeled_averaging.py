@@ -12,8 +12,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.common.arrays import Array, Flags
-from lidarops.retrieve.common.frozen_arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Flags, frozen
 from lidarops.retrieve.signal.averaging import Averages, RunningMean, join_bits
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 

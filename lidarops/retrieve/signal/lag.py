@@ -14,9 +14,8 @@ from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.common.compiled_code import compiled, summing
-from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _PARTS: Final = 16

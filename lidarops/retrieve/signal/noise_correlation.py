@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.frozen_arrays import frozen
-from lidarops.retrieve.common.usable import HUGE
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 

@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtri
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, frozen
 from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.common.frozen_arrays import frozen
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 

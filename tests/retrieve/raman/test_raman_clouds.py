@@ -8,8 +8,7 @@ import xarray as xr
 from support.raman_signals import LASER, make_sky, mean_over
 
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman.cells import make_cells
-from lidarops.retrieve.raman.cloud_cells import largest_of_cells, state_of_cells, touched
+from lidarops.retrieve.raman.cells import largest_of_cells, make_cells, state_of_cells, touched
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.labeled import Assumptions, retrieve
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage

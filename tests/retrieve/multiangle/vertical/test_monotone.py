@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lidarops.retrieve.multiangle.vertical.monotone import project
+from lidarops.retrieve.multiangle.vertical.smooth_profile import nearest_rising
 
 ROWS = arrays(
     np.float64,
@@ -19,7 +19,7 @@ ROWS = arrays(
 @settings(deadline=None)
 @given(ROWS, st.integers(0, 2**32 - 1))
 def test_is_the_nearest_admissible_profile(profiles, seed):
-    projection = project(profiles)
+    projection = nearest_rising(profiles)
     other = np.sort(np.abs(np.random.default_rng(seed).normal(size=profiles.shape)), axis=1)
     # The admissible profiles are a convex cone: no direction into it leads nearer.
     gain = ((profiles - projection) * (other - projection)).sum(axis=1)
@@ -32,14 +32,14 @@ def test_is_the_nearest_admissible_profile(profiles, seed):
 @given(ROWS, st.data())
 def test_missing_altitudes_are_skipped(profiles, data):
     holes = data.draw(arrays(np.bool_, profiles.shape))
-    projection = project(np.where(holes, np.nan, profiles))
+    projection = nearest_rising(np.where(holes, np.nan, profiles))
     np.testing.assert_array_equal(np.isnan(projection), holes)
     for row, hole, values in zip(profiles, holes, projection, strict=True):
         if not hole.all():
-            alone = project(row[np.newaxis, ~hole])[0]
+            alone = nearest_rising(row[np.newaxis, ~hole])[0]
             np.testing.assert_array_equal(values[~hole], alone)
 
 
 def test_profile_that_is_admissible_stays():
     row = np.array([[0.0, 0.1, 0.1, 0.4]])
-    np.testing.assert_array_equal(project(row), row)
+    np.testing.assert_array_equal(nearest_rising(row), row)

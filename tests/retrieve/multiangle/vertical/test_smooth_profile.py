@@ -13,10 +13,13 @@ from support.oracles.angle_scenes import clear, clear_depth, cloud, estimates
 from support.oracles.banded_matrices import dense
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.multiangle.vertical import _banded, _outliers, monotone
+from lidarops.retrieve.multiangle.vertical import _banded, _outliers
 from lidarops.retrieve.multiangle.vertical import correlation as correlation_of_air
 from lidarops.retrieve.multiangle.vertical.correlation import residual_moments
-from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
+from lidarops.retrieve.multiangle.vertical.smooth_profile import (
+    nearest_rising,
+    smooth_optical_depth,
+)
 
 ALTITUDE = 150.0 + 30.0 * np.arange(60)
 PER_KM = 1e-3
@@ -345,7 +348,7 @@ def test_robust_passes_cost_clean_data_nothing():
 def test_monotone_profile_is_near_and_never_decreases():
     depth, information, truth = plain(40, np.random.default_rng(12), error=0.1)
     result = smooth_optical_depth(depth, information, ALTITUDE)
-    rising = monotone.project(result.optical_depth)
+    rising = nearest_rising(result.optical_depth)
     assert np.all(np.diff(rising, axis=1) >= 0.0)
     assert rms(rising - truth) <= 1.001 * rms(result.optical_depth - truth)
 
