@@ -60,25 +60,6 @@ def inverse_of_weak(value: Array, error: Array) -> Array:
     return np.asarray(np.sqrt(0.5 * np.pi) / error * erfcx(value / (np.sqrt(2.0) * error)))
 
 
-def ratio_of_counts(counts: Array, denominator: Array) -> tuple[Array, Array]:
-    r"""Return mean and standard deviation of the posterior of a ratio of means of Poisson counts.
-
-    With gamma posteriors :math:`\Gamma(N_1, 1)` and :math:`\Gamma(N_2 + 2, 1)`, the mean is
-    :math:`N_1 / (N_2 + 1)`, whose expectation is :math:`\mu_1/\mu_2 \, (1 - e^{-\mu_2})`. Sum the
-    counts of the denominator over bins until the exponential is negligible.
-
-    Parameters
-    ----------
-    counts, denominator : (...) float
-        Counts without background.
-    """
-    first, second = np.asarray(counts, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
-    mean = first / (second + 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        square = np.where(second > 0.0, first * (first + 1.0) / ((second + 1.0) * second), np.inf)
-    return mean, np.sqrt(square - mean**2)
-
-
 @dataclass(frozen=True, slots=True)
 class Backscatter:
     """Total backscatter at the laser wavelength, (cell,) unless stated."""

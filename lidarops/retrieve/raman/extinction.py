@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.raman.depth_fit import DepthFit, root_of_squares
 
@@ -109,49 +108,3 @@ def mean_weights(length: Array, step: float) -> Array:
     inside -= np.maximum(low[:, np.newaxis], edges[:-1])
     np.maximum(inside, 0.0, out=inside)
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))
-
-
-def sliding_line(
-    signal: Array, variance: Array, step: float, ratio: float, cells: int
-) -> tuple[Array, Array]:
-    r"""Return extinction and standard error by lines through the logarithm, for comparison.
-
-    The classical method (`ansmann1990`, `pappalardo2004`): a weighted line through
-    :math:`-\ln y` of `cells` neighbouring cells, whose slope is :math:`(1 + \kappa) \alpha`.
-
-    Parameters
-    ----------
-    signal, variance : (cell,) float
-        Raman signal over that of clean air.
-    step : float
-        m, length of a cell.
-    ratio : float
-        :math:`\kappa`.
-    cells : int
-        Odd number of cells, 3 or more.
-
-    Returns
-    -------
-    (cell,) float64, (cell,) float64
-        m-1, NaN within half a window of the ends and where a signal of the window is not positive.
-
-    Raises
-    ------
-    RetrievalInputError
-        For an even number of cells, or fewer than 3.
-    """
-    if cells < 3 or cells % 2 == 0:
-        raise RetrievalInputError(f"is {cells}", field="cells", remedy="give an odd number from 3")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(signal > 0.0, -np.log(signal), np.nan)
-        weight = signal**2 / variance
-    z = step * (np.arange(cells) - cells // 2)
-    value, error = np.full((2, signal.size), np.nan)
-    for middle in range(cells // 2, signal.size - cells // 2):
-        window = slice(middle - cells // 2, middle + cells // 2 + 1)
-        w, y = weight[window], depth[window]
-        away = z - (w * z).sum() / w.sum()
-        spread = (w * away**2).sum()
-        value[middle] = (w * away * y).sum() / spread
-        error[middle] = np.sqrt(1.0 / spread)
-    return value / (1.0 + ratio), error / (1.0 + ratio)

@@ -83,7 +83,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]], *, known: float) -> Chan
         Bins, where the correlation is not significant
         (`lidarops.retrieve.signal.lag.estimate_lag`).
     """
-    estimate = _lag.estimate_lag_of_groups(
+    estimate = _lag.estimate_lag(
         (analog[:, : photon.shape[-1]], photon[:, : analog.shape[-1]]) for analog, photon in groups
     )
     if not estimate.significant:

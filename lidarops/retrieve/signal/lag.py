@@ -48,10 +48,14 @@ class LagEstimate:
     """(lag,), bins."""
 
 
-def estimate_lag(
-    analog: npt.ArrayLike,
-    photon_counting: npt.ArrayLike,
-) -> LagEstimate:
+def profile_groups(profiles: int) -> list[slice]:
+    """Return groups of about equal size, of at most 32 profiles, from which noise is taken."""
+    groups = max(-(-profiles // PROFILES_AT_ONCE), 1)
+    edges = np.linspace(0, profiles, groups + 1).astype(int)
+    return [slice(int(first), int(last)) for first, last in itertools.pairwise(edges)]
+
+
+def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
     r"""Return the lag of analog behind photon counting from the correlation of their noise.
 
     Both record the same photoelectrons, so their shot noise is correlated at the lag and nowhere
@@ -66,8 +70,9 @@ def estimate_lag(
 
     Parameters
     ----------
-    analog, photon_counting : (..., time, range) float
-        Simultaneous, on bins of the same width, in any unit, with or without background; NaN is
+    groups : iterable of (analog, photon_counting)
+        At least one, (..., time, range) each, of the profiles of one of `profile_groups`:
+        simultaneous, on bins of the same width, in any unit, with or without background; NaN is
         skipped. One profile is enough if its noise is large enough.
 
     Returns
@@ -75,37 +80,6 @@ def estimate_lag(
     LagEstimate
         The standard error includes the scatter and the distance to the centroid of 4 bins,
         because a recorder may ring or spread a photoelectron over more than two bins.
-
-    Raises
-    ------
-    RetrievalInputError
-        For shapes that do not match, or fewer than 200 bins between the largest lags.
-    """
-    first, second = _pair(analog, photon_counting)
-    return estimate_lag_of_groups(
-        (first[..., profiles, :], second[..., profiles, :])
-        for profiles in profile_groups(first.shape[-2])
-    )
-
-
-def profile_groups(profiles: int) -> list[slice]:
-    """Return groups of about equal size, of at most 32 profiles, from which noise is taken."""
-    groups = max(-(-profiles // PROFILES_AT_ONCE), 1)
-    edges = np.linspace(0, profiles, groups + 1).astype(int)
-    return [slice(int(first), int(last)) for first, last in itertools.pairwise(edges)]
-
-
-def estimate_lag_of_groups(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
-    """Return the lag of analog behind photon counting from groups of profiles, one after another.
-
-    Parameters
-    ----------
-    groups : iterable of (analog, photon_counting)
-        At least one, as for `estimate_lag`, each of the profiles of one of `profile_groups`.
-
-    Returns
-    -------
-    LagEstimate
 
     Raises
     ------
@@ -149,20 +123,6 @@ def _estimate(by_part: Array) -> LagEstimate:
         correlation=total[..., _MARGIN:-_MARGIN],
         lags=_LAGS[_MARGIN:-_MARGIN],
     )
-
-
-def _pair(analog: npt.ArrayLike, photon_counting: npt.ArrayLike) -> tuple[Array, Array]:
-    first = inputs.real_array(analog, "analog").astype(np.float64, copy=False)
-    second = inputs.real_array(photon_counting, "photon_counting").astype(np.float64, copy=False)
-    if first.ndim < 2:
-        raise RetrievalInputError(
-            f"has the shape {first.shape}", field="analog", remedy="give (..., time, range)"
-        )
-    if first.shape != second.shape:
-        raise RetrievalInputError(
-            f"has the shape {second.shape}, analog {first.shape}", field="photon_counting"
-        )
-    return first, second
 
 
 def _noise(profiles: Array) -> Array:

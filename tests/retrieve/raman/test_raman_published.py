@@ -14,14 +14,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from support.raman_signals import along, mean_over
+from support.raman_signals import along, mean_over, sliding_line
 
 from lidarops.flags import Quality
 from lidarops.products.raman.settings import RamanProductSettings, RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.cells import make_cells
-from lidarops.retrieve.raman.extinction import sliding_line
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal, cell_signals
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import optimize
+from support.lags import lag_of
 from support.oracles import signal as oracle
 
 from lidarops.errors import RetrievalInputError
@@ -244,7 +245,7 @@ def test_a_real_station_is_glued_after_lag_correction(data_root, wavelength):
     range_ = (np.arange(4000) + 0.5) * 7.5
     clean = analog - dark.mean(axis=0)
     sky = photon[:, 3500:3950].mean(axis=1)
-    estimate = lag.estimate_lag(analog, photon)
+    estimate = lag_of(analog, photon)
     results = []
     for bins in (0.0, estimate.lag):
         moved, _ = lag.shift_signal(clean, bins)

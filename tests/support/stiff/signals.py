@@ -11,8 +11,9 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, known_shape
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
-from lidarops.retrieve.signal import averaging, counts_to_signal, gluing, lag
+from lidarops.retrieve.signal import averaging, counts_to_signal, gluing
 from lidarops.simulate import counting
+from support.lags import lag_of
 from support.stiff.cases import (
     Accepted,
     Answer,
@@ -289,7 +290,7 @@ def _lag(shift: int | None) -> Answer:
     rng = np.random.default_rng(15)
     common = rng.standard_normal((40, 1200))
     shifted = rng.standard_normal((40, 1200)) if shift is None else np.roll(common, shift, axis=-1)
-    estimate = lag.estimate_lag(shifted + 0.5 * rng.standard_normal(common.shape), common)
+    estimate = lag_of(shifted + 0.5 * rng.standard_normal(common.shape), common)
     quality = np.where(estimate.significant, np.int32(0), np.int32(Quality.NO_GLUING))
     values = {"lag": estimate.lag, "lag_standard_error": estimate.standard_error}
     return Answer(values, np.atleast_1d(quality).astype(np.int32))
