@@ -13,6 +13,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.arrays import Array, Block, Floats
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
+_Array = TypeVar("_Array", bound=Block)
 
 SHORTEST_REACH = 100.0
 """m. No lidar section ends nearer, but every section in km does: detects wrong units."""
@@ -54,6 +55,21 @@ def real_array(values: npt.ArrayLike, name: str) -> Floats:
     if array.dtype.kind == "f" and array.dtype.itemsize == 4:
         return array.astype(np.float32, copy=False)
     return array.astype(np.float64, copy=False)
+
+
+def broadcast(array: _Array, shape: tuple[int, ...], name: str) -> _Array:
+    """Return an array in a shape to which it broadcasts.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where it does not.
+    """
+    try:
+        return np.broadcast_to(array, shape)  # type: ignore[return-value]
+    except ValueError:
+        problem = f"has the shape {array.shape}, which does not broadcast to {shape}"
+        raise RetrievalInputError(problem, field=name) from None
 
 
 def range_grid(values: npt.ArrayLike) -> RangeGrid:
@@ -127,14 +143,7 @@ def noise_rows(
         array = grid.turn(array)
     shared = array.size == 1 or all(length == 1 for length in array.shape[:-1])
     target = (*((1,) * len(leading) if shared else leading), grid.size)
-    try:
-        rows = np.broadcast_to(array.reshape(array.shape[-1:]) if shared else array, target)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, which does not broadcast to the shape"
-            f" {(*leading, grid.size)} of power",
-            field=name,
-        ) from None
+    rows = broadcast(array.reshape(array.shape[-1:]) if shared else array, target, name)
     return np.ascontiguousarray(rows.reshape(1 if shared else _count(leading), grid.size))
 
 
@@ -169,17 +178,8 @@ def profile_values(
     if values is None:
         return None
     array = real_array(values, name).astype(np.float64, copy=False)
-    if array.size == 1:
-        flat = array.reshape(1)
-    else:
-        try:
-            flat = np.ascontiguousarray(np.broadcast_to(array, leading).reshape(_count(leading)))
-        except ValueError:
-            raise RetrievalInputError(
-                f"has the shape {array.shape}, which does not broadcast to the shape {leading} of"
-                " the profiles",
-                field=name,
-            ) from None
+    spread = array if array.size == 1 else broadcast(array, leading, name)
+    flat = np.ascontiguousarray(spread.reshape(-1))
     if not np.all(np.isfinite(flat)):
         raise RetrievalInputError("is not finite", field=name)
     return flat

@@ -208,13 +208,7 @@ def _cube(
         raise RetrievalInputError(
             "is negative", field="variance", remedy="give squares of the signal's unit"
         )
-    try:
-        spread = np.broadcast_to(noise, array.shape)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {noise.shape}, which does not broadcast to {array.shape}",
-            field="variance",
-        ) from None
+    spread = inputs.broadcast(noise, array.shape, "variance")
     cubes = (np.require(cube, np.float64, ["C", "W"]) for cube in (array, spread))
     rows, variances = (np.asarray(cube).reshape(count, *shape) for cube in cubes)
     return rows, variances, leading

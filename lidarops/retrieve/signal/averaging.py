@@ -126,12 +126,7 @@ def _averages(sums: Array, count: Integers) -> Averages:
 def _term(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
     """Return values that broadcast to a shape, in that shape."""
     array = inputs.real_array(values, name).astype(np.float64, copy=False)
-    try:
-        return frozen(np.broadcast_to(array, shape))
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, which does not broadcast to {shape}", field=name
-        ) from None
+    return frozen(inputs.broadcast(array, shape, name))
 
 
 def _positive(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:

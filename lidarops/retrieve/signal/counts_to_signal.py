@@ -388,14 +388,7 @@ def _counts(counts: npt.ArrayLike, grid: Array, shots: npt.ArrayLike) -> npt.NDA
 def _per_profile(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
     """Return one value for each profile, (profile,)."""
     array = np.require(inputs.real_array(values, name), np.float64, "A")
-    try:
-        return np.broadcast_to(array, leading).reshape(-1)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, which does not broadcast to the shape {leading} of the"
-            " profiles",
-            field=name,
-        ) from None
+    return inputs.broadcast(array, leading, name).reshape(-1)
 
 
 def _per_bin(values: npt.ArrayLike | None, name: str, shape: tuple[int, ...]) -> Array:

@@ -300,13 +300,7 @@ def shift_signal(
     if not math.isfinite(lag):
         raise RetrievalInputError("is not finite", field="lag")
     noise = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
-    try:
-        noise = np.broadcast_to(noise, values.shape)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {noise.shape}, which does not broadcast to {values.shape}",
-            field="variance",
-        ) from None
+    noise = inputs.broadcast(noise, values.shape, "variance")
     shifted, variances = np.zeros((2, *values.shape))
     whole_bins = math.floor(lag)
     fraction = lag - whole_bins
