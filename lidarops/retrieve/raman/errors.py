@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter
-from lidarops.retrieve.raman.cells import Cells
 from lidarops.retrieve.raman.depth_fit import DepthFit
 from lidarops.retrieve.raman.extinction import Extinction, slope
 from lidarops.retrieve.raman.settings import RamanSettings
@@ -28,23 +27,14 @@ RANDOM: Final = frozenset({"noise", "resolution", "background"})
 
 
 @dataclass(frozen=True, slots=True)
-class AirCells:
-    """Clean air in cells, (cell,)."""
+class Quotient:
+    """A quotient with its errors, (cell,); NaN where the denominator is too uncertain."""
 
-    range: Array
-    """m."""
-    backscatter: Array
-    """m-1 sr-1."""
-    depth: Array
-    raman_depth: Array
-    overlap: Array
-    """1 where it is not known."""
-
-    @classmethod
-    def of(cls, air: AirColumn, cells: Cells) -> Self:
-        """Return the means of cells."""
-        profiles = (air.range, air.backscatter, air.depth, air.raman_depth, air.known_overlap)
-        return cls(*(cells.mean(profile) for profile in profiles))
+    value: Array
+    random: Array
+    """Standard error by random causes."""
+    systematic: Array
+    """Standard error by all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +80,8 @@ class Effects:
     profile: Profile
     calibrated: Backscatter | None
     """None without reference; backscatter is NaN then."""
-    air: AirCells
+    air: AirColumn
+    """In cells, with an overlap of 1 where it is not known."""
     step: float
     """m, length of a cell."""
     settings: RamanSettings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter, inverse_of_weak
 from lidarops.retrieve.raman.depth_fit import root_of_squares
-from lidarops.retrieve.raman.errors import RANDOM, Cause
+from lidarops.retrieve.raman.errors import RANDOM, Cause, Quotient
 from lidarops.retrieve.raman.extinction import Extinction
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
@@ -21,17 +20,6 @@ _NODES: Final = np.linspace(-6.0, 6.0, 49)
 """Standard deviations at which chances of lidar ratios are compared."""
 
 
-@dataclass(frozen=True, slots=True)
-class LidarRatio:
-    """Lidar ratio, (cell,), sr; NaN where backscatter is too uncertain."""
-
-    value: Array
-    random: Array
-    """Standard error by random causes."""
-    systematic: Array
-    """Standard error by all others."""
-
-
 def lidar_ratio_of(
     extinction: Extinction,
     calibrated: Backscatter,
@@ -39,7 +27,7 @@ def lidar_ratio_of(
     noise: Array,
     causes: Sequence[Cause],
     usable: Booleans,
-) -> LidarRatio:
+) -> Quotient:
     r"""Return the lidar ratio, from equally smoothed extinction and backscatter.
 
     Its change is :math:`\delta S = (\delta\alpha - S\,\delta b) / b`, of noise and of each cause.
@@ -92,7 +80,7 @@ def lidar_ratio_of(
         least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
     certain = complete & (smooth > 0.0) & (likely > least)
     parts = (ratio, np.sqrt(scatter), np.sqrt(systematic))
-    return LidarRatio(*(np.where(certain, part, np.nan) for part in parts))
+    return Quotient(*(np.where(certain, part, np.nan) for part in parts))
 
 
 def _chances(extinction: Array, backscatter: Array, random: Array) -> tuple[Array, Array]:

@@ -18,14 +18,14 @@ from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth, 
 from lidarops.retrieve.raman.errors import (
     BACKSCATTER_CAUSES,
     EXTINCTION_CAUSES,
-    AirCells,
     Effects,
     Profile,
+    Quotient,
     summed,
 )
 from lidarops.retrieve.raman.extinction import extinction_of
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.lidar_ratio import LidarRatio, lidar_ratio_of
+from lidarops.retrieve.raman.lidar_ratio import lidar_ratio_of
 from lidarops.retrieve.raman.reference import choose_window
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import AirColumn, CellSignal, ChannelSignal, cell_signals
@@ -129,7 +129,7 @@ def retrieve_raman(
     edges = np.stack(window.edges, axis=-1)
     errors = window.relative_error(settings.reference_relative_error)
     assumed = [replace(settings, reference_relative_error=float(error)) for error in errors]
-    in_cells = AirCells.of(air, cells)
+    in_cells = air.in_cells(cells)
     solved = [
         _Solution.of(row, in_cells, cells, assumed[number], partial[number], edges[number], number)
         for number, row in enumerate(rows)
@@ -158,7 +158,7 @@ class _Solution:
     extinction_budget: dict[str, Array]
     backscatter: Array
     backscatter_budget: dict[str, Array]
-    lidar_ratio: LidarRatio
+    lidar_ratio: Quotient
     negative: Booleans
     """Cells beyond which the Raman signal falls by less than in clean air."""
 
@@ -166,7 +166,7 @@ class _Solution:
     def of(
         cls,
         profile: Profile,
-        air: AirCells,
+        air: AirColumn,
         cells: Cells,
         settings: RamanSettings,
         partial: Booleans,
@@ -193,7 +193,7 @@ class _Solution:
         if calibrated is None:
             absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)
             return cls(
-                number, profile, budget, empty, absent, LidarRatio(empty, empty, empty), negative
+                number, profile, budget, empty, absent, Quotient(empty, empty, empty), negative
             )
         noise = calibrated.respond(np.zeros((molecular.size, 1)), profile.fit.noise)
         of_backscatter = summed(BACKSCATTER_CAUSES, [(c.name, c.backscatter) for c in causes])

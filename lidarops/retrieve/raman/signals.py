@@ -71,6 +71,11 @@ class AirColumn:
         """Overlap, 1 where it is not known."""
         return np.where(np.isnan(self.overlap), 1.0, self.overlap)
 
+    def in_cells(self, cells: Cells) -> AirColumn:
+        """Return the means of cells, with the known overlap."""
+        profiles = (self.range, self.backscatter, self.depth, self.raman_depth, self.density)
+        return AirColumn(*(cells.mean(values) for values in (*profiles, self.known_overlap)))
+
 
 @dataclass(frozen=True, slots=True)
 class CellSignal:

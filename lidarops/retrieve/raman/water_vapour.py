@@ -9,20 +9,10 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import inverse_mean
+from lidarops.retrieve.raman.errors import Quotient
 from lidarops.retrieve.raman.scattering import particle_ratio
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import CellSignal
-
-
-@dataclass(frozen=True, slots=True)
-class MixingRatio:
-    """Mass of water vapour over that of dry air, (cell,)."""
-
-    value: Array
-    random: Array
-    """Standard error by noise and backgrounds."""
-    systematic: Array
-    """Standard error by all other causes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +46,7 @@ def mixing_ratio(
     constant: float,
     particles: ParticleTransmission,
     relative_errors: Sequence[Array | float],
-) -> MixingRatio:
+) -> Quotient:
     r"""Return the mixing ratio, with the calibration constant of both channels.
 
     .. math:: w = C \frac{y_W}{e^{-\theta}} e^{(\kappa_W - \kappa) \tau_p}
@@ -102,4 +92,4 @@ def mixing_ratio(
     shared = dead_time**2 + baseline**2 + (particles.standard_error * beyond) ** 2
     shared += sum(np.square(relative) for relative in relative_errors)
     systematic = np.sqrt(value**2 * shared + factor**2 * (water.dead_time**2 + water.baseline**2))
-    return MixingRatio(value, np.sqrt(noise), systematic)
+    return Quotient(value, np.sqrt(noise), systematic)
