@@ -7,20 +7,17 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen
+from lidarops.retrieve.common.compiled_code import compiled
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Codes = npt.NDArray[np.int32]
 
-_HUGE: Final = 1e300
 _SHORTEST: Final = 1e-9
 """m; half length of a window of one bin, to divide by."""
 _DEPENDENT: Final = 1e-12
@@ -34,8 +31,6 @@ FIELDS: Final = 9
 
 _PROBABLE: Final = 1.645
 """Standard errors that 95 % of normal errors do not exceed."""
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Rejection(IntFlag):
@@ -64,7 +59,7 @@ class ReferenceWindow:
     Where no candidate passes, floats are NaN.
     """
 
-    chosen: Mask
+    chosen: Booleans
     bottom: Array
     """m."""
     top: Array
@@ -299,7 +294,7 @@ def _edges(
 
 def _excluded(
     exclude: npt.NDArray[np.bool_] | None, grid: inputs.RangeGrid, leading: tuple[int, ...]
-) -> Mask:
+) -> Booleans:
     if exclude is None:
         return np.zeros((1, grid.size), dtype=np.bool_)
     mask = np.asarray(exclude)
@@ -398,14 +393,14 @@ def _detection_limit(
     return np.asarray((THRESHOLDS.most_deviation + _PROBABLE) * limit)
 
 
-@_compiled
+@compiled
 def _usable(power: float, variance: float) -> bool:
-    return abs(power) < _HUGE and 0.0 < variance < _HUGE
+    return abs(power) < HUGE and 0.0 < variance < HUGE
 
 
-@_compiled
+@compiled
 def _fit(
-    power: Array, variance: Array, shape: Array, range_: Array, excluded: Mask, out: Array
+    power: Array, variance: Array, shape: Array, range_: Array, excluded: Booleans, out: Array
 ) -> None:
     """Fit the molecular shape times polynomials in range that are orthogonal under the noise."""
     middle = 0.5 * (range_[0] + range_[-1])
@@ -453,13 +448,13 @@ def _fit(
         out[CURVATURE] = (y2 - c * y0 - b * (y1 - a * y0)) / math.sqrt(norm2)
 
 
-@_compiled
+@compiled
 def _compare_with_air(
     power: Array,
     variance: Array,
     shape: Array,
     range_: Array,
-    excluded: Mask,
+    excluded: Booleans,
     edges: npt.NDArray[np.int64],
     out: Array,
 ) -> None:

@@ -22,11 +22,8 @@ from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.clouds import layers as _layers
 from lidarops.retrieve.clouds import outlying_bins as _outlying_bins
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.signal.labeled import actual_noise, baseline_error, counts_per_power
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 
 _CARRIED: Final = WITHHELD | int(Quality.PILE_UP | Quality.SINGLE_RECORD)
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
@@ -72,19 +69,19 @@ class MeanSignal:
     power: Array
     background: Array
     background_standard_error: Array
-    uncertain: Mask
+    uncertain: Booleans
 
 
 @dataclass(frozen=True, slots=True)
 class Clouds:
     """Clouds of means, (time, range)."""
 
-    mask: Mask
+    mask: Booleans
     """Clouds of the mean, or of all profiles in it."""
     fraction: Array
     """Share of the profiles with a cloud; NaN where only the mean shows it, or is examined, and
     where noise would hide one."""
-    unknown: Mask
+    unknown: Booleans
     """Bins in which neither the mean nor a part of it can show a cloud, or noise would hide it."""
 
     @property
@@ -93,12 +90,12 @@ class Clouds:
         return np.where(self.unknown, np.int8(UNKNOWN), self.mask + self.any.astype(np.int8))
 
     @property
-    def partly(self) -> Mask:
+    def partly(self) -> Booleans:
         """Bins that are cloudy in some of the profiles, but not in the mean."""
         return np.asarray((self.fraction > 0.0) & ~self.mask)
 
     @property
-    def any(self) -> Mask:
+    def any(self) -> Booleans:
         """Bins that are cloudy in some profiles or the mean."""
         return np.asarray(self.mask | self.partly)
 
@@ -170,7 +167,7 @@ class MeanProfiles:
         self.noise = np.where(bridged.outlying, bridged.variance, self.noise)
         self.quality = self.quality | np.where(bridged.outlying, _OUTLIER, np.int32(0))
 
-    def reject_overlap(self, partial: Mask) -> None:
+    def reject_overlap(self, partial: Booleans) -> None:
         """Flag bins in which the overlap is incomplete."""
         self.quality = self.quality | np.where(partial, _INCOMPLETE_OVERLAP, np.int32(0))
 
@@ -205,7 +202,7 @@ class MeanProfiles:
             quantum=self.quantum,
         )
 
-    def visible_air(self, power: Array, cloudy: Mask) -> Mask:
+    def visible_air(self, power: Array, cloudy: Booleans) -> Booleans:
         """Return where noise would not hide a cloud in a signal without background."""
         return _layers.find_visible_air(
             power,
@@ -323,7 +320,7 @@ def cloud_heights(
 
 def _signal_beyond_overlap(
     means: MeanProfiles, reference: Reference, *, known_shape: bool, overlap_is_stated: bool
-) -> tuple[MeanSignal, _layers.Layers, Mask]:
+) -> tuple[MeanSignal, _layers.Layers, Booleans]:
     """Return signals without background, their layers, and those that may be the overlap's."""
     signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
     near = clouds.mask & _begin_before(clouds.mask, means.distance < reference.lowest)
@@ -366,7 +363,7 @@ def _signal_beyond_clouds(
     return signal, means.find_clouds(signal.power)
 
 
-def with_margin(mask: Mask, distance: Array) -> Mask:
+def with_margin(mask: Booleans, distance: Array) -> Booleans:
     """Return the bins of layers, (..., range), and those in which their thin edges may be."""
     bins = round(THRESHOLDS.cloud_margin / float(np.median(np.diff(distance))))
     near = np.cumsum(np.pad(mask, [(0, 0)] * (mask.ndim - 1) + [(bins + 1, bins)]), axis=-1)
@@ -374,8 +371,8 @@ def with_margin(mask: Mask, distance: Array) -> Mask:
 
 
 def _less_than_air(
-    ratio: Array, error: Array, near: Mask, window: _reference.ReferenceWindow, distance: Array
-) -> Mask:
+    ratio: Array, error: Array, near: Booleans, window: _reference.ReferenceWindow, distance: Array
+) -> Booleans:
     """Return the bins up to the last one before the window with less light than its air gives.
 
     Empty where no layer of `near` begins beyond such a bin: other causes lessen the signal, too.
@@ -393,11 +390,11 @@ def _less_than_air(
 
 def _overlap_bins(
     ratio: Array,
-    partial: Mask,
-    clouds: Mask,
+    partial: Booleans,
+    clouds: Booleans,
     window: _reference.ReferenceWindow,
     means: MeanProfiles,
-) -> tuple[Mask, Mask]:
+) -> tuple[Booleans, Booleans]:
     """Return the bins of profiles with a partial overlap in which it is so, and may be so.
 
     It is incomplete up to the largest ratio to air below the first cloud, and may be so farther
@@ -411,18 +408,18 @@ def _overlap_bins(
     return concerned & nearer, concerned & ~nearer
 
 
-def _begin_before(mask: Mask, near: Mask) -> Mask:
+def _begin_before(mask: Booleans, near: Booleans) -> Booleans:
     """Return whether the last run of a mask that began up to a bin began near."""
     begin = np.where(_begins(mask), np.arange(near.size), 0)
     return np.asarray(near[np.maximum.accumulate(begin, axis=-1)])
 
 
-def _begins(mask: Mask) -> Mask:
+def _begins(mask: Booleans) -> Booleans:
     """Return the first bins of the runs of a mask."""
     return np.asarray(np.diff(mask.astype(np.int8), axis=-1, prepend=0) == 1)
 
 
-def _subtract_background(means: MeanProfiles, usable: Mask, *, known_shape: bool) -> MeanSignal:
+def _subtract_background(means: MeanProfiles, usable: Booleans, *, known_shape: bool) -> MeanSignal:
     noise, r = means.noise * means.correlation_length[:, np.newaxis], means.distance
     # The mean of a bin that was saturated in some profiles is that of the others.
     raw = np.where((means.quality & np.int32(Quality.SATURATED)) != 0, np.nan, means.raw)
@@ -438,7 +435,7 @@ def _subtract_background(means: MeanProfiles, usable: Mask, *, known_shape: bool
 
 
 def reference_window(
-    signal: MeanSignal, means: MeanProfiles, reference: Reference, clouds: Mask
+    signal: MeanSignal, means: MeanProfiles, reference: Reference, clouds: Booleans
 ) -> _reference.ReferenceWindow:
     """Return the window of clean air outside of clouds, (time, range), and of their margins."""
     highest = min(reference.highest, float(means.distance[-1]))

@@ -16,12 +16,10 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, frozen
 from lidarops.retrieve.elastic import _fernald
 from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Reference = tuple[npt.ArrayLike, npt.ArrayLike]
 
 
@@ -80,10 +78,10 @@ class ElasticResult:
     """sr, as given, broadcast to the power."""
     molecular_relative_error: Array
     """Relative error as given, broadcast to the power."""
-    valid: Mask
-    unstable: Mask
+    valid: Booleans
+    unstable: Booleans
     """No value: the denominator of the solution is too small, or not certain to be positive."""
-    calibrated: Mask
+    calibrated: Booleans
     """Whether the reference window holds a positive signal, with the leading axes of the power."""
 
     @property
@@ -391,7 +389,7 @@ def _require_molecular(rows: Array, name: str, largest: float) -> None:
     _require(rows < largest, rows, name, "give m-1, not km-1")
 
 
-def _require(acceptable: Mask, values: Array, name: str, remedy: str) -> None:
+def _require(acceptable: Booleans, values: Array, name: str, remedy: str) -> None:
     # Comparisons are False for NaN; infinities are refused as well.
     invalid = ~acceptable | np.isinf(values)
     if np.any(invalid):
@@ -413,7 +411,7 @@ def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) 
         ) from None
 
 
-def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ...]) -> Mask:
+def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ...]) -> Booleans:
     """Return the bins of the reference window as (profile or 1, bin)."""
     if not isinstance(reference, tuple) or len(reference) != 2:
         raise RetrievalInputError(
