@@ -16,13 +16,13 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 89_550,
-    "lines of code alone": 59_100,
-    "lines without bench": 79_700,
-    "modules": 453,
-    "dataclasses": 405,
-    "lines of dataclasses": 9_730,
-    "tuning numbers": 256,
+    "lines": 88_980,
+    "lines of code alone": 58_750,
+    "lines without bench": 79_170,
+    "modules": 446,
+    "dataclasses": 402,
+    "lines of dataclasses": 9_700,
+    "tuning numbers": 254,
     "tuning numbers that are assumed": 87,
     "copied thresholds": 1,
     "most parameters": 24,
