@@ -33,8 +33,6 @@ BLOCK: Final = 16
 
 _LOWEST: Final = np.iinfo(np.int32).min
 _HIGHEST: Final = np.iinfo(np.int32).max
-_FLAT: Final = 1e-12
-"""Relative spread below which values differ only by rounding."""
 _MISSING: Final = int(Quality.INPUT_MISSING)
 _SATURATED: Final = int(Quality.SATURATED)
 _PILE_UP: Final = int(Quality.PILE_UP)
