@@ -85,9 +85,39 @@ LONGEST_REASON: Final = 300
 """Characters of a reason that products state; a damaged header may be quoted in it."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """What a raw file states of itself: its format makes it, the catalog stores it."""
+
+    format: str = ""
+    """Name of the raw format; empty where the file is refused."""
+    start: datetime | None = None
+    """UTC."""
+    stop: datetime | None = None
+    """UTC."""
+    zenith_angle: float | None = None
+    """degree, 0 = up; None where it is unknown."""
+    azimuth: float | None = None
+    """degree in [0, 360), clockwise from north."""
+    latitude: float | None = None
+    longitude: float | None = None
+    altitude: float | None = None
+    """m above the geoid."""
+    layout: tuple[ChannelLayout, ...] = ()
+    """Channels and their range grids, in file order."""
+    notes: tuple[str, ...] = ()
+    """Peculiarities in words."""
+    header_digest: str | None = None
+    """At most 16 characters; equal for files whose headers differ only in the fields above and in
+    the lasers; None where unknown, or where the file may have changed."""
+    setup: str = ""
+    """Equal for files of one site whose channels were recorded in the same way, whatever their
+    shots; empty where the file is refused."""
+
+
 @dataclass(frozen=True, slots=True)
-class Granule:
-    """One raw file as catalogued."""
+class Granule(Header):
+    """One raw file as catalogued: times, pointing and position are those of the campaign."""
 
     path: str
     """Relative to the archive root, with forward slashes."""
@@ -98,31 +128,10 @@ class Granule:
     status: Status
     reason: str = ""
     """Why the granule is refused; empty when good."""
-    notes: tuple[str, ...] = ()
-    """Peculiarities of a good granule, in words."""
     contradictions: tuple[str, ...] = ()
     """Statements of the campaign on the station that the header contradicts, in words."""
-    start: datetime | None = None
-    stop: datetime | None = None
-    zenith_angle: float | None = None
-    """degree, 0 = up."""
-    azimuth: float | None = None
-    """degree, clockwise from north."""
-    latitude: float | None = None
-    longitude: float | None = None
-    altitude: float | None = None
-    """m above the geoid."""
-    layout: tuple[ChannelLayout, ...] = ()
     sha256: str | None = None
     """Digest of the file; None until the whole file has been read."""
-    format: str = ""
-    """Name of its raw format; empty where the file is refused."""
-    header_digest: str | None = None
-    """Equal for files whose headers differ only in the fields above and in the lasers; None where
-    unknown, or where the file may have changed."""
-    setup: str = ""
-    """Equal for files of one site whose channels were recorded in the same way, whatever their
-    shots; empty where the file is refused."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -228,6 +228,11 @@ class InstrumentFacts(SettingsModel):
         default={}, description="facts about channels, by their names such as photon_532o"
     )
 
+    @property
+    def clock_error(self) -> timedelta:
+        """Clock of the raw files minus UTC."""
+        return timedelta(seconds=self.clock_offset)
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.valid_to <= self.valid_from:
@@ -331,10 +336,17 @@ class Instrument(SettingsModel):
 
     def facts_at(self, moment: datetime) -> InstrumentFacts:
         """Return the facts that are valid at `moment`, or empty facts."""
-        for fact in self.facts:
-            if fact.valid_from <= moment < fact.valid_to:
-                return fact
-        return InstrumentFacts()
+        valid = (fact for fact in self.facts if fact.valid_from <= moment < fact.valid_to)
+        return next(valid, InstrumentFacts())
+
+    def facts_by_clock(self, moment: datetime) -> InstrumentFacts:
+        """Return the facts of a time by the clock of the instrument, or empty facts."""
+        valid = (
+            fact
+            for fact in self.facts
+            if fact.valid_from <= moment - fact.clock_error < fact.valid_to
+        )
+        return next(valid, InstrumentFacts())
 
 
 class NetworkMembers(SettingsModel):

@@ -424,14 +424,17 @@ def _sentences(stored: str) -> tuple[str, ...]:
 
 
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
-    (
-        path, size, mtime_ns, instrument, role, status, reason, notes, contradictions, start, stop,
-        zenith_angle, azimuth, latitude, longitude, altitude, layout, *others,
-    ) = row  # fmt: skip
+    stored = row._asdict()
+    start, stop = stored["start"], stored["stop"]
     return Granule(
-        path, size, mtime_ns, instrument, _ROLES[role], _STATUSES[status], reason,
-        _sentences(notes), _sentences(contradictions),
-        None if start is None else start.replace(tzinfo=UTC),
-        None if stop is None else stop.replace(tzinfo=UTC),
-        zenith_angle, azimuth, latitude, longitude, altitude, layouts[layout], *others,
-    )  # fmt: skip
+        **stored
+        | {
+            "role": _ROLES[stored["role"]],
+            "status": _STATUSES[stored["status"]],
+            "notes": _sentences(stored["notes"]),
+            "contradictions": _sentences(stored["contradictions"]),
+            "start": None if start is None else start.replace(tzinfo=UTC),
+            "stop": None if stop is None else stop.replace(tzinfo=UTC),
+            "layout": layouts[stored["layout"]],
+        }
+    )

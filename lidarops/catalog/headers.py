@@ -1,24 +1,24 @@
 """Make granules from the headers of raw files.
 
-Processes that read headers import only this module, so it imports little, to start quickly.
+Its sources decide whether a header is read again, so it imports little.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
+from datetime import datetime
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, read_start
-from lidarops.raw.header import HeaderOrder, HeaderPointing, RawHeader
+from lidarops.raw.header import RawHeader
 from lidarops.records import UNKNOWN_FORMAT, UNREADABLE, Granule, Role, Status
 
 if TYPE_CHECKING:
-    from lidarops.campaign.model import Campaign, Instrument, Station
+    from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, Station
 
 _TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
@@ -41,43 +41,22 @@ class UnreadFile(NamedTuple):
     """Digest of the settings that affect its granule."""
 
 
-class _Facts(NamedTuple):
-    """What the campaign states in one period that headers state too."""
-
-    valid_from: datetime = datetime.min.replace(tzinfo=UTC)
-    valid_to: datetime = datetime.max.replace(tzinfo=UTC)
-    zenith_angle: float | None = None
-    azimuth: float | None = None
-    clock_offset: float = 0.0
-    """s; clock of the instrument minus UTC."""
-
-
 @dataclass(frozen=True, slots=True)
-class _Place:
-    """Position and facts of an instrument, as far as headers hold them too."""
+class _Lidar:
+    """What the campaign states of an instrument that headers state too."""
 
-    latitude: float
-    longitude: float
-    altitude: float
-    header_position: HeaderOrder | Literal["ignore"]
-    header_pointing: HeaderPointing
-    position_tolerance: float
-    """degree."""
-    altitude_tolerance: float
-    """m."""
-    facts: tuple[_Facts, ...]
-
-    def facts_of(self, start: datetime) -> _Facts:
-        """Return the facts of a file that starts at a time by the clock of the instrument."""
-        for fact in self.facts:
-            if fact.valid_from <= start - timedelta(seconds=fact.clock_offset) < fact.valid_to:
-                return fact
-        return _Facts()
+    instrument: Instrument
+    station: Station
 
     def is_near(self, latitude: float, longitude: float) -> bool:
         """Return whether a position is that of the station, within the tolerance."""
-        eastward = (longitude - self.longitude + 180.0) % 360.0 - 180.0
-        return max(abs(latitude - self.latitude), abs(eastward)) <= self.position_tolerance
+        eastward = (longitude - self.station.longitude + 180.0) % 360.0 - 180.0
+        northward = latitude - self.station.latitude
+        return max(abs(northward), abs(eastward)) <= self.instrument.position_tolerance
+
+    def is_level(self, altitude: float) -> bool:
+        """Return whether an altitude is that of the station, within the tolerance."""
+        return abs(altitude - self.station.altitude) <= self.instrument.altitude_tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,23 +65,23 @@ class Headers:
 
     source: Source
     _campaign: str
-    _places: Mapping[str, _Place]
+    _lidars: Mapping[str, _Lidar]
 
     @classmethod
     def of(cls, campaign: Campaign, source: Source, entered_as: str) -> Self:
-        """Extract the settings for headers from a campaign, whose module takes long to import.
+        """Return the settings of a campaign for headers.
 
         Rows get the name `entered_as`, by which the catalog knows the campaign.
         """
-        places = {
-            name: _place(campaign.stations[instrument.station], instrument)
+        lidars = {
+            name: _Lidar(instrument, campaign.stations[instrument.station])
             for name, instrument in campaign.instruments.items()
         }
-        return cls(source, entered_as, places)
+        return cls(source, entered_as, lidars)
 
-    def place(self, instrument: str) -> _Place:
-        """Return position and pointing of an instrument."""
-        return self._places[instrument]
+    def lidar(self, instrument: str) -> _Lidar:
+        """Return an instrument with its station."""
+        return self._lidars[instrument]
 
     def row(self, due: UnreadFile, granule: Granule) -> GranuleRow:
         """Return the row of a granule."""
@@ -127,18 +106,18 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
     try:
         head = headers.source.head(file.path, HEADER_BYTES)
         header = parse_raw_header(head, file=file.path, size=file.size)
-        return _accepted(due, header, headers.place(due.instrument))
+        return _accepted(due, header, headers.lidar(due.instrument))
     except RawFormatError as error:
         reason = str(error).removeprefix(f"{file.path}: ")
-        return _refused(due, reason, _start(head, headers.place(due.instrument)))
+        return _refused(due, reason, _start(head, headers.lidar(due.instrument)))
     except OSError as error:
         return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
 
 
-def _start(head: bytes, place: _Place) -> datetime | None:
+def _start(head: bytes, lidar: _Lidar) -> datetime | None:
     """Return the start of a file that is refused, by which it belongs to a scene."""
     start = read_start(head)
-    return start and start - timedelta(seconds=place.facts_of(start).clock_offset)
+    return start and start - lidar.instrument.facts_by_clock(start).clock_error
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
@@ -154,9 +133,10 @@ def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Gra
     )
 
 
-def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
-    facts = place.facts_of(header.start)
-    header = header.read_as(place.header_pointing)
+def _accepted(due: UnreadFile, header: RawHeader, lidar: _Lidar) -> Granule:
+    instrument, station = lidar.instrument, lidar.station
+    facts = instrument.facts_by_clock(header.start)
+    header = header.read_as(instrument.header_pointing)
     if header.doubt and facts.zenith_angle is None:
         raise RawFormatError(
             header.doubt,
@@ -165,10 +145,18 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
             remedy="leave the file out, or set header_pointing if it states no scan, or give"
             " zenith_angle in the facts if the beam is fixed: it holds for all files of the period",
         )
-    shift = timedelta(seconds=facts.clock_offset)
-    order = place.header_position
+    order = instrument.header_position
     position = None if order == "ignore" else header.position(order)
-    latitude, longitude = position or (place.latitude, place.longitude)
+    latitude, longitude = position or (station.latitude, station.longitude)
+    of_campaign = {
+        "start": header.start - facts.clock_error,
+        "stop": header.stop - facts.clock_error,
+        "zenith_angle": header.zenith_angle if facts.zenith_angle is None else facts.zenith_angle,
+        "azimuth": header.azimuth if facts.azimuth is None else facts.azimuth,
+        "latitude": latitude,
+        "longitude": longitude,
+        "notes": (*header.notes, *_overridden(header, facts, lidar)),
+    }
     return Granule(
         path=due.file.path,
         size=due.file.size,
@@ -176,50 +164,39 @@ def _accepted(due: UnreadFile, header: RawHeader, place: _Place) -> Granule:
         instrument=due.instrument,
         role=due.role,
         status=Status.GOOD,
-        notes=(*header.notes, *_overridden(header, facts, place)),
-        contradictions=() if order == "ignore" else tuple(_contradictions(header, position, place)),
-        start=header.start - shift,
-        stop=header.stop - shift,
-        zenith_angle=header.zenith_angle if facts.zenith_angle is None else facts.zenith_angle,
-        azimuth=header.azimuth if facts.azimuth is None else facts.azimuth,
-        latitude=latitude,
-        longitude=longitude,
-        altitude=header.altitude,
-        layout=header.layout,
-        format=header.format,
-        header_digest=header.digest,
-        setup=header.setup,
+        contradictions=() if order == "ignore" else tuple(_contradictions(header, position, lidar)),
+        **header.stated | of_campaign,
     )
 
 
 def _contradictions(
-    header: RawHeader, position: tuple[float, float] | None, place: _Place
+    header: RawHeader, position: tuple[float, float] | None, lidar: _Lidar
 ) -> Iterator[str]:
     """Yield what the header states otherwise than the station of the campaign."""
-    if position is not None and not place.is_near(*position):
+    station, altitude = lidar.station, header.altitude
+    if position is not None and not lidar.is_near(*position):
         latitude, longitude = position
         remedy = "correct the station, or set header_position: ignore or position_tolerance"
-        if place.is_near(longitude, latitude):
+        if lidar.is_near(longitude, latitude):
             remedy = (
                 "they look swapped: correct the station, or set header_position if the header has"
                 " them in another order"
             )
         yield (
             f"the header states the position {latitude:.1f} N {longitude:.1f} E, the station of the"
-            f" campaign {place.latitude:.1f} N {place.longitude:.1f} E ({remedy})"
+            f" campaign {station.latitude:.1f} N {station.longitude:.1f} E ({remedy})"
         )
-    altitude = header.altitude
-    if altitude is not None and abs(altitude - place.altitude) > place.altitude_tolerance:
+    if altitude is not None and not lidar.is_level(altitude):
         remedy = "correct the station, or set header_position: ignore or altitude_tolerance"
-        if abs(altitude - 1e3 * place.altitude) <= place.altitude_tolerance:
+        if abs(altitude - 1e3 * station.altitude) <= lidar.instrument.altitude_tolerance:
             remedy = "that of the station looks like km: give m"
         yield (
             f"the header states the altitude {altitude:.0f} m, the station of the campaign"
-            f" {place.altitude:.5g} m ({remedy})"
+            f" {station.altitude:.5g} m ({remedy})"
         )
 
 
-def _overridden(header: RawHeader, facts: _Facts, place: _Place) -> Iterator[str]:
+def _overridden(header: RawHeader, facts: InstrumentFacts, lidar: _Lidar) -> Iterator[str]:
     """Yield what of the campaign overrides what the header states otherwise."""
     for name in ("zenith_angle", "azimuth"):
         stated, given = getattr(header, name), getattr(facts, name)
@@ -229,27 +206,9 @@ def _overridden(header: RawHeader, facts: _Facts, place: _Place) -> Iterator[str
             yield f"{name} {given:g} degree of the campaign overrides {stated:g} of the header"
     if header.doubt:
         yield f"zenith_angle {facts.zenith_angle:g} of the facts overrides header: {header.doubt}"
-    if place.header_position == "ignore":
+    if lidar.instrument.header_position == "ignore":
         pair, altitude = header.coordinates, header.altitude
-        if pair is not None and not (place.is_near(*pair) or place.is_near(*pair[::-1])):
+        if pair is not None and not (lidar.is_near(*pair) or lidar.is_near(*pair[::-1])):
             yield f"header_position: ignore overrides {pair[0]:g}, {pair[1]:g} of the header"
-        if altitude is not None and abs(altitude - place.altitude) > place.altitude_tolerance:
+        if altitude is not None and not lidar.is_level(altitude):
             yield f"header_position: ignore overrides the altitude {altitude:g} m of the header"
-
-
-def _place(station: Station, instrument: Instrument) -> _Place:
-    return _Place(
-        station.latitude,
-        station.longitude,
-        station.altitude,
-        instrument.header_position,
-        instrument.header_pointing,
-        instrument.position_tolerance,
-        instrument.altitude_tolerance,
-        tuple(
-            _Facts(
-                fact.valid_from, fact.valid_to, fact.zenith_angle, fact.azimuth, fact.clock_offset
-            )
-            for fact in instrument.facts
-        ),
-    )

@@ -10,7 +10,7 @@ The modules in reading order. For every format:
 
 For Licel files:
 
-6. `licel_header`: bytes to `Header` and `Dataset` records.
+6. `licel_header`: bytes to `Header` and `Dataset`.
 7. `licel`: header to counts, counts to physical arrays (mV and MHz). The public functions of the
    format.
 8. `licel_write`: numbers to header text, counts to bytes.

@@ -151,12 +151,12 @@ def _read_headers(
             header = read_raw_header(file, "" if granule is None else granule.format)
             stamps.append((path, file.size, file.mtime_ns))
         if granule is None:
-            unnamed.append(header._replace(record=None))
+            unnamed.append(header)
             continue
         known = columns.position_order == "ignore" and granule.start
         named = _renamed(header, granule.layout or header.layout)
         columns.append(named, granule if known else None)
-        if alike == (header.digest, header.size, granule.layout):
+        if alike == (header.header_digest, header.size, granule.layout):
             variants[alike] = columns.variant[-1]
     names = recorder_names((header.layout, 1, header.start) for header in unnamed)
     for header in unnamed:
@@ -172,7 +172,7 @@ def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
             file=header.path,
             remedy="run lidarops catalog again",
         )
-    return header._replace(channels=_with_names(header.channels, layout))
+    return replace(header, channels=_with_names(header.channels, layout))
 
 
 # Files with equal channels share one tuple.

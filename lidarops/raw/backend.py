@@ -20,7 +20,7 @@ from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.file import RawFile
 from lidarops.raw.header import RawChannel, RawHeader, channel_names, to_physical
-from lidarops.raw.licel_format import FORMAT, raw_header
+from lidarops.raw.licel_format import FORMAT
 from lidarops.raw.model import Columns, Position, build_raw_dataset
 
 
@@ -63,7 +63,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
                 f"cannot open a {type(filename_or_obj).__name__}", remedy="give a local path"
             )
         columns = Columns(channel_names(channels), header_position)
-        header = raw_header(licel.read_header(filename_or_obj))
+        header = licel.read_header(filename_or_obj)
         columns.append(header)
 
         def signal(_: int, channel: RawChannel) -> Any:

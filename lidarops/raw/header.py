@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from functools import lru_cache
-from typing import Any, Final, Literal, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.records import ChannelLayout, DetectionMode, Header
 
 _LEAST_TEXT: Final = 64
 """Bytes; the counts of 16 bins are not printable by chance."""
@@ -33,13 +33,14 @@ class IncompleteHeaderError(RawFormatError):
     """Bytes that end inside the header."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RawChannel:
     """One analog or photon-counting channel that a raw file stores."""
 
     name: str
     """Unique in its file: mode, wavelength in nm and polarisation, such as ``photon_532o``."""
-    mode: DetectionMode
+    mode: DetectionMode | None
+    """None for what a file holds beside signals, such as a power meter; no channel of a header."""
     wavelength: float
     """m; NaN where the header gives no plausible wavelength."""
     wavelength_label: str
@@ -83,48 +84,53 @@ class RawChannel:
         return self.shots * ((1 << self.adc_bits) - 1) if analog else None
 
 
+_RECORDED: Final = tuple(
+    item.name for item in fields(RawChannel) if item.name not in {"shots", "scale", "places"}
+)
+"""Properties of a channel that say how it was recorded."""
+
+
 def holds_text(data: bytes) -> bool:
     """Return whether bytes are printable text; False where there are too few to tell."""
     return len(data) >= _LEAST_TEXT and not data.translate(None, _TEXT)
 
 
-class RawHeader(NamedTuple):
-    """Header of one raw file; a tuple, because millions are made."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawHeader(Header):
+    """Header of one raw file as its format parses it.
 
-    format: str
-    """Name of the raw format."""
-    path: str
+    A format may add fields in a subclass; ``lidarops inspect`` shows them too.
+    """
+
+    path: str = field(compare=False)
     """File, for messages."""
     size: int
     """Bytes of the file."""
     start: datetime
-    """UTC."""
     stop: datetime
-    """UTC."""
     channels: tuple[RawChannel, ...]
     """In file order. Files with equal channels should share one tuple, for speed."""
-    digest: str
-    """At most 16 characters; equal for files with equal site and channels."""
-    zenith_angle: float | None = None
-    """degree, 0 = up; None where the file does not state it."""
-    azimuth: float | None = None
-    """degree in [0, 360)."""
-    altitude: float | None = None
-    """m above the geoid."""
-    coordinates: tuple[float, float] | None = None
-    """degree; longitude and latitude, unless the instrument writes them the other way round."""
+    layout: tuple[ChannelLayout, ...] = field(init=False, compare=False)
+    """Follows from the channels."""
+    setup: str = field(init=False, compare=False)
+    """Follows from site and channels."""
     site: str = ""
-    notes: tuple[str, ...] = ()
-    """Oddities of the header, in words."""
     doubt: str = ""
     """Why the pointing is unknown although the header holds one, in words; the file is refused
     unless the campaign gives header_pointing or zenith_angle."""
     written_angle: float | None = None
     """degree; the angle as written, where no line of the file tells what it is."""
-    record: Any = None
-    """The header as its format holds it, a dataclass; ``lidarops inspect`` shows its fields too."""
 
-    def read_as(self, pointing: HeaderPointing) -> RawHeader:
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "layout", _layout(self.channels))
+        object.__setattr__(self, "setup", _setup(self.site, self.channels))
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The fields of `records.Header`, by name."""
+        return {name: getattr(self, name) for name in _STATED}
+
+    def read_as(self, pointing: HeaderPointing) -> Self:
         """Return the header with its written angle read as what the campaign says that it is.
 
         Elevations may be positive or negative upwards. Where a zenith angle is negative, or an
@@ -138,7 +144,14 @@ class RawHeader(NamedTuple):
             azimuth = (azimuth + 180.0) % 360.0
         notes = [note for note in self.notes if POINTING_NOTE not in note]
         notes.append(f"the angle of the header is {POINTING_NOTE} {pointing}: header_pointing")
-        return self._replace(zenith_angle=abs(angle), azimuth=azimuth, doubt="", notes=tuple(notes))
+        return replace(self, zenith_angle=abs(angle), azimuth=azimuth, doubt="", notes=tuple(notes))
+
+    @property
+    def coordinates(self) -> tuple[float, float] | None:
+        """degree; longitude and latitude, unless the instrument writes them the other way round."""
+        if self.longitude is None or self.latitude is None:
+            return None
+        return self.longitude, self.latitude
 
     def position(self, order: HeaderOrder = "longitude_first") -> tuple[float, float] | None:
         """Return latitude and longitude in degree; None where the header holds none.
@@ -155,40 +168,19 @@ class RawHeader(NamedTuple):
         """
         if self.coordinates is None:
             return None
-        return place_on_earth(*self.coordinates, order, self.path)
+        longitude, latitude = self.coordinates[:: -1 if order == "latitude_first" else 1]
+        if abs(latitude) > 90 or abs(longitude) > 180:
+            raise RawFormatError(
+                f"latitude {latitude:g}, longitude {longitude:g} is not a place on Earth",
+                file=self.path,
+                field="position",
+                remedy=f"header_position is {order}: choose the other order, or 'ignore',"
+                " in the campaign",
+            )
+        return latitude, longitude
 
-    @property
-    def layout(self) -> tuple[ChannelLayout, ...]:
-        """Channels and their range grids, in file order."""
-        return _layout(self.channels)
 
-    @property
-    def setup(self) -> str:
-        """Digest of site and channels whatever their shots, and wherever the file holds them."""
-        return _setup(self.site, self.channels)
-
-
-def place_on_earth(
-    longitude: float, latitude: float, order: HeaderOrder, file: str
-) -> tuple[float, float]:
-    """Return latitude and longitude of a header, swapped if it holds the latitude first.
-
-    Raises
-    ------
-    RawFormatError
-        If the pair is impossible in this order.
-    """
-    if order == "latitude_first":
-        latitude, longitude = longitude, latitude
-    if abs(latitude) > 90 or abs(longitude) > 180:
-        raise RawFormatError(
-            f"latitude {latitude:g}, longitude {longitude:g} is not a place on Earth",
-            file=file,
-            field="position",
-            remedy=f"header_position is {order}: choose the other order, or 'ignore',"
-            " in the campaign",
-        )
-    return latitude, longitude
+_STATED: Final = tuple(item.name for item in fields(Header))
 
 
 @lru_cache(maxsize=128)
@@ -196,7 +188,7 @@ def _layout(channels: tuple[RawChannel, ...]) -> tuple[ChannelLayout, ...]:
     return tuple(
         ChannelLayout(
             name=channel.name,
-            mode=channel.mode,
+            mode=DetectionMode(str(channel.mode)),
             wavelength=channel.wavelength,
             bins=channel.bins,
             bin_width=channel.bin_width,
@@ -209,8 +201,10 @@ def _layout(channels: tuple[RawChannel, ...]) -> tuple[ChannelLayout, ...]:
 
 @lru_cache(maxsize=128)
 def _setup(site: str, channels: tuple[RawChannel, ...]) -> str:
-    recorded = [replace(channel, shots=0, scale=0.0, places=()) for channel in channels]
-    return hashlib.sha256(f"{site} {recorded}".encode()).hexdigest()[:16]
+    digest = hashlib.sha256(site.encode())
+    for channel in channels:
+        digest.update(repr([getattr(channel, name) for name in _RECORDED]).encode())
+    return digest.hexdigest()[:16]
 
 
 def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:
@@ -245,18 +239,7 @@ def chosen(stored: Mapping[str, _Channel], names: Sequence[str], file: str) -> t
     return tuple(stored[name] for name in names)
 
 
-class _Grid(Protocol):
-    @property
-    def name(self) -> str: ...
-    @property
-    def bins(self) -> int: ...
-    @property
-    def bin_width(self) -> float: ...
-    @property
-    def adc_bits(self) -> int: ...
-
-
-def check_layout(path: str, channels: Sequence[_Grid], expected: Sequence[_Grid]) -> None:
+def check_layout(path: str, channels: Sequence[RawChannel], expected: Sequence[RawChannel]) -> None:
     """Raise if channels of a file differ from the `expected` ones in range grid or ADC bits.
 
     Raises
@@ -278,7 +261,7 @@ def check_layout(path: str, channels: Sequence[_Grid], expected: Sequence[_Grid]
     )
 
 
-def _grids(channels: Sequence[_Grid]) -> set[tuple[str, int, float, int]]:
+def _grids(channels: Sequence[RawChannel]) -> set[tuple[str, int, float, int]]:
     return {(c.name, c.bins, c.bin_width, c.adc_bits) for c in channels}
 
 

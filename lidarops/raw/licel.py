@@ -150,10 +150,10 @@ def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Datas
     RawFormatError
         If a channel is not stored, or there is no channel; the error names the stored ones.
     """
-    stored = {d.name: d for d in header.datasets if d.offset is not None}
+    stored = {d.name: d for d in header.datasets if d.places}
     names = channel_names(channels)
-    signals = [d.name for d in header.channels]
-    return chosen(stored, signals if names is None else names, header.path or header.name)
+    signals = [d.name for d in stored.values() if d.is_signal]
+    return chosen(stored, signals if names is None else names, header.path)
 
 
 def select_signals(header: Header, channels: Iterable[str] | None = None) -> tuple[Dataset, ...]:
@@ -169,7 +169,7 @@ def select_signals(header: Header, channels: Iterable[str] | None = None) -> tup
         if dataset.mode is None:
             raise RawFormatError(
                 f"{dataset.name} is not a signal: it has no physical values",
-                file=header.path or header.name,
+                file=header.path,
                 field="channels",
                 remedy="read it with licel.read_counts",
             )

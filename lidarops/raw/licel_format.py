@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-from dataclasses import fields, replace
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw import licel
+from lidarops.raw import licel, licel_header
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import RawFormat
 from lidarops.raw.header import RawChannel, RawHeader, Stretches
-from lidarops.raw.licel_header import memories, stated_start
 
 _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
 
@@ -29,16 +25,13 @@ counts of a recorder."""
 _SECTOR: Final = 128
 """Bins in 512 bytes, the smallest block that a disk loses."""
 
-_COMMON: Final = tuple(field.name for field in fields(RawChannel) if field.name != "places")
-"""Properties of channels that datasets have under the same name."""
-
 
 def _recognises(head: bytes) -> bool:
     return _FIRST_LINES.match(head) is not None
 
 
 def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
-    header = raw_header(licel.parse_header(head, file=file, size=size))
+    header = licel.parse_header(head, file=file, size=size)
     if len(head) == size:
         for channel in header.channels:
             first, *further = (np.frombuffer(head, "<i4", channel.bins, p) for p in channel.places)
@@ -46,33 +39,6 @@ def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
             _check_full_scale(counts, channel, header.path)
             _check_blocks(counts, channel, header.path)
     return header
-
-
-def raw_header(header: licel.Header) -> RawHeader:
-    """Return the header of a Licel file in the general form."""
-    return RawHeader(
-        format=FORMAT.name,
-        path=header.path or header.name,
-        size=header.size,
-        start=header.start,
-        stop=header.stop,
-        channels=_channels(header.datasets),
-        digest=_digest(header.site, header.data_start, _after_lasers(header)),
-        zenith_angle=header.zenith_angle,
-        azimuth=header.azimuth,
-        altitude=header.altitude,
-        coordinates=(header.longitude, header.latitude),
-        site=header.site,
-        notes=header.notes,
-        doubt=header.pointing_doubt,
-        written_angle=header.zenith_as_written if header.scan is None else None,
-        record=header,
-    )
-
-
-def _after_lasers(header: licel.Header) -> bytes:
-    lines = 3 if header.scan is None else 4
-    return header.source.split(b"\r\n", lines)[lines]
 
 
 def _check_full_scale(counts: NDArray[np.int32], channel: RawChannel, path: str) -> None:
@@ -123,29 +89,6 @@ def _check_blocks(counts: NDArray[np.int32], channel: RawChannel, path: str) -> 
             )
 
 
-@lru_cache(maxsize=128)
-def _channels(datasets: tuple[licel.Dataset, ...]) -> tuple[RawChannel, ...]:
-    return tuple(
-        RawChannel(
-            places=tuple(memory.offset for memory in group if memory.offset is not None),
-            **{name: getattr(_added(group), name) for name in _COMMON},
-        )
-        for group in memories(datasets)
-    )
-
-
-def _added(group: tuple[licel.Dataset, ...]) -> licel.Dataset:
-    """Return the dataset of a channel with the shots of all its memories."""
-    return replace(group[0], shots=sum(memory.shots for memory in group))
-
-
-# All but name, times, place, lasers and weather; the same in many files.
-@lru_cache(maxsize=128)
-def _digest(site: str, data_start: int, datasets: bytes) -> str:
-    prefix = f"{site}\n{data_start}\n".encode()
-    return hashlib.sha256(prefix + datasets).hexdigest()[:16]
-
-
 def _read_counts(
     file: RawFile, place: int, stretches: Stretches | None, row: NDArray[np.int32]
 ) -> None:
@@ -160,11 +103,11 @@ def _read_counts(
 
 
 FORMAT: Final = RawFormat(
-    name="licel",
+    name=licel_header.FORMAT,
     title="Licel",
     conversion=licel.CONVENTION,
     recognises=_recognises,
     parse_header=_parse_header,
     read_counts=_read_counts,
-    read_start=stated_start,
+    read_start=licel_header.stated_start,
 )

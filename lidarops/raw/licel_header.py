@@ -13,6 +13,7 @@ the size of the file: truncated files, and files with surplus bytes, are refused
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections import Counter
@@ -26,9 +27,11 @@ from typing import Final, NamedTuple
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
-from lidarops.raw.header import HeaderOrder, IncompleteHeaderError, holds_text, place_on_earth
+from lidarops.raw.header import IncompleteHeaderError, RawChannel, RawHeader, holds_text
 from lidarops.records import DetectionMode
 
+FORMAT: Final = "licel"
+"""Name of the raw format."""
 CONVENTION: Final = (
     "analog: mV = counts * input_range * 1000 / (shots * 2^adc_bits);"
     " photon counting: MHz = counts / shots * (150 m / bin_width)"
@@ -44,7 +47,8 @@ _MAX_BINS = 1_000_000
 _MAX_BIN_WIDTH = 1000.0
 _MAX_BITS = 32
 _MAX_INPUT_RANGE = 100.0
-_WAVELENGTHS = (1e-7, 2e-5)
+_SHORTEST, _LONGEST_WAVE = 1e-7, 2e-5
+"""m."""
 _YEARS = (1960, 2200)
 _ICE_POINT = 273.15
 
@@ -112,48 +116,35 @@ class Laser(NamedTuple):
     """Hz; 0 in many files, although the laser fires."""
 
 
-@dataclass(frozen=True, slots=True)
-class Dataset:
-    """One dataset line of a header, from the parser or `licel_write.new_dataset`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dataset(RawChannel):
+    """One dataset line of a header, from the parser or `licel_write.new_dataset`.
 
-    name: str
-    """Unique in its header: ``analog_532o``, ``photon_355p``, ``analog_532o_2``."""
+    Its name is unique in its header: ``analog_532o``, ``photon_355p``, ``analog_532o_2``. Its
+    places are the bytes at which counts start.
+    """
+
+    # Both follow from other properties, and NaN equals nothing.
+    wavelength: float = field(compare=False)
+    scale: float = field(compare=False)
     kind: DatasetKind
     active: bool
-    laser: int
-    bins: int
     laser_polarisation: int
-    high_voltage: float
-    """V."""
-    bin_width: float
-    """m."""
-    wavelength_label: str
-    """Label as written, for example ``00532.o``."""
-    polarisation: str
-    """o none, p parallel, s perpendicular, r and l circular."""
-    bin_shift: float
-    """Bins."""
-    adc_bits: int
-    """0 for photon counting."""
-    shots: int
-    input_range: float | None
-    """V; None unless analog."""
-    discriminator: float | None
-    """V; None unless photon counting."""
-    device: str
     comment: str
-    offset: int | None
-    """Byte at which the counts start; None if the file does not store them."""
     line: bytes = field(compare=False, repr=False)
     """Header line as written, with CRLF."""
 
-    def __hash__(self) -> int:
-        return hash((self.name, self.offset, self.shots))
+    __hash__ = RawChannel.__hash__
+
+    @property
+    def offset(self) -> int | None:
+        """Byte at which the counts start; None if the file does not store them."""
+        return self.places[0] if self.places else None
 
     @property
     def is_signal(self) -> bool:
         """Whether the file stores it and it is a signal."""
-        return self.offset is not None and self.kind in _MODES
+        return bool(self.places) and self.mode is not None
 
     @property
     def recorded_as(self) -> tuple[object, ...]:
@@ -163,57 +154,38 @@ class Dataset:
             self.bin_width, self.adc_bits, self.input_range, self.bin_shift,
         )  # fmt: skip
 
-    @property
-    def mode(self) -> DetectionMode | None:
-        """Detection mode; None if the dataset is not a signal."""
-        return _MODES.get(self.kind)
 
-    @property
-    def wavelength(self) -> float:
-        """m; NaN if the label is outside of the optical range, such as 53200 nm."""
-        wavelength = int(self.wavelength_label.partition(".")[0]) * 1e-9
-        low, high = _WAVELENGTHS
-        return wavelength if low < wavelength < high else math.nan
-
-    @property
-    def units(self) -> str:
-        """Unit of the physical values."""
-        return "mV" if self.kind is DatasetKind.ANALOG else "MHz"
-
-    @property
-    def scale(self) -> float:
-        """Physical value of one count, mV or MHz (`CONVENTION`); NaN without shots or signal."""
-        if self.shots == 0 or self.mode is None:
-            return math.nan
-        if self.input_range is not None:
-            return self.input_range * 1e3 / (self.shots << self.adc_bits)
-        return LICEL_RANGE_PER_MICROSECOND / self.bin_width / self.shots
-
-    @property
-    def full_scale(self) -> int | None:
-        """Counts of a saturated digitiser, ``shots (2^adc_bits - 1)``; None without one."""
-        return self.shots * ((1 << self.adc_bits) - 1) if self.kind is DatasetKind.ANALOG else None
+@lru_cache(maxsize=1024)
+def _wavelength(nanometres: str) -> float:
+    """Return the wavelength of a label, m; NaN outside of the optical range, such as 53200 nm."""
+    wavelength = int(nanometres) * 1e-9
+    return wavelength if _SHORTEST < wavelength < _LONGEST_WAVE else math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class Header:
-    """Header of a Licel file, from the parser or `licel_write.new_header`."""
+@lru_cache(maxsize=1024)
+def _scale(
+    kind: DatasetKind, bin_width: float, shots: int, adc_bits: int, input_range: float | None
+) -> float:
+    """Return the physical value of one count, mV or MHz; NaN without shots or signal."""
+    if shots == 0 or kind not in _MODES:
+        return math.nan
+    if input_range is not None:
+        return input_range * 1e3 / (shots << adc_bits)
+    return LICEL_RANGE_PER_MICROSECOND / bin_width / shots
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header(RawHeader):
+    """Header of a Licel file, from the parser or `licel_write.new_header`.
+
+    Times are by the clock of the instrument, taken as UTC; a stop that is not later than the start
+    as written follows from shots and repetition rate.
+    """
 
     name: str
     """File name in line 1."""
-    site: str
-    start: datetime
-    """By the clock of the instrument, taken as UTC."""
-    stop: datetime
-    """The same; where it is not later than the start as written, from shots and repetition rate."""
-    altitude: float
-    """m above the geoid."""
-    longitude: float
-    """degree; the first of the two coordinates, see `position`."""
-    latitude: float
-    """degree; the second of the two coordinates, see `position`."""
     zenith_as_written: float
-    """degree; see `zenith_angle`."""
+    """degree; see `_pointing`."""
     azimuth_as_written: float | None
     """degree in [0, 360)."""
     temperature: float | None
@@ -232,75 +204,8 @@ class Header:
     """In file order, with inactive datasets and those that are not signals."""
     data_start: int
     """Byte after the empty line."""
-    size: int
-    """Bytes of the file."""
-    notes: tuple[str, ...]
-    """Oddities of the header, in words."""
-    path: str = field(compare=False)
-    """File of the header; empty for bytes in memory."""
     source: bytes = field(compare=False, repr=False)
     """The header as written: `data_start` bytes."""
-
-    @property
-    def pointing_doubt(self) -> str:
-        """Why the zenith angle is unknown, in words; empty where it is known."""
-        written = self.zenith_as_written
-        if self.scan is not None:
-            azimuth = self.azimuth_as_written
-            if self.scan.holds(written, math.nan if azimuth is None else azimuth):
-                return ""
-            at = "unknown azimuth" if azimuth is None else f"azimuth {azimuth:g}"
-            return (
-                f"the pointing {written:g} degree at {at} is not on the grid of its scan: it is"
-                " that of an earlier file"
-            )
-        if written >= 0.0 or written == -90.0:
-            return ""
-        return (
-            f"the pointing {written:g} degree may be an elevation or a zenith angle: the header"
-            " holds no grid of a scan"
-        )
-
-    @property
-    def zenith_angle(self) -> float | None:
-        """degree, 0 = up; None where `pointing_doubt` says why it is unknown.
-
-        -90 as written means vertical. Scans state elevations, negative upwards (Raymetrics).
-        """
-        if self.pointing_doubt:
-            return None
-        if self.scan is not None:
-            return 90.0 + self.zenith_as_written
-        return max(self.zenith_as_written, 0.0)
-
-    @property
-    def azimuth(self) -> float | None:
-        """Azimuth in degree in [0, 360); None where it is unknown."""
-        if self.azimuth_as_written is None or self.scan is None:
-            return self.azimuth_as_written
-        if self.pointing_doubt:
-            return None
-        return (self.azimuth_as_written + self.scan.azimuth_offset) % 360.0
-
-    @property
-    def channels(self) -> tuple[Dataset, ...]:
-        """Stored analog and photon-counting datasets, in file order."""
-        return tuple(d for d in self.datasets if d.is_signal)
-
-    def position(self, order: HeaderOrder = "longitude_first") -> tuple[float, float]:
-        """Return latitude and longitude in degree.
-
-        Parameters
-        ----------
-        order : {"longitude_first", "latitude_first"}
-            Coordinate that the instrument wrote first; by the specification the longitude.
-
-        Raises
-        ------
-        RawFormatError
-            If the pair is impossible in this order.
-        """
-        return place_on_earth(self.longitude, self.latitude, order, self.path or self.name)
 
 
 class _Place(NamedTuple):
@@ -387,16 +292,29 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     notes += _note_on_shots(datasets, lasers)
     if written_stop < start:
         notes += ("stop lies 1 s before start: the interval follows from the shots",)
-    if len(memories(datasets)) < sum(dataset.is_signal for dataset in datasets):
+    channels = _channels(datasets)
+    if sum(len(channel.places) for channel in channels) > len(channels):
         notes += ("channels have two memories: counts and shots of both are added",)
+    site, source = second[: dates.start()].strip(), buffer[:data_start]
+    zenith, azimuth, doubt = _pointing(place.zenith, place.azimuth, scan)
     return Header(
-        name=first.strip(),
-        site=second[: dates.start()].strip(),
+        format=FORMAT,
+        path=file or first.strip(),
+        size=size,
         start=start,
-        stop=_true_stop(start, written_stop, lasers, datasets),
-        altitude=place.altitude,
-        longitude=place.longitude,
+        stop=_true_stop(start, written_stop, lasers, channels),
+        zenith_angle=zenith,
+        azimuth=azimuth,
         latitude=place.latitude,
+        longitude=place.longitude,
+        altitude=place.altitude,
+        notes=place.notes + notes + dataset_notes,
+        header_digest=_digest(site, data_start, source[ends[-1] + 2 :]),
+        channels=channels,
+        site=site,
+        doubt=doubt,
+        written_angle=place.zenith if scan is None else None,
+        name=first.strip(),
         zenith_as_written=place.zenith,
         azimuth_as_written=place.azimuth,
         temperature=place.temperature,
@@ -407,11 +325,53 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         timestamp=timestamp,
         datasets=datasets,
         data_start=data_start,
-        size=size,
-        notes=place.notes + notes + dataset_notes,
-        path=file,
-        source=buffer[:data_start],
+        source=source,
     )
+
+
+# All but name, times, place, lasers and weather; the same in many files.
+@lru_cache(maxsize=128)
+def _digest(site: str, data_start: int, datasets: bytes) -> str:
+    prefix = f"{site}\n{data_start}\n".encode()
+    return hashlib.sha256(prefix + datasets).hexdigest()[:16]
+
+
+@lru_cache(maxsize=128)
+def _channels(datasets: tuple[Dataset, ...]) -> tuple[Dataset, ...]:
+    """Return the signals, each with the shots and places of all its memories."""
+    return tuple(_added(group) for group in memories(datasets))
+
+
+def _added(group: tuple[Dataset, ...]) -> Dataset:
+    first, *others = group
+    if not others:
+        return first
+    shots = sum(memory.shots for memory in group)
+    return replace(
+        first,
+        shots=shots,
+        scale=_scale(first.kind, first.bin_width, shots, first.adc_bits, first.input_range),
+        places=tuple(place for memory in group for place in memory.places),
+    )
+
+
+def _pointing(
+    written: float, azimuth: float | None, scan: ScanGrid | None
+) -> tuple[float | None, float | None, str]:
+    """Return zenith angle and azimuth in degree, and why they are unknown, in words.
+
+    -90 as written means vertical. Scans state elevations, negative upwards (Raymetrics).
+    """
+    if scan is None:
+        if written >= 0.0 or written == -90.0:
+            return max(written, 0.0), azimuth, ""
+        doubt = "may be an elevation or a zenith angle: the header holds no grid of a scan"
+        return None, azimuth, f"the pointing {written:g} degree {doubt}"
+    if azimuth is not None and scan.holds(written, azimuth):
+        return 90.0 + written, (azimuth + scan.azimuth_offset) % 360.0, ""
+    at = "unknown azimuth" if azimuth is None else f"azimuth {azimuth:g}"
+    doubt = "is not on the grid of its scan: it is that of an earlier file"
+    return None, None, f"the pointing {written:g} degree at {at} {doubt}"
 
 
 def stated_start(buffer: bytes) -> datetime | None:
@@ -495,13 +455,13 @@ def _moment(numbers: list[int], name: str) -> datetime:
 
 
 def _true_stop(
-    start: datetime, stop: datetime, lasers: tuple[Laser, ...], datasets: tuple[Dataset, ...]
+    start: datetime, stop: datetime, lasers: tuple[Laser, ...], channels: tuple[Dataset, ...]
 ) -> datetime:
     """Return the stop; where the header states no duration, from shots and repetition rate."""
     if stop > start:
         return stop
     rate = max(laser.repetition_rate for laser in lasers)
-    shots = max((sum(d.shots for d in group) for group in memories(datasets)), default=0)
+    shots = max((channel.shots for channel in channels), default=0)
     return start + timedelta(seconds=shots / rate) if rate > 0.0 else start
 
 
@@ -690,7 +650,7 @@ def _parse_datasets(
 
 
 def _promised_size(datasets: Iterable[Dataset], data_start: int) -> int:
-    return data_start + sum(4 * d.bins + 2 for d in datasets if d.offset is not None)
+    return data_start + sum(4 * d.bins + 2 for d in datasets if d.places)
 
 
 def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Dataset, ...]:
@@ -704,7 +664,7 @@ def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Datase
             field = f"dataset {len(datasets) + 1}, {error.field}"
             raise RawFormatError(error.problem, field=field) from None
         datasets.append(dataset)
-        offset += 0 if dataset.offset is None else 4 * dataset.bins + 2
+        offset += 4 * dataset.bins + 2 if dataset.places else 0
         start = end
     uses: Counter[str] = Counter()
     # Active datasets get their names first: an inactive one must not take the plain name.
@@ -749,8 +709,13 @@ def _parse_line(line: bytes, offset: int, stored: bool) -> Dataset:  # noqa: FBT
     shots = _integer(tokens[13], "shots")
     _bounded(shots, 0, 10**9, "shots")
     active = _active(tokens[0])
+    input_range = level if analog else None
     return Dataset(
         name=f"{kind.name.lower()}_{int(label[1])}{polarisation}",
+        mode=_MODES.get(kind),
+        wavelength=_wavelength(label[1]),
+        scale=_scale(kind, width, shots, bits, input_range),
+        places=(offset,) if active or stored else (),
         kind=kind,
         active=active,
         laser=_integer(tokens[2], "laser"),
@@ -763,11 +728,10 @@ def _parse_line(line: bytes, offset: int, stored: bool) -> Dataset:  # noqa: FBT
         bin_shift=_bin_shift(*tokens[10:12]),
         adc_bits=bits,
         shots=shots,
-        input_range=level if analog else None,
+        input_range=input_range,
         discriminator=level * 1e-3 if photon else None,
         device=intern(tokens[15]),
         comment=" ".join(tokens[16:]),
-        offset=offset if active or stored else None,
         line=line,
     )
 

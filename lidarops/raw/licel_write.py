@@ -231,7 +231,7 @@ def format_header(header: Header) -> bytes:
     if parse_header(header.source, file=header.path, size=header.size) != header:
         raise RawFormatError(
             "the fields contradict the text of the header",
-            file=header.path or header.name,
+            file=header.path,
             remedy="build a changed header with new_header",
         )
     return header.source
@@ -251,7 +251,7 @@ def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
     RawFormatError
         If counts are missing, surplus, of a wrong shape or type, or exceed 32 bits.
     """
-    stored = [dataset for dataset in header.datasets if dataset.offset is not None]
+    stored = [dataset for dataset in header.datasets if dataset.places]
     surplus = set(counts) - {dataset.name for dataset in stored}
     if surplus:
         raise RawFormatError(f"not stored by the header: {', '.join(sorted(surplus))}")

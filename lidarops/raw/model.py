@@ -346,7 +346,7 @@ def _is_constant(values: NDArray[Any]) -> bool:
 
 def _attributes(channel: RawChannel, *, scaled: bool) -> dict[str, Any]:
     polarisation = POLARISATIONS.get(channel.polarisation, channel.polarisation)
-    mode = channel.mode.value
+    mode = str(channel.mode)
     label = int(channel.wavelength_label.partition(".")[0])
     wavelength = {} if math.isnan(channel.wavelength) else {"wavelength": channel.wavelength}
     return {

@@ -145,9 +145,7 @@ def _raw(file: Path) -> dict[str, Any]:
             formats = ", ".join(raw_formats())
             error.remedy = f"lidarops inspect reads NetCDF products and raw files of {formats}"
         raise
-    description: dict[str, Any] = _plain(header._asdict())
-    # What only its format holds comes besides.
-    return {"type": "raw", "file": str(file), **(description.pop("record") or {}), **description}
+    return {"type": "raw", "file": str(file), **_plain(header)}
 
 
 def _folder(folder: Path) -> dict[str, Any]:

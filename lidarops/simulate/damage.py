@@ -106,7 +106,7 @@ def _in_counts(edit: Callable[[Dataset, NDArray[np.int32], np.random.Generator],
 
 def _channels(content: bytearray) -> Iterator[tuple[Dataset, NDArray[np.int32]]]:
     header = parse_header(bytes(content))
-    for dataset in header.channels:
+    for dataset in header.datasets:
         yield dataset, np.frombuffer(content, "<i4", dataset.bins, dataset.offset or 0)
 
 

@@ -19,7 +19,6 @@ from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
 from lidarops.raw.file import RawFile
-from lidarops.raw.licel_format import raw_header
 from lidarops.records import Granule, Role, Status
 
 SYNCHRONOUS = {"scheduler": "synchronous"}
@@ -208,7 +207,7 @@ def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
     """Return the granules of files, as in a catalog."""
     granules = []
     for path in paths:
-        header = raw_header(licel.read_header(path))
+        header = licel.read_header(path)
         granules.append(
             Granule(
                 path=str(path.relative_to(folder)),
@@ -223,7 +222,7 @@ def catalogued(folder: Path, paths: list[Path]) -> list[Granule]:
                 zenith_angle=header.zenith_angle,
                 azimuth=header.azimuth,
                 altitude=header.altitude,
-                header_digest=header.digest,
+                header_digest=header.header_digest,
             )
         )
     return granules

@@ -15,7 +15,6 @@ from support.licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.formats import parse_raw_header
-from lidarops.raw.licel_format import raw_header
 from lidarops.records import DetectionMode
 
 DATES = "02/10/2024 17:30:00 02/10/2024 17:30:10"
@@ -111,7 +110,7 @@ def test_zenith_angle(written, angle, notes):
     assert header.zenith_angle == angle
     assert header.zenith_as_written == float(written)
     assert len(header.notes) == notes
-    assert bool(header.pointing_doubt) == (angle is None)
+    assert bool(header.doubt) == (angle is None)
 
 
 def test_position_order_and_refusal():
@@ -274,7 +273,7 @@ def test_datasets_that_are_no_signal_do_not_move_the_others(tmp_path):
     assert counts["photon_532p"].tolist() == [500, 501, 502, 503]
     assert [d.mode for d in header.datasets[1:5]] == [None] * 4
     assert all(math.isnan(d.scale) for d in header.datasets[1:5])
-    assert len(raw_header(header).layout) == 2
+    assert len(header.layout) == 2
     every = [dataset.name for dataset in header.datasets]
     _, counts = licel.read_counts(path, every)
     assert counts["power_meter_0o"].tolist() == [300, 301]

@@ -15,7 +15,6 @@ from support.licel_strategies import naive_physical, naive_read
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.formats import parse_raw_header
-from lidarops.raw.licel_format import raw_header
 from lidarops.raw.licel_header import memories
 
 
@@ -185,7 +184,7 @@ def test_pilar(data_root):
 
 
 def test_layout(data_root):
-    channels = raw_header(licel.read_header(data_root / "pilar/20241002/h24A0217.301035")).layout
+    channels = licel.read_header(data_root / "pilar/20241002/h24A0217.301035").layout
     assert len(channels) == 12
     assert channels[3].name == "photon_408o"
     assert (channels[3].bins, channels[3].bin_width, channels[3].adc_bits) == (4096, 7.5, 0)
@@ -209,7 +208,7 @@ def test_checks_of_headers_follow_from_what_measured_files_state(data_root):
         shots = {sum(d.shots for d in group) for group in memories(header.datasets)}
         assert len(shots - {0}) <= 1, name
         as_line_3 += shots - {0} <= {laser.shots for laser in header.lasers}
-        for channel in raw_header(header).channels:
+        for channel in header.channels:
             if channel.full_scale is not None and channel.shots:
                 bins = int(np.count_nonzero(counts[channel.name] > channel.full_scale))
                 if bins:
@@ -224,7 +223,7 @@ def test_simulated_signals_that_are_scaled_to_32_bits_are_read(data_root):
     for path in (data_root / "synthetic").rglob("*"):
         if path.is_file() and path.suffix not in {".csv", ".nc", ".txt"}:
             header, counts = licel.read_counts(path)
-            for channel in raw_header(header).channels:
+            for channel in header.channels:
                 values = counts[channel.name]
                 if channel.full_scale and np.count_nonzero(values > channel.full_scale) > 1:
                     assert values.max() == np.iinfo(np.int32).max

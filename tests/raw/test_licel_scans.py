@@ -69,10 +69,10 @@ def test_elevations_of_a_scan_become_zenith_angles(elevation, azimuth, offset, e
     assert (header.temperature, header.pressure) == (288.15, 101_300.0)
     if expected is None:
         assert (header.zenith_angle, header.azimuth) == (None, None)
-        assert f"{float(elevation):g} degree at azimuth {float(azimuth):g}" in header.pointing_doubt
+        assert f"{float(elevation):g} degree at azimuth {float(azimuth):g}" in header.doubt
     else:
         assert (header.zenith_angle, header.azimuth) == pytest.approx(expected)
-        assert not header.pointing_doubt
+        assert not header.doubt
 
 
 def test_seven_values_without_a_grid_are_no_elevation():

@@ -61,7 +61,6 @@ def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
     start, stop = _moment(values, "start", file), _moment(values, "stop", file)
     if stop < start:
         raise _refused("lies before the start", "stop", file)
-    placed = "latitude" in values
     return RawHeader(
         format=FORMAT.name,
         path=file,
@@ -69,13 +68,12 @@ def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
         start=start,
         stop=stop,
         channels=parsed,
-        digest=hashlib.sha256(repr(parsed).encode()).hexdigest()[:16],
+        header_digest=hashlib.sha256(repr(parsed).encode()).hexdigest()[:16],
         zenith_angle=_number(values, "zenith_angle", file),
         azimuth=_number(values, "azimuth", file) if "azimuth" in values else None,
         altitude=_number(values, "altitude", file) if "altitude" in values else None,
-        coordinates=(_number(values, "longitude", file), _number(values, "latitude", file))
-        if placed
-        else None,
+        longitude=_number(values, "longitude", file) if "latitude" in values else None,
+        latitude=_number(values, "latitude", file) if "latitude" in values else None,
     )
 
 
