@@ -7,6 +7,8 @@ from typing import Final
 SPEED_OF_LIGHT: Final = 299_792_458.0
 """m s-1, exact (SI)."""
 
+PLANCK: Final = 6.62607015e-34
+"""J s, exact (SI)."""
 EARTH_RADIUS: Final = 6_371_008.8
 """m, mean radius of the ellipsoid WGS 84."""
 BEAM_CURVATURE: Final = 0.17

@@ -42,6 +42,7 @@ from lidarops.settings import (
     SettingsModel,
     located_error,
     nearest,
+    ordered,
     quantity,
 )
 from lidarops.system.stores import refuse_keys
@@ -233,11 +234,7 @@ class InstrumentFacts(SettingsModel):
         """Clock of the raw files minus UTC."""
         return timedelta(seconds=self.clock_offset)
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.valid_to <= self.valid_from:
-            raise ValueError("valid_to must be later than valid_from")
-        return self
+    _ordered = ordered("valid_from", "valid_to", "valid_to must be later than valid_from")
 
     @model_validator(mode="after")
     def _one_role_of_each_file(self) -> Self:
@@ -466,11 +463,7 @@ class CampaignPeriod(SettingsModel):
         description="products of scenes that begin in the period are not replaced without --thaw",
     )
 
-    @model_validator(mode="after")
-    def _ends_after_its_start(self) -> Self:
-        if self.until <= self.since:
-            raise ValueError("until must be later than since")
-        return self
+    _ordered = ordered("since", "until", "until must be later than since")
 
 
 class Acknowledged(SettingsModel):

@@ -14,60 +14,27 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.campaign.simulated_atmosphere import (
+from lidarops.campaign.simulated_air import (
     Aerosol,
     AtmosphereSettings,
     BoundaryLayer,
+    DiurnalExtinction,
     Homogeneous,
+    Instant,
     Layer,
 )
-from lidarops.campaign.simulated_files import (
+from lidarops.campaign.simulated_instrument import (
     Acquisition,
     Damage,
     DamageKind,
-    Handling,
-    Pointing,
-    RandomDamage,
-)
-from lidarops.campaign.simulated_instrument import (
-    AnalogRecorder,
-    Background,
     Detector,
     LaserDrift,
-    Optics,
-    PhotonCounter,
+    Pointing,
     Pulse,
+    RandomDamage,
 )
-from lidarops.campaign.simulation_base import DiurnalCourse, Instant
+from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.settings import SettingsModel, located_error, quantity
-
-__all__ = [
-    "Acquisition",
-    "Aerosol",
-    "AnalogRecorder",
-    "AtmosphereSettings",
-    "Background",
-    "BoundaryLayer",
-    "Damage",
-    "DamageKind",
-    "Detector",
-    "DiurnalCourse",
-    "Handling",
-    "HorizontalPath",
-    "InstrumentSimulation",
-    "LaserDrift",
-    "Layer",
-    "Lidar",
-    "Optics",
-    "PhotonCounter",
-    "Pointing",
-    "Pulse",
-    "RandomDamage",
-    "SimulationSettings",
-    "TruthSettings",
-    "VerticalColumn",
-]
-
 
 _DAMAGE_OF_OUTPUT = {
     "photon": {DamageKind.DEAD_PHOTON},
@@ -121,17 +88,17 @@ class _Instrument(SettingsModel):
 
     @model_validator(mode="after")
     def _pulse_is_short(self) -> Self:
-        # Length of the pulse in range, c / 2 times its duration, against the recorded range.
         shortest = min(
             (detector.bins or self.acquisition.bins)
             * (detector.bin_width or self.acquisition.bin_width)
             for detector in self.detectors
         )
-        if self.pulse is not None and 149_896_229.0 * self.pulse.width > 0.1 * shortest:
+        length = 0.0 if self.pulse is None else 0.5 * SPEED_OF_LIGHT * self.pulse.width
+        if self.pulse is not None and length > 0.1 * shortest:
             raise ValueError(
-                f"pulse.width of {self.pulse.width:g} s is {149_896_229.0 * self.pulse.width:.0f} m"
-                f" of range, more than a tenth of the recorded {shortest:g} m: give the width in"
-                " seconds (8e-9), or more bins"
+                f"pulse.width of {self.pulse.width:g} s is {length:.0f} m of range, more than a"
+                f" tenth of the recorded {shortest:g} m: give the width in seconds (8e-9), or more"
+                " bins"
             )
         return self
 
@@ -151,7 +118,9 @@ class HorizontalPath(_Instrument):
 
     kind: Literal["horizontal"] = Field(description="a homogeneous path")
     aerosol: Aerosol = Aerosol()
-    aerosol_extinction: DiurnalCourse = quantity(unit="m-1", description="of aerosol, at 532 nm")
+    aerosol_extinction: DiurnalExtinction = quantity(
+        unit="m-1", description="of aerosol, at 532 nm"
+    )
 
     @property
     def air(self) -> AtmosphereSettings:
@@ -160,12 +129,6 @@ class HorizontalPath(_Instrument):
             aerosol=self.aerosol, extinction=self.aerosol_extinction, molecules_constant=True
         )
         return AtmosphereSettings(homogeneous=path)
-
-    @model_validator(mode="after")
-    def _is_air(self) -> Self:
-        if self.aerosol_extinction.maximum > 1.0:
-            raise ValueError("aerosol_extinction is in m-1: 1e-4 m-1 is 0.1 km-1")
-        return self
 
     @model_validator(mode="after")
     def _one_extinction(self) -> Self:

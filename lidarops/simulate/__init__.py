@@ -4,8 +4,8 @@ The modules follow the light:
 
 1. Atmosphere: `atmosphere` (extinction and backscatter along a beam), `sun` (sky brightness),
    `mie` (scattering by spheres).
-2. Signal: `overlap`, `signal` (short pulse), `pulse` (pulse of any shape), `echo` (the pulse of a
-   campaign file), `laser` (pulse energy), `lidar` (signal in W and MHz from physical units).
+2. Signal: `overlap`, `signal` (short pulse), `pulse` (pulse of any shape), `lidar` (signal in W and
+   MHz from physical units).
 3. Detectors: `photoelectrons`, then `counting` (photon counter with dead time) and `analog`
    (digitiser).
 4. Raw files: `dialects` (headers of real stations), `damage` (truncated, foreign and odd files),

@@ -15,22 +15,20 @@ step, where rounding errors do not average out over shots.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import cos, erfc, exp, pi, sin, sqrt
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarops.campaign.simulated_instrument import AnalogRecorder
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, limited_rate
 
 FastCounts = NDArray[np.int32]
 
-LEAST_NOISE: Final = 0.02
-"""Steps. Less noise would need more harmonics than double precision resolves."""
 _NEGLIGIBLE: Final = 20.0
 """Harmonics of less than exp(-20) = 2e-9 steps are left out."""
 _NEGLIGIBLE_FAST: Final = 9.2
@@ -43,67 +41,9 @@ _MANY: Final = 50.0
 """Photoelectrons in a sample above which the sum of their charges is normal."""
 
 
-class Recorder(Protocol):
-    """An analog recorder: `Digitiser`, or the settings of a campaign file."""
-
-    @property
-    def gain(self) -> float:
-        """Voltage for a rate of photoelectrons, mV per MHz."""
-
-    @property
-    def step(self) -> float:
-        """Least significant bit, mV."""
-
-    @property
-    def noise(self) -> float:
-        """Electronic noise of one sample of one shot, mV."""
-
-    @property
-    def excess_noise(self) -> float:
-        """Mean square of the charge of a photoelectron over the square of its mean."""
-
-    @property
-    def dark_offset(self) -> float:
-        """Voltage without any light, mV."""
-
-    @property
-    def adc_bits(self) -> int:
-        """Resolution of the digitiser, bits."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Digitiser:
-    """An analog recorder."""
-
-    gain: float
-    """mV per MHz of photoelectrons."""
-    noise: float
-    """Electronic noise of one sample of one shot, mV."""
-    dark_offset: float
-    """mV, without any light."""
-    excess_noise: float = 1.2
-    """Mean square of the charge over the square of its mean, at least 1."""
-    adc_range: float = 500.0
-    """mV at full scale."""
-    adc_bits: int = 12
-
-    def __post_init__(self) -> None:
-        _checks.positive("gain", self.gain, "mV MHz-1")
-        _checks.not_negative("noise", self.noise, "mV")
-        _checks.not_negative("dark_offset", self.dark_offset, "mV")
-        _checks.between("excess_noise", self.excess_noise, 1.0, 10.0)
-        _checks.positive("adc_range", self.adc_range, "mV")
-        _checks.between("adc_bits", self.adc_bits, 4, 20)
-
-    @property
-    def step(self) -> float:
-        """Least significant bit, mV."""
-        return self.adc_range / 2.0**self.adc_bits
-
-
 def digitise(
     released: Photoelectrons,
-    recorder: Recorder,
+    recorder: AnalogRecorder,
     *,
     random: np.random.Generator,
 ) -> Counts:
@@ -112,18 +52,13 @@ def digitise(
     Parameters
     ----------
     released : Photoelectrons
-    recorder : Recorder
+    recorder : AnalogRecorder
     random : numpy.random.Generator
 
     Returns
     -------
     ndarray of int, shape (bins,)
         Digitiser steps summed over shots, 0 to shots times full scale; 0 without shots.
-
-    Raises
-    ------
-    SimulationInputError
-        If the electronic noise is less than `LEAST_NOISE` steps.
 
     Notes
     -----
@@ -154,7 +89,7 @@ def digitise(
 
 def digitise_fast(
     rate: Array,
-    recorder: Recorder,
+    recorder: AnalogRecorder,
     *,
     shots: int,
     bin_time: float,
@@ -166,7 +101,7 @@ def digitise_fast(
     ----------
     rate : ndarray, MHz, shape (bins,)
         Expected rate of photoelectrons.
-    recorder : Recorder
+    recorder : AnalogRecorder
     shots : int
     bin_time : float, s
         For which a bin is open after one shot.
@@ -175,8 +110,8 @@ def digitise_fast(
     Raises
     ------
     SimulationInputError
-        As `digitise`; or if a rate, a time or the number of shots is negative or NaN, or the sums
-        do not fit into 32 bits.
+        If a rate, a time or the number of shots is negative or NaN, or the sums do not fit into 32
+        bits.
 
     Notes
     -----
@@ -206,13 +141,15 @@ def digitise_fast(
     return total
 
 
-def sample_moments(rate: Array, recorder: Recorder, *, bin_time: float) -> tuple[Array, Array]:
+def sample_moments(
+    rate: Array, recorder: AnalogRecorder, *, bin_time: float
+) -> tuple[Array, Array]:
     """Return mean and variance of one sample of one shot before clipping, steps.
 
     Parameters
     ----------
     rate : ndarray, MHz, shape (bins,)
-    recorder : Recorder
+    recorder : AnalogRecorder
     bin_time : float, s
     """
     rate = _checked(rate, bin_time)
@@ -226,24 +163,17 @@ def _checked(rate: Array, bin_time: float) -> Array:
     return limited_rate(rate)
 
 
-def _dark(recorder: Recorder, shape: tuple[int, ...]) -> Array:
+def _dark(recorder: AnalogRecorder, shape: tuple[int, ...]) -> Array:
     """Return the voltage without light, steps."""
     return np.full(shape, recorder.dark_offset) / recorder.step
 
 
 def _sample_parameters(
-    recorder: Recorder, bin_time: float, negligible: float = _NEGLIGIBLE
+    recorder: AnalogRecorder, bin_time: float, negligible: float = _NEGLIGIBLE
 ) -> tuple[float, float, float, float, NDArray[np.float64], NDArray[np.complex128]]:
     """Return the parameters that all bins share, with the harmonics of a photoelectron's charge."""
     unit = recorder.gain / recorder.step / (bin_time * 1e6)
     spread, dark_noise = recorder.excess_noise - 1.0, recorder.noise / recorder.step
-    if dark_noise < LEAST_NOISE:
-        raise SimulationInputError(
-            f"of {recorder.noise:g} mV is {dark_noise:g} digitiser steps, less than"
-            f" {LEAST_NOISE:g}",
-            field="noise",
-            remedy=f"give at least {LEAST_NOISE * recorder.step:g} mV",
-        )
     most = int(sqrt(negligible / (2.0 * pi**2)) / dark_noise)
     omega = 2.0 * pi * np.arange(1, most + 1)
     gauss = np.exp(-0.5 * (omega * dark_noise) ** 2)

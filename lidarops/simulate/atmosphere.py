@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from lidarops.campaign.simulated_atmosphere import Gradient, Plume, Sounding, Turbulence
+from lidarops.campaign.simulated_air import (
+    Aerosol,
+    AtmosphereSettings,
+    Gradient,
+    Plume,
+    Sounding,
+    Turbulence,
+)
 from lidarops.campaign.simulated_instrument import RamanLines
-from lidarops.campaign.simulation import Aerosol, AtmosphereSettings, DiurnalCourse
 from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.retrieve.air.molecular import (
     HIGHEST,
@@ -80,14 +86,6 @@ class _Points(NamedTuple):
     height: Array
 
 
-def _diurnal(course: DiurnalCourse, moment: datetime) -> float:
-    """Return the value of a diurnal course: a cosine that peaks at a given hour (UTC)."""
-    midnight = moment.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
-    hours = (moment - midnight) / timedelta(hours=1)
-    phase = math.cos(2.0 * math.pi * (hours - course.hour_of_maximum) / 24.0)
-    return course.minimum + (course.maximum - course.minimum) * 0.5 * (1.0 + phase)
-
-
 class Air:
     """The atmosphere of simulated lidars.
 
@@ -126,10 +124,10 @@ class Air:
         height = (air.boundary_layer and air.boundary_layer.height) or None
         moving = air.plumes or air.turbulence
         return (
-            None if extinction is None else _diurnal(extinction, moment),
-            None if height is None else _diurnal(height, moment),
-            tuple(layer.start <= moment < layer.stop for layer in air.layers),
-            tuple(cloud.start <= moment < cloud.stop for cloud in air.clouds),
+            None if extinction is None else extinction.at(moment),
+            None if height is None else height.at(moment),
+            tuple(layer.holds(moment) for layer in air.layers),
+            tuple(cloud.holds(moment) for cloud in air.clouds),
             moment if moving else None,
         )
 
@@ -155,7 +153,7 @@ class Air:
             extinction += particles
             backscatter += particles / aerosol.lidar_ratio
         for cloud in self._settings.clouds:
-            if cloud.start <= moment < cloud.stop:
+            if cloud.holds(moment):
                 inside = (points.height >= cloud.base) & (points.height < cloud.top)
                 extinction += inside * cloud.extinction
                 backscatter += inside * (cloud.extinction / cloud.lidar_ratio)
@@ -199,14 +197,14 @@ class Air:
     def _particles(self, points: _Points, moment: datetime) -> Iterator[tuple[Aerosol, Array]]:
         air = self._settings
         if air.homogeneous is not None:
-            everywhere = np.full_like(points.height, _diurnal(air.homogeneous.extinction, moment))
+            everywhere = np.full_like(points.height, air.homogeneous.extinction.at(moment))
             yield air.homogeneous.aerosol, everywhere
         if air.boundary_layer is not None:
             layer = air.boundary_layer
-            rise = (_diurnal(layer.height, moment) - points.height) / layer.entrainment_depth
+            rise = (layer.height.at(moment) - points.height) / layer.entrainment_depth
             yield layer.aerosol, layer.extinction * expit(rise)
         for elevated in air.layers:
-            if elevated.start <= moment < elevated.stop:
+            if elevated.holds(moment):
                 rise = (points.height - elevated.height) / elevated.depth
                 yield elevated.aerosol, elevated.extinction * np.exp(-0.5 * rise**2)
         for profile in air.profiles:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Final
 import xarray as xr
 
 from lidarops.campaign.model import Campaign, Station
-from lidarops.campaign.simulation import DamageKind, SimulationSettings
+from lidarops.campaign.simulated_instrument import DamageKind
+from lidarops.campaign.simulation import SimulationSettings
 from lidarops.errors import CampaignError, CatalogError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator

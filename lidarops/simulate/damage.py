@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.campaign.simulated_files import DamageKind
+from lidarops.campaign.simulated_instrument import DamageKind
 from lidarops.raw.licel import Dataset, parse_header
 from lidarops.records import DetectionMode
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final, Literal
 
-from lidarops.campaign.simulated_files import DialectName
+from lidarops.campaign.simulated_instrument import DialectName
 from lidarops.raw.licel import Dataset, Header, Laser, ScanGrid, new_header
 from lidarops.raw.licel_header import parse_dataset
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.campaign.model import InstrumentFacts, channel_facts
-from lidarops.campaign.simulation import (
+from lidarops.campaign.simulated_instrument import (
     Acquisition,
     AnalogRecorder,
     DamageKind,
@@ -27,8 +27,6 @@ from lidarops.simulate.atmosphere import Air, Beam, BeamPath
 from lidarops.simulate.counting import count_fast, count_photons
 from lidarops.simulate.damage import damage_file
 from lidarops.simulate.dialects import Measurement, dataset_in_dialect, make_header, scan_grid
-from lidarops.simulate.echo import pulse_echo
-from lidarops.simulate.laser import laser_energy
 from lidarops.simulate.photoelectrons import (
     BRIGHTEST,
     Photoelectrons,
@@ -43,6 +41,7 @@ from lidarops.simulate.planned_files import (
     photon_dead_time,
     random_stream,
 )
+from lidarops.simulate.pulse import pulse_echo
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.sun import sky_brightness, solar_elevation
 from lidarops.simulate.truth import (
@@ -209,7 +208,7 @@ class Simulator:
             zenith_angle=zenith,
             azimuth=azimuth,
             sun=solar_elevation(middle, site.station.latitude, site.station.longitude),
-            energy=laser_energy(site.simulated.laser, hours, acquisition.shots, random),
+            energy=site.simulated.laser.energy(hours, acquisition.shots, random),
             hours=hours,
             beam=Beam(*self._position, zenith, azimuth or 0.0),
             air_time=air_time,

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.constants import LICEL_RANGE_PER_MICROSECOND, SPEED_OF_LIGHT
+from lidarops.constants import LICEL_RANGE_PER_MICROSECOND, PLANCK, SPEED_OF_LIGHT
 from lidarops.simulate import _checks
 from lidarops.simulate.overlap import Overlap, SineOverlap
 from lidarops.simulate.pulse import Pulse, pulsed_signal
 
 Array = NDArray[np.float64]
-
-PLANCK: Final = 6.62607015e-34
-"""J s, exact (SI)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,14 +12,8 @@ from typing import Final
 import numpy as np
 
 from lidarops.campaign.model import Instrument, InstrumentFacts, Station, channel_facts
-from lidarops.campaign.simulation import (
-    Acquisition,
-    DamageKind,
-    Detector,
-    HorizontalPath,
-    InstrumentSimulation,
-    SimulationSettings,
-)
+from lidarops.campaign.simulated_instrument import Acquisition, DamageKind, Detector
+from lidarops.campaign.simulation import HorizontalPath, InstrumentSimulation, SimulationSettings
 from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.records import DetectionMode, Role

@@ -15,6 +15,7 @@ is the integral of :math:`R^{-2}` itself: a rectangular pulse gives the near-ran
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, Protocol
@@ -24,10 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from lidarops.campaign import simulated_instrument as settings
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.atmosphere import BeamPath
 from lidarops.simulate.overlap import Overlap, SineOverlap, finite_at_lidar
+from lidarops.simulate.signal import bin_centres
 
 Array = NDArray[np.float64]
 
@@ -305,6 +309,60 @@ def pulsed_signal(
         full, cell_overlap = math.nan, shape(_positions(distance, cells.edges))
     signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full, cell_overlap)
     return system_constant * signal
+
+
+def pulse_echo(
+    distance: Array,
+    path: BeamPath,
+    pulse: settings.Pulse,
+    *,
+    system_constant: float,
+    full_overlap_range: float,
+) -> Array:
+    """Return the mean rate of photoelectrons while each bin is open, MHz.
+
+    Parameters
+    ----------
+    distance : ndarray, m, shape (bins,)
+        Range of the bin centres, equally spaced; time zero is the centroid of the pulse.
+    path : BeamPath
+        Optical properties at the bin centres, linear between them.
+    pulse : simulated_instrument.Pulse
+        Of a campaign file.
+    system_constant : float, MHz m3 sr
+    full_overlap_range : float, m
+        Must be positive: without overlap the signal at the lidar is infinite.
+
+    Raises
+    ------
+    SimulationInputError
+        See `pulsed_signal`.
+
+    References
+    ----------
+    `vasylkivskyi2009`, equations 20 to 23.
+    """
+    step = float(distance[1] - distance[0])
+    shape, centroid = _SHAPES[pulse.shape](pulse.width)
+    signal = pulsed_signal(
+        distance + 0.5 * SPEED_OF_LIGHT * centroid,
+        extinction=path.extinction,
+        backscatter=path.backscatter,
+        system_constant=system_constant,
+        pulse=shape,
+        bin_width=step,
+        full_overlap_range=full_overlap_range,
+        path=bin_centres(distance.size, step, float(distance[0]) - 0.5 * step),
+    )
+    return np.where(distance > 0.0, signal, 0.0)
+
+
+_SHAPES: Final[Mapping[str, Callable[[float], tuple[Pulse, float]]]] = {
+    "rectangle": lambda width: (RectangularPulse(width), 0.5 * width),
+    "gaussian": lambda width: (GaussianPulse(width, Origin.PEAK), 0.0),
+    "exponential": lambda width: (ExponentialPulse(width), width),
+}
+"""Shape in a campaign file -> width in s -> the pulse, and the time of its centroid, s."""
 
 
 def _refuse_near(distance: Array, cells: Response, shape: Overlap) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.campaign.simulated_files import DamageKind, Handling
+from lidarops.campaign.simulated_instrument import DamageKind, Handling
 from lidarops.constants import LIDAR_EQUATION_PAPER
 from lidarops.records import DetectionMode
 

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from lidarops.campaign.simulation import AtmosphereSettings
+from lidarops.campaign.simulated_air import AtmosphereSettings
 from lidarops.simulate.atmosphere import Air, Beam
 
 START = datetime(2025, 6, 1, tzinfo=UTC)

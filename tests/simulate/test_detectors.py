@@ -10,17 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from lidarops.campaign.simulation import LaserDrift
+from lidarops.campaign.simulated_instrument import AnalogRecorder, LaserDrift
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.analog import Digitiser, digitise
+from lidarops.simulate.analog import digitise
 from lidarops.simulate.counting import count_photons
-from lidarops.simulate.laser import laser_energy
 from lidarops.simulate.photoelectrons import delay_recorder, release
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 BIN_WIDTH = 7.5
 DEAD_TIME = 4e-9
-RECORDER = Digitiser(gain=0.05, noise=0.3, dark_offset=3.0, adc_range=100, excess_noise=1.3)
+RECORDER = AnalogRecorder(gain=0.05, noise=0.3, dark_offset=3.0, adc_range=100, excess_noise=1.3)
 
 
 def test_both_outputs_see_the_same_photoelectrons():
@@ -163,14 +162,14 @@ def test_the_same_seed_gives_the_same_bytes_on_any_thread():
 def test_the_energy_of_a_laser_drifts_and_jitters():
     random = np.random.default_rng(81)
     drift = LaserDrift(per_hour=-0.1)
-    assert laser_energy(drift, 2.0, 600, random) == pytest.approx(0.8)
-    assert laser_energy(drift, 20.0, 600, random) == 0.0
+    assert drift.energy(2.0, 600, random) == pytest.approx(0.8)
+    assert drift.energy(20.0, 600, random) == 0.0
     shots = LaserDrift(shot_jitter=0.1)
-    energies = [laser_energy(shots, 0.0, 100, random) for _ in range(4000)]
+    energies = [shots.energy(0.0, 100, random) for _ in range(4000)]
     assert np.mean(energies) == pytest.approx(1.0, abs=4.5 * 0.01 / 4000**0.5)
     assert np.std(energies) == pytest.approx(0.01, rel=0.06)
     both = LaserDrift(shot_jitter=0.1, jitter=0.03)
-    energies = [laser_energy(both, 0.0, 100, random) for _ in range(4000)]
+    energies = [both.energy(0.0, 100, random) for _ in range(4000)]
     assert np.std(energies) == pytest.approx(np.hypot(0.01, 0.03), rel=0.06)
     for change in ({"per_hour": np.nan}, {"jitter": -0.1}, {"shot_jitter": 3.0}):
         with pytest.raises(ValidationError, match=next(iter(change))):
@@ -184,7 +183,7 @@ def test_jitter_of_shots_is_one_factor_for_a_file():
     energy = 1 + jitter * random.standard_normal((files, shots, 1))
     single = random.poisson(np.maximum(energy, 0) * mean).sum(axis=1)
     drift = LaserDrift(shot_jitter=jitter)
-    rate = [laser_energy(drift, 0.0, shots, random) * mean / 0.05 for _ in range(files)]
+    rate = [drift.energy(0.0, shots, random) * mean / 0.05 for _ in range(files)]
     ours = np.array([
         release(r, shots=shots, bin_width=BIN_WIDTH, random=random).number for r in rate
     ])  # fmt: skip

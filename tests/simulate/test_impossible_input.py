@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from lidarops.campaign.simulation import AtmosphereSettings, SimulationSettings
+from lidarops.campaign.simulated_air import AtmosphereSettings
+from lidarops.campaign.simulated_instrument import AnalogRecorder
+from lidarops.campaign.simulation import SimulationSettings
 from lidarops.errors import CatalogError
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.analog import Digitiser, digitise_fast
+from lidarops.simulate.analog import digitise_fast
 from lidarops.simulate.atmosphere import Air
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.counting import count_fast, counter_moments
@@ -21,7 +23,7 @@ from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.sun import solar_elevation
 
 BIN_TIME = 50e-9
-RECORDER = Digitiser(gain=0.1, noise=0.3, dark_offset=3.0)
+RECORDER = AnalogRecorder(gain=0.1, noise=0.3, dark_offset=3.0)
 
 
 def count(rate, shots=600, dead_time=4e-9, bin_time=BIN_TIME):

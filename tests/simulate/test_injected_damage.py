@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidarops.campaign.simulation import DamageKind, Handling
+from lidarops.campaign.simulated_instrument import DamageKind, Handling
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, RawFormatError
@@ -119,7 +119,7 @@ def test_the_retrieval_flags_exactly_the_damaged_profiles(small):
         expected = raised.get(DamageKind(kind), {}) if kind else {}
         for channel in ("photon_532o", "analog_532o"):
             flag = flags.get((truth["time"].values[index], channel))
-            if kind and DamageKind(kind).refused:
+            if kind and DamageKind(kind).handling is Handling.REFUSE:
                 assert flag is None, kind
                 continue
             used += 1

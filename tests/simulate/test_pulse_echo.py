@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import expon, norm, uniform
 
-from lidarops.campaign.simulation import Pulse
+from lidarops.campaign.simulated_instrument import Pulse
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate.atmosphere import BeamPath
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.simulate.echo import pulse_echo
+from lidarops.simulate.pulse import pulse_echo
 from lidarops.simulate.signal import backscatter_signal
 
 STEP = 7.5

@@ -7,20 +7,18 @@ from datetime import UTC, datetime
 import pytest
 from pydantic import ValidationError
 
-from lidarops.campaign.simulation import (
+from lidarops.campaign.simulated_air import DiurnalCourse, Layer
+from lidarops.campaign.simulated_instrument import (
     Acquisition,
     AnalogRecorder,
     Background,
     DamageKind,
     Detector,
-    DiurnalCourse,
     Handling,
-    HorizontalPath,
-    Layer,
     PhotonCounter,
     Pointing,
-    SimulationSettings,
 )
+from lidarops.campaign.simulation import HorizontalPath, SimulationSettings
 
 
 def _coast(tree):
