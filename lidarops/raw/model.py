@@ -30,7 +30,7 @@ from lidarops.errors import RawFormatError
 from lidarops.raw.formats import raw_format
 from lidarops.raw.header import RawChannel, RawHeader, Stretches, check_layout, select_channels
 from lidarops.raw.recorders import POLARISATIONS
-from lidarops.records import Granule
+from lidarops.records import Granule, Header
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
 
@@ -73,7 +73,7 @@ class Columns:
     sizes: list[int] = field(default_factory=list)
     times: list[tuple[int, int]] = field(default_factory=list)
     """Start and stop in ns since 1970."""
-    places: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+    places: list[tuple[float, ...]] = field(default_factory=list)
     """Latitude, longitude, altitude, zenith angle, azimuth; NaN if unknown."""
     sites: set[str] = field(default_factory=set)
     notes: set[str] = field(default_factory=set)
@@ -115,22 +115,16 @@ class Columns:
             check_layout(header.path, selected, self.selected if self.variants else selected)
             ordered = sorted(selected, key=lambda channel: self._rank(channel.name))
             self.variants[header.channels] = (len(self.variants), tuple(ordered))
-        position = (
-            None if self.position_order == "ignore" else header.position(self.position_order)
-        ) or (math.nan, math.nan)
+        variant = self.variants[header.channels][0]
+        position = None
+        if self.position_order != "ignore":
+            position = header.position(self.position_order)
         self.sites.add(header.site)
         if granule is not None:
-            self.append_alike(granule, header.path, self.variants[header.channels][0])
+            self.append_alike(granule, header.path, variant)
             return
-        pointing = (_nan_if_none(header.zenith_angle), _nan_if_none(header.azimuth))
-        self.notes.update((*header.notes, *([header.doubt] if header.doubt else [])))
-        self._add_row(
-            header.path,
-            header.size,
-            (header.start, header.stop),
-            (*position, _nan_if_none(header.altitude), *pointing),
-            self.variants[header.channels][0],
-        )
+        self.notes.update((header.doubt,) if header.doubt else ())
+        self._add(header, header.path, header.size, variant, position)
 
     def _start_format(self, header: RawHeader) -> None:
         if self.format:
@@ -153,32 +147,32 @@ class Columns:
         variant : int
             Number of the variant of the other file.
         """
-        if granule.start is None or granule.stop is None:
-            raise RawFormatError("has no start or stop in the catalog", file=path, field="start")
-        pointing = (_nan_if_none(granule.zenith_angle), _nan_if_none(granule.azimuth))
-        self.notes.update(granule.notes)
-        self._add_row(
-            path,
-            granule.size,
-            (granule.start, granule.stop),
-            (math.nan, math.nan, _nan_if_none(granule.altitude), *pointing),
-            variant,
-        )
+        self._add(granule, path, granule.size, variant)
 
-    def _add_row(
+    def _add(
         self,
+        header: Header,
         path: str,
         size: int,
-        interval: tuple[datetime, datetime],
-        place: tuple[float, float, float, float, float],
         variant: int,
+        position: tuple[float, float] | None = None,
     ) -> None:
+        if header.start is None or header.stop is None:
+            raise RawFormatError("has no start or stop in the catalog", file=path, field="start")
         self.paths.append(path)
         self.sizes.append(size)
-        start, stop = interval
-        nanoseconds = [1000 * ((moment - _EPOCH) // _MICROSECOND) for moment in (start, stop)]
-        self.times.append((nanoseconds[0], nanoseconds[1]))
-        self.places.append(place)
+        start, stop = (
+            1000 * ((moment - _EPOCH) // _MICROSECOND) for moment in (header.start, header.stop)
+        )
+        self.times.append((start, stop))
+        stated = (header.altitude, header.zenith_angle, header.azimuth)
+        self.places.append(
+            (
+                *(position or (math.nan, math.nan)),
+                *(math.nan if value is None else value for value in stated),
+            )
+        )
+        self.notes.update(header.notes)
         self.variant.append(variant)
 
     @property
@@ -246,10 +240,6 @@ class Columns:
         if not self.variants:
             return 0
         return next(i for i, channel in enumerate(self.selected) if channel.name == name)
-
-
-def _nan_if_none(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def count_bins(stretches: Stretches) -> int:

@@ -14,7 +14,7 @@ from datetime import datetime
 from typing import Final, Literal
 
 from lidarops.campaign.simulated_instrument import DialectName
-from lidarops.raw.licel import Dataset, Header, Laser, ScanGrid, new_header
+from lidarops.raw.licel import Dataset, Laser, ScanGrid
 from lidarops.raw.licel_header import parse_dataset
 
 _LINE = 78
@@ -59,6 +59,54 @@ class Dialect:
         """Number of the laser in the dataset lines."""
         return 2 if self.second_laser else 1
 
+    @property
+    def weather(self) -> tuple[float, float] | tuple[None, None]:
+        """Temperature (K) and pressure (Pa) at the ground; None where headers state neither."""
+        return (303.15, 1.013e5) if self.layout == "raymetrics" else (None, None)
+
+    def site_of(self, key: str, name: str) -> str:
+        """Return the site of a station as headers state it, by its key and name."""
+        if self.site == "key":
+            return key
+        return name[:8].strip() if self.site == "cut" else name
+
+    def written_zenith(self, zenith: float, scan: ScanGrid | None) -> float:
+        """Return a zenith angle in degree as headers state it."""
+        if scan is not None:
+            return round(zenith - 90.0, 1)
+        return -90.0 if (self.minus_90 or self.scans) and zenith == 0.0 else zenith
+
+    def lasers(self, shots: int, repetition_rate: float) -> tuple[Laser, Laser]:
+        """Return the lasers of line 3, by the shots of a file and their rate in Hz."""
+        stated = self.shots_of_memories(shots)[0]
+        firing = Laser(stated, repetition_rate)
+        if self.both_lasers:
+            return firing, firing
+        if self.two_memories:
+            return firing, Laser(stated, 0.0)
+        if self.second_laser:
+            return Laser(0, repetition_rate), firing
+        return firing, Laser(0, 0.0)
+
+    def name_suffix(self, stop: datetime, jumps: int) -> str:
+        """Return the end of a file name: minutes and seconds of the stop time.
+
+        The last two digits count the jumps of the clock, so files from before and after a jump
+        have different names.
+        """
+        if self.tens:
+            return f"{stop:%M}{stop.second // 10:d}"
+        return f"{stop:%M%S}{jumps:02d}"
+
+    def written_dataset(self, dataset: Dataset) -> Dataset:
+        """Return a dataset line as the station writes it."""
+        if not self.whole_bin_widths:
+            return dataset
+        tokens = dataset.line.decode("latin-1").split()
+        tokens[6] = f"{dataset.bin_width:04.0f}"
+        text = (" " + " ".join(tokens)).ljust(_LINE) + "\r\n"
+        return parse_dataset(text.encode("latin-1"))
+
 
 DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     "licel": Dialect(),
@@ -70,97 +118,6 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     "golmud": Dialect(layout="classic", site="whole", whole_bin_widths=True),
     "raymetrics_scan": Dialect(layout="raymetrics", scans=True, two_memories=True),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Name and position of a lidar, as in its headers."""
-
-    key: str
-    """Key of the station in the campaign."""
-    name: str
-    altitude: float
-    """m above the geoid."""
-    first: float
-    """degree; the coordinate that the instrument writes first, mostly the longitude."""
-    second: float
-    """degree."""
-
-
-@dataclass(frozen=True, slots=True)
-class Measurement:
-    """Header values that differ from file to file."""
-
-    start: datetime
-    """By the clock of the computer."""
-    stop: datetime
-    zenith_angle: float
-    """degree, 0 = up."""
-    azimuth: float | None
-    """degree; None if unknown."""
-    shots: int
-    repetition_rate: float
-    """Hz."""
-    scan: ScanGrid | None = None
-    """For dialects that write it; None where the pointing is fixed."""
-    temperature: float = 303.15
-    """K at the ground, for dialects that write it."""
-    pressure: float = 1.013e5
-    """Pa."""
-
-
-def name_suffix(dialect: Dialect, stop: datetime, jumps: int = 0) -> str:
-    """Return the end of a file name: minutes and seconds of the stop time.
-
-    The last two digits count the jumps of the clock, so files from before and after a jump have
-    different names.
-    """
-    if dialect.tens:
-        return f"{stop:%M}{stop.second // 10:d}"
-    return f"{stop:%M%S}{jumps:02d}"
-
-
-def make_header(
-    dialect: Dialect,
-    name: str,
-    place: Place,
-    measurement: Measurement,
-    datasets: tuple[Dataset, ...],
-) -> Header:
-    """Return the header of one file in a station's dialect.
-
-    Raises
-    ------
-    RawFormatError
-        If a number or text does not fit the dialect.
-    """
-    weather = dialect.layout == "raymetrics"
-    scan = measurement.scan if dialect.scans else None
-    return new_header(
-        name=name,
-        site=_site(dialect, place),
-        start=measurement.start,
-        stop=measurement.stop if scan is None else measurement.start,
-        altitude=place.altitude,
-        longitude=place.first,
-        latitude=place.second,
-        zenith_angle=_zenith_angle(dialect, measurement),
-        azimuth=measurement.azimuth if dialect.holds_azimuth else None,
-        scan=scan,
-        temperature=measurement.temperature if weather else None,
-        pressure=measurement.pressure if weather else None,
-        datasets=datasets,
-        lasers=_lasers(dialect, measurement),
-        dialect=dialect.layout,
-    )
-
-
-def _zenith_angle(dialect: Dialect, measurement: Measurement) -> float:
-    """Return the zenith angle as the station writes it."""
-    zenith = measurement.zenith_angle
-    if dialect.scans and measurement.scan is not None:
-        return round(zenith - 90.0, 1)
-    return -90.0 if (dialect.minus_90 or dialect.scans) and zenith == 0.0 else zenith
 
 
 def scan_grid(pointings: Sequence[tuple[float, float]]) -> ScanGrid:
@@ -176,31 +133,3 @@ def scan_grid(pointings: Sequence[tuple[float, float]]) -> ScanGrid:
 def _common_step(angles: Sequence[float]) -> float:
     """Return the largest step of tenths of a degree on which all angles lie."""
     return math.gcd(*(round(10.0 * (angle - angles[0])) for angle in angles)) / 10.0
-
-
-def dataset_in_dialect(dialect: Dialect, dataset: Dataset) -> Dataset:
-    """Return a dataset line as the station writes it."""
-    if not dialect.whole_bin_widths:
-        return dataset
-    tokens = dataset.line.decode("latin-1").split()
-    tokens[6] = f"{dataset.bin_width:04.0f}"
-    text = (" " + " ".join(tokens)).ljust(_LINE) + "\r\n"
-    return parse_dataset(text.encode("latin-1"))
-
-
-def _site(dialect: Dialect, place: Place) -> str:
-    if dialect.site == "key":
-        return place.key
-    return place.name[:8].strip() if dialect.site == "cut" else place.name
-
-
-def _lasers(dialect: Dialect, measurement: Measurement) -> tuple[Laser, Laser]:
-    shots = dialect.shots_of_memories(measurement.shots)[0]
-    firing = Laser(shots, measurement.repetition_rate)
-    if dialect.both_lasers:
-        return firing, firing
-    if dialect.two_memories:
-        return firing, Laser(shots, 0.0)
-    if dialect.second_laser:
-        return Laser(0, measurement.repetition_rate), firing
-    return firing, Laser(0, 0.0)

@@ -20,13 +20,13 @@ from lidarops.campaign.simulated_instrument import (
     PhotonCounter,
 )
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
-from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset
+from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset, new_header
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.analog import digitise, digitise_fast
 from lidarops.simulate.atmosphere import Air, Beam, BeamPath
 from lidarops.simulate.counting import count_fast, count_photons
 from lidarops.simulate.damage import damage_file
-from lidarops.simulate.dialects import Measurement, dataset_in_dialect, make_header, scan_grid
+from lidarops.simulate.dialects import scan_grid
 from lidarops.simulate.photoelectrons import (
     BRIGHTEST,
     Photoelectrons,
@@ -217,21 +217,28 @@ class Simulator:
 
     def _header(self, conditions: _Conditions) -> Header:
         site, acquisition = self.site, conditions.acquisition
+        dialect, pointing = site.dialect, site.simulated.pointing
         _, error = site.simulated.acquisition.clock_error(conditions.start)
         start = conditions.start + error
-        scan = site.simulated.pointing
-        measurement = Measurement(
+        scan = scan_grid(pointing.cycle()) if pointing is not None and dialect.scans else None
+        longitude, latitude = site.written_position
+        temperature, pressure = dialect.weather
+        return new_header(
+            name=site.name_of(conditions.planned),
+            site=dialect.site_of(site.instrument.station, site.station.name),
             start=start,
-            stop=start + site.duration_of(conditions.planned),
-            zenith_angle=conditions.zenith_angle,
-            azimuth=conditions.azimuth,
-            shots=acquisition.shots,
-            repetition_rate=acquisition.repetition_rate,
-            scan=None if scan is None else scan_grid(scan.cycle()),
-        )
-        name = site.name_of(conditions.planned)
-        return make_header(
-            site.dialect, name, site.place, measurement, self._dataset_lines(acquisition)
+            stop=start + site.duration_of(conditions.planned) if scan is None else start,
+            altitude=site.station.altitude,
+            longitude=longitude,
+            latitude=latitude,
+            zenith_angle=dialect.written_zenith(conditions.zenith_angle, scan),
+            azimuth=conditions.azimuth if dialect.holds_azimuth else None,
+            scan=scan,
+            datasets=self._dataset_lines(acquisition),
+            lasers=dialect.lasers(acquisition.shots, acquisition.repetition_rate),
+            dialect=dialect.layout,
+            temperature=temperature,
+            pressure=pressure,
         )
 
     def _dataset_lines(self, acquisition: Acquisition) -> tuple[Dataset, ...]:
@@ -499,4 +506,4 @@ def _dataset(
         discriminator=level * LICEL_DISCRIMINATOR_STEP,
         device=f"BC{number}" if analog is None else f"BT{number}",
     )
-    return dataset_in_dialect(site.dialect, dataset)
+    return site.dialect.written_dataset(dataset)

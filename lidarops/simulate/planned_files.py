@@ -18,7 +18,7 @@ from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.damage import FOREIGN_NAME
-from lidarops.simulate.dialects import DIALECTS, Dialect, Place, name_suffix
+from lidarops.simulate.dialects import DIALECTS, Dialect
 
 _MASK: Final = (1 << 64) - 1
 
@@ -66,15 +66,14 @@ class SimulatedInstrument:
         return DIALECTS[self.simulated.acquisition.dialect]
 
     @property
-    def place(self) -> Place:
-        """Name and position of the instrument, as in its headers."""
-        station = self.station
-        pair = station.longitude, station.latitude
+    def written_position(self) -> tuple[float, float]:
+        """The two coordinates in the order and with the signs of its headers, degree."""
+        pair = self.station.longitude, self.station.latitude
         if self.instrument.header_position == "latitude_first":
             pair = pair[::-1]
         if self.simulated.acquisition.signs_lost:
             pair = abs(pair[0]), abs(pair[1])
-        return Place(self.instrument.station, station.name, station.altitude, *pair)
+        return pair
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -143,7 +142,7 @@ class SimulatedInstrument:
         start = self.start_of(planned.role, planned.index)
         jumps, error = self.simulated.acquisition.clock_error(start)
         stop = start + self.duration_of(planned) + error
-        suffix = name_suffix(self.dialect, stop, jumps)
+        suffix = self.dialect.name_suffix(stop, jumps)
         return f"{self.prefix[planned.role]}{stop:%y}{stop.month:X}{stop:%d%H}.{suffix}"
 
     def duration_of(self, planned: PlannedFile) -> timedelta:
