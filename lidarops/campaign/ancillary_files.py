@@ -26,21 +26,41 @@ from lidarops.retrieve.raman.flags import RamanQuality
 
 Array = npt.NDArray[np.float64]
 
-_SCALE: Final[Mapping[str, Mapping[str, float]]] = {
-    "altitude": {"m": 1.0, "km": 1000.0},
-    "range": {"m": 1.0, "km": 1000.0},
-    "pressure": {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0},
-    "temperature": {"K": 1.0, "degC": 1.0},
-    "overlap": {"1": 1.0},
-    "lidar_ratio": {"sr": 1.0},
-    "lidar_ratio_standard_error": {"sr": 1.0},
+Table = Mapping[str, tuple[str, Array]]
+"""Name of a column -> its unit, its values."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """A quantity of ancillary files, and the values that it may have."""
+
+    units: Mapping[str, float]
+    """Unit -> factor to the SI unit, which comes first."""
+    least: float = -np.inf
+    most: float = np.inf
+    remedy: str = ""
+
+
+_METRES: Final = _Column({"m": 1.0, "km": 1000.0})
+_COLUMNS: Final[Mapping[str, _Column]] = {
+    "altitude": _METRES,
+    "range": _METRES,
+    "pressure": _Column({"Pa": 1.0, "hPa": 100.0, "mbar": 100.0}),
+    "temperature": _Column({"K": 1.0, "degC": 1.0}),
+    "overlap": _Column(
+        {"1": 1.0},
+        float(np.nextafter(0.0, 1.0)),
+        1.0,
+        "give values above 0 and at most 1; leave out ranges without overlap",
+    ),
+    # As for the facts of these names.
+    "lidar_ratio": _Column({"sr": 1.0}, 1.0, 200.0, "give values from 1 to 200 sr"),
+    "lidar_ratio_standard_error": _Column({"sr": 1.0}, 0.0, 200.0, "give values from 0 to 200 sr"),
 }
 _FULL: Final = 0.95
 """Smallest final overlap of a profile that counts as full."""
 _SHORTEST: Final = 30.0
-"""m; a shorter overlap profile is probably in km."""
-_LIDAR_RATIOS: Final = (1.0, 200.0)
-"""sr; as for the fact ``lidar_ratio``."""
+"""m; a profile that ends nearer is probably in km."""
 _MEASURED: Final = frozenset({"lidar_ratio_error_random", "lidar_ratio_error_systematic", "usable"})
 """Variables of a product with measured lidar ratios and overlap."""
 _LIDAR_RATIO_NEEDS: Final = frozenset(
@@ -174,13 +194,11 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
     AncillaryError
         If columns are missing, are not numbers or have wrong units; the message names the file.
     """
-    content = _read(folder, name)
-    names = ("altitude", "pressure", "temperature")
-    columns, with_unit = _columns(content, folder, name, names)
+    table, digest = _table(folder, name)
+    columns = _columns(table, name, ("altitude", "pressure", "temperature"))
     try:
         profile = MolecularProfile.from_profile(
-            *(columns[column] for column in names),
-            pressure_unit="Pa" if "pressure" in with_unit else None,
+            *columns, pressure_unit="Pa" if table["pressure"][0] else None
         )
     except RetrievalInputError as error:
         problem, field, remedy = error.problem, error.field, error.remedy
@@ -194,7 +212,7 @@ def molecular_profile(folder: Path, name: str) -> tuple[MolecularProfile, str]:
             field="altitude",
             remedy=f"give levels at most {_WIDEST:g} m apart",
         )
-    return profile, hashlib.sha256(content).hexdigest()
+    return profile, digest
 
 
 def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
@@ -214,33 +232,10 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
     AncillaryError
         If the file holds no overlap function; the message names the file.
     """
-    content = _read(folder, name)
-    raw = _table(content, folder, name)
-    if raw.keys() >= _MEASURED:
-        return _measured_overlap(raw, name), hashlib.sha256(content).hexdigest()
-    columns, _ = _columns(content, folder, name, ("range", "overlap"))
-    ranges, overlap = columns["range"], columns["overlap"]
-    if ranges.size != overlap.size or ranges.size < 2 or not np.all(np.diff(ranges) > 0):
-        raise AncillaryError(
-            f"does not rise strictly over the {overlap.size} values of overlap",
-            file=name,
-            field="range",
-            remedy="sort the rows by range",
-        )
-    if not np.all((overlap > 0) & (overlap <= 1.0)):
-        raise AncillaryError(
-            f"has values from {overlap.min():g} to {overlap.max():g}",
-            file=name,
-            field="overlap",
-            remedy="give values above 0 and at most 1; leave out ranges without overlap",
-        )
-    if ranges[-1] < _SHORTEST:
-        raise AncillaryError(
-            f"ends at {ranges[-1]:g} m",
-            file=name,
-            field="range",
-            remedy="give ranges in m, not in km",
-        )
+    table, digest = _table(folder, name)
+    if table.keys() >= _MEASURED:
+        return _measured_overlap(table, name), digest
+    ranges, overlap = _profile(table, name, ("range", "overlap"), fewest=2)
     if overlap[-1] < _FULL:
         raise AncillaryError(
             f"ends at {overlap[-1]:g}, although overlap beyond the last range is taken as 1",
@@ -248,7 +243,7 @@ def overlap_profile(folder: Path, name: str) -> tuple[Overlap, str]:
             field="overlap",
             remedy="continue the profile to full overlap",
         )
-    return Overlap(ranges, overlap), hashlib.sha256(content).hexdigest()
+    return Overlap(ranges, overlap), digest
 
 
 def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
@@ -268,52 +263,15 @@ def lidar_ratio_profile(folder: Path, name: str) -> tuple[LidarRatio, str]:
     AncillaryError
         If the file holds no lidar ratios; the message names the file.
     """
-    content = _read(folder, name)
-    raw = _table(content, folder, name)
-    if raw.keys() >= _MEASURED:
-        return _measured_lidar_ratio(raw, name), hashlib.sha256(content).hexdigest()
+    table, digest = _table(folder, name)
+    if table.keys() >= _MEASURED:
+        return _measured_lidar_ratio(table, name), digest
     names = ("altitude", "lidar_ratio", "lidar_ratio_standard_error")
-    columns, _ = _columns(content, folder, name, names)
-    altitude, ratio, error = (columns[column] for column in names)
-    if len({values.size for values in (altitude, ratio, error)}) > 1:
-        raise AncillaryError(
-            "has columns of different length",
-            file=name,
-            remedy="give all three over the same altitudes",
-        )
-    if not np.all(np.diff(altitude) > 0):
-        raise AncillaryError(
-            "does not rise strictly",
-            file=name,
-            field="altitude",
-            remedy="sort the rows by altitude",
-        )
-    if 0.0 < altitude[-1] < _SHORTEST:
-        raise AncillaryError(
-            f"ends at {altitude[-1]:g} m",
-            file=name,
-            field="altitude",
-            remedy="give altitudes in m, not in km, or name the unit: altitude [km]",
-        )
-    least, largest = _LIDAR_RATIOS
-    if not np.all((ratio >= least) & (ratio <= largest)):
-        raise AncillaryError(
-            f"has values from {ratio.min():g} to {ratio.max():g} sr",
-            file=name,
-            field="lidar_ratio",
-            remedy=f"give values from {least:g} to {largest:g} sr",
-        )
-    if not np.all((error >= 0.0) & (error <= largest)):
-        raise AncillaryError(
-            f"has values from {error.min():g} to {error.max():g} sr",
-            file=name,
-            field="lidar_ratio_standard_error",
-            remedy=f"give values from 0 to {largest:g} sr",
-        )
-    return LidarRatio(altitude, ratio, error), hashlib.sha256(content).hexdigest()
+    altitude, ratio, error = _profile(table, name, names)
+    return LidarRatio(altitude, ratio, error), digest
 
 
-def _measured_overlap(raw: Mapping[str, tuple[str, Array]], name: str) -> Overlap:
+def _measured_overlap(raw: Table, name: str) -> Overlap:
     """Return the mean over time of the overlap of a product, up to where it is full."""
     overlap, error = raw["overlap"][1], raw["overlap_standard_error"][1]
     known = (overlap > 0.0) & (error > 0.0)
@@ -350,7 +308,7 @@ def _within_cells(ranges: Array, measured: npt.NDArray[np.intp], means: Array) -
     return Overlap(fine[first:], overlap[first:])
 
 
-def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> LidarRatio:
+def _measured_lidar_ratio(raw: Table, name: str) -> LidarRatio:
     """Return the mean extinction of a product outside of clouds over its mean backscatter.
 
     Means over time are of all values that are usable, weighted by the noise of whole profiles
@@ -403,8 +361,8 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
     ratio = mean(extinction) / np.where(certain, scattered, np.nan)
     of_backscatter += square_error("aerosol_backscatter", ["reference"])
     error = np.sqrt(of_extinction + ratio**2 * of_backscatter) / scattered
-    least, largest = _LIDAR_RATIOS
-    measured = (ratio >= least) & (ratio <= largest) & (ratio >= error)
+    possible = _COLUMNS["lidar_ratio"]
+    measured = (ratio >= possible.least) & (ratio <= possible.most) & (ratio >= error)
     if not measured.any():
         raise AncillaryError(
             "holds no usable value outside of clouds that exceeds its error",
@@ -416,7 +374,7 @@ def _measured_lidar_ratio(raw: Mapping[str, tuple[str, Array]], name: str) -> Li
     return LidarRatio(altitude, ratio, error, altitude[-1])
 
 
-def _profile_weights(raw: Mapping[str, tuple[str, Array]], total: Array) -> Array:
+def _profile_weights(raw: Table, total: Array) -> Array:
     """Return the inverse square of the noise of each profile relative to total backscatter."""
     names = [f"aerosol_backscatter_error_{cause}" for cause in ("noise", "background")]
     noise = np.hypot(*(raw[name][1] for name in names)) / np.abs(total)
@@ -427,7 +385,7 @@ def _profile_weights(raw: Mapping[str, tuple[str, Array]], total: Array) -> Arra
     return weights
 
 
-def _as_resolved(raw: Mapping[str, tuple[str, Array]]) -> Array:
+def _as_resolved(raw: Table) -> Array:
     """Return backscatter over the resolution of extinction, m-1 sr-1, NaN where it has none."""
     ranges = raw["range"][1]
     step = float(np.median(np.diff(ranges)))
@@ -464,37 +422,73 @@ def _read(folder: Path, name: str) -> bytes:
     raise AncillaryError(problem, file=name)
 
 
-def _columns(
-    content: bytes, folder: Path, file: str, names: tuple[str, ...]
-) -> tuple[dict[str, Array], frozenset[str]]:
-    """Return the columns in SI units, and the names of those with a unit."""
-    raw = _table(content, folder, file)
-    columns = {}
+def _profile(
+    table: Table, file: str, names: tuple[str, ...], *, fewest: int = 1
+) -> tuple[Array, ...]:
+    """Return columns over the first one, range or altitude in m, which rises."""
+    columns = _columns(table, file, names)
+    grid, *others = columns
+    if any(values.size != grid.size for values in others):
+        raise AncillaryError(
+            f"has columns of different length: {', '.join(names)}",
+            file=file,
+            remedy=f"give all of them over the same {names[0]}s",
+        )
+    if grid.size < fewest or not np.all(np.diff(grid) > 0):
+        raise AncillaryError(
+            f"does not rise strictly over at least {fewest} values",
+            file=file,
+            field=names[0],
+            remedy=f"sort the rows by {names[0]}",
+        )
+    for name, values in zip(names, columns, strict=True):
+        column = _COLUMNS[name]
+        if not np.all((values >= column.least) & (values <= column.most)):
+            extremes = f"has values from {values.min():g} to {values.max():g}"
+            raise AncillaryError(extremes, file=file, field=name, remedy=column.remedy)
+    # Altitudes may end below the sea.
+    if grid[-1] < _SHORTEST and (names[0] == "range" or grid[-1] > 0.0):
+        raise AncillaryError(
+            f"ends at {grid[-1]:g} m",
+            file=file,
+            field=names[0],
+            remedy=f"give values in m, not in km, or name the unit: {names[0]} [km]",
+        )
+    return columns
+
+
+def _columns(table: Table, file: str, names: tuple[str, ...]) -> tuple[Array, ...]:
+    """Return columns in SI units."""
+    columns = []
     for name in names:
-        if name not in raw:
+        if name not in table:
             raise AncillaryError(
-                f"has no column {name!r}; its columns are {', '.join(raw) or 'none'}",
+                f"has no column {name!r}; its columns are {', '.join(table) or 'none'}",
                 file=file,
                 remedy=f"give {', '.join(names)} in its first line, with units in brackets",
             )
-        unit, values = raw[name]
-        scale = _SCALE[name].get(unit or next(iter(_SCALE[name])))
+        unit, values = table[name]
+        units = _COLUMNS[name].units
+        scale = units.get(unit or next(iter(units)))
         if scale is None:
             raise AncillaryError(
                 f"has the unknown unit {unit!r}",
                 file=file,
                 field=name,
-                remedy=f"use {', '.join(_SCALE[name])}",
+                remedy=f"use {', '.join(units)}",
             )
         if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
             raise AncillaryError("is not a column of finite numbers", file=file, field=name)
-        columns[name] = values * scale + (_ZERO_CELSIUS if unit == "degC" else 0.0)
-    return columns, frozenset(name for name in names if raw[name][0])
+        columns.append(values * scale + (_ZERO_CELSIUS if unit == "degC" else 0.0))
+    return tuple(columns)
 
 
-def _table(content: bytes, folder: Path, file: str) -> dict[str, tuple[str, Array]]:
-    """Return the columns of a file with their units."""
-    return _netcdf(folder / file, file) if file.lower().endswith(".nc") else _csv(content, file)
+def _table(folder: Path, file: str) -> tuple[Table, str]:
+    """Return the columns of a file, and its sha256."""
+    content = _read(folder, file)
+    is_netcdf = file.lower().endswith(".nc")
+    table = _netcdf(folder / file, file) if is_netcdf else _csv(content, file)
+    return table, hashlib.sha256(content).hexdigest()
 
 
 def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
