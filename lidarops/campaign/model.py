@@ -7,7 +7,7 @@ periods, because instruments change within an archive of years.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from itertools import pairwise
@@ -481,6 +481,12 @@ class Acknowledged(SettingsModel):
         return self.until is None or datetime.now(UTC) < self.until
 
 
+def _refuse_unknown(what: str, name: str, known: Collection[str], *keys: str | int) -> None:
+    if name not in known:
+        others = f"{nearest(name, known)}known {what}s: {', '.join(sorted(known))}"
+        raise located_error(f"unknown {what} {name!r}; {others}", *keys)
+
+
 class Campaign(SettingsModel):
     """One campaign: stations, instruments, networks, raw files and requested products."""
 
@@ -533,15 +539,9 @@ class Campaign(SettingsModel):
     @model_validator(mode="after")
     def _known_stations(self) -> Self:
         for key, instrument in self.instruments.items():
-            if instrument.station not in self.stations:
-                known = ", ".join(sorted(self.stations))
-                raise located_error(
-                    f"unknown station {instrument.station!r};"
-                    f" {nearest(instrument.station, self.stations)}known stations: {known}",
-                    "instruments",
-                    key,
-                    "station",
-                )
+            _refuse_unknown(
+                "station", instrument.station, self.stations, "instruments", key, "station"
+            )
         return self
 
     @model_validator(mode="after")
@@ -550,16 +550,8 @@ class Campaign(SettingsModel):
             if key in self.instruments or key in self.stations:
                 raise located_error("is the key of an instrument or station", "networks", key)
             for index, member in enumerate(network.instruments):
-                if member not in self.instruments:
-                    known = ", ".join(sorted(self.instruments))
-                    raise located_error(
-                        f"unknown instrument {member!r};"
-                        f" {nearest(member, self.instruments)}known instruments: {known}",
-                        "networks",
-                        key,
-                        "instruments",
-                        index,
-                    )
+                place = ("networks", key, "instruments", index)
+                _refuse_unknown("instrument", member, self.instruments, *place)
         return self
 
     def is_frozen(self, moment: datetime) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import UTC, date, datetime
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -19,11 +19,7 @@ RETRY: Final = ""
 NO_NOTES: Final = "[]"
 """Stored notes of a file that has none."""
 
-_AS_THEY_ARE: Final = (
-    "path", "size", "mtime_ns", "instrument", "reason", "zenith_angle", "azimuth", "latitude",
-    "longitude", "altitude", "sha256", "format", "header_digest", "setup",
-)  # fmt: skip
-"""Fields of a granule that are columns."""
+_FIELDS: Final = tuple(item.name for item in fields(Granule))
 _HALF: Final = (1 << 31) - 1
 _EPOCH: Final = date(1970, 1, 1).toordinal()
 
@@ -100,7 +96,7 @@ def _layout_row(layout: tuple[ChannelLayout, ...]) -> tuple[str, str]:
 def _values(granule: Granule, campaign: str, scan_key: str, layout: str) -> dict[str, Any]:
     low, high = _stamp(granule, scan_key, layout)
     return {
-        **{name: getattr(granule, name) for name in _AS_THEY_ARE},
+        **{name: getattr(granule, name) for name in _FIELDS},
         "campaign": campaign,
         "scan_key": scan_key,
         "role": granule.role.value,
