@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +28,7 @@ from lidarops.errors import RawFormatError
 from lidarops.plan.outlying_headers import without_outlying
 from lidarops.plan.scenes import cut_scenes
 from lidarops.raw.formats import parse_raw_header
-from lidarops.raw.header import RawHeader
+from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import Granule, Role, Status
 from lidarops.simulate.campaign import simulate_campaign
 
@@ -111,15 +112,14 @@ class Flips:
             return None
 
 
-def _used(header: RawHeader, role: Role) -> RawHeader:
+def _used(header: RawHeader, role: Role) -> list[object]:
     """Return what products and scenes follow from."""
-    # Dark signal is the same wherever the beam points.
-    if role is Role.DARK:
-        header = header._replace(zenith_angle=None, azimuth=None)
-    # The position of a product is that of its station.
-    return header._replace(
-        digest="", notes=(), record=None, coordinates=None, altitude=None, site=""
-    )
+    # Dark signal is the same wherever the beam points; the position is that of the station.
+    pointing = () if role is Role.DARK else ("zenith_angle", "azimuth")
+    names = ("format", "size", "start", "stop", "doubt", "written_angle", *pointing)
+    return [getattr(header, name) for name in names] + [
+        getattr(channel, item.name) for channel in header.channels for item in fields(RawChannel)
+    ]
 
 
 def _files(campaign: Campaign) -> Iterator[UnreadFile]:
