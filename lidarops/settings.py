@@ -83,18 +83,6 @@ def located_error(problem: str, *keys: str | int) -> PydanticCustomError:
     return PydanticCustomError("located", "{problem}", {"problem": problem, "keys": keys})
 
 
-def ordered(low: str, high: str, problem: str, *, may_be_equal: bool = False) -> Any:
-    """Return a validator of a model: the value of field `high` exceeds that of `low`."""
-
-    def check(model: SettingsModel) -> SettingsModel:
-        first, last = getattr(model, low), getattr(model, high)
-        if last < first or (last == first and not may_be_equal):
-            raise ValueError(problem)
-        return model
-
-    return model_validator(mode="after")(check)
-
-
 def _written_date(value: Any) -> Any:
     # Pydantic would read a year as seconds since 1970.
     if isinstance(value, int | float) or (isinstance(value, str) and value.isdecimal()):

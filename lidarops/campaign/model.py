@@ -42,7 +42,6 @@ from lidarops.settings import (
     SettingsModel,
     located_error,
     nearest,
-    ordered,
     quantity,
 )
 from lidarops.system.stores import refuse_keys
@@ -229,12 +228,11 @@ class InstrumentFacts(SettingsModel):
         default={}, description="facts about channels, by their names such as photon_532o"
     )
 
-    @property
-    def clock_error(self) -> timedelta:
-        """Clock of the raw files minus UTC."""
-        return timedelta(seconds=self.clock_offset)
-
-    _ordered = ordered("valid_from", "valid_to", "valid_to must be later than valid_from")
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.valid_to <= self.valid_from:
+            raise ValueError("valid_to must be later than valid_from")
+        return self
 
     @model_validator(mode="after")
     def _one_role_of_each_file(self) -> Self:
@@ -341,7 +339,7 @@ class Instrument(SettingsModel):
         valid = (
             fact
             for fact in self.facts
-            if fact.valid_from <= moment - fact.clock_error < fact.valid_to
+            if fact.valid_from <= moment - timedelta(seconds=fact.clock_offset) < fact.valid_to
         )
         return next(valid, InstrumentFacts())
 
@@ -463,7 +461,11 @@ class CampaignPeriod(SettingsModel):
         description="products of scenes that begin in the period are not replaced without --thaw",
     )
 
-    _ordered = ordered("since", "until", "until must be later than since")
+    @model_validator(mode="after")
+    def _ends_after_its_start(self) -> Self:
+        if self.until <= self.since:
+            raise ValueError("until must be later than since")
+        return self
 
 
 class Acknowledged(SettingsModel):

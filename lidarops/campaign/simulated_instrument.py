@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period
+from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period, ordered
 from lidarops.constants import PLANCK, SPEED_OF_LIGHT
-from lidarops.settings import SettingsModel, ordered, quantity
+from lidarops.settings import SettingsModel, quantity
 
 if TYPE_CHECKING:
     import numpy as np

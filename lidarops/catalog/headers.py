@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 from lidarops.catalog.rows import RETRY, GranuleRow, row_of
@@ -117,7 +117,8 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
 def _start(head: bytes, lidar: _Lidar) -> datetime | None:
     """Return the start of a file that is refused, by which it belongs to a scene."""
     start = read_start(head)
-    return start and start - lidar.instrument.facts_by_clock(start).clock_error
+    facts = start and lidar.instrument.facts_by_clock(start)
+    return start and facts and start - timedelta(seconds=facts.clock_offset)
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
@@ -145,12 +146,13 @@ def _accepted(due: UnreadFile, header: RawHeader, lidar: _Lidar) -> Granule:
             remedy="leave the file out, or set header_pointing if it states no scan, or give"
             " zenith_angle in the facts if the beam is fixed: it holds for all files of the period",
         )
+    shift = timedelta(seconds=facts.clock_offset)
     order = instrument.header_position
     position = None if order == "ignore" else header.position(order)
     latitude, longitude = position or (station.latitude, station.longitude)
     of_campaign = {
-        "start": header.start - facts.clock_error,
-        "stop": header.stop - facts.clock_error,
+        "start": header.start - shift,
+        "stop": header.stop - shift,
         "zenith_angle": header.zenith_angle if facts.zenith_angle is None else facts.zenith_angle,
         "azimuth": header.azimuth if facts.azimuth is None else facts.azimuth,
         "latitude": latitude,
