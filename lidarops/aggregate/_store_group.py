@@ -12,9 +12,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate._join import shared_attributes
+from lidarops.aggregate._join import open_piece, shared_attributes
 from lidarops.aggregate._optional_packages import need
-from lidarops.aggregate._pieces import open_piece
 from lidarops.aggregate.facts import Facts, opened, plain, refuse_changed, refuse_duplicates
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError

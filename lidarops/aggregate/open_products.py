@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lidarops.aggregate._join import join, shared_attributes
-from lidarops.aggregate._pieces import open_piece
+from lidarops.aggregate._join import join, open_piece, shared_attributes
 from lidarops.aggregate.facts import (
     Facts,
     Group,
