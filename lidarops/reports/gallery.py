@@ -24,8 +24,7 @@ from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.netcdf.read import UNREADABLE, opened_product
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
-from lidarops.reports.reading import Readers, reason
-from lidarops.reports.sources import Compared, Group, Problem, Sources
+from lidarops.reports.reading import Compared, Group, Problem, Readers, Sources, reason
 from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40

@@ -24,8 +24,8 @@ from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
 from lidarops.reports.findings import disagreement_rows, finding_rows, lacking, scene_note_rows
 from lidarops.reports.gallery import Gallery, Picture
+from lidarops.reports.reading import Compared
 from lidarops.reports.run_record import FILE_NAME, INDEX
-from lidarops.reports.sources import Compared
 from lidarops.system.files import write_atomically
 
 ROWS: Final = 2000
