@@ -596,7 +596,7 @@ class UnusableFile:
 
 @dataclass(frozen=True, slots=True)
 class LostFiles:
-    """Raw files that products were made from, and that have vanished or cannot be read."""
+    """Raw files of products that have vanished, are empty or cannot be read."""
 
     instrument: str
     files: int

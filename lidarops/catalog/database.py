@@ -7,7 +7,7 @@ import re
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from lidarops.errors import CatalogError, LidarOpsError
 
 _T = TypeVar("_T")
 
-BATCH = 1000
+_BATCH: Final = 1000
 """Largest number of values in the list of one statement."""
 _MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all products again"
 _URLS: Final = "give sqlite:///FILE or postgresql+psycopg://USER@HOST/NAME"
@@ -102,6 +102,18 @@ class Database:
                 yield self.decoded(connection.execution_options(**options).execute(query))
         except sa.exc.SQLAlchemyError as error:
             raise self._catalog_error(error) from error
+
+    def read(self, query: sa.Select[Any], make: Callable[[Any], _T]) -> list[_T]:
+        """Return what is made of each row of a query."""
+        with self.transaction() as connection:
+            return list(self.decoded(map(make, connection.execute(query))))
+
+    def read_batches(self, names: Collection[str], query: Callable[[list[str]], Any]) -> list[Any]:
+        """Return the rows of a query on many names, some of which make a statement."""
+        ordered = sorted(names)
+        batches = (ordered[k : k + _BATCH] for k in range(0, len(ordered), _BATCH))
+        with self.transaction() as connection:
+            return [row for batch in batches for row in connection.execute(query(batch))]
 
     def decoded(self, records: Iterable[_T]) -> Iterator[_T]:
         """Yield rows, or what is made of them as they are read.

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
-from lidarops.catalog.database import BATCH, Database
+from lidarops.catalog.database import Database
 from lidarops.catalog.rows import NO_NOTES, GranuleRow, day_of, naive
 from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
 from lidarops.raw.recorders import Names, recorder_names
@@ -158,9 +158,7 @@ class Granules(Database):
     def _granules(self, *conditions: sa.ColumnElement[bool]) -> list[Granule]:
         query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
         query = query.order_by(_C.instrument, _C.start, _C.path)
-        with self.transaction() as connection:
-            stored = connection.execute(sa.select(LAYOUT))
-            layouts = dict(self.decoded((row.hash, _layout_from(row.channels)) for row in stored))
+        layouts = dict(self.read(sa.select(LAYOUT), lambda row: (row.hash, _layout_from(row[1]))))
         with self.stream(query) as rows:
             return list(self.decoded(_granule_from(row, layouts) for row in rows))
 
@@ -191,8 +189,7 @@ class Granules(Database):
             )
             .group_by(_C.day)
         )
-        with self.transaction() as connection:
-            return sorted(start.replace(tzinfo=UTC) for start in connection.scalars(query))
+        return sorted(self.read(query, lambda row: row[0].replace(tzinfo=UTC)))
 
     def _good_below(self, folder: str) -> list[sa.ColumnElement[bool]]:
         conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
@@ -205,8 +202,7 @@ class Granules(Database):
         """Return the number of granules."""
         conditions = [] if status is None else [_C.status == status.value]
         query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *conditions)
-        with self.transaction() as connection:
-            return int(connection.scalar(query) or 0)
+        return int(self.read(query, tuple)[0][0])
 
     def day_sums(self) -> list[DaySum]:
         """Return the sums of the stamps of good granules by day and role."""
@@ -222,14 +218,9 @@ class Granules(Database):
             .group_by(_C.day, _C.role)
             .order_by(_C.day, _C.role)
         )
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            return list(
-                self.decoded(
-                    DaySum(day, Role(role), count, int(low), int(high))
-                    for day, role, count, low, high in rows
-                )
-            )
+        return self.read(
+            query, lambda row: DaySum(row[0], Role(row[1]), row[2], int(row[3]), int(row[4]))
+        )
 
     def _signals(self) -> tuple[sa.ColumnElement[bool], ...]:
         good, signal = Status.GOOD.value, Role.SIGNAL.value
@@ -267,23 +258,19 @@ class Granules(Database):
             .join(LAYOUT, LAYOUT.c.hash == groups.c.layout)
             .order_by(groups.c.instrument, groups.c.period, groups.c.layout)
         )
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            return list(
-                self.decoded(
-                    Holding(name, begins[k], _layout_from(text), files, first.replace(tzinfo=UTC))
-                    for name, k, _, files, first, text in rows
-                )
-            )
+
+        def holding(row: Any) -> Holding:
+            name, k, _, files, first, text = row
+            return Holding(name, begins[k], _layout_from(text), files, first.replace(tzinfo=UTC))
+
+        return self.read(query, holding)
 
     def channel_names(self) -> Mapping[str, Names]:
         """Return the names that recorders have for good, by instrument."""
         query = sa.select(CHANNEL_NAME).where(CHANNEL_NAME.c.campaign == self.campaign)
         names: dict[str, dict[Any, str]] = defaultdict(dict)
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            for row, recorder in self.decoded((row, json.loads(row.recorder)) for row in rows):
-                names[row.instrument][tuple(recorder)] = row.name
+        for row, recorder in self.read(query, lambda row: (row, json.loads(row.recorder))):
+            names[row.instrument][tuple(recorder)] = row.name
         return names
 
     def bind_channel_names(self) -> None:
@@ -320,8 +307,7 @@ class Granules(Database):
             query = query.where(_C.day >= first)
         if last is not None:
             query = query.where(_C.day <= last)
-        with self.transaction() as connection:
-            return {name: (first, last) for name, first, last in connection.execute(query)}
+        return {name: (begin, end) for name, begin, end in self.read(query, tuple)}
 
     def has_files(
         self, instrument: str, since: datetime | None = None, until: datetime | None = None
@@ -333,8 +319,7 @@ class Granules(Database):
             query = query.where(_C.day >= day_of(since), _C.start >= naive(since))
         if until is not None:
             query = query.where(_C.day <= day_of(until), _C.start < naive(until))
-        with self.transaction() as connection:
-            return connection.execute(query).first() is not None
+        return bool(self.read(query, tuple))
 
     def file_notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
         """Return the notes on good signal granules, contradictions first, then by frequency.
@@ -349,13 +334,11 @@ class Granules(Database):
             sa.select(*columns, sa.func.count()).where(*self._signals(), noted).group_by(*columns)
         )
         files: Counter[tuple[bool, str, str]] = Counter()
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            known = (row for row in rows if row.instrument in instruments)
-            sentences = self.decoded(
-                (row, _sentences(row.notes), _sentences(row.contradictions)) for row in known
-            )
-            for (instrument, *_, count), *stored in sentences:
+        sentences = self.read(
+            query, lambda row: (row, _sentences(row.notes), _sentences(row.contradictions))
+        )
+        for (instrument, *_, count), *stored in sentences:
+            if instrument in instruments:
                 for texts, contradicts in zip(stored, (False, True), strict=True):
                     for text in texts:
                         files[contradicts, instrument, text] += count
@@ -378,16 +361,9 @@ class Granules(Database):
 
     def paths_by_digest(self, digests: Collection[str]) -> dict[str, str]:
         """Return SHA-256 -> path of the granules with these digests."""
-        paths: dict[str, str] = {}
-        ordered = sorted(digests)
-        with self.transaction() as connection:
-            for first in range(0, len(ordered), BATCH):
-                batch = ordered[first : first + BATCH]
-                query = sa.select(_C.sha256, _C.path).where(
-                    _C.campaign == self.campaign, _C.sha256.in_(batch)
-                )
-                paths.update((row.sha256, row.path) for row in connection.execute(query))
-        return paths
+        columns = sa.select(_C.sha256, _C.path).where(_C.campaign == self.campaign)
+        rows = self.read_batches(digests, lambda batch: columns.where(_C.sha256.in_(batch)))
+        return dict(rows)
 
 
 _GRANULE_COLUMNS: Final = tuple(_C[field.name] for field in fields(Granule))

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import groupby
@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
-from lidarops.catalog.database import BATCH
 from lidarops.catalog.granules import Granules
 from lidarops.catalog.rows import RETRY, aware, naive, row_of
 from lidarops.catalog.schema import (
@@ -80,11 +79,6 @@ class RecordedProduct:
     depends_on: Dependence
     run: str
     stamp: Stamp
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """Scene, kind and channel."""
-        return self.scene, self.kind, self.channel
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,19 +192,31 @@ _MADE: Final = (
 class Ledger(Granules):
     """Products, their inputs, and the runs that made them."""
 
+    @contextmanager
+    def _writing(self, token: str) -> Iterator[sa.Connection]:
+        """Yield a connection for a transaction; refuse it if the lock was lost."""
+        with self.transaction() as connection:
+            held = connection.execute(
+                sa.update(LOCK)
+                .where(LOCK.c.campaign == self.campaign, LOCK.c.token == token)
+                .values(heartbeat=self.clock())
+            )
+            if held.rowcount != 1:
+                raise CatalogError(
+                    "another run has taken over, because this one sent no heartbeat",
+                    file=self.place,
+                    remedy="see lidarops runs; the scenes that this run entered are kept",
+                )
+            yield connection
+
     # Runs
 
     def begin_run(self, run: Run, token: str, *, swept: bool = True) -> None:
         """Enter a starting run; close runs whose process died, if what they left is swept."""
-        with self.transaction() as connection:
-            self._hold(connection, token)
+        with self._writing(token) as connection:
             if swept:
                 connection.execute(self._closing())
-            values = asdict(run) | {
-                "campaign": self.campaign,
-                "started": naive(run.started),
-                "status": run.status.value,
-            }
+            values = asdict(run) | {"campaign": self.campaign, "started": naive(run.started)}
             del values["seconds"]
             connection.execute(sa.insert(RUN), values)
 
@@ -222,20 +228,16 @@ class Ledger(Granules):
 
     def has_open_run(self) -> bool:
         """Return whether a run has begun and not ended."""
-        with self.transaction() as connection:
-            query = sa.select(RUN.c.id).where(*self._open_runs()).limit(1)
-            return connection.execute(query).first() is not None
+        return bool(self.read(sa.select(RUN.c.id).where(*self._open_runs()).limit(1), tuple))
 
     def close_runs(self, token: str) -> None:
         """Close runs whose process died."""
-        with self.transaction() as connection:
-            self._hold(connection, token)
+        with self._writing(token) as connection:
             connection.execute(self._closing())
 
     def end_run(self, run: str, status: RunStatus, *, refused: int, token: str) -> None:
         """Enter the end of a run."""
-        with self.transaction() as connection:
-            self._hold(connection, token)
+        with self._writing(token) as connection:
             connection.execute(
                 sa.update(RUN)
                 .where(RUN.c.id == run)
@@ -250,9 +252,13 @@ class Ledger(Granules):
             .order_by(RUN.c.started.desc(), RUN.c.id.desc())
             .limit(limit)
         )
-        with self.transaction() as connection:
-            rows = list(self.decoded(connection.execute(query)))
-            return list(self.decoded(_run_from(row, _stages(connection, row.id)) for row in rows))
+        stage = STAGE.c
+        seconds = sa.select(stage.stage, sa.func.sum(stage.seconds)).group_by(stage.stage)
+        seconds = seconds.order_by(stage.stage)
+        return [
+            replace(run, seconds=dict(self.read(seconds.where(stage.run == run.id), tuple)))
+            for run in self.read(query, _run_from)
+        ]
 
     # Outcomes
 
@@ -262,22 +268,16 @@ class Ledger(Granules):
             "campaign": self.campaign, "scene": scene, "day": day, "key": "", "run": run,
             "error": "", "internal": "", "final": False, "crashes": 1,
         }  # fmt: skip
-        with self.transaction() as connection:
-            self._hold(connection, token)
-            statement = self.insert(SCENE)
-            connection.execute(
-                statement.on_conflict_do_update(
-                    index_elements=["campaign", "scene"],
-                    set_={"crashes": SCENE.c.crashes + 1, "run": run, "day": day},
-                ),
-                row,
-            )
+        with self._writing(token) as connection:
+            again = {"crashes": SCENE.c.crashes + 1, "run": run, "day": day}
+            keys = ["campaign", "scene"]
+            statement = self.insert(SCENE).on_conflict_do_update(index_elements=keys, set_=again)
+            connection.execute(statement, row)
 
     def record(self, entry: SceneEntry, run: str, token: str) -> None:
         """Enter the outcome of a scene in one transaction: products, inputs, digests, timings."""
         outcome = entry.outcome
-        with self.transaction() as connection:
-            self._hold(connection, token)
+        with self._writing(token) as connection:
             self._enter_products(connection, entry, run)
             self._enter_scene(connection, entry, run)
             if outcome.error:
@@ -296,76 +296,32 @@ class Ledger(Granules):
                 )
             )
 
-    def _hold(self, connection: sa.Connection, token: str) -> None:
-        """Refuse to write if the lock was lost."""
-        held = connection.execute(
-            sa.update(LOCK)
-            .where(LOCK.c.campaign == self.campaign, LOCK.c.token == token)
-            .values(heartbeat=self.clock())
-        )
-        if held.rowcount != 1:
-            raise CatalogError(
-                "another run has taken over, because this one sent no heartbeat",
-                file=self.place,
-                remedy="see lidarops runs; the scenes that this run entered are kept",
-            )
-
     def _enter_products(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
-        if not entry.products:
+        made = {new.record.path: new for new in entry.products}
+        if not made:
             return
-        rows = [self._product_row(new, entry, run) for new in entry.products]
-        paths = [row["path"] for row in rows]
-        before = connection.execute(
-            sa.select(_P.path, _P.sha256, _P.run).where(
-                _P.campaign == self.campaign, _P.path.in_(paths)
-            )
-        )
-        shas = {new.record.path: (new.record.sha256, new.kept) for new in entry.products}
+        own, ours = _P.campaign == self.campaign, {"campaign": self.campaign}
+        before = sa.select(_P.path, _P.sha256, _P.run).where(own, _P.path.in_(made))
         replaced = [
-            {
-                "campaign": self.campaign, "path": path, "sha256": sha256, "run": old,
-                "replaced_by": run, "kept": shas[path][1],
-            }
-            for path, sha256, old in before
-            if shas[path][0] != sha256
-        ]  # fmt: skip
+            {**ours, "path": path, "sha256": sha256, "run": old, "replaced_by": run, "kept": kept}
+            for path, sha256, old in connection.execute(before)
+            for kept in [made[path].kept]
+            if made[path].record.sha256 != sha256
+        ]
         if replaced:
             connection.execute(self.insert_new(SUPERSEDED), replaced)
-        self._drop_products(connection, paths)
-        connection.execute(sa.insert(PRODUCT), rows)
-        self._enter_inputs(connection, entry.products)
-
-    def _product_row(self, new: NewProduct, entry: SceneEntry, run: str) -> dict[str, Any]:
-        stated = ("path", "kind", "channel", "sha256", "size", "usable")
-        change, written = new.record.change, new.record.stamp.written
-        return {
-            "campaign": self.campaign,
-            "scene": entry.outcome.scene,
-            "day": entry.day,
-            "mtime_ns": new.mtime_ns,
-            "run": run,
-            **{name: getattr(new.record, name) for name in stated},
-            **asdict(new.depends_on),
-            "version": new.record.stamp.version,
-            "written": None if written is None else naive(written),
-            "change": "" if change is None else json.dumps(change.as_dict()),
-        }
-
-    def _enter_inputs(self, connection: sa.Connection, products: Sequence[NewProduct]) -> None:
+        self._drop_products(connection, made)
+        scene = {**ours, "scene": entry.outcome.scene, "day": entry.day, "run": run}
+        connection.execute(sa.insert(PRODUCT), [scene | _product_row(new) for new in made.values()])
         sets: dict[str, list[InputRecord]] = {}
-        rows = []
-        for new in products:
+        links = []
+        for path, new in made.items():
             by_role = sorted(new.inputs, key=attrgetter("role", "path"))
             for role, files in groupby(by_role, key=attrgetter("role")):
                 members = list(files)
                 name = _set_id(members)
                 sets[name] = members
-                rows.append(
-                    {
-                        "campaign": self.campaign, "product": new.record.path,
-                        "role": role.value, "file_set": name,
-                    }
-                )  # fmt: skip
+                links.append({**ours, "product": path, "role": role.value, "file_set": name})
         known = set(
             connection.scalars(sa.select(FILE_SET.c.id).where(FILE_SET.c.id.in_(sets)).distinct())
         )
@@ -377,8 +333,8 @@ class Ledger(Granules):
         ]
         if files_of_sets:
             connection.execute(self.insert_new(FILE_SET), files_of_sets)
-        if rows:
-            connection.execute(sa.insert(PRODUCT_INPUT), rows)
+        if links:
+            connection.execute(sa.insert(PRODUCT_INPUT), links)
 
     def _enter_scene(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
         outcome = entry.outcome
@@ -388,37 +344,28 @@ class Ledger(Granules):
             "final": entry.final, "crashes": 0,
         }  # fmt: skip
         connection.execute(self.upsert(SCENE), row)
-        stages = [
-            {"run": run, "scene": outcome.scene, "stage": stage, "seconds": seconds}
-            for stage, seconds in outcome.seconds.items()
-        ]
+        ours = {"run": run, "scene": outcome.scene}
+        stages = [{**ours, "stage": name, "seconds": s} for name, s in outcome.seconds.items()]
         if stages:
             connection.execute(self.insert_new(STAGE), stages)
 
     def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
         """Enter granules that cannot be used; the next scan tries what was not read again."""
         # Whole rows: a scan leaves a row whose stamp is that of the file as it reads it.
-        rows = [
-            row_of(granule, self.campaign, self._scan_key(connection, granule)).values
-            for granule in refused
-        ]
-        if rows:
-            connection.execute(self.upsert(GRANULE), rows)
-
-    def _scan_key(self, connection: sa.Connection, refused: Granule) -> str:
-        """Return the key by which a scan knows a damaged file, or `RETRY` if it was not read."""
-        here = GRANULE.c.campaign == self.campaign, GRANULE.c.path == refused.path
-        known = sa.select(GRANULE.c.scan_key).where(*here)
-        return (connection.scalar(known) if refused.sha256 else None) or RETRY
+        own = GRANULE.c.campaign == self.campaign
+        for granule in refused:
+            # By this key a scan knows a damaged file.
+            query = sa.select(GRANULE.c.scan_key).where(own, GRANULE.c.path == granule.path)
+            known = connection.scalar(query) if granule.sha256 else None
+            row = row_of(granule, self.campaign, known or RETRY)
+            connection.execute(self.upsert(GRANULE), row.values)
 
     # Products
 
     def products_of_days(self, first: int, last: int) -> list[RecordedProduct]:
         """Return the products of scenes that start on days `first` to `last`."""
         query = sa.select(*_MADE).where(_P.campaign == self.campaign, _P.day.between(first, last))
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            return list(self.decoded(_made_from(row) for row in rows))
+        return self.read(query, _made_from)
 
     @contextmanager
     def all_products(self) -> Iterator[Iterator[RecordedProduct]]:
@@ -429,13 +376,8 @@ class Ledger(Granules):
 
     def made_by_any_campaign(self, paths: Collection[str]) -> set[str]:
         """Return those of some paths that are products of any campaign of the database."""
-        made: set[str] = set()
-        ordered = sorted(paths)
-        with self.transaction() as connection:
-            for first in range(0, len(ordered), BATCH):
-                batch = ordered[first : first + BATCH]
-                made.update(connection.scalars(sa.select(_P.path).where(_P.path.in_(batch))))
-        return made
+        made = sa.select(_P.path)
+        return {path for (path,) in self.read_batches(paths, lambda b: made.where(_P.path.in_(b)))}
 
     def scenes_with_product(
         self, owner: str, kind: str, channel: str, *, without: Collection[str]
@@ -467,8 +409,7 @@ class Ledger(Granules):
     def products(self) -> list[Mapping[str, Any]]:
         """Return the rows of all products, ordered by path."""
         query = sa.select(PRODUCT).where(_P.campaign == self.campaign).order_by(_P.path)
-        with self.transaction() as connection:
-            return [dict(row) for row in connection.execute(query).mappings()]
+        return self.read(query, lambda row: dict(row._mapping))  # noqa: SLF001 - is public
 
     def inputs_of(self, product: str) -> list[InputRecord]:
         """Return the files that a product was made from."""
@@ -480,14 +421,12 @@ class Ledger(Granules):
             .where(link.role != Role.UNUSED.value)
             .order_by(link.role, FILE_SET.c.path)
         )
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            return list(
-                self.decoded(InputRecord(path, Role(role), sha256) for path, role, sha256 in rows)
-            )
+        return self.read(query, lambda row: InputRecord(row[0], Role(row[1]), row[2]))
 
     def lost_inputs(self) -> list[tuple[str, str]]:
-        """Return set and path of raw inputs of products that the catalog lacks or could not read.
+        """Return set and path of raw inputs of products that the archive no longer gives.
+
+        The catalog lacks them, could not read them, or knows them as empty.
 
         Also of files that products state as unused, and the catalog lacks. Without those whose
         content is known under another path.
@@ -495,11 +434,11 @@ class Ledger(Granules):
         listed = sa.exists().where(
             GRANULE.c.campaign == self.campaign,
             GRANULE.c.path == FILE_SET.c.path,
-            GRANULE.c.reason.not_like(f"{UNREADABLE}%") | (FILE_SET.c.sha256 == ""),
+            (GRANULE.c.reason.not_like(f"{UNREADABLE}%") & (GRANULE.c.size > 0))
+            | (FILE_SET.c.sha256 == ""),
         )
         query = sa.select(FILE_SET).where(FILE_SET.c.id.in_(self._raw_sets()), ~listed)
-        with self.stream(query) as rows:
-            lost = [(name, path, sha256) for name, path, sha256 in rows]
+        lost = self.read(query, tuple)
         if not lost:
             return []
         # In one pass, because digests have no index.
@@ -517,9 +456,8 @@ class Ledger(Granules):
         """Return the sets of raw files of products, by their ids."""
         link, files = PRODUCT_INPUT.c, FILE_SET.c
         sizes = sa.select(files.id, sa.func.count()).where(files.id.in_(self._raw_sets()))
-        with self.transaction() as connection:
-            size = dict(connection.execute(sizes.group_by(files.id)).tuples().all())
-            rows = list(connection.execute(self._raw_sets().add_columns(link.role, link.product)))
+        size = dict(self.read(sizes.group_by(files.id), tuple))
+        rows = self.read(self._raw_sets().add_columns(link.role, link.product), tuple)
         sets: dict[str, RawSet] = {}
         for name, role, product in rows:
             sets.setdefault(name, RawSet(Role(role), size[name], [])).products.append(product)
@@ -562,8 +500,7 @@ class Ledger(Granules):
 
     def forget_products(self, paths: Collection[str], token: str) -> None:
         """Remove products, and their inputs that no other product uses."""
-        with self.transaction() as connection:
-            self._hold(connection, token)
+        with self._writing(token) as connection:
             self._drop_products(connection, paths)
             used = sa.select(PRODUCT_INPUT.c.file_set)
             connection.execute(sa.delete(FILE_SET).where(FILE_SET.c.id.not_in(used)))
@@ -586,8 +523,7 @@ class Ledger(Granules):
         columns = (old[field.name] for field in fields(SupersededVersion))
         query = sa.select(*columns).where(old.campaign == self.campaign)
         query = query.order_by(old.path, old.run)
-        with self.transaction() as connection:
-            return [SupersededVersion(*row) for row in connection.execute(query)]
+        return self.read(query, lambda row: SupersededVersion(*row))
 
     # Scenes and verdicts
 
@@ -598,18 +534,18 @@ class Ledger(Granules):
         query = sa.select(*columns).where(
             known.campaign == self.campaign, known.day.between(first, last)
         )
-        with self.transaction() as connection:
-            return {row[0]: LastTry(*row[1:]) for row in connection.execute(query)}
+        return {scene: LastTry(*tried) for scene, *tried in self.read(query, tuple)}
 
     def scenes_of_other_days(self, days: Collection[int]) -> list[str]:
         """Return the scenes of other days than these that were tried."""
-        known = SCENE.c
-        where = known.campaign == self.campaign
-        with self.transaction() as connection:
-            tried = set(connection.scalars(sa.select(known.day).where(where).distinct()))
-            others = sorted(tried.difference(days))
-            query = sa.select(known.scene).where(where, known.day == sa.bindparam("other"))
-            return [scene for day in others for scene in connection.scalars(query, {"other": day})]
+        own = SCENE.c.campaign == self.campaign
+        tried = {day for (day,) in self.read(sa.select(SCENE.c.day).where(own).distinct(), tuple)}
+        scenes = sa.select(SCENE.c.scene).where(own)
+        return [
+            scene
+            for day in sorted(tried.difference(days))
+            for (scene,) in self.read(scenes.where(SCENE.c.day == day), tuple)
+        ]
 
     def failures(self) -> dict[str, str]:
         """Return scene -> error of the scenes whose last try failed."""
@@ -620,11 +556,9 @@ class Ledger(Granules):
         return self._said_of_scenes(SCENE.c.internal)
 
     def _said_of_scenes(self, column: sa.Column[str]) -> dict[str, str]:
-        query = sa.select(SCENE.c.scene, column).where(
-            SCENE.c.campaign == self.campaign, column != ""
-        )
-        with self.transaction() as connection:
-            return dict(connection.execute(query).tuples().all())
+        query = sa.select(SCENE.c.scene, column)
+        own = SCENE.c.campaign == self.campaign
+        return dict(self.read(query.where(own, column != ""), tuple))
 
     def unusable_scenes(self, *, without: Collection[str] = ()) -> list[str]:
         """Return the scenes whose retrievals gave no usable value; see `SceneOutcome.unusable`.
@@ -651,40 +585,32 @@ class Ledger(Granules):
 
     def forget_scenes(self, scenes: Collection[str]) -> None:
         """Remove the entries of scenes that no longer exist."""
-        names = sorted(scenes)
-        with self.transaction() as connection:
-            for first in range(0, len(names), BATCH):
-                connection.execute(
-                    sa.delete(SCENE).where(
-                        SCENE.c.campaign == self.campaign,
-                        SCENE.c.scene.in_(names[first : first + BATCH]),
-                    )
-                )
+        own = SCENE.c.campaign == self.campaign, SCENE.c.scene == sa.bindparam("gone")
+        if scenes:
+            with self.transaction() as connection:
+                gone = [{"gone": scene} for scene in sorted(scenes)]
+                connection.execute(sa.delete(SCENE).where(*own), gone)
 
     def verdicts(self) -> dict[int, Verdict]:
         """Return the verdicts on settled days."""
-        query = sa.select(*(VERDICT.c[name] for name in ("day", *Verdict._fields))).where(
-            VERDICT.c.campaign == self.campaign
+        columns = (VERDICT.c[name] for name in ("day", *Verdict._fields))
+        query = sa.select(*columns).where(VERDICT.c.campaign == self.campaign)
+        return dict(
+            self.read(
+                query, lambda row: (row[0], Verdict._make((*row[1:-1], json.loads(row.files))))
+            )
         )
-        with self.transaction() as connection:
-            rows = connection.execute(query)
-            return dict(self.decoded((row.day, _verdict_from(row)) for row in rows))
 
     def store_verdicts(self, verdicts: Mapping[int, Verdict]) -> None:
         """Note that all requested products of these days are fresh."""
-        if not verdicts:
-            return
+        own = {"campaign": self.campaign}
         rows = [
-            {
-                "campaign": self.campaign,
-                "day": day,
-                **verdict._asdict(),
-                "files": json.dumps(verdict.files),
-            }
+            {**own, "day": day, **verdict._asdict(), "files": json.dumps(verdict.files)}
             for day, verdict in verdicts.items()
         ]
-        with self.transaction() as connection:
-            connection.execute(self.upsert(VERDICT), rows)
+        if rows:
+            with self.transaction() as connection:
+                connection.execute(self.upsert(VERDICT), rows)
 
 
 def _set_id(files: Sequence[InputRecord]) -> str:
@@ -694,34 +620,27 @@ def _set_id(files: Sequence[InputRecord]) -> str:
     return digest.hexdigest()[:32]
 
 
+def _product_row(new: NewProduct) -> dict[str, Any]:
+    """Return the columns of a product without those of its scene."""
+    record, change = new.record, new.record.change
+    return {
+        **{name: getattr(record, name) for name in ("path", "kind", "channel", "sha256", "size")},
+        **asdict(new.depends_on),
+        "mtime_ns": new.mtime_ns,
+        "usable": record.usable,
+        "version": record.stamp.version,
+        "written": naive(record.stamp.written),
+        "change": "" if change is None else json.dumps(change.as_dict()),
+    }
+
+
 def _made_from(row: Any) -> RecordedProduct:
     # In the order of `_MADE`.
     stamp = Stamp(row.version, None if row.written is None else aware(row.written))
     return RecordedProduct(*(*row[:8], Dependence(*row[8:12]), row.run, stamp))
 
 
-def _verdict_from(row: Any) -> Verdict:
-    return Verdict(row.signature, row.empty_scenes, row.set_aside, json.loads(row.files))
-
-
-def _stages(connection: sa.Connection, run: str) -> dict[str, float]:
-    query = (
-        sa.select(STAGE.c.stage, sa.func.sum(STAGE.c.seconds))
-        .where(STAGE.c.run == run)
-        .group_by(STAGE.c.stage)
-        .order_by(STAGE.c.stage)
-    )
-    return {stage: float(seconds) for stage, seconds in connection.execute(query)}
-
-
-def _run_from(row: Any, seconds: Mapping[str, float]) -> Run:
-    values = {field.name: getattr(row, field.name) for field in fields(Run)[:-1]}
-    return Run(
-        **values
-        | {
-            "started": row.started.replace(tzinfo=UTC),
-            "finished": aware(row.finished),
-            "status": RunStatus(row.status),
-            "seconds": seconds,
-        }
-    )
+def _run_from(row: Any) -> Run:
+    values = {name: getattr(row, name) for name in (field.name for field in fields(Run)[:-1])}
+    times = {name: aware(values[name]) for name in ("started", "finished")}
+    return Run(**values | times | {"status": RunStatus(row.status)})

@@ -47,32 +47,27 @@ def verify_archive(
     inputs : bool
         Whether to read also the inputs: raw, dark, molecular and overlap files.
     """
-    temporary = list(versions.temporary_files(Path(campaign.output)))
+    output, products = Path(campaign.output), campaign.products_root
+    temporary = [path.relative_to(output).as_posix() for path in versions.temporary_files(output)]
     if not _is_written(store):
         for path in temporary:
-            name = path.relative_to(campaign.output).as_posix()
-            yield CheckedFile("temporary", name, LEFT_OVER)
+            yield CheckedFile("temporary", path, LEFT_OVER)
     # Listed first: what a run writes from now on may be in the ledger only later.
-    unlisted = set(product_paths(campaign.products_root))
-    read = _digests_below(campaign.products_root)
+    unlisted = set(product_paths(products))
     with store.all_products() as rows:
         for made in rows:
             unlisted.discard(made.path)
-            yield CheckedFile("product", made.path, _problem(read, made.path, made.sha256))
-    yield from _check_unlisted(store, unlisted)
-    read = _digests_below(Path(campaign.output))
-    for old in store.superseded():
-        if old.kept:
-            yield CheckedFile("superseded", old.kept, _problem(read, old.kept, old.sha256))
-    if inputs:
-        yield from _check_inputs(campaign, store)
-
-
-def _check_unlisted(store: Store, unlisted: set[str]) -> Iterator[CheckedFile]:
-    """Yield files that no campaign of the database has made."""
+            problem = _problem(_digests_below(products), made.path, made.sha256)
+            yield CheckedFile("product", made.path, problem)
     if unlisted and not _is_written(store):
         for path in sorted(unlisted - store.made_by_any_campaign(unlisted)):
             yield CheckedFile("unlisted", path, _UNLISTED)
+    for old in store.superseded():
+        if old.kept:
+            problem = _problem(_digests_below(output), old.kept, old.sha256)
+            yield CheckedFile("superseded", old.kept, problem)
+    if inputs:
+        yield from _check_inputs(campaign, store)
 
 
 def _is_written(store: Store) -> bool:

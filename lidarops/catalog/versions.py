@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import re
 import shutil
@@ -24,6 +25,7 @@ _WRITER: Final = re.compile(r"\.(\d+)-[0-9a-f]+\.tmp$")
 """The number of the process that writes a temporary file, in its name."""
 _LOADED: Final = time.time()
 
+_LOG = logging.getLogger(__name__)
 _NO_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.EXDEV, errno.EMLINK, errno.ENOSYS})
 
 
@@ -86,7 +88,7 @@ def drop(output: Path, kept: str) -> None:
             (output / kept).unlink(missing_ok=True)
 
 
-def sweep(output: Path, is_written: Callable[[], bool]) -> tuple[list[str], bool]:
+def sweep(output: Path, is_written: Callable[[], bool]) -> bool:
     """Remove hidden temporary files that killed processes left among products and reports.
 
     Parameters
@@ -99,23 +101,20 @@ def sweep(output: Path, is_written: Callable[[], bool]) -> tuple[list[str], bool
 
     Returns
     -------
-    list of str
-        Paths of the removed files.
     bool
         Whether all could be found and removed; if not, a later run has to try again.
     """
-    swept: list[str] = []
     failures: list[OSError] = []
     paths = list(temporary_files(output, failures))
     if is_written():
-        return [], False
+        return False
     for path in paths:
         try:
             path.unlink(missing_ok=True)
-            swept.append(str(path))
+            _LOG.warning("removed %s, left by a killed process", path)
         except OSError as error:
             failures.append(error)
-    return swept, not failures
+    return not failures
 
 
 def temporary_files(output: Path, failures: list[OSError] | None = None) -> Iterator[Path]:
@@ -124,20 +123,16 @@ def temporary_files(output: Path, failures: list[OSError] | None = None) -> Iter
     Processes of other machines may write them, if a run is at work. Folders that exist and cannot
     be read are appended to the failures.
     """
-
-    def note(error: OSError) -> None:
-        if failures is not None and not isinstance(error, FileNotFoundError):
-            failures.append(error)
-
+    unread: list[OSError] = [] if failures is None else failures
     for kept in ("products", FOLDER, "report"):
-        for folder, _, names in os.walk(output / kept, onerror=note):
+        for folder, _, names in os.walk(output / kept, onerror=unread.append):
             for name in names:
-                if not (name.startswith(".") and name.endswith(".tmp")):
-                    continue
                 path = Path(folder, name)
-                old = kept != "report" or _age(path) > LONGEST_WRITE
+                hidden = name.startswith(".") and name.endswith(".tmp")
+                old = hidden and (kept != "report" or _age(path) > LONGEST_WRITE)
                 if old and not _has_writer(path):
                     yield path
+    unread[:] = [error for error in unread if not isinstance(error, FileNotFoundError)]
 
 
 def _has_writer(path: Path) -> bool:

@@ -72,7 +72,7 @@ def show_plan(
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops.catalog.scratch import without_writing
+    from lidarops.catalog.access import without_writing
 
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)

@@ -71,7 +71,8 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
             )
         more = lost.files - len(lost.names)
         names = ", ".join(lost.names) + (f" and {more:,} more" if more else "")
-        problem = f"have vanished or cannot be read, though products were made from them; {fate}"
+        gone = "have vanished, are empty now or cannot be read"
+        problem = f"{gone}, though products were made from them; {fate}"
         subject = f"{lost.files:,} of {counted(lost.of, 'raw file')}: {names}"
         yield FindingRow(lost.instrument, subject, problem, fails=bool(lost.kept))
     for idle in findings.idle_patterns:

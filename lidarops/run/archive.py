@@ -38,7 +38,7 @@ from lidarops.run.findings import find
 from lidarops.run.leftovers import Orphan
 from lidarops.run.options import NO_USABLE_VALUE, Options, Result
 from lidarops.run.selection import Selection, check_selection
-from lidarops.run.session import Session, sweep
+from lidarops.run.session import Session
 from lidarops.run.staleness import REACH, DaysJudged, Judge, Judgement, Signature
 from lidarops.scene.job import Job
 from lidarops.system.files import only_one
@@ -97,7 +97,20 @@ def reprocess(
     options: Options | None = None,
     client: Client | None = None,
 ) -> RunRecord | None:
+    """Do what `bring_up_to_date` does, and return the record; None if there was nothing to do."""
+    return bring_up_to_date(campaign, selection=selection, options=options, client=client).record
+
+
+def bring_up_to_date(
+    campaign: Campaign,
+    *,
+    selection: Selection | None = None,
+    options: Options | None = None,
+    client: Client | None = None,
+) -> Result:
     """Bring catalog and products up to date: make all stale products, and nothing else.
+
+    Nothing is written if there is nothing to do.
 
     Parameters
     ----------
@@ -110,8 +123,8 @@ def reprocess(
 
     Returns
     -------
-    RunRecord or None
-        None if there was nothing to do; then nothing was written.
+    Result
+        What the run did, and the state of the archive after it.
 
     Raises
     ------
@@ -122,17 +135,6 @@ def reprocess(
     SceneError
         If the cluster is lost.
     """
-    return bring_up_to_date(campaign, selection=selection, options=options, client=client).record
-
-
-def bring_up_to_date(
-    campaign: Campaign,
-    *,
-    selection: Selection | None = None,
-    options: Options | None = None,
-    client: Client | None = None,
-) -> Result:
-    """Do what `reprocess` does, and return the state of the archive after the run."""
     selection = selection or Selection()
     options = options or Options()
     check_selection(campaign, selection)
@@ -182,8 +184,13 @@ def assess(
         update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection)
-        days = _days_to_judge(judge, store, selection, force=everything)
-        for batch in judge.batches(days):
+        verdicts, signatures = store.verdicts(), judge.signatures()
+        days = [
+            day
+            for day, now in signatures.items()
+            if everything or not judge.is_settled(now, verdicts.get(day))
+        ]
+        for batch in judge.batches(selection.days(days)):
             for judged in judge.days(batch).judgements:
                 if everything or judged.due or judged.held or judged.frozen or judged.kept:
                     yield judge.explained(judged)
@@ -207,7 +214,7 @@ def survey(
     summary = update_catalog(campaign, wait=wait)
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection)
-        return find(judge, store, selection, summary.idle_patterns)
+        return find(judge, summary.idle_patterns)
 
 
 class EarlierProblems(NamedTuple):
@@ -254,21 +261,18 @@ def _acquire(lock: Lock) -> None:
         raise _OvertakenError
 
 
-def _days_to_judge(judge: Judge, store: Store, selection: Selection, *, force: bool) -> list[int]:
-    verdicts = store.verdicts()
-    signatures = judge.signatures()
-    days = selection.days(sorted(signatures))
-    if force:
-        return days
-    return [day for day in days if not judge.is_settled(signatures[day], verdicts.get(day))]
-
-
 @dataclass(slots=True)
-class _Gathered:
-    """What a pass over the archive collects; of what is judged again, the last judgement."""
+class _Pass:
+    """One pass: update the catalog, judge, process what is stale, enter it in the ledger."""
 
+    campaign: Campaign
+    store: Store
+    lock: Lock
+    selection: Selection
+    options: Options
+    judge: Judge = field(init=False)
     orphans: dict[str, Orphan] = field(default_factory=dict)
-    """By path."""
+    """By path; this and what follows as it was judged last."""
     set_aside: dict[str, Granule] = field(default_factory=dict)
     """By path."""
     file_notes: list[FileNote] = field(default_factory=list)
@@ -284,19 +288,6 @@ class _Gathered:
     succeed."""
     open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
     """Days with stale products -> scenes."""
-
-
-@dataclass(slots=True)
-class _Pass:
-    """One pass: update the catalog, judge, process what is stale, enter it in the ledger."""
-
-    campaign: Campaign
-    store: Store
-    lock: Lock
-    selection: Selection
-    options: Options
-    judge: Judge = field(init=False)
-    gathered: _Gathered = field(default_factory=_Gathered)
     judgements: dict[str, Judgement] = field(default_factory=dict)
     """Of the scenes that are yet to end."""
     suspects: list[Job] = field(default_factory=list)
@@ -315,7 +306,11 @@ class _Pass:
         self.judge = self._new_judge()
         signatures = self.judge.signatures()
         verdicts = self.store.verdicts()
-        days = _days_to_judge(self.judge, self.store, self.selection, force=self.options.force)
+        days = self.selection.days(
+            day
+            for day, now in signatures.items()
+            if self.options.force or not self.judge.is_settled(now, verdicts.get(day))
+        )
         clean = [
             day
             for day in sorted(signatures.keys() - set(days))
@@ -334,18 +329,10 @@ class _Pass:
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
                     self.lost_worker = True
-            self._settle(signatures)
+            self._settle(signatures, stopped=status is not RunStatus.FINISHED)
         self._clear_up()
-        findings = find(
-            self.judge,
-            self.store,
-            self.selection,
-            summary.idle_patterns,
-            self.gathered.orphans.keys(),
-            settled=not days,
-        )
-        gathered = self.gathered
-        file_notes = (*findings.file_notes, *joined_notes(gathered.file_notes))
+        findings = find(self.judge, summary.idle_patterns, self.orphans.keys(), settled=not days)
+        file_notes = (*findings.file_notes, *joined_notes(self.file_notes))
         findings = replace(findings, file_notes=file_notes)
         record = self._conclude(status, findings)
         self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])
@@ -353,15 +340,15 @@ class _Pass:
             record=record,
             status=status,
             summary=summary,
-            orphans=tuple(gathered.orphans.values()),
+            orphans=tuple(self.orphans.values()),
             failures=self.store.failures(),
             internal=self.store.internal_errors(),
             # Orphans are never made again, so they would be reported for ever.
-            unusable=tuple(self.store.unusable_scenes(without=gathered.orphans.keys())),
-            empty_scenes=gathered.empty_scenes,
-            set_aside={path: granule.reason for path, granule in gathered.set_aside.items()},
+            unusable=tuple(self.store.unusable_scenes(without=self.orphans.keys())),
+            empty_scenes=self.empty_scenes,
+            set_aside={path: granule.reason for path, granule in self.set_aside.items()},
             more_unused=sum(verdicts[day].unused for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
-            frozen=gathered.frozen,
+            frozen=self.frozen,
             findings=findings,
             signal=caught,
         )
@@ -371,8 +358,8 @@ class _Pass:
         judge = Judge(self.campaign, self.store)
         for batch in judge.batches(days):
             judged = judge.days(batch)
-            self.gathered.set_aside |= {granule.path: granule for granule in judged.set_aside}
-            self.gathered.empty_scenes |= _empty_scenes(judged)
+            self.set_aside |= {granule.path: granule for granule in judged.set_aside}
+            self.empty_scenes |= _empty_scenes(judged)
 
     def _new_judge(self, *, again: bool = False) -> Judge:
         force = self.options.force and not again
@@ -406,23 +393,21 @@ class _Pass:
                     own = partial(local_client, 1, memory=options.memory)
                     used_client = self._reached(own, stack, stop)
                 if used_client is not None:
-                    self._enter_suspects(used_client, stop)
+                    for job in self.suspects:
+                        self._take(job)
+                    ended = process_one_by_one(self.suspects, client=used_client, stop=stop)
+                    self._enter(ended, stop)
 
     def _process_reduced(
         self, known: Collection[int], client: Client | None, stop: StopRequest
     ) -> None:
         """Process what is stale without the refused files: other scenes or plans may follow."""
-        notes = list(self.gathered.file_notes)
+        notes = list(self.file_notes)
         while self.reduced and not stop:
             days = self.selection.days(sorted(self.reduced.intersection(known)))
             self.judge, self.reduced, self.suspects = self._new_judge(again=True), set(), []
             self._process(days, client, stop)
-        self.gathered.file_notes = notes
-
-    def _enter_suspects(self, client: Client, stop: StopRequest) -> None:
-        for job in self.suspects:
-            self._take(job)
-        self._enter(process_one_by_one(self.suspects, client=client, stop=stop), stop)
+        self.file_notes = notes
 
     def _reached(
         self,
@@ -474,51 +459,40 @@ class _Pass:
         for judged in self._judged(days, client):
             self._note(judged)
             due = [scene for scene in judged.judgements if scene.due]
+            for scene in due:
+                self.judgements[scene.scene.id] = scene
+                self.open[scene.day].add(scene.scene.id)
+            if self.options.expect:
+                self.options.expect(sum(len(scene.scene.granules) for scene in due))
+            unplanned = [
+                EndedScene.failed(scene.failure, scene.scene, scene.plan)
+                for scene in due
+                if scene.failure and not scene.planned
+            ]
+            if unplanned:
+                self._enter(unplanned, stop)
             jobs = [
-                Job(
-                    self.campaign,
-                    scene.scene,
-                    scene.needed(),
-                    self.options.profiles_per_chunk,
-                    products=tuple((made.kind, made.channel) for made in scene.stale),
-                    places=scene.places,
-                )
+                scene.job(self.campaign, self.options.profiles_per_chunk)
                 for scene in due
                 if scene.stale
             ]
-            self.judgements.update((scene.scene.id, scene) for scene in due)
-            for scene in due:
-                self.gathered.open[scene.day].add(scene.scene.id)
-            if self.options.expect:
-                self.options.expect(sum(len(scene.scene.granules) for scene in due))
-            unplanned = [scene for scene in due if not scene.planned]
-            if unplanned:
-                self._enter(
-                    (
-                        EndedScene.failed(scene.failure, scene.scene, scene.plan)
-                        for scene in unplanned
-                        if scene.failure
-                    ),
-                    stop,
-                )
-            suspects = {scene.scene.id for scene in due if scene.stale and scene.suspect}
-            self.suspects += [job for job in jobs if job.scene.id in suspects]
             # A large scene at the end would keep one worker busy while the others idle.
             for job in sorted(jobs, key=read_bytes, reverse=True):
-                if job.scene.id not in suspects:
+                if self.judgements[job.scene.id].suspect:
+                    self.suspects.append(job)
+                else:
                     yield job
 
     def _note(self, judged: DaysJudged) -> None:
-        gathered = self.gathered
-        gathered.orphans |= {orphan.path: orphan for orphan in judged.orphans}
-        gathered.set_aside |= {granule.path: granule for granule in judged.set_aside}
-        gathered.file_notes += judged.file_notes
-        gathered.verdicts.update(judged.verdicts)
-        gathered.empty_scenes |= _empty_scenes(judged)
+        self.orphans |= {orphan.path: orphan for orphan in judged.orphans}
+        self.set_aside |= {granule.path: granule for granule in judged.set_aside}
+        self.file_notes += judged.file_notes
+        self.verdicts.update(judged.verdicts)
+        self.empty_scenes |= _empty_scenes(judged)
         for scene in judged.judgements:
-            gathered.held.pop(scene.scene.id, None)
-        gathered.held |= {scene.scene.id: scene for scene in judged.judgements if scene.held}
-        gathered.frozen |= {
+            self.held.pop(scene.scene.id, None)
+        self.held |= {scene.scene.id: scene for scene in judged.judgements if scene.held}
+        self.frozen |= {
             stale.before.path: stale.reason
             for scene in judged.judgements
             for stale in scene.frozen
@@ -550,48 +524,36 @@ class _Pass:
 
     # The end
 
-    def _settle(self, signatures: Mapping[int, Signature]) -> None:
+    def _settle(self, signatures: Mapping[int, Signature], *, stopped: bool) -> None:
         """Record the days on which everything is fresh; they are not judged again until changed."""
-        gathered = self.gathered
-        settled = _signed(signatures, gathered.verdicts, gathered.open)
-        if gathered.open and self.selection.everything:
+        settled = _signed(signatures, self.verdicts, self.open)
+        if self.open and self.selection.everything:
             judge = self._new_judge(again=True)
-            signatures_after = judge.signatures(gathered.open)
-            changed_days = {
+            after = judge.signatures(self.open)
+            done = self.session.settled if self.session else set()
+            other = {
                 day
-                for day, now in signatures_after.items()
+                for day, now in after.items()
                 # Files may have come or gone after its scenes ended.
-                if now.sources != signatures[day].sources or not self._went_as_planned(day)
+                if now.sources != signatures[day].sources or not self.open[day] <= done
             }
-            settled |= _signed(signatures_after, gathered.verdicts, changed_days)
-            # A day with scenes that were not tried stays open.
-            waiting = {judged.day for judged in self.judgements.values()}
-            for batch in judge.batches(changed_days - waiting):
+            settled |= _signed(after, self.verdicts, other)
+            for batch in () if stopped else judge.batches(other):
                 judged = judge.days(batch)
                 # Of a forced scene that failed, the former products are fresh: the next run judges
                 # its day, and forgets the failure.
-                healed = {scene.day for scene in judged.judgements if scene.scene.id in judged.gone}
-                settled |= _signed(signatures_after, judged.verdicts, judged.open | healed)
+                settled |= _signed(after, judged.verdicts, {*judged.open, *judged.gone.values()})
         known = self.store.verdicts()
-        new = {
-            day: verdict
-            for day, verdict in settled.items()
-            if verdict.signature and known.get(day) != verdict
-        }
+        new = {day: verdict for day, verdict in settled.items() if known.get(day) != verdict}
         if new:
             _acquire(self.lock)
             self.store.store_verdicts(new)
-
-    def _went_as_planned(self, day: int) -> bool:
-        """Return whether every product that was stale on a day is now fresh."""
-        done = self.session.settled if self.session else set()
-        return self.gathered.open[day] <= done
 
     def _clear_up(self) -> None:
         """Remove what a killed run left, if this one has not; another run may be at work."""
         if self.session is None and (self.store.has_dead_run() or self._is_littered()):
             _acquire(self.lock)
-            if sweep(self.store, Path(self.campaign.output)):
+            if versions.sweep(Path(self.campaign.output), self.store.others_at_work):
                 self.store.close_runs(self.lock.token)
 
     def _is_littered(self) -> bool:
@@ -604,17 +566,17 @@ class _Pass:
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
         if self.session is None:
             return None
-        for held in self.gathered.held.values():
+        for held in self.held.values():
             if held.failure:
                 error = f"{held.failure.error} (not tried again, because nothing has changed)"
                 outcome = held.failure.outcome(held.scene, held.plan)
                 self.session.add(replace(outcome, error=error))
         return self.session.finish(
             status,
-            tuple(self.gathered.set_aside.values()),
             findings,
-            empty_scenes=self.gathered.empty_scenes,
-            frozen=self.gathered.frozen,
+            set_aside=self.set_aside.values(),
+            empty_scenes=self.empty_scenes,
+            frozen=self.frozen,
             lost_worker=self.lost_worker,
         )
 
@@ -638,7 +600,7 @@ def _signed(
     return {
         day: verdict._replace(signature=signatures[day].whole)
         for day, verdict in verdicts.items()
-        if day in signatures and day not in without
+        if day in signatures and day not in without and signatures[day].whole
     }
 
 

@@ -8,9 +8,9 @@ from typing import Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.plan import availability
-from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, Unmet, UnusableFile
-from lidarops.run.lost_files import Lost
-from lidarops.run.selection import Selection, station_of
+from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, UnusableFile
+from lidarops.run.leftovers import Lost
+from lidarops.run.selection import station_of
 from lidarops.run.staleness import Judge, Judgement
 from lidarops.scene import dependence
 from lidarops.scene.case import REQUEST
@@ -25,22 +25,17 @@ _NO_OVERLAP: Final = (
 
 def find(
     judge: Judge,
-    store: Store,
-    selection: Selection,
     idle_patterns: Iterable[IdlePattern],
     orphans: Collection[str] = (),
     *,
     settled: bool = False,
 ) -> Findings:
-    """Return the findings on the selected instruments and networks.
+    """Return the findings on the instruments and networks that a judge has selected.
 
     Parameters
     ----------
     judge : Judge
-        Of the campaign.
-    store : Store
-        Its catalog and ledger, after the run.
-    selection : Selection
+        With the catalog and ledger after the run.
     idle_patterns : iterable of IdlePattern
         Of the scan.
     orphans : collection of str
@@ -48,7 +43,7 @@ def find(
     settled : bool
         Whether no day was judged, so that no raw file is lost but those that are acknowledged.
     """
-    campaign = judge.campaign
+    campaign, store, selection = judge.campaign, judge.store, judge.selection
     owners = [
         name
         for name in (*campaign.instruments, *campaign.networks)
@@ -58,11 +53,18 @@ def find(
     exchanged = availability.exchanged_recorders(judge.names.holdings)
     lost = Lost() if settled and not campaign.acknowledged else judge.lost
     return Findings(
-        unmet=_unmet(judge, selection, instruments),
+        unmet=availability.unavailable_channels(
+            campaign,
+            judge.names.holdings,
+            instruments=instruments,
+            kinds=selection.kinds,
+            since=selection.since,
+            until=selection.until,
+        ),
         file_notes=(*store.file_notes(instruments), *judge.names.notes(instruments)),
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(judge, sorted(instruments))),
-        unmade=tuple(_unmade(judge, store, selection, owners, orphans)),
+        unmade=tuple(_unmade(judge, owners, orphans)),
         incomplete_facts=(
             *_incomplete_facts(campaign, store, sorted(instruments)),
             *(note for note in exchanged if note.instrument in instruments),
@@ -76,18 +78,6 @@ def _members(campaign: Campaign, owner: str) -> Collection[str]:
     """Return the instruments of a network, or the instrument itself."""
     network = campaign.networks.get(owner)
     return (owner,) if network is None else network.instruments
-
-
-def _unmet(judge: Judge, selection: Selection, instruments: Collection[str]) -> tuple[Unmet, ...]:
-    """Return the channels that products or facts name and files do not hold."""
-    return availability.unavailable_channels(
-        judge.campaign,
-        judge.names.holdings,
-        instruments=instruments,
-        kinds=selection.kinds,
-        since=selection.since,
-        until=selection.until,
-    )
 
 
 def _incomplete_facts(
@@ -139,14 +129,9 @@ def _unusable_files(judge: Judge, instruments: Iterable[str]) -> Iterator[Unusab
                 yield UnusableFile(name, key, path, problem)
 
 
-def _unmade(
-    judge: Judge,
-    store: Store,
-    selection: Selection,
-    owners: Iterable[str],
-    orphans: Collection[str],
-) -> Iterator[Unmade]:
+def _unmade(judge: Judge, owners: Iterable[str], orphans: Collection[str]) -> Iterator[Unmade]:
     """Yield the requested products that have files and that no selected scene has."""
+    store, selection = judge.store, judge.selection
     missing = [
         (owner, kind, channel)
         for owner in owners

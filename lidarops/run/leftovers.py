@@ -1,19 +1,33 @@
-"""Find what is left over: scenes without product, and products that would not be made again."""
+"""Find what is left over or lost, of scenes, products and raw files.
+
+Scenes may give no product, and products may not be made again. Raw files that products were made
+from may be lost: a product is neither removed nor replaced by one of fewer files where more than a
+few are lost, of it or of all products with lost files, or all its dark files. The listing may be
+incomplete, or a disk not mounted.
+"""
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from enum import StrEnum
 from functools import cached_property
+from typing import Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.ledger import RecordedProduct
+from lidarops.catalog.sources import path_pattern
+from lidarops.catalog.store import Store
+from lidarops.netcdf.context import path_of_product
 from lidarops.plan.scenes import Cut, parse_scene_id
-from lidarops.records import GLUED, Granule, InputRecord, LeftOut, Plan, Scene
+from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene
 from lidarops.scene import dependence
+from lidarops.scene.dependence import ProductKey
 from lidarops.scene.job import nothing_to_do
+
+_NAMES_SHOWN: Final = 3
+_IDLE: Final = "matches no raw file that has vanished: take the entry out, or correct it"
+_OVER: Final = "has expired: its files count as lost again; take the entry out, or set until later"
 
 Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""
@@ -33,71 +47,23 @@ class Orphan:
     """Whether the campaign still requests it, but no raw file of its scene is left."""
 
 
-class Fate(StrEnum):
-    """What happened to the signal files of a product whose scene no longer exists."""
-
-    CUT_ANEW = "its files belong to other scenes now"
-    UNUSED = "its raw files are refused, or belong to no scene"
-    GONE = "no raw file of its scene is left"
-
-
-class Fates:
-    """Finds what happened to the signal files of products.
-
-    Parameters
-    ----------
-    cut : Cut
-        The scenes of some days, and the good granules that belong to none.
-    refused : callable
-        Returns the granules that the catalog refuses; called at most once.
-    signals : callable
-        Returns the signal files that a product was made from.
-    """
-
-    def __init__(
-        self,
-        cut: Cut,
-        refused: Callable[[], Iterable[Granule]],
-        signals: Callable[[RecordedProduct], Iterable[InputRecord]],
-    ) -> None:
-        self._cut = cut
-        self._refused = refused
-        self._signals = signals
-
-    def of(self, made: RecordedProduct) -> Fate:
-        """Return the fate of the files of a product; if some are left, the fate of these."""
-        signals = list(self._signals(made))
-        if any(used.path in self._in_scenes or used.sha256 in self._in_scenes for used in signals):
-            return Fate.CUT_ANEW
-        return Fate.UNUSED if any(used.path in self._idle for used in signals) else Fate.GONE
-
-    @cached_property
-    def _in_scenes(self) -> set[str | None]:
-        granules = (granule for scene in self._cut.scenes for granule in scene.granules)
-        return {name for granule in granules for name in (granule.path, granule.sha256)}
-
-    @cached_property
-    def _idle(self) -> set[str]:
-        return {granule.path for granule in (*self._refused(), *self._cut.set_aside)}
-
-
-def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> dict[str, str]:
+def scenes_without_product(planned: Sequence[Planned], campaign: Campaign) -> dict[str, str]:
     """Return the scenes that give no product and are used by no network, and why.
 
     Parameters
     ----------
-    planned : iterable of (Scene, Plan)
+    planned : sequence of (Scene, Plan)
         All scenes of some days.
     campaign : Campaign
     """
-    scenes = list(planned)
-    without = [(scene, plan) for scene, plan in scenes if not dependence.planned_products(plan)]
     in_networks = {
-        granule.path for scene, _ in scenes if scene.members for granule in scene.granules
+        granule.path for scene, _ in planned if scene.members for granule in scene.granules
     }
     reasons = {}
-    for scene, plan in without:
-        networks = _of_networks_alone(scene, campaign)
+    for scene, plan in planned:
+        if dependence.planned_products(plan):
+            continue
+        networks = _networks_of_member(scene, campaign)
         if not networks:
             reasons[scene.id] = nothing_to_do(plan)
         elif not any(granule.path in in_networks for granule in scene.granules):
@@ -108,72 +74,124 @@ def scenes_without_product(planned: Iterable[Planned], campaign: Campaign) -> di
     return reasons
 
 
-def _of_networks_alone(scene: Scene, campaign: Campaign) -> list[str]:
+def _networks_of_member(scene: Scene, campaign: Campaign) -> list[str]:
     """Return the networks of an instrument that has no requested product of its own."""
     owner = campaign.instruments.get(scene.instrument)
     if owner is None or owner.products.requested():
         return []
-    return [
-        name
-        for name, network in campaign.networks.items()
-        if scene.instrument in network.instruments
-    ]
+    return [name for name, net in campaign.networks.items() if scene.instrument in net.instruments]
 
 
-def orphaned_products(
-    planned: Sequence[Planned],
-    made: Iterable[RecordedProduct],
-    campaign: Campaign,
-    other_files: Callable[[RecordedProduct, Scene], bool],
-    fate: Callable[[RecordedProduct], Fate],
-) -> list[tuple[RecordedProduct, Orphan]]:
-    """Return the products that would not be made again, and why.
+class Leftovers:
+    """Finds the products of some days that would not be made again, and why.
 
     Parameters
     ----------
-    planned : sequence of (Scene, Plan)
-        All scenes of some days.
-    made : iterable of RecordedProduct
-        The products of those days.
     campaign : Campaign
-    other_files : callable
-        Whether a product was made from other signal files than its scene has now.
-    fate : callable
-        Returns what happened to the signal files of a product whose scene is gone; `Fates.of`.
-
-    Returns
-    -------
-    list of (RecordedProduct, Orphan)
+    store : Store
+    planned : sequence of (Scene, Plan)
+        All scenes of these days.
+    cut : Cut
+        The same scenes, and the good granules that belong to none.
+    content : callable
+        Returns the SHA-256 of a granule.
     """
-    scenes = {scene.id: (scene, plan) for scene, plan in planned}
-    requested = {
-        (scene.id, kind, channel)
-        for scene, plan in planned
-        for kind, channel in dependence.planned_products(plan)
-    }
-    orphans = []
-    for product in made:
-        if product.key in requested:
-            continue
-        reason, kept, lost = "the campaign no longer requests it", False, False
-        if _requests(campaign, product):
-            if product.scene in scenes:
-                scene, plan = scenes[product.scene]
-                omissions = _omissions(plan, product)
-                reason = "; ".join(dict.fromkeys(left.reason for left in omissions))
-                reason = reason or "its plan leaves it out"
-                # The file may be mended, and the product is right.
-                unusable = any(left.rule == dependence.UNUSABLE_FILE for left in omissions)
-                kept = unusable or other_files(product, scene)
-            else:
-                missing = _missing_members(product, planned, campaign)
-                file_fate = fate(product)
-                # Unreadable files may be the only copies; keep the product.
-                kept = bool(missing) or file_fate is Fate.UNUSED
-                lost = not missing and file_fate is Fate.GONE
-                reason = missing or file_fate.value
-        orphans.append((product, Orphan(product.path, reason, product.run, kept, lost)))
-    return orphans
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        store: Store,
+        planned: Sequence[Planned],
+        cut: Cut,
+        content: Callable[[Granule], str],
+    ) -> None:
+        self._campaign = campaign
+        self._store = store
+        self._planned = {scene.id: (scene, plan) for scene, plan in planned}
+        self._cut = cut
+        self._content = content
+
+    def orphans(self, made: Iterable[RecordedProduct]) -> list[tuple[RecordedProduct, Orphan]]:
+        """Return those of the products of these days that no scene would give."""
+        wanted = {
+            product_file(scene, product)
+            for scene, plan in self._planned.values()
+            for product in dependence.planned_products(plan)
+        }
+        return [
+            (product, Orphan(product.path, reason, product.run, kept, lost))
+            for product in made
+            if product.path not in wanted
+            for reason, kept, lost in [self._fate(product)]
+        ]
+
+    def _fate(self, product: RecordedProduct) -> tuple[str, bool, bool]:
+        """Return why no scene gives a product, whether it is kept, and whether it is lost."""
+        if not _requests(self._campaign, product):
+            return "the campaign no longer requests it", False, False
+        if product.scene in self._planned:
+            return *self._left_out(product), False
+        missing = self._missing_members(product)
+        if missing:
+            return missing, True, False
+        signals = self._signals(product)
+        if not self._in_scenes.isdisjoint({*signals, *signals.values()}):
+            return "its files belong to other scenes now", False, False
+        if not self._idle.isdisjoint(signals):
+            # Unreadable files may be the only copies.
+            return "its raw files are refused, or belong to no scene", True, False
+        return "no raw file of its scene is left", False, True
+
+    def _left_out(self, product: RecordedProduct) -> tuple[str, bool]:
+        """Return why the plan of its scene gives a product no more, and whether it is kept."""
+        scene, plan = self._planned[product.scene]
+        if (product.kind, product.channel) in dependence.planned_products(plan):
+            return "it has another name now", False
+        omissions = [
+            left
+            for left in plan.left_out
+            if left.channel == product.channel and left.name in (product.kind, "read")
+        ]
+        reason = "; ".join(dict.fromkeys(left.reason for left in omissions))
+        # The file may be mended, and the product is right.
+        unusable = any(left.rule == dependence.UNUSABLE_FILE for left in omissions)
+        kept = unusable or set(self._signals(product).values()) != {
+            self._content(granule) for granule in scene.granules
+        }
+        return reason or "its plan leaves it out", kept
+
+    def _missing_members(self, product: RecordedProduct) -> str:
+        """Return which instruments of a network have no files left; empty if not the cause."""
+        name, start = parse_scene_id(product.scene)
+        if name not in self._campaign.networks:
+            return ""
+        members = self._campaign.networks[name].instruments
+        scenes = (scene for scene, _ in self._planned.values())
+        present = {scene.instrument for scene in scenes if scene.start <= start < scene.stop}
+        missing = [member for member in members if member not in present]
+        # If the network has a scene at that time, it replaces the one that is gone.
+        if name in present or len(missing) in {0, len(members)}:
+            return ""
+        return f"no raw file of {' and '.join(missing)} is left"
+
+    def _signals(self, product: RecordedProduct) -> dict[str, str]:
+        """Return path -> SHA-256 of the signal files that a product was made from."""
+        inputs = self._store.inputs_of(product.path)
+        return {used.path: used.sha256 for used in inputs if used.role is Role.SIGNAL}
+
+    @cached_property
+    def _in_scenes(self) -> set[str | None]:
+        granules = (granule for scene in self._cut.scenes for granule in scene.granules)
+        return {name for granule in granules for name in (granule.path, granule.sha256)}
+
+    @cached_property
+    def _idle(self) -> set[str]:
+        return {granule.path for granule in (*self._store.refused(), *self._cut.set_aside)}
+
+
+def product_file(scene: Scene, product: ProductKey) -> str:
+    """Return the path of a product, by which it is known, below the folder of products."""
+    return path_of_product((scene.station, scene.instrument, *product), scene.id, scene.start)
 
 
 def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
@@ -188,30 +206,84 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
     return settings is not None and settings.covers(product.channel, of_files=of_files)
 
 
-def _omissions(plan: Plan, product: RecordedProduct) -> list[LeftOut]:
-    """Return the omissions of a plan because of which it does not give a requested product."""
-    return [
-        omission
-        for omission in plan.left_out
-        if omission.channel == product.channel and omission.name in (product.kind, "read")
-    ]
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The lost raw files of a campaign."""
+
+    findings: tuple[LostFiles, ...] = ()
+    """What a report says of those that the campaign does not acknowledge, by instrument."""
+    protected: frozenset[str] = frozenset()
+    """Products that are neither replaced nor removed."""
+    excused: frozenset[str] = frozenset()
+    """Products of which the campaign acknowledges lost files."""
+    idle: tuple[FactsNote, ...] = ()
+    """Entries of `acknowledged` that match no lost file, or have expired."""
 
 
-def _missing_members(
-    product: RecordedProduct, planned: Sequence[Planned], campaign: Campaign
-) -> str:
-    """Return which instruments of a network have no files left; empty if this is not the cause."""
-    name, start = parse_scene_id(product.scene)
-    if name not in campaign.networks:
-        return ""
-    members = campaign.networks[name].instruments
-    present = {scene.instrument for scene, _ in planned if _holds(scene, start)}
-    missing = [member for member in members if member not in present]
-    # If the network has a scene at that time, it replaces the one that is gone.
-    if name in present or len(missing) in {0, len(members)}:
-        return ""
-    return f"no raw file of {' and '.join(missing)} is left"
+def find_lost(campaign: Campaign, store: Store) -> Lost:
+    """Return the raw files that products were made from and the archive does not give.
+
+    Files whose content is found under another path, and those that no instrument of the campaign
+    claims any more, are not lost.
+    """
+    claims = {
+        name: _matcher((*instrument.files, *instrument.dark_files))
+        for name, instrument in campaign.instruments.items()
+    }
+    inputs = store.lost_inputs()
+    owners = {path: name for _, path in inputs for name, has in claims.items() if has(path)}
+    known: set[str] = set()
+    idle = []
+    for entry in campaign.acknowledged:
+        matched = set(filter(_matcher(entry.what), owners)) if entry.holds else set()
+        known |= matched
+        if not matched:
+            reason = _IDLE if entry.holds else _OVER
+            idle.append(FactsNote("all", f"acknowledged: {', '.join(entry.what)}", reason))
+    if not owners:
+        return Lost(idle=tuple(idle))
+    sets = store.raw_sets()
+    size, lost, gone = Counter[str](), Counter[str](), Counter[str]()
+    excused, products_of = set[str](), defaultdict[str, set[str]](set)
+    for raw in sets.values():
+        size.update(dict.fromkeys(raw.products, raw.files))
+    for name, path in inputs:
+        products = sets[name].products
+        gone[name] += path in owners
+        if path in known:
+            excused.update(products)
+        elif path in owners:
+            lost.update(products)
+            products_of[owners[path]].update(products)
+    unknown = sorted(owners.keys() - known)
+    concerned = {name for name, raw in sets.items() if not lost.keys().isdisjoint(raw.products)}
+    total = store.count_raw(concerned, known) if concerned else 0
+
+    def too_many(files: int, of: int) -> bool:
+        return files > 1 and files > campaign.vanished_share * of
+
+    many = too_many(len(unknown), total)
+    without_dark = {
+        product
+        for name, files in gone.items()
+        if sets[name].role is Role.DARK and files == sets[name].files
+        for product in sets[name].products
+        if campaign.vanished_share < 1
+    }
+    protected = frozenset(
+        product
+        for product, files in lost.items()
+        if many or product in without_dark or too_many(files, size[product])
+    )
+    findings = []
+    for owner, products_with in sorted(products_of.items()):
+        paths = tuple(path for path in unknown if owners[path] == owner)
+        kept = len(products_with & protected)
+        findings.append(LostFiles(owner, len(paths), total, paths[:_NAMES_SHOWN], kept))
+    return Lost(tuple(findings), protected, frozenset(excused), tuple(idle))
 
 
-def _holds(scene: Scene, moment: datetime) -> bool:
-    return scene.start <= moment < scene.stop
+def _matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
+    """Return a function that tells whether a path matches one of some patterns."""
+    expressions = [path_pattern(pattern) for pattern in patterns]
+    return lambda path: any(expression.match(path) for expression in expressions)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from itertools import groupby
-from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.ledger import Dependence, NewProduct, Run, RunStatus, SceneEntry
+from lidarops.catalog.ledger import Dependence, NewProduct, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.store import Store
@@ -29,10 +29,8 @@ from lidarops.plan.scenes import parse_scene_id
 from lidarops.records import Plan, ProductRecord, Role, SceneOutcome
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
-from lidarops.run.staleness import Judge, Judgement
+from lidarops.run.staleness import Judge, Judgement, settings_digest
 from lidarops.scene import dependence
-from lidarops.scene.context import recorded_settings
-from lidarops.scene.job import Job
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
 
@@ -52,24 +50,6 @@ class Rebuilt:
     """Entered products of scenes that present raw files and campaign do not give."""
     problems: dict[str, str] = field(default_factory=dict)
     """Path -> why it was not entered."""
-
-
-@dataclass(frozen=True, slots=True)
-class _ProductFile:
-    """What a product file says of itself."""
-
-    path: str
-    recipe: Recipe
-    record: ProductRecord
-    mtime_ns: int
-
-    @property
-    def scene(self) -> str:
-        return self.recipe.plan.scene
-
-    @property
-    def start(self) -> datetime:
-        return parse_scene_id(self.scene)[1]
 
 
 def rebuild_ledger(
@@ -100,68 +80,48 @@ def rebuild_ledger(
     """
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store, wait=wait) as lock:
         lock.acquire()
-        return _Rebuilding(campaign, store, lock, progress).carry_out()
-
-
-@dataclass(slots=True)
-class _Rebuilding:
-    """Enters the products of one day after the other, so that memory holds those of one."""
-
-    campaign: Campaign
-    store: Store
-    lock: Lock
-    progress: Callable[[int], None]
-    rebuilt: Rebuilt = field(default_factory=Rebuilt)
-    run: Run | None = None
-    """None until there is something to enter."""
-
-    def carry_out(self) -> Rebuilt:
-        with self.store.all_products() as made:
+        with store.all_products() as made:
             known = {product.path for product in made}
-        paths: dict[int | None, list[str]] = defaultdict(list)
-        for path in product_paths(self.campaign.products_root):
-            if path in known:
-                self.rebuilt.known += 1
-                self.progress(1)
-            else:
-                paths[_day_in(path)].append(path)
+        files = product_paths(campaign.products_root)
+        rebuilt = Rebuilt(known=len(known.intersection(files)))
+        progress(rebuilt.known)
+        days: dict[int | None, list[str]] = defaultdict(list)
+        for path in files:
+            if path not in known:
+                days[_day_in(path)].append(path)
+        read = partial(_read_products, campaign, rebuilt, progress)
         # Says which name each of them should have.
-        self._read(paths.pop(None, []))
-        judge = Judge(self.campaign, self.store)
-        for batch in judge.batches(day for day in paths if day is not None):
+        read(days.pop(None, []))
+        judge, run = Judge(campaign, store), None
+        for batch in judge.batches(day for day in days if day is not None):
             judgements = {judged.scene.id: judged for judged in judge.days(batch).judgements}
-            for day in batch:
-                products = sorted(self._read(paths[day]), key=_order)
-                for scene, members in groupby(products, attrgetter("scene")):
-                    self._enter(judge, judgements.get(scene), day, tuple(members))
-        if self.run is not None:
-            refused = len(self.store.refused())
-            self.store.end_run(
-                self.run.id, RunStatus.FINISHED, refused=refused, token=self.lock.token
-            )
-        return self.rebuilt
+            scenes = ((day, *group) for day in batch for group in groupby(read(days[day]), _scene))
+            for day, scene, products in scenes:
+                if run is None:
+                    run = new_run(campaign)
+                    store.begin_run(run, lock.token)
+                judged = judgements.get(scene)
+                entry = _entry(judge, judged, day, tuple(products))
+                store.record(entry, run.id, lock.token)
+                rebuilt.entered += len(entry.products)
+                rebuilt.without_scene += len(entry.products) if judged is None else 0
+        if run is not None:
+            refused = len(store.refused())
+            store.end_run(run.id, RunStatus.FINISHED, refused=refused, token=lock.token)
+    return rebuilt
 
-    def _read(self, paths: Iterable[str]) -> list[_ProductFile]:
-        """Return the products among some files, and note what the others are."""
-        products = []
-        for path in paths:
-            self.progress(1)
-            try:
-                products.append(_read_product(self.campaign, path))
-            except LidarOpsError as error:
-                root = f"{self.campaign.products_root}/"
-                self.rebuilt.problems[path] = str(error).removeprefix(root)
-        return products
 
-    def _enter(
-        self, judge: Judge, judged: Judgement | None, day: int, products: tuple[_ProductFile, ...]
-    ) -> None:
-        if self.run is None:
-            self.run = new_run(self.campaign)
-            self.store.begin_run(self.run, self.lock.token)
-        self.rebuilt.entered += len(products)
-        self.rebuilt.without_scene += len(products) if judged is None else 0
-        self.store.record(_entry(judge, judged, day, products), self.run.id, self.lock.token)
+@dataclass(frozen=True, slots=True)
+class _ProductFile:
+    """What a product file says of itself."""
+
+    recipe: Recipe
+    record: ProductRecord
+    mtime_ns: int
+
+
+def _scene(product: _ProductFile) -> str:
+    return product.recipe.plan.scene
 
 
 def _day_in(path: str) -> int | None:
@@ -172,39 +132,42 @@ def _day_in(path: str) -> int | None:
         return None
 
 
-def _order(product: _ProductFile) -> tuple[str, str]:
-    return product.scene, product.path
+def _read_products(
+    campaign: Campaign, rebuilt: Rebuilt, progress: Callable[[int], None], paths: Iterable[str]
+) -> list[_ProductFile]:
+    """Return the products among some files, by scene and path, and note what the others are."""
+    products = []
+    for path in paths:
+        progress(1)
+        try:
+            products.append(_read_product(campaign, path))
+        except LidarOpsError as error:
+            problem = str(error).removeprefix(f"{campaign.products_root}/")
+            rebuilt.problems[path] = problem
+    return sorted(products, key=lambda product: (_scene(product), product.record.path))
 
 
 def _read_product(campaign: Campaign, path: str) -> _ProductFile:
     file = campaign.products_root / path
     with reading(file):
-        return _read_file(campaign, path, file)
-
-
-def _read_file(campaign: Campaign, path: str, file: Path) -> _ProductFile:
-    recipe = Recipe.of(file)
-    if recipe.campaign_name != campaign.name:
-        raise ProductError(f"is a product of campaign {recipe.campaign_name!r}", file=file)
-    if recipe.kind not in kinds():
-        raise ProductError(f"is of the unknown kind {recipe.kind!r}", file=file)
-    if path != _expected_path(recipe):
-        raise ProductError(f"should have the name {_expected_path(recipe)}", file=file)
-    status = file.stat()
-    values, unflagged, usable = _counts(file, recipe.kind)
-    record = ProductRecord(
-        path=path,
-        kind=recipe.kind,
-        channel=recipe.channel,
-        sha256=sha256_of(file),
-        size=status.st_size,
-        values=values,
-        flagged={},
-        unflagged=unflagged,
-        usable=usable,
-        stamp=recipe.stamp,
-    )
-    return _ProductFile(path, recipe, record, status.st_mtime_ns)
+        recipe = Recipe.of(file)
+        keys, kind, channel = recipe.settings["keys"], recipe.kind, recipe.channel
+        if recipe.campaign_name != campaign.name:
+            raise ProductError(f"is a product of campaign {recipe.campaign_name!r}", file=file)
+        if kind not in kinds():
+            raise ProductError(f"is of the unknown kind {kind!r}", file=file)
+        names = (keys["station"], keys["instrument"], kind, channel)
+        start = datetime.fromisoformat(recipe.settings["window"][0])
+        name = path_of_product(names, recipe.plan.scene, start)
+        if path != name:
+            raise ProductError(f"should have the name {name}", file=file)
+        status = file.stat()
+        values, unflagged, usable = _counts(file, kind)
+        record = ProductRecord(
+            path, kind, channel, sha256_of(file), status.st_size, values, {}, unflagged, usable,
+            stamp=recipe.stamp,
+        )  # fmt: skip
+        return _ProductFile(recipe, record, status.st_mtime_ns)
 
 
 def _counts(file: Path, kind: str) -> tuple[int, int, int]:
@@ -224,24 +187,17 @@ def _counts(file: Path, kind: str) -> tuple[int, int, int]:
     return flags.size, unflagged, usable
 
 
-def _expected_path(recipe: Recipe) -> str:
-    keys, window = recipe.settings["keys"], recipe.settings["window"]
-    names = (keys["station"], keys["instrument"], recipe.kind, recipe.channel)
-    return path_of_product(names, recipe.plan.scene, datetime.fromisoformat(window[0]))
-
-
 def _entry(
     judge: Judge, judged: Judgement | None, day: int, products: tuple[_ProductFile, ...]
 ) -> SceneEntry:
-    first = products[0]
-    keys = first.recipe.settings["keys"]
-    signals = {used.path for used in first.recipe.inputs if used.role is Role.SIGNAL}
+    recipe = products[0].recipe
+    keys, scene = recipe.settings["keys"], recipe.plan.scene
     outcome = SceneOutcome(
-        scene=first.scene,
+        scene=scene,
         station=keys["station"],
         instrument=keys["instrument"],
-        start=first.start,
-        granules=len(signals),
+        start=parse_scene_id(scene)[1],
+        granules=len({used.path for used in recipe.inputs if used.role is Role.SIGNAL}),
         plan=None,
         products=tuple(product.record for product in products),
     )
@@ -258,43 +214,33 @@ def _entry(
 
 
 def _dependence(judge: Judge, judged: Judgement | None, recipe: Recipe) -> Dependence:
-    """Return what a product depends on; as of now, as far as it was made so."""
-    recorded = Dependence(
-        plan_hash=recipe.plan.hash,
-        settings_hash=dependence.digest(recipe.settings),
+    """Return what a product depends on: the plan of now if it is the one that it carried out."""
+    plan, product = recipe.plan, (recipe.kind, recipe.channel)
+    if judged is not None and product in dependence.planned_products(judged.plan):
+        planned, settings = judge.plan_and_settings(judged.scene, judged.plan, product)
+        same_settings = dependence.digest(settings) == dependence.digest(recipe.settings)
+        plan = planned if same_settings and _became(planned, plan) else plan
+    return Dependence(
+        plan_hash=plan.hash,
+        settings_hash=settings_digest(recipe.settings),
         inputs_hash=dependence.inputs_digest(recipe.inputs),
         code_version=recipe.code_version,
     )
-    product = (recipe.kind, recipe.channel)
-    if judged is None or product not in dependence.planned_products(judged.plan):
-        return recorded
-    closure = dependence.plan_closure(judged.plan, [product])
-    job = Job(judge.campaign, judged.scene, judged.plan)
-    settings = recorded_settings(job, judged.scene, closure, product)
-    now, _ = judge.depends_on(judged.scene, judged.plan, product, recipe.inputs)
-    if dependence.digest(settings) == recorded.settings_hash:
-        recorded = replace(recorded, settings_hash=now.settings_hash)
-    if _is_carried_out(closure, recipe.plan):
-        recorded = replace(recorded, plan_hash=now.plan_hash)
-    return recorded
 
 
-def _is_carried_out(planned: Plan, recorded: Plan) -> bool:
+def _became(planned: Plan, stated: Plan) -> bool:
     """Return whether a plan became another one when the data were looked at.
 
     That leaves out parts of products, and changes nothing else.
     """
-    recorded_omissions = [omission.as_dict() for omission in recorded.left_out]
-    planned_omissions = [omission.as_dict() for omission in planned.left_out]
-    return (
-        _comparable(planned) == _comparable(recorded)
-        and recorded_omissions[: len(planned_omissions)] == planned_omissions
-    )
+    (steps, left_out), (stated_steps, stated_left_out) = map(_comparable, (planned, stated))
+    return steps == stated_steps and left_out == stated_left_out[: len(left_out)]
 
 
-def _comparable(plan: Plan) -> list[dict[str, Any]]:
-    """Return the steps of a plan without the settings of products, which a look may change."""
-    return [
+def _comparable(plan: Plan) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return steps, without the settings of products, which a look may change, and omissions."""
+    steps = [
         step.as_dict() | ({"settings": {}} if dependence.is_product(step) else {})
         for step in plan.steps
     ]
+    return steps, [omission.as_dict() for omission in plan.left_out]

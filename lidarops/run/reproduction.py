@@ -7,16 +7,15 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import xarray as xr
 
 from lidarops.campaign.model import CATALOG_VARIABLE
-from lidarops.catalog.ledger import Run
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.provenance import package_versions
@@ -29,6 +28,7 @@ from lidarops.system.code_version import code_version
 from lidarops.system.files import sha256_of
 from lidarops.system.stores import RemoteStore, is_url
 
+_T = TypeVar("_T")
 _LOG = logging.getLogger(__name__)
 
 _MOST_LISTED: Final = 20
@@ -129,20 +129,18 @@ def _staged(
     """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
         staged = Path(name)
-        if is_url(archive):
-            store = RemoteStore(archive)
-            place, bring = store.url, _from_store(store, staged)
-        else:
-            place, bring = archive, _from_folder(Path(archive), staged)
+        store = RemoteStore(archive) if is_url(archive) else None
+        place = archive if store is None else store.url
+        bring = _from_folder(Path(archive), staged) if store is None else _from_store(store, staged)
         bring({record.path: record.path for record in records})
-        changed = list(_changed(staged, records, place))
-        wrong = {difference.name for difference in changed}
-        lost = [record for record in records if record.path in wrong]
+        wrong = list(_changed(staged, records, place))
+        lost = [record for record in records if record.path in {each.name for each in wrong}]
         moved = _moved(recipe, lost, catalog)
         if moved:
             bring(moved)
-        wrong = {difference.name for difference in _changed(staged, lost, place)}
-        yield staged, [difference for difference in changed if difference.name in wrong]
+            still = {each.name for each in _changed(staged, lost, place)}
+            wrong = [each for each in wrong if each.name in still]
+        yield staged, wrong
 
 
 def _from_store(store: RemoteStore, staged: Path) -> Callable[[Mapping[str, str]], None]:
@@ -178,26 +176,27 @@ def _cleared(target: Path) -> Path:
 
 def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
     """Return recorded name -> present name of files that a catalog knows under another name."""
-    url = _catalog_url(recipe, catalog)
-    if not lost or not url:
-        return {}
+    digests = {record.sha256 for record in lost}
+    present = _asked(recipe, catalog, lambda store: store.paths_by_digest(digests)) if lost else {}
+    names = {record.path: (present or {}).get(record.sha256, record.path) for record in lost}
+    return {old: new for old, new in names.items() if old != new and stays_inside(new)}
+
+
+def _asked(recipe: Recipe, catalog: str | None, question: Callable[[Store], _T]) -> _T | None:
+    """Return what the catalog of a product answers; None where no catalog is found."""
+    near = (parent / "catalog.sqlite" for parent in recipe.file.resolve().parents)
+    found = next((f"sqlite:///{file}" for file in near if file.is_file()), "")
+    url = catalog or os.environ.get(CATALOG_VARIABLE) or found
+    if not url:
+        return None
     try:
         with Store(url, recipe.campaign_name, create=False) as store:
-            present = store.paths_by_digest({record.sha256 for record in lost})
+            return question(store)
     except CatalogError:
         # A catalog that was not given but only found may be unusable.
         if catalog is not None:
             raise
-        return {}
-    names = {record.path: present.get(record.sha256, record.path) for record in lost}
-    return {old: new for old, new in names.items() if old != new and stays_inside(new)}
-
-
-def _nearest_catalog(file: Path) -> str:
-    for parent in file.resolve().parents:
-        if (parent / "catalog.sqlite").is_file():
-            return f"sqlite:///{parent / 'catalog.sqlite'}"
-    return ""
+        return None
 
 
 def _folder(
@@ -214,7 +213,7 @@ def _folder(
     """
     digests = {record.path: record.sha256 for record in records}
     moved = {name: digests[old] for old, name in _moved(recipe, records, catalog).items()}
-    last = _last_run(recipe, catalog)
+    last = _asked(recipe, catalog, lambda store: next(iter(store.runs(limit=1)), None))
     known = "" if last is None else last.archive if option == "--archive" else last.folder
     last_read = [Path(known)] if known and not is_url(known) else []
     local = [*_folders_above(recipe.file), *last_read]
@@ -233,25 +232,6 @@ def _folder(
     )
 
 
-def _last_run(recipe: Recipe, catalog: str | None) -> Run | None:
-    """Return the last run of the campaign in the catalog; None where no catalog is found."""
-    url = _catalog_url(recipe, catalog)
-    if not url:
-        return None
-    try:
-        with Store(url, recipe.campaign_name, create=False) as store:
-            return next(iter(store.runs(limit=1)), None)
-    except CatalogError:
-        # A catalog that was not given but only found may be unusable.
-        if catalog is not None:
-            raise
-        return None
-
-
-def _catalog_url(recipe: Recipe, catalog: str | None) -> str:
-    return catalog or os.environ.get(CATALOG_VARIABLE) or _nearest_catalog(recipe.file)
-
-
 def _holds_content(folder: Path, digests: Mapping[str, str]) -> bool:
     """Return whether any named file has the digest of its name."""
     return any(
@@ -267,14 +247,9 @@ def _holds_name(folder: Path, digests: Mapping[str, str]) -> bool:
 def _folders_above(file: Path) -> Iterator[Path]:
     """Yield the folders above a file from the nearest on, each with its subfolders."""
     for parent in file.resolve().parents:
-        yield from (parent, *_folders_in(parent))
-
-
-def _folders_in(parent: Path) -> list[Path]:
-    try:
-        return sorted(path for path in parent.iterdir() if path.is_dir())
-    except OSError:
-        return []
+        yield parent
+        with suppress(OSError):
+            yield from sorted(path for path in parent.iterdir() if path.is_dir())
 
 
 def _changed(folder: Path, records: Iterable[InputRecord], place: str) -> Iterator[Difference]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import islice
@@ -58,18 +58,6 @@ def new_run(campaign: Campaign) -> Run:
     )
 
 
-def sweep(store: Store, output: Path) -> bool:
-    """Remove temporary files of killed runs; return whether all are removed.
-
-    The lock must be held. None is removed while a run of another campaign is at work, which may
-    write into the same folder.
-    """
-    paths, complete = versions.sweep(output, store.others_at_work)
-    for path in paths:
-        _LOG.warning("removed %s, left by a killed process", path)
-    return complete
-
-
 class Session:
     """A run that enters each scene in the ledger as it ends.
 
@@ -110,7 +98,7 @@ class Session:
 
     def begin(self) -> None:
         """Enter the run in the ledger, and remove temporary files of killed runs."""
-        swept = sweep(self._store, self._output)
+        swept = versions.sweep(self._output, self._store.others_at_work)
         self._store.begin_run(self._run, self._lock.token, swept=swept)
         if self._journal:
             self._journal.begin(self._record((), Findings()))
@@ -163,21 +151,12 @@ class Session:
         if self._journal:
             self._journal.add(brief)
         self._store.record(entry, self.id, self._lock.token)
-        self._settle(judged, outcome, new)
+        if _went_as_planned(judged, outcome):
+            self.settled.add(judged.scene.id)
         self._settle_versions(judged, outcome)
         self._log(outcome)
         self._outcomes[outcome.scene] = brief
         return outcome
-
-    def _settle(self, judged: Judgement, outcome: SceneOutcome, new: Sequence[NewProduct]) -> None:
-        # A refused file no longer belongs to the scene.
-        if outcome.error or outcome.refused:
-            return
-        made = {
-            (product.record.kind, product.record.channel): product.depends_on for product in new
-        }
-        if self._judge.settles(judged, outcome.inputs, made):
-            self.settled.add(judged.scene.id)
 
     def add(self, outcome: SceneOutcome) -> None:
         """Add a scene that was not tried to the record of the run."""
@@ -186,40 +165,40 @@ class Session:
     def finish(
         self,
         status: RunStatus,
-        set_aside: Sequence[Granule],
         findings: Findings,
         *,
-        empty_scenes: Mapping[str, str] | None = None,
-        frozen: Mapping[str, str] | None = None,
-        lost_worker: bool = False,
+        set_aside: Iterable[Granule],
+        empty_scenes: Mapping[str, str],
+        frozen: Mapping[str, str],
+        lost_worker: bool,
     ) -> RunRecord:
         """Close the run in the ledger and return its record.
 
         Parameters
         ----------
         status : RunStatus
-        set_aside : sequence of Granule
-            Good granules that belong to no scene.
         findings : Findings
-        empty_scenes : mapping of str to str, optional
+        set_aside : iterable of Granule
+            Good granules that belong to no scene.
+        empty_scenes : mapping of str to str
             Scene -> why it can give no product.
-        frozen : mapping of str to str, optional
+        frozen : mapping of str to str
             Product of a frozen period that would be replaced -> why.
-        lost_worker : bool, optional
+        lost_worker : bool
             Whether a worker may have left half a file.
         """
         if lost_worker:
-            sweep(self._store, self._output)
+            versions.sweep(self._output, self._store.others_at_work)
         unused = (*self._store.refused(), *set_aside)
         stated = {file.path for outcome in self._outcomes.values() for file in outcome.refused}
         refused = tuple(granule for granule in unused if granule.path not in stated)
-        listed = dict(islice((empty_scenes or {}).items(), MOST_EMPTY_SCENES))
+        listed = dict(islice(empty_scenes.items(), MOST_EMPTY_SCENES))
         record = replace(
             self._record(refused, findings),
             scenes=tuple(self._outcomes[scene] for scene in sorted(self._outcomes)),
             empty_scenes=listed,
-            more_empty_scenes=len(empty_scenes or {}) - len(listed),
-            frozen=dict(frozen or {}),
+            more_empty_scenes=len(empty_scenes) - len(listed),
+            frozen=dict(frozen),
         )
         if self._journal:
             self._save(record)
@@ -328,6 +307,19 @@ def _joined(before: SceneOutcome, after: SceneOutcome) -> SceneOutcome:
         products=tuple(made.values()),
         refused=tuple(refused.values()),
     )
+
+
+def _went_as_planned(judged: Judgement, outcome: SceneOutcome) -> bool:
+    """Return whether every product that was stale was made from the files that were judged."""
+    # A refused file no longer belongs to the scene.
+    if outcome.error or outcome.refused:
+        return False
+    made = {(product.kind, product.channel) for product in outcome.products}
+    granules = (*judged.scene.granules, *judged.scene.dark)
+    known = {granule.path: granule.sha256 for granule in granules if granule.sha256}
+    known |= {used.path: used.sha256 for used in judged.ancillaries}
+    same = all(known.get(used.path, used.sha256) == used.sha256 for used in outcome.inputs)
+    return same and made.issuperset(stale.product for stale in judged.stale)
 
 
 def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -43,9 +43,14 @@ from lidarops.records import (
     Stamp,
     UnusedFile,
 )
-from lidarops.run import leftovers
-from lidarops.run.leftovers import Orphan
-from lidarops.run.lost_files import Lost, find_lost
+from lidarops.run.leftovers import (
+    Leftovers,
+    Lost,
+    Orphan,
+    find_lost,
+    product_file,
+    scenes_without_product,
+)
 from lidarops.run.selection import Selection, requested_kinds
 from lidarops.scene import dependence
 from lidarops.scene.context import recorded_settings
@@ -63,6 +68,8 @@ MOST_GRANULES: Final = 50_000
 """Granules that are judged at a time, unless one day has more. Memory holds the current group and,
 if workers process the scenes, the next group."""
 
+_UNCOUNTED: Final = frozenset({"products", "files", "keys", "members"})
+"""Settings that a product states, and that count otherwise; members count one by one."""
 _PLANNING: Final = (
     "lidarops.plan.channel_names",
     "lidarops.plan.outlying_headers",
@@ -85,6 +92,11 @@ class Stale:
     """Its ledger entry, if it was made before."""
     restored: bool = False
     """Whether it depends on the same as before, so that only its file is made again."""
+
+    @property
+    def product(self) -> ProductKey:
+        """Kind and channel."""
+        return self.kind, self.channel
 
     @property
     def place(self) -> Place | None:
@@ -136,15 +148,19 @@ class Judgement:
         """Whether the run must enter an outcome of the scene."""
         return bool(self.stale) or (self.failure is not None and not self.held)
 
-    @property
-    def places(self) -> dict[ProductKey, Place]:
-        """What stands at the places of the stale products."""
-        return {(stale.kind, stale.channel): stale.place for stale in self.stale if stale.place}
-
     def needed(self) -> Plan:
         """Return the part of the plan that the stale products need."""
-        return dependence.plan_closure(
-            self.plan, [(product.kind, product.channel) for product in self.stale]
+        return dependence.plan_closure(self.plan, [stale.product for stale in self.stale])
+
+    def job(self, campaign: Campaign, profiles_per_chunk: int | None) -> Job:
+        """Return the job that makes the stale products."""
+        return Job(
+            campaign,
+            self.scene,
+            self.needed(),
+            profiles_per_chunk,
+            products=tuple(stale.product for stale in self.stale),
+            places={stale.product: stale.place for stale in self.stale if stale.place},
         )
 
 
@@ -170,8 +186,8 @@ class DaysJudged:
     """Of days that may be settled, without signature."""
     open: frozenset[int]
     """Days with stale products; they may be settled after processing."""
-    gone: frozenset[str]
-    """Scenes with a recorded failure that no longer exist or are all fresh."""
+    gone: Mapping[str, int]
+    """Scenes with a recorded failure that no longer exist or are all fresh -> day."""
     touched: Mapping[str, int]
     """Products with the recorded content but a new modification time (ns), by path."""
     digests: Mapping[str, str]
@@ -202,15 +218,18 @@ class Judge:
         thaw: bool = False,
     ) -> None:
         self.campaign = campaign
-        self._store = store
-        self._selection = selection or Selection()
+        self.store = store
+        self.selection = selection or Selection()
         self._force = force
         self._thaw = thaw
-        self._settings = dependence.Settings(campaign)
         self._ancillaries: dict[str, str] = {}
         self._problems: dict[tuple[str, Role], str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
+        self._touched: dict[str, int] = {}
+        self._whole: Plan | None = None
+        self._parts: dict[ProductKey, tuple[Plan, Mapping[str, Any]]] = {}
+        """Parts of the plan `_whole`, of the scene that was judged last."""
 
     # Days
 
@@ -222,36 +241,33 @@ class Judge:
         days : collection of int, optional
             Days to return; default all days with granules or products.
         """
-        sums: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
-        for day_sum in self._store.day_sums():
+        files: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+        for day_sum in self.store.day_sums():
             fingerprint = (day_sum.role.value, day_sum.good, day_sum.low, day_sum.high)
-            _add_around(sums, day_sum.day, day_sum.role, fingerprint)
+            _add_to_days(files, day_sum.day, day_sum.role, fingerprint)
         for file in self._refused:
             unused = UnusedFile.of(file.granule)
-            _add_around(sums, day_of(file.time), unused.role, unused)
-        products, broken = self._product_days()
-        base = self._base()
+            _add_to_days(files, day_of(file.time), unused.role, unused)
+        root, base = str(self.campaign.products_root), self._base
+        products: dict[int, Any] = defaultdict(hashlib.sha256)
+        broken: set[int] = set()
+        with self.store.all_products() as rows:
+            for made in rows:
+                products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
+                if not _looks_right(root, made):
+                    broken.add(made.day)
         signatures = {}
-        for day in sums.keys() | products.keys():
+        for day in sorted(files.keys() | products.keys()):
             if days is None or day in days:
-                digest = hashlib.sha256(f"{base}{day}{sorted(sums[day], key=repr)}".encode())
+                digest = hashlib.sha256(f"{base}{day}{sorted(files[day], key=repr)}".encode())
                 sources = digest.hexdigest()
                 digest.update(products[day].digest() if day in products else b"")
                 signatures[day] = Signature(sources, "" if day in broken else digest.hexdigest())
         return signatures
 
-    def _product_days(self) -> tuple[dict[int, Any], set[int]]:
-        root = str(self.campaign.products_root)
-        products: dict[int, Any] = defaultdict(hashlib.sha256)
-        broken: set[int] = set()
-        with self._store.all_products() as rows:
-            for made in rows:
-                products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
-                if not _looks_right(root, made):
-                    broken.add(made.day)
-        return products, broken
-
+    @cached_property
     def _base(self) -> str:
+        """Digest of settings, code and recorders on which scenes, plans and products depend."""
         settings, held = as_settings(self.campaign), self.names.holdings
         return dependence.digest(
             [
@@ -274,7 +290,7 @@ class Judge:
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
         counts: dict[int, int] = defaultdict(int)
-        for day_sum in self._store.day_sums():
+        for day_sum in self.store.day_sums():
             counts[day_sum.day] += day_sum.good
         group: list[int] = []
         held = 0
@@ -295,90 +311,87 @@ class Judge:
         days : sequence of int
             Ascending; from `batches`.
         """
-        first, last, judged_days = days[0], days[-1], set(days)
-        tried = self._store.last_tries(first, last)
-        products = self._store.products_of_days(first, last)
-        cut = self._cut(first, last, judged_days, {product.scene for product in products})
-        made = {product.key: product for product in products if product.day in judged_days}
-        touched: dict[str, int] = {}
-        judgements = [
-            self._judged(scene, made, tried.get(scene.id), touched) for scene in cut.scenes
-        ]
+        first, last, within = days[0], days[-1], set(days)
+        tried = self.store.last_tries(first, last)
+        products = self.store.products_of_days(first, last)
+        cut = self._cut(first, last, within, {product.scene for product in products})
+        made = {product.path: product for product in products if product.day in within}
+        self._touched, self._digests = {}, {}
+        judgements = [self._judged(scene, made, tried.get(scene.id)) for scene in cut.scenes]
         planned = [(judged.scene, judged.plan) for judged in judgements]
-        empty_reasons = leftovers.scenes_without_product(planned, self.campaign)
+        reasons = scenes_without_product(planned, self.campaign)
         judgements = [
-            replace(judged, empty_reason=empty_reasons.get(judged.scene.id, ""))
+            replace(judged, empty_reason=reasons.get(judged.scene.id, ""))
             if judged.planned
             else judged
             for judged in judgements
         ]
-        selected_scenes = self._selection.scenes(cut.scenes)
-        selected = {scene.id for scene in selected_scenes}
-        fates = leftovers.Fates(cut, self._store.refused, self._signals)
-        orphans = leftovers.orphaned_products(
-            planned, made.values(), self.campaign, self._other_files, fates.of
-        )
         unplanned = {judged.scene.id for judged in judgements if not judged.planned}
+        leftovers = Leftovers(self.campaign, self.store, planned, cut, self._content)
         orphans = [
             (product, self._kept_orphan(orphan))
-            for product, orphan in orphans
+            for product, orphan in leftovers.orphans(made.values())
             # What the archive lost on purpose is no finding.
             if product.scene not in unplanned and not (orphan.lost and self._is_excused(product))
         ]
-        unsettled = {product.day for product, _ in orphans}
-        # A product that is not replaced is reported by every run.
-        unsettled |= {judged.day for judged in judgements if judged.frozen or judged.kept}
-        # The signature of a day does not hold all that may end an internal error.
-        unsettled |= {
+        # What is not replaced is reported by every run, and a signature does not hold all that
+        # may end an internal error.
+        unsettled = {product.day for product, _ in orphans} | {
             judged.day
             for judged in judgements
-            if not judged.planned or (judged.failure and judged.failure.internal)
+            if judged.frozen
+            or judged.kept
+            or not judged.planned
+            or (judged.failure and judged.failure.internal)
         }
-        digests, self._digests = self._digests, {}
-        gone = {judged.scene.id for judged in judgements if self._healed(judged, tried)}
-        present = {scene.id for scene in cut.scenes}
-        gone |= {
-            scene
-            for scene, last_try in tried.items()
-            if last_try.day in judged_days and scene not in present
-        }
+        settled = within - unsettled if self.selection.everything else set()
         orphans += [
-            (
-                stale.before,
-                Orphan(stale.before.path, stale.reason, stale.before.run, requested=True),
-            )
+            (known, Orphan(known.path, stale.reason, known.run, requested=True))
             for judged in judgements
             for stale in judged.kept
-            if stale.before
+            for known in [stale.before]
+            if known
         ]
+        selected_scenes = self.selection.scenes(cut.scenes)
+        selected = {scene.id for scene in selected_scenes}
+        instruments = {
+            member.instrument for scene in selected_scenes for member in scene.members or (scene,)
+        }
         return DaysJudged(
             judgements=tuple(judged for judged in judgements if judged.scene.id in selected),
             orphans=tuple(
                 orphan
                 for product, orphan in orphans
-                if self._selection.product(product, self.campaign)
+                if self.selection.product(product, self.campaign)
             ),
             set_aside=cut.set_aside,
-            file_notes=tuple(
-                note
-                for note in cut.file_notes
-                if any(note.instrument in _instruments(scene) for scene in selected_scenes)
-            ),
-            verdicts=_unsigned(
-                [day for day in days if day not in unsettled], judgements, cut.set_aside
-            )
-            if self._selection.everything
-            else {},
+            file_notes=tuple(note for note in cut.file_notes if note.instrument in instruments),
+            verdicts=_verdicts(settled, judgements, cut.set_aside),
             open=frozenset(judged.day for judged in judgements if judged.due),
-            gone=frozenset(gone),
-            touched=touched,
-            digests=digests,
+            gone=self._gone(judgements, tried, within),
+            touched=self._touched,
+            digests=self._digests,
         )
+
+    def _gone(
+        self, judgements: Iterable[Judgement], tried: Mapping[str, LastTry], days: Collection[int]
+    ) -> dict[str, int]:
+        """Return the tried scenes that no longer exist, or are complete again -> day."""
+        gone = {scene: last.day for scene, last in tried.items() if last.day in days}
+        for judged in judgements:
+            last = tried.get(judged.scene.id)
+            # For example, because a file came back.
+            incomplete = judged.stale or judged.failure or self.selection.kinds
+            if last is None or incomplete or not last.error:
+                gone.pop(judged.scene.id, None)
+            else:
+                gone[judged.scene.id] = judged.day
+        return gone
 
     @cached_property
     def lost(self) -> Lost:
-        """Raw files of products that have vanished or cannot be read; looked up once."""
-        return find_lost(self.campaign, self._store)
+        """Raw files of products that the archive no longer gives; looked up once."""
+        return find_lost(self.campaign, self.store)
 
     def _is_excused(self, made: RecordedProduct) -> bool:
         return made.path in self.lost.excused - self.lost.protected
@@ -388,14 +401,8 @@ class Judge:
         stays = orphan.path in self.lost.protected
         return replace(orphan, requested=True, lost=False) if stays else orphan
 
-    def _healed(self, judged: Judgement, tried: Mapping[str, LastTry]) -> bool:
-        """Return whether a failed scene is complete again, e.g. because a file came back."""
-        last = tried.get(judged.scene.id)
-        complete = not (judged.stale or judged.failure or self._selection.kinds)
-        return last is not None and bool(last.error) and complete
-
     def _cut(self, first: int, last: int, days: set[int], recorded: set[str]) -> Cut:
-        stored = self._store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
+        stored = self.store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
         kept, refused = without_outlying(granules, used, self._header)
@@ -420,12 +427,12 @@ class Judge:
     @cached_property
     def names(self) -> ChannelNames:
         """Names of the channels of all files in the catalog."""
-        return ChannelNames(self.campaign, self._store)
+        return ChannelNames(self.campaign, self.store)
 
     @cached_property
     def _refused(self) -> tuple[Refused, ...]:
         """Files that the catalog refuses, with times to which they belong."""
-        store = self._store
+        store = self.store
         return tuple(dated(self.campaign, store.refused(), store.files_in, store.days_below))
 
     def _header(self, granule: Granule) -> RawHeader | None:
@@ -444,12 +451,11 @@ class Judge:
     def _judged(
         self,
         scene: Scene,
-        made: Mapping[tuple[str, str, str], RecordedProduct],
+        made: Mapping[str, RecordedProduct],
         last: LastTry | None,
-        touched: dict[str, int],
     ) -> Judgement:
         """Return the judgement of a scene, also if a bug prevents its plan."""
-        judged = guarded(lambda: self._planned(scene, made, touched))
+        judged = guarded(lambda: self._planned(scene, made))
         if isinstance(judged, Failure):
             failure, plan = judged, Plan(scene.id, (), ())
             judged = replace(self.judgement(scene, plan), failure=failure, planned=False)
@@ -463,12 +469,7 @@ class Judge:
         failure = Failure(last.error, last.internal)
         return replace(judged, stale=(), failure=failure, held=True)
 
-    def _planned(
-        self,
-        scene: Scene,
-        made: Mapping[tuple[str, str, str], RecordedProduct],
-        touched: dict[str, int],
-    ) -> Judgement:
+    def _planned(self, scene: Scene, made: Mapping[str, RecordedProduct]) -> Judgement:
         planned = plan_scene(scene, self.campaign)
         files = ancillary_files(planned.steps)
         problems = {name: self.file_problem(name, role) for name, role in files.items()}
@@ -480,11 +481,11 @@ class Judge:
         stale: list[Stale] = []
         frozen: list[Stale] = []
         kept: list[Stale] = []
-        requested = dependence.plan_of_kinds(whole, self._selection.kinds)
+        requested = dependence.plan_of_kinds(whole, self.selection.kinds)
         products = dependence.planned_products(requested)
         for kind, channel in products:
-            known = made.get((scene.id, kind, channel))
-            reason, restored = self._reason(judged, (kind, channel), known, touched)
+            known = made.get(product_file(scene, (kind, channel)))
+            reason, restored = self._reason(judged, (kind, channel), known)
             if reason:
                 one = Stale(kind, channel, reason, known, restored)
                 if known and known.path in self.lost.protected:
@@ -555,9 +556,12 @@ class Judge:
         return dependence.digest(
             [
                 *software,
-                whole.hash if judged.planned else self._base(),
+                whole.hash if judged.planned else self._base,
                 joint_code_version({kind for kind, _ in products}),
-                [self._settings.of(scene, whole, product) for product in products],
+                [
+                    settings_digest(self.plan_and_settings(scene, whole, product)[1])
+                    for product in products
+                ],
                 [
                     [granule.path, granule.size, granule.mtime_ns]
                     for granule in (*scene.granules, *scene.dark)
@@ -578,76 +582,50 @@ class Judge:
         return replace(judged, stale=stale, frozen=frozen, kept=kept)
 
     def _explained(self, judged: Judgement, stale: Stale) -> Stale:
-        scene, product, made = judged.scene, (stale.kind, stale.channel), stale.before
+        made = stale.before
         if made is None:
             return stale
-        closure = dependence.plan_closure(judged.plan, [product])
+        closure, settings = self.plan_and_settings(judged.scene, judged.plan, stale.product)
         known = made.depends_on
-        if (known.plan_hash, known.settings_hash) == (
-            closure.hash,
-            dependence.digest(self._settings.of(scene, closure, product)),
-        ):
+        if (known.plan_hash, known.settings_hash) == (closure.hash, settings_digest(settings)):
             return stale
-        job = Job(self.campaign, scene, judged.plan)
-        now = recorded_settings(job, scene, closure, product)
         try:
-            changes = planned_changes(self.campaign.products_root / made.path, now, closure)
+            file = self.campaign.products_root / made.path
+            changes = planned_changes(file, settings, closure)
         except ProductError:
             # A file that is lost is a reason of its own.
             return stale
         return replace(stale, reason="; ".join([stale.reason, *changes]))
 
+    def plan_and_settings(
+        self, scene: Scene, whole: Plan, product: ProductKey
+    ) -> tuple[Plan, Mapping[str, Any]]:
+        """Return the part of a plan that a product needs, and the settings that it would state."""
+        if self._whole is not whole:
+            self._whole, self._parts = whole, {}
+        if product not in self._parts:
+            closure = dependence.plan_closure(whole, [product])
+            job = Job(self.campaign, scene, whole)
+            self._parts[product] = closure, recorded_settings(job, scene, closure, product)
+        return self._parts[product]
+
     def depends_on(
         self, scene: Scene, whole: Plan, product: ProductKey, files: Sequence[InputRecord]
     ) -> tuple[Dependence, tuple[InputRecord, ...]]:
         """Return what a product depends on, and its files: used ones, and those stated unused."""
-        closure = dependence.plan_closure(whole, [product])
+        closure, settings = self.plan_and_settings(scene, whole, product)
         used = dependence.product_inputs(closure, files)
-        settings = self._settings.of(scene, closure, product)
         depends_on = Dependence(
             plan_hash=closure.hash,
-            settings_hash=dependence.digest(settings),
+            settings_hash=settings_digest(settings),
             inputs_hash=dependence.inputs_digest(used),
             code_version=code_version(product[0]),
         )
         unused = dependence.product_unused(scene, closure)
         return depends_on, (*used, *dependence.unused_inputs(unused))
 
-    def settles(
-        self, judged: Judgement, files: Sequence[InputRecord], made: Mapping[ProductKey, Dependence]
-    ) -> bool:
-        """Return whether every product that was stale is now fresh.
-
-        Parameters
-        ----------
-        judged : Judgement
-        files : sequence of InputRecord
-            Files that its products were made from.
-        made : mapping of (str, str) to Dependence
-            Dependences of each product, by kind and channel.
-        """
-        contents = {used.path: used.sha256 for used in files}
-        scene, whole = judged.scene, judged.plan
-        for granule in (*scene.granules, *scene.dark):
-            # Other products may have been judged fresh by a digest that is no longer valid.
-            if granule.sha256 and contents.get(granule.path, granule.sha256) != granule.sha256:
-                return False
-        now = _files(judged, lambda granule: contents.get(granule.path) or granule.sha256 or "")
-        for stale in judged.stale:
-            product = (stale.kind, stale.channel)
-            used = dependence.product_inputs(dependence.plan_closure(whole, [product]), now)
-            if product not in made:
-                return False
-            if made[product].inputs_hash != dependence.inputs_digest(used):
-                return False
-        return True
-
     def _reason(
-        self,
-        judged: Judgement,
-        product: ProductKey,
-        known: RecordedProduct | None,
-        touched: dict[str, int],
+        self, judged: Judgement, product: ProductKey, known: RecordedProduct | None
     ) -> tuple[str, bool]:
         """Return why a product is stale, and whether it depends on the same as before.
 
@@ -656,7 +634,7 @@ class Judge:
         if known is None:
             return "forced" if self._force else "not made yet", False
         difference = self._dependence_reason(judged, product, known)
-        lost = self._file_reason(known, touched)
+        lost = self._file_reason(known)
         reason = "; ".join(filter(None, (lost, difference)))
         return "forced" if self._force else reason, not difference
 
@@ -664,30 +642,35 @@ class Judge:
         self, judged: Judgement, product: ProductKey, known: RecordedProduct
     ) -> str:
         """Return what has changed of what a product depends on; empty if nothing has."""
-        recorded = known.depends_on
-        closure = dependence.plan_closure(judged.plan, [product])
-        settings = dependence.digest(self._settings.of(judged.scene, closure, product))
-        code = code_version(product[0])
-        if (recorded.code_version, recorded.plan_hash, recorded.settings_hash) != (
-            code,
-            closure.hash,
-            settings,
-        ):
-            return _changed(recorded, closure.hash, code)
+        recorded, code = known.depends_on, code_version(product[0])
+        closure, settings = self.plan_and_settings(judged.scene, judged.plan, product)
+        if recorded.code_version != code:
+            return f"the code changed, from {recorded.code_version} to {code}"
+        if recorded.plan_hash != closure.hash:
+            return "its plan changed"
+        if recorded.settings_hash != settings_digest(settings):
+            return "its settings in the campaign, or the files that are unused, changed"
         # Last, because files may have to be read for it.
-        used = dependence.product_inputs(closure, _files(judged, self._content))
+        granules = {
+            granule.path: granule for granule in (*judged.scene.granules, *judged.scene.dark)
+        }
+        raw = [InputRecord(path, granule.role, "") for path, granule in granules.items()]
+        used = [
+            replace(file, sha256=self._content(granules[file.path])) if not file.sha256 else file
+            for file in dependence.product_inputs(closure, [*raw, *judged.ancillaries])
+        ]
         if recorded.inputs_hash != dependence.inputs_digest(used):
-            return _difference(self._store.inputs_of(known.path), used)
+            return _difference(self.store.inputs_of(known.path), used)
         return ""
 
-    def _file_reason(self, made: RecordedProduct, touched: dict[str, int]) -> str:
+    def _file_reason(self, made: RecordedProduct) -> str:
         path = self.campaign.products_root / made.path
         try:
             status = path.stat()
             if (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns):
                 return ""
             if status.st_size == made.size and sha256_of(path) == made.sha256:
-                touched[made.path] = status.st_mtime_ns
+                self._touched[made.path] = status.st_mtime_ns
                 return ""
         except FileNotFoundError:
             return "its file is missing"
@@ -705,15 +688,6 @@ class Judge:
                 digest = None
         return digest or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
-    def _other_files(self, made: RecordedProduct, scene: Scene) -> bool:
-        return {used.sha256 for used in self._signals(made)} != {
-            self._content(granule) for granule in scene.granules
-        }
-
-    def _signals(self, made: RecordedProduct) -> list[InputRecord]:
-        """Return the signal files that a product was made from."""
-        return [used for used in self._store.inputs_of(made.path) if used.role is Role.SIGNAL]
-
     def _ancillary(self, name: str) -> str:
         """Return the SHA-256 of an ancillary file when it was first needed."""
         if name not in self._ancillaries:
@@ -725,29 +699,27 @@ class Judge:
         return self._ancillaries[name]
 
 
-def _instruments(scene: Scene) -> set[str]:
-    return {member.instrument for member in scene.members or (scene,)}
+def settings_digest(settings: Mapping[str, Any]) -> str:
+    """Return the sha256 of the settings that a product states, as far as they count.
 
-
-def _add_around(
-    sums: dict[int, list[tuple[Any, ...]]], day: int, role: Role, fingerprint: tuple[Any, ...]
-) -> None:
-    """Add what is known of files of a day to the sums of all days whose products may use them."""
-    sums[day].append(fingerprint)
-    reach = REACH if role is Role.DARK else NEAR_DAYS
-    for near in range(1, reach + 1):
-        sums[day - near].append((near, *fingerprint))
-        sums[day + near].append((-near, *fingerprint))
-
-
-def _files(judged: Judgement, content: Callable[[Granule], str]) -> tuple[InputRecord, ...]:
-    """Return the present inputs of a scene."""
-    scene = judged.scene
-    raw = (
-        InputRecord(granule.path, granule.role, content(granule))
-        for granule in (*scene.granules, *scene.dark)
+    Requested settings count by the plan, files by their content, and keys by the scene.
+    """
+    parts = {"": settings, **settings.get("members", {})}
+    return dependence.digest(
+        [
+            [name, {key: value for key, value in part.items() if key not in _UNCOUNTED}]
+            for name, part in sorted(parts.items())
+        ]
     )
-    return (*raw, *judged.ancillaries)
+
+
+def _add_to_days(
+    files: dict[int, list[tuple[Any, ...]]], day: int, role: Role, known: tuple[Any, ...]
+) -> None:
+    """Add what is known of files of a day to all days whose products may use them."""
+    reach = REACH if role is Role.DARK else NEAR_DAYS
+    for offset in range(-reach, reach + 1):
+        files[day + offset].append((-offset, *known) if offset else known)
 
 
 def _looks_right(root: str, made: RecordedProduct) -> bool:
@@ -758,7 +730,7 @@ def _looks_right(root: str, made: RecordedProduct) -> bool:
     return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
 
 
-def _unsigned(
+def _verdicts(
     days: Iterable[int], judgements: Iterable[Judgement], set_aside: Iterable[Granule]
 ) -> dict[int, Verdict]:
     """Return the verdicts on some days, without signature."""
@@ -768,14 +740,6 @@ def _unsigned(
     for judged in judgements:
         files[judged.day] |= {used.path: used.sha256 for used in judged.ancillaries}
     return {day: Verdict("", empty[day], aside[day], files[day]) for day in days}
-
-
-def _changed(recorded: Dependence, plan_hash: str, code: str) -> str:
-    if recorded.code_version != code:
-        return f"the code changed, from {recorded.code_version} to {code}"
-    if recorded.plan_hash != plan_hash:
-        return "its plan changed"
-    return "its settings in the campaign, or the files that are unused, changed"
 
 
 def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> str:

@@ -42,12 +42,6 @@ OPERATION: Final = frozenset(
      "acknowledged"}
 )  # fmt: skip
 """Settings of a campaign that change neither the scenes nor the content of a product."""
-_OF_CAMPAIGN: Final = OPERATION | {"all_steps", "scenes", "stations", "instruments", "networks"}
-_OF_INSTRUMENT: Final = frozenset(
-    {"files", "dark_files", "header_position", "header_pointing", "position_tolerance",
-     "altitude_tolerance", "facts", "products"}
-)  # fmt: skip
-"""Settings that affect products only through plan, scene and inputs. All others count."""
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
 _FILES: Final = {
     "overlap_profile": Role.OVERLAP,
@@ -187,54 +181,6 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
         if omission.name in names or omission in closure.left_out
     )
     return replace(closure, left_out=left_out)
-
-
-class Settings:
-    """The parts of a campaign on which the contents of its products depend."""
-
-    def __init__(self, campaign: Campaign) -> None:
-        self._campaign = campaign
-        settings = as_settings(campaign)
-        self._common = {key: settings[key] for key in sorted(settings.keys() - _OF_CAMPAIGN)}
-        self._stations = settings["stations"]
-        self._networks = settings.get("networks", {})
-        self._instruments = {
-            name: {key: value for key, value in known.items() if key not in _OF_INSTRUMENT}
-            for name, known in settings["instruments"].items()
-        }
-
-    def of(self, scene: Scene, plan: Plan, product: ProductKey) -> dict[str, Any]:
-        """Return what a product depends on besides its inputs, as plain JSON types.
-
-        Parameters
-        ----------
-        scene : Scene
-        plan : Plan
-            Plan of the product, from `plan_closure`.
-        product : (str, str)
-            Its kind and channel.
-        """
-        kind, channel = product
-        members = scene.members or (scene,)
-        return {
-            "campaign": self._common,
-            "network": (
-                single_kind_settings(self._networks[scene.instrument], kind)
-                if scene.members
-                else None
-            ),
-            "scene": [scene.id, scene.start.isoformat(), scene.stop.isoformat()],
-            "notes": product_notes(scene, plan, channel),
-            **unused_settings(scene, plan),
-            "members": [
-                {
-                    "station": self._stations[member.station],
-                    "instrument": self._instruments[member.instrument],
-                    "facts": facts_settings(scene_facts(self._campaign, member), plan, channel),
-                }
-                for member in members
-            ],
-        }
 
 
 def product_notes(scene: Scene, plan: Plan, channel: str) -> tuple[str, ...]:

@@ -395,6 +395,23 @@ def test_products_of_scenes_that_are_cut_differently_are_not_reported_as_lost(
     assert not result.has_failures
 
 
+def test_products_that_get_another_name_are_made_again_and_the_old_ones_removed(
+    archive: Archive,
+) -> None:
+    before = archive.contents("out/products")
+    archive.tree["stations"]["shore"] = archive.tree["stations"].pop("coast")
+    for instrument in archive.tree["instruments"].values():
+        instrument["station"] = "shore"
+    result = bring_up_to_date(archive.write())
+    assert {orphan.path for orphan in result.orphans} == before.keys()
+    assert {orphan.reason for orphan in result.orphans} == {"it has another name now"}
+    shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
+    assert shown.exit_code == 0
+    after = archive.contents("out/products")
+    assert set(after) == {path.replace("coast", "shore") for path in before}
+    assert bring_up_to_date(archive.write()).orphans == ()
+
+
 def test_nothing_is_removed_if_the_archive_is_missing(archive: Archive) -> None:
     _empty(archive)
     with sqlite3.connect(archive.folder / "out" / "catalog.sqlite") as connection:
@@ -436,7 +453,7 @@ def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
     command = ["reprocess", str(archive.file), *(["--json"] if as_json else [])]
     with monkeypatch.context() as patch:
         patch.setattr(gallery, "fill", fails)
-        failed = CliRunner().invoke(app, command)
+        failed = CliRunner().invoke(app, command, env={"COLUMNS": "300"})
     assert failed.exit_code == code
     (folder,) = (archive.folder / "out/report").glob("*")
     if fails is _full:
@@ -450,7 +467,7 @@ def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
         )
     else:
         assert "poor_20260301T000000" in failed.stdout
-        assert "poor_20260302T000000" in failed.stdout
+        assert "_20260302T000000.nc" in failed.stdout
         assert "report:" not in failed.stdout
     shown = CliRunner().invoke(app, command)
     page = str(folder / "index.html")

@@ -112,17 +112,37 @@ def test_the_share_is_a_setting(archive: Archive) -> None:
     assert len(made(reprocess(archive.write()))) == 24
 
 
-def test_files_that_cannot_be_read_count_as_lost(archive: Archive) -> None:
+def _unreadable(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("nowhere")
+
+
+def _emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("fault", [_unreadable, _emptied])
+def test_files_that_cannot_be_read_or_became_empty_count_as_lost(
+    archive: Archive, fault: Callable[[Path], object]
+) -> None:
     before = archive.contents("out/products")
     for name in THIRD:
-        path = archive.folder / "raw" / name
-        path.unlink()
-        path.symlink_to("nowhere")
-    assert reprocess(archive.write()) is None
+        fault(archive.folder / "raw" / name)
+    result = bring_up_to_date(archive.write())
+    assert result.record is None
+    assert sum(lost.files for lost in result.findings.lost_files) == len(THIRD)
     assert archive.contents("out/products") == before
 
 
-@pytest.mark.parametrize("fault", [Path.unlink, lambda path: path.write_bytes(b"")])
+def test_one_file_that_became_empty_is_named_as_lost(archive: Archive) -> None:
+    _emptied(archive.folder / "raw/poor/h11")
+    result = bring_up_to_date(archive.write())
+    assert len(made(result.record)) == 2
+    (lost,) = result.findings.lost_files
+    assert (lost.names, lost.kept) == (("poor/h11",), 0)
+
+
+@pytest.mark.parametrize("fault", [Path.unlink, _emptied])
 def test_files_that_are_lost_after_the_scan_worsen_no_product(
     archive: Archive, monkeypatch: pytest.MonkeyPatch, fault: Callable[[Path], object]
 ) -> None:

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidarops.process.context import recorded_settings
+from lidarops.process.job import Job
 from support import factories
 from support.archives.network_plans import campaign as network_campaign
 from support.archives.network_plans import granules as network_granules
@@ -56,10 +58,11 @@ def test_settings_of_one_kind_concern_no_other_product_of_the_network() -> None:
     changed = network_campaign({"average": "30min"})
     before, after = (
         [
-            dependence.Settings(campaign).of(scene, PLANS["network"], (kind, "photon_532o"))
+            recorded_settings(job, scene, job.plan, (kind, "photon_532o"))
             for kind in ("visibility", "of_another_package")
         ]
         for campaign in (network_campaign(), changed)
+        for job in [Job(campaign, scene, PLANS["network"])]
     )
     assert before[0] != after[0]
     assert before[1] == after[1]

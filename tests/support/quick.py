@@ -10,7 +10,10 @@ from pathlib import Path
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import LidarOpsError
 from lidarops.records import ProductRecord, SceneOutcome
+from lidarops.run.leftovers import product_file
+from lidarops.run.staleness import settings_digest
 from lidarops.scene import dependence
+from lidarops.scene.context import recorded_settings
 from lidarops.scene.guard import Failure
 from lidarops.scene.input_files import check_files
 from lidarops.scene.job import Job
@@ -36,14 +39,14 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         inputs += Ancillaries.read(job.campaign.folder, files).inputs
     except LidarOpsError as error:
         return Failure(str(error)).outcome(job.scene, job.plan), True
-    settings = dependence.Settings(job.campaign)
     products = []
     for kind, channel in dependence.planned_products(job.plan):
         closure = dependence.plan_closure(job.plan, [(kind, channel)])
         used = sorted(record.sha256 for record in dependence.product_inputs(closure, inputs))
-        fields = [closure.as_dict(), settings.of(job.scene, closure, (kind, channel)), used]
+        settings = recorded_settings(job, job.scene, closure, (kind, channel))
+        fields = [closure.as_dict(), settings_digest(settings), used]
         content = json.dumps(fields, sort_keys=True).encode()
-        path = f"{scene.instrument}/{scene.id}_{kind}_{channel}.nc"
+        path = product_file(scene, (kind, channel))
         target = job.campaign.products_root / path
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.with_name(f".{target.name}.tmp")

@@ -30,6 +30,7 @@ from lidarops.records import (
     SceneOutcome,
     Status,
 )
+from lidarops.run.leftovers import product_file
 from lidarops.run.staleness import Judge
 from lidarops.scene import dependence
 from lidarops.scene.plan import plan_scene
@@ -164,7 +165,7 @@ def _product(
     files: Sequence[InputRecord],
 ) -> NewProduct:
     kind, channel = key
-    path = f"{scene.instrument}/{scene.id}_{kind}_{channel}.nc"
+    path = product_file(scene, key)
     target = campaign.products_root / path
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(_CONTENT)
