@@ -117,8 +117,9 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
 def _start(head: bytes, lidar: _Lidar) -> datetime | None:
     """Return the start of a file that is refused, by which it belongs to a scene."""
     start = read_start(head)
-    facts = start and lidar.instrument.facts_by_clock(start)
-    return start and facts and start - timedelta(seconds=facts.clock_offset)
+    if start is None:
+        return None
+    return start - timedelta(seconds=lidar.instrument.facts_by_clock(start).clock_offset)
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
