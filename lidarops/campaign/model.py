@@ -332,7 +332,7 @@ class Instrument(SettingsModel):
     def facts_at(self, moment: datetime) -> InstrumentFacts:
         """Return the facts that are valid at `moment`, or empty facts."""
         valid = (fact for fact in self.facts if fact.valid_from <= moment < fact.valid_to)
-        return next(valid, InstrumentFacts())
+        return next(valid, None) or InstrumentFacts()
 
     def facts_by_clock(self, moment: datetime) -> InstrumentFacts:
         """Return the facts of a time by the clock of the instrument, or empty facts."""
@@ -341,7 +341,7 @@ class Instrument(SettingsModel):
             for fact in self.facts
             if fact.valid_from <= moment - timedelta(seconds=fact.clock_offset) < fact.valid_to
         )
-        return next(valid, InstrumentFacts())
+        return next(valid, None) or InstrumentFacts()
 
 
 class NetworkMembers(SettingsModel):
@@ -707,7 +707,7 @@ def _located(location: str, base: Path) -> str:
 
 def channel_facts(facts: InstrumentFacts, channel: str) -> ChannelFacts:
     """Return the facts about a channel, or empty facts."""
-    return facts.channels.get(channel, ChannelFacts())
+    return facts.channels.get(channel) or ChannelFacts()
 
 
 def as_settings(model: BaseModel) -> Mapping[str, Any]:
