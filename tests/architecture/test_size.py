@@ -29,7 +29,7 @@ MOST = {
     "lines of the largest package": 9_900,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 96, "functions": 862, "changes": 470},
+    "homogeneous": {"modules": 94, "functions": 845, "changes": 442},
     "elastic": {"modules": 104, "functions": 990, "changes": 486},
 }
 
