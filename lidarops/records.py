@@ -300,8 +300,13 @@ class Plan:
     @property
     def hash(self) -> str:
         """sha256 of the canonical JSON form."""
-        text = json.dumps(self.as_dict(), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        return digest(self.as_dict())
+
+
+def digest(value: Any) -> str:
+    """Return the sha256 of plain JSON types."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

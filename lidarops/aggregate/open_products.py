@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -24,12 +25,14 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.index import INDEX, IndexedPaths, find_in_index
 from lidarops.aggregate.selection import parse_selection
-from lidarops.aggregate.usable import CARE, masked
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.netcdf.read import reading
+from lidarops.netcdf.variables import USABLE
 from lidarops.system.files import within
 
+CARE: Final = 1
+ALL: Final = 2
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
@@ -89,7 +92,7 @@ def open_products(
     selection = parse_selection(kind, channel, station, instrument, since, until)
     store = _path_of(source)
     if store is not None and is_store(Path(store)):
-        return masked(open_store(Path(store), selection, version), usable)
+        return _masked(open_store(Path(store), selection, version), usable)
     if version is not None:
         raise RetrievalInputError(
             "only stores have versions", field="version", remedy="give the folder of a store"
@@ -105,7 +108,7 @@ def open_products(
             remedy="select by kind, channel, station or instrument, or give the files of one grid",
         )
     (products,) = by_group.values()
-    return masked(_opened(root, products), usable)
+    return _masked(_opened(root, products), usable)
 
 
 def _remedy(folder: str | None) -> str:
@@ -174,3 +177,23 @@ def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
     joined.attrs = shared_attributes([piece.attrs for piece in pieces])
     # Decoded once, which is much faster than decoding each piece.
     return xr.decode_cf(joined)
+
+
+def _masked(data: xr.Dataset, worst: int) -> xr.Dataset:
+    """Return data without the floating-point values whose ``usable`` is worse than `worst`."""
+    if worst not in (0, CARE, ALL):
+        raise RetrievalInputError(
+            f"is {worst!r}",
+            field="usable",
+            remedy="0 keeps unflagged values, 1 also those to use with care, 2 all values",
+        )
+    if worst == ALL:
+        return data
+    quality = data[USABLE]
+    kept = quality <= worst
+    masked_values = {
+        name: variable.where(kept)
+        for name, variable in data.data_vars.items()
+        if variable.dtype.kind == "f" and variable.dims == quality.dims
+    }
+    return data.assign(masked_values)

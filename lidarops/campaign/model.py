@@ -12,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import yaml
 from pydantic import (
@@ -64,6 +64,11 @@ __all__ = [
 
 ARCHIVE_VARIABLE = "LIDAROPS_ARCHIVE"
 CATALOG_VARIABLE = "LIDAROPS_CATALOG"
+OPERATION: Final = frozenset(
+    {"archive", "output", "catalog", "superseded", "simulation", "periods", "vanished_share",
+     "acknowledged"}
+)  # fmt: skip
+"""Settings of a campaign that change neither the scenes nor the content of a product."""
 
 
 class Station(SettingsModel):

@@ -131,7 +131,7 @@ class Verdict(NamedTuple):
     """That all requested products of a day were fresh."""
 
     signature: str
-    """State of the day; see `lidarops.run.staleness.Signature`."""
+    """State of the day; see `lidarops.run.day_states.Signature`."""
     empty_scenes: int
     """Number of scenes of the day without product."""
     set_aside: int

@@ -33,6 +33,10 @@ _held: set[str] = set()
 """Tokens of the locks that this process holds."""
 
 
+class OvertakenError(Exception):
+    """Another run has worked on the catalog since it was read."""
+
+
 @dataclass(frozen=True, slots=True)
 class Holder:
     """The holder of a lock."""
@@ -116,6 +120,11 @@ class Lock:
         self._thread = threading.Thread(target=self._beat, name="lidarops-lock", daemon=True)
         self._thread.start()
         return waited
+
+    def acquire_unchanged(self) -> None:
+        """Acquire the lock, or raise an OvertakenError if it had to wait."""
+        if self.acquire():
+            raise OvertakenError
 
     def wait_until_free(self) -> None:
         """Wait until no other process holds the lock, without acquiring it.

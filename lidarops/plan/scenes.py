@@ -17,23 +17,18 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import lru_cache
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.errors import RetrievalInputError, SceneError
+from lidarops.plan.windows import DARK_REACH, STAMP, Window, window_at
 from lidarops.records import ChannelLayout, FileNote, Granule, Role, Scene, Status
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.scene.pointing import LEAST_SPREAD
 
-DARK_REACH = timedelta(hours=24)
-"""Longest time between a scene and the dark files that it uses."""
 MOST_NOTES = 20
 """Different notes on the files of a scene that are kept."""
-Window = tuple[datetime, datetime]
-"""Start and end of a window."""
-_STAMP = "%Y%m%dT%H%M%S"
-"""Format of the start time in the name of a scene."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +109,7 @@ def _of_network(
             suffix = f"-{_grids_key(members)}" if len(combinations) > 1 else ""
             scenes.append(
                 Scene(
-                    id=f"{key}_{start:{_STAMP}}{suffix}",
+                    id=f"{key}_{start:{STAMP}}{suffix}",
                     campaign=campaign.name,
                     station=key,
                     instrument=key,
@@ -149,49 +144,6 @@ def as_recorded(scene: Scene, recorded: Collection[str]) -> Scene:
     return replace(scene, id=whole if whole in recorded else scene.id, members=members)
 
 
-def parse_scene_id(scene: str) -> tuple[str, datetime]:
-    """Return the instrument or network, and the start time, from the id of a scene."""
-    instrument, _, rest = scene.rpartition("_")
-    return instrument, datetime.strptime(rest.partition("-")[0], _STAMP).replace(tzinfo=UTC)
-
-
-def scene_stop(scene: str, campaign: Campaign) -> datetime:
-    """Return when a scene with this id would end with the present campaign file."""
-    key, start = parse_scene_id(scene)
-    members = campaign.networks[key].instruments if key in campaign.networks else [key]
-    return window_at(campaign, [name for name in members if name in campaign.instruments], start)[1]
-
-
-def select_scenes(
-    scenes: Sequence[Scene],
-    *,
-    instruments: Sequence[str] = (),
-    since: datetime | None = None,
-    until: datetime | None = None,
-) -> tuple[Scene, ...]:
-    """Return the scenes of these instruments (all where empty) that touch [since, until).
-
-    Raises
-    ------
-    SceneError
-        If an instrument has no scene; the message names those that have.
-    """
-    known = sorted({scene.instrument for scene in scenes})
-    for instrument in instruments:
-        if instrument not in known:
-            raise SceneError(
-                f"no scene of instrument {instrument!r}",
-                remedy=f"instruments with scenes: {', '.join(known) or 'none'}",
-            )
-    return tuple(
-        scene
-        for scene in scenes
-        if (not instruments or scene.instrument in instruments)
-        and (since is None or scene.stop > since)
-        and (until is None or scene.start < until)
-    )
-
-
 def _start(granule: Granule) -> datetime:
     if granule.start is None:
         raise SceneError("has no start time", file=granule.path)
@@ -215,7 +167,7 @@ def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule
 
 def _in_windows(
     campaign: Campaign, instruments: Sequence[str], granules: Iterable[Granule]
-) -> Iterator[tuple[Granule, tuple[datetime, datetime]]]:
+) -> Iterator[tuple[Granule, Window]]:
     """Yield granules with their windows; fast where granules come in order of time."""
     opens = closes = datetime.min.replace(tzinfo=UTC)
     for granule in granules:
@@ -260,32 +212,6 @@ def _cycles(granules: Sequence[Granule]) -> list[int]:
         return list(range(len(granules)))
 
 
-def window_at(
-    campaign: Campaign, instruments: Sequence[str], start: datetime
-) -> tuple[datetime, datetime]:
-    """Return the window that holds `start`, narrowed so that no fact changes within it."""
-    length = timedelta(days=1) if campaign.scenes.window == "day" else campaign.scenes.window
-    midnight = start.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
-    opens = midnight + (start - midnight) // length * length
-    closes = opens + length
-    for instrument in instruments:
-        for fact in campaign.instruments[instrument].facts:
-            opens, closes = _narrow(fact, start, opens, closes)
-    return opens, closes
-
-
-def _narrow(
-    fact: InstrumentFacts, moment: datetime, opens: datetime, closes: datetime
-) -> tuple[datetime, datetime]:
-    """Narrow a window around `moment` so that no edge of the validity period lies inside."""
-    for edge in (fact.valid_from, fact.valid_to):
-        if opens < edge <= moment:
-            opens = edge
-        elif moment < edge < closes:
-            closes = edge
-    return opens, closes
-
-
 def _by_layout(
     campaign: Campaign,
     instrument: str,
@@ -302,7 +228,7 @@ def _by_layout(
         suffix = f"-{key}" if len(layouts) > 1 else ""
         scenes.append(
             Scene(
-                id=f"{instrument}_{start:{_STAMP}}{suffix}",
+                id=f"{instrument}_{start:{STAMP}}{suffix}",
                 campaign=campaign.name,
                 station=campaign.instruments[instrument].station,
                 instrument=instrument,

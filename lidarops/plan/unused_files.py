@@ -10,16 +10,15 @@ import itertools
 from bisect import bisect
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from operator import attrgetter
 from typing import Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
-from lidarops.plan.scenes import DARK_REACH, window_at
-from lidarops.records import Granule, Role, Scene
-from lidarops.scene.dependence import with_unused
+from lidarops.plan.windows import DARK_REACH, window_at
+from lidarops.records import Granule, Role, Scene, UnusedFile
 
 MOST_IN_DOUBT: Final = 10
 """Dark files of unknown time that a scene names; all those of an archive may be refused."""
@@ -163,16 +162,13 @@ def name_unused(scenes: Iterable[Scene], refused: Iterable[Refused]) -> tuple[Sc
 
 
 def _named(scene: Scene, refused: dict[str, list[Refused]]) -> Scene:
-    members = scene.members or (scene,)
-    return with_unused(
-        scene,
-        (
-            file.granule
-            for member in members
-            for file in refused.get(member.instrument, ())
-            if _belongs(file, member)
-        ),
-    )
+    unused = {*scene.unused} | {
+        UnusedFile.of(file.granule)
+        for member in scene.members or (scene,)
+        for file in refused.get(member.instrument, ())
+        if _belongs(file, member)
+    }
+    return replace(scene, unused=tuple(sorted(unused))) if unused else scene
 
 
 def _belongs(file: Refused, scene: Scene) -> bool:

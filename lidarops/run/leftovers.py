@@ -19,7 +19,8 @@ from lidarops.catalog.ledger import RecordedProduct
 from lidarops.catalog.sources import path_pattern
 from lidarops.catalog.store import Store
 from lidarops.netcdf.context import path_of_product
-from lidarops.plan.scenes import Cut, parse_scene_id
+from lidarops.plan.scenes import Cut
+from lidarops.plan.windows import parse_scene_id
 from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene
 from lidarops.scene import dependence
 from lidarops.scene.dependence import ProductKey

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog import versions
 from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.records import Findings, RunRecord, SceneOutcome
 from lidarops.reports import run_record
-from lidarops.run.leftovers import Orphan
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from lidarops.run.leftovers import Orphan
 
 Progress = Callable[[SceneOutcome], None]
 NO_USABLE_VALUE: Final = "its retrievals gave no usable value"
@@ -55,17 +59,17 @@ class Result:
     """None if there was nothing to do."""
     status: RunStatus
     summary: ScanSummary
-    orphans: tuple[Orphan, ...]
     failures: Mapping[str, str]
     """Scene -> error, of every scene whose last try failed."""
     internal: Mapping[str, str]
     """Scene -> traceback, of those that ended with an internal error: a bug of lidarops."""
     unusable: tuple[str, ...]
     """Scenes whose retrievals gave no usable value; orphaned products do not count."""
-    empty_scenes: Mapping[str, str]
+    empty_scenes: Mapping[str, str] = field(default_factory=dict)
     """Scene -> why it can give no product."""
-    set_aside: Mapping[str, str]
+    set_aside: Mapping[str, str] = field(default_factory=dict)
     """Path of a good granule that belongs to no scene -> why."""
+    orphans: tuple[Orphan, ...] = ()
     more_unused: int = 0
     """Number of further empty scenes and granules set aside, on unchanged days."""
     frozen: Mapping[str, str] = field(default_factory=dict)
@@ -136,3 +140,11 @@ def missing_report(campaign: Campaign) -> str:
                 return f"{problem}; make it with: lidarops report {folder}"
             return f"{problem}, and so is its record; lidarops reprocess --force makes new ones"
     return ""
+
+
+def is_littered(campaign: Campaign, store: Store) -> bool:
+    """Return whether there are temporary files that no run writes and this one may remove."""
+    files = versions.temporary_files(Path(campaign.output))
+    if store.in_use() or store.others_at_work():
+        return False
+    return any(os.access(file.parent, os.W_OK) for file in files)

@@ -25,8 +25,8 @@ from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.plan.scenes import parse_scene_id
-from lidarops.records import Plan, ProductRecord, Role, SceneOutcome
+from lidarops.plan.windows import parse_scene_id
+from lidarops.records import Plan, ProductRecord, Role, SceneOutcome, digest
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, Judgement, settings_digest
@@ -218,7 +218,7 @@ def _dependence(judge: Judge, judged: Judgement | None, recipe: Recipe) -> Depen
     plan, product = recipe.plan, (recipe.kind, recipe.channel)
     if judged is not None and product in dependence.planned_products(judged.plan):
         planned, settings = judge.plan_and_settings(judged.scene, judged.plan, product)
-        same_settings = dependence.digest(settings) == dependence.digest(recipe.settings)
+        same_settings = digest(settings) == digest(recipe.settings)
         plan = planned if same_settings and _became(planned, plan) else plan
     return Dependence(
         plan_hash=plan.hash,

@@ -12,7 +12,7 @@ from lidarops.catalog.rows import day_of
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
-from lidarops.plan.scenes import cut_scenes, parse_scene_id, scene_stop, select_scenes
+from lidarops.plan.windows import parse_scene_id, scene_stop
 from lidarops.records import Scene
 
 
@@ -63,8 +63,10 @@ class Selection:
         """Return the selected scenes."""
         return tuple(
             scene
-            for scene in select_scenes(scenes, since=self.since, until=self.until)
+            for scene in scenes
             if self.owner(scene.instrument, scene.station)
+            and (self.since is None or scene.stop > self.since)
+            and (self.until is None or scene.start < self.until)
         )
 
     def owner(self, name: str, station: str) -> bool:
@@ -131,6 +133,8 @@ def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
     """
     if selection.everything:
         return False
+    from lidarops.plan.scenes import cut_scenes  # noqa: PLC0415 - loads numerics
+
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
         days = selection.days(sorted({day_sum.day for day_sum in store.day_sums()}))
         # No scene is longer than a day; the first selected scene decides.

@@ -7,30 +7,25 @@ other product is stale, and the reason is stated.
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from math import ceil
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from lidarops.campaign.ancillary_files import Ancillaries
-from lidarops.campaign.model import Campaign, as_settings
+from lidarops.campaign.model import Campaign
 from lidarops.catalog.headers import HEADER_BYTES
 from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdict
 from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import AncillaryError, ProductError, RawFormatError
+from lidarops.errors import ProductError, RawFormatError
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
-from lidarops.plan.channel_names import ChannelNames
 from lidarops.plan.outlying_headers import NEAR_DAYS, new_notes, without_outlying
-from lidarops.plan.scenes import DARK_REACH, Cut, as_recorded, cut_scenes
-from lidarops.plan.unused_files import Refused, dated, name_unused
+from lidarops.plan.scenes import Cut, as_recorded, cut_scenes
+from lidarops.plan.unused_files import Refused, name_unused
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import (
@@ -41,8 +36,9 @@ from lidarops.records import (
     Role,
     Scene,
     Stamp,
-    UnusedFile,
+    digest,
 )
+from lidarops.run.day_states import DARK_DAYS, DayStates
 from lidarops.run.leftovers import (
     Leftovers,
     Lost,
@@ -51,34 +47,22 @@ from lidarops.run.leftovers import (
     product_file,
     scenes_without_product,
 )
-from lidarops.run.selection import Selection, requested_kinds
+from lidarops.run.selection import Selection
 from lidarops.scene import dependence
 from lidarops.scene.context import recorded_settings
-from lidarops.scene.dependence import OPERATION, ProductKey, ancillary_files
+from lidarops.scene.dependence import ProductKey, ancillary_files
 from lidarops.scene.guard import Failure, guarded
 from lidarops.scene.job import Job, Place
 from lidarops.scene.plan import plan_scene
 from lidarops.system.code_version import code_version, joint_code_version, source_version
 from lidarops.system.files import sha256_of
 
-DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
-REACH: Final = NEAR_DAYS + DARK_DAYS
-"""Days before and after a file on which products may use it."""
 MOST_GRANULES: Final = 50_000
 """Granules that are judged at a time, unless one day has more. Memory holds the current group and,
 if workers process the scenes, the next group."""
 
 _UNCOUNTED: Final = frozenset({"products", "files", "keys", "members"})
 """Settings that a product states, and that count otherwise; members count one by one."""
-_PLANNING: Final = (
-    "lidarops.plan.channel_names",
-    "lidarops.plan.outlying_headers",
-    "lidarops.scene.plan",
-    "lidarops.plan.scenes",
-    "lidarops.plan.unused_files",
-)
-"""Modules that decide which scenes and plans a day has. A product records its own scene and plan,
-so that a change of these modules makes it stale only if they changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,15 +148,6 @@ class Judgement:
         )
 
 
-class Signature(NamedTuple):
-    """State of one day without ancillary files: if it and they are unchanged, nothing is stale."""
-
-    sources: str
-    """Digest of what its products are made from."""
-    whole: str
-    """Digest of the sources and the products; empty if a product file is not as recorded."""
-
-
 @dataclass(frozen=True, slots=True)
 class DaysJudged:
     """Judgements of the scenes of some days."""
@@ -194,7 +169,7 @@ class DaysJudged:
     """SHA-256 of files that had to be read in full, by path; for the catalog."""
 
 
-class Judge:
+class Judge(DayStates):
     """Compares the products of a campaign with its ledger.
 
     Parameters
@@ -217,13 +192,9 @@ class Judge:
         force: bool = False,
         thaw: bool = False,
     ) -> None:
-        self.campaign = campaign
-        self.store = store
-        self.selection = selection or Selection()
+        super().__init__(campaign, store, selection)
         self._force = force
         self._thaw = thaw
-        self._ancillaries: dict[str, str] = {}
-        self._problems: dict[tuple[str, Role], str] = {}
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
         self._touched: dict[str, int] = {}
@@ -232,60 +203,6 @@ class Judge:
         """Parts of the plan `_whole`, of the scene that was judged last."""
 
     # Days
-
-    def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
-        """Return the state of every day.
-
-        Parameters
-        ----------
-        days : collection of int, optional
-            Days to return; default all days with granules or products.
-        """
-        files: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
-        for day_sum in self.store.day_sums():
-            fingerprint = (day_sum.role.value, day_sum.good, day_sum.low, day_sum.high)
-            _add_to_days(files, day_sum.day, day_sum.role, fingerprint)
-        for file in self._refused:
-            unused = UnusedFile.of(file.granule)
-            _add_to_days(files, day_of(file.time), unused.role, unused)
-        root, base = str(self.campaign.products_root), self._base
-        products: dict[int, Any] = defaultdict(hashlib.sha256)
-        broken: set[int] = set()
-        with self.store.all_products() as rows:
-            for made in rows:
-                products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
-                if not _looks_right(root, made):
-                    broken.add(made.day)
-        signatures = {}
-        for day in sorted(files.keys() | products.keys()):
-            if days is None or day in days:
-                digest = hashlib.sha256(f"{base}{day}{sorted(files[day], key=repr)}".encode())
-                sources = digest.hexdigest()
-                digest.update(products[day].digest() if day in products else b"")
-                signatures[day] = Signature(sources, "" if day in broken else digest.hexdigest())
-        return signatures
-
-    @cached_property
-    def _base(self) -> str:
-        """Digest of settings, code and recorders on which scenes, plans and products depend."""
-        settings, held = as_settings(self.campaign), self.names.holdings
-        return dependence.digest(
-            [
-                {key: value for key, value in settings.items() if key not in OPERATION},
-                [entry.what for entry in self.campaign.acknowledged if entry.holds],
-                joint_code_version(requested_kinds(self.campaign), *_PLANNING),
-                sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
-            ]
-        )
-
-    def is_settled(self, signature: Signature, verdict: Verdict | None) -> bool:
-        """Return whether nothing has changed on a day since its verdict."""
-        return (
-            verdict is not None
-            and bool(signature.whole)
-            and signature.whole == verdict.signature
-            and all(self._ancillary(name) == known for name, known in verdict.files.items())
-        )
 
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
@@ -334,13 +251,14 @@ class Judge:
             # What the archive lost on purpose is no finding.
             if product.scene not in unplanned and not (orphan.lost and self._is_excused(product))
         ]
-        # What is not replaced is reported by every run, and a signature does not hold all that
-        # may end an internal error.
+        # What is not replaced and files that cannot be used are reported by every run; a signature
+        # does not hold all that may end an internal error.
         unsettled = {product.day for product, _ in orphans} | {
             judged.day
             for judged in judgements
             if judged.frozen
             or judged.kept
+            or any(self.file_problem(used.path, used.role) for used in judged.ancillaries)
             or not judged.planned
             or (judged.failure and judged.failure.internal)
         }
@@ -415,7 +333,7 @@ class Judge:
                 if granule.role is Role.DARK or day_of(_moment(granule)) in days
             ],
         )
-        unused = [*self._refused, *(Refused(granule, _moment(granule)) for granule in refused)]
+        unused = [*self.refused, *(Refused(granule, _moment(granule)) for granule in refused)]
         scenes = name_unused([as_recorded(scene, recorded) for scene in cut.scenes], unused)
         return replace(
             cut,
@@ -423,17 +341,6 @@ class Judge:
             set_aside=(*cut.set_aside, *aside),
             file_notes=tuple(new_notes(granules, kept, days)),
         )
-
-    @cached_property
-    def names(self) -> ChannelNames:
-        """Names of the channels of all files in the catalog."""
-        return ChannelNames(self.campaign, self.store)
-
-    @cached_property
-    def _refused(self) -> tuple[Refused, ...]:
-        """Files that the catalog refuses, with times to which they belong."""
-        store = self.store
-        return tuple(dated(self.campaign, store.refused(), store.files_in, store.days_below))
 
     def _header(self, granule: Granule) -> RawHeader | None:
         """Return the header of a file; None where this file cannot be read now."""
@@ -523,19 +430,9 @@ class Judge:
 
     def _ancillary_records(self, plan: Plan) -> tuple[InputRecord, ...]:
         return tuple(
-            InputRecord(name, role, self._ancillary(name))
+            InputRecord(name, role, self.ancillary(name))
             for name, role in sorted(ancillary_files(plan.steps).items())
         )
-
-    def file_problem(self, name: str, role: Role) -> str:
-        """Return why an ancillary file cannot be used; empty if it can."""
-        if (name, role) not in self._problems:
-            try:
-                Ancillaries.read(self.campaign.folder, {name: role})
-                self._problems[name, role] = ""
-            except AncillaryError as error:
-                self._problems[name, role] = str(error).removeprefix(f"{name}: ")
-        return self._problems[name, role]
 
     def key(self, judged: Judgement, *, internal: bool = False) -> str:
         """Return the digest of everything that may change the outcome of a scene.
@@ -553,10 +450,10 @@ class Judge:
         scene, whole = judged.scene, judged.plan
         products = dependence.planned_products(whole)
         software = [source_version(), package_versions()] if internal else []
-        return dependence.digest(
+        return digest(
             [
                 *software,
-                whole.hash if judged.planned else self._base,
+                whole.hash if judged.planned else self.base,
                 joint_code_version({kind for kind, _ in products}),
                 [
                     settings_digest(self.plan_and_settings(scene, whole, product)[1])
@@ -688,16 +585,6 @@ class Judge:
                 digest = None
         return digest or f"{granule.size}:{granule.mtime_ns}:{granule.path}"
 
-    def _ancillary(self, name: str) -> str:
-        """Return the SHA-256 of an ancillary file when it was first needed."""
-        if name not in self._ancillaries:
-            try:
-                self._ancillaries[name] = sha256_of(self.campaign.folder / name)
-            except (OSError, ValueError):
-                # The processing of the scene reports the problem.
-                self._ancillaries[name] = "unreadable"
-        return self._ancillaries[name]
-
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
     """Return the sha256 of the settings that a product states, as far as they count.
@@ -705,29 +592,12 @@ def settings_digest(settings: Mapping[str, Any]) -> str:
     Requested settings count by the plan, files by their content, and keys by the scene.
     """
     parts = {"": settings, **settings.get("members", {})}
-    return dependence.digest(
+    return digest(
         [
             [name, {key: value for key, value in part.items() if key not in _UNCOUNTED}]
             for name, part in sorted(parts.items())
         ]
     )
-
-
-def _add_to_days(
-    files: dict[int, list[tuple[Any, ...]]], day: int, role: Role, known: tuple[Any, ...]
-) -> None:
-    """Add what is known of files of a day to all days whose products may use them."""
-    reach = REACH if role is Role.DARK else NEAR_DAYS
-    for offset in range(-reach, reach + 1):
-        files[day + offset].append((-offset, *known) if offset else known)
-
-
-def _looks_right(root: str, made: RecordedProduct) -> bool:
-    try:
-        status = os.stat(f"{root}/{made.path}")  # noqa: PTH116 - for each file, a Path is slow
-    except OSError:
-        return False
-    return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
 
 
 def _verdicts(

@@ -7,7 +7,6 @@ not depend on must neither appear in it nor make it stale.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +15,6 @@ from typing import Any, Final
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
 from lidarops.kinds import Scope, kinds_of
 from lidarops.records import (
-    Granule,
     InputRecord,
     LeftOut,
     Plan,
@@ -37,11 +35,6 @@ UNUSED: Final = "unused"
 ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
-OPERATION: Final = frozenset(
-    {"archive", "output", "catalog", "superseded", "simulation", "periods", "vanished_share",
-     "acknowledged"}
-)  # fmt: skip
-"""Settings of a campaign that change neither the scenes nor the content of a product."""
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
 _FILES: Final = {
     "overlap_profile": Role.OVERLAP,
@@ -199,12 +192,6 @@ def product_notes(scene: Scene, plan: Plan, channel: str) -> tuple[str, ...]:
     return tuple(note for note in scene.notes if others.isdisjoint(note.split(": ")))
 
 
-def with_unused(scene: Scene, refused: Iterable[Granule]) -> Scene:
-    """Return a scene that names refused files, too, as unused."""
-    unused = {*scene.unused, *map(UnusedFile.of, refused)}
-    return replace(scene, unused=tuple(sorted(unused))) if unused else scene
-
-
 def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     """Return the unused files of a scene that a product would be made from.
 
@@ -316,13 +303,6 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
 
 def _reads_dark(plan: Plan) -> bool:
     return any(step.name == "dark" for step in plan.steps)
-
-
-def digest(value: Any) -> str:
-    """Return the sha256 of plain JSON types."""
-    return hashlib.sha256(
-        json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
 
 
 def inputs_digest(files: Sequence[InputRecord]) -> str:

@@ -6,12 +6,12 @@ import random
 from dataclasses import replace
 from datetime import timedelta
 
-import pytest
 from support import factories
 
-from lidarops.errors import SceneError
-from lidarops.plan.scenes import cut_scenes, scene_stop, select_scenes
+from lidarops.plan.scenes import cut_scenes
+from lidarops.plan.windows import scene_stop
 from lidarops.records import Granule, Role, Status
+from lidarops.run.selection import Selection
 
 
 def test_one_scene_for_each_utc_day() -> None:
@@ -129,11 +129,9 @@ def test_refused_granules_are_passed_over() -> None:
     )
 
 
-def test_selection_names_the_instruments_there_are() -> None:
+def test_a_selection_of_times_holds_the_scenes_that_touch_it() -> None:
     scenes = cut_scenes(
         factories.campaign(), [factories.granule(0), factories.granule(1500)]
     ).scenes
-    assert len(select_scenes(scenes, since=factories.DAY + timedelta(days=1))) == 1
-    assert len(select_scenes(scenes, until=factories.DAY + timedelta(hours=1))) == 1
-    with pytest.raises(SceneError, match="lidar"):
-        select_scenes(scenes, instruments=["radar"])
+    assert len(Selection(since=factories.DAY + timedelta(days=1)).scenes(scenes)) == 1
+    assert len(Selection(until=factories.DAY + timedelta(hours=1)).scenes(scenes)) == 1

@@ -11,7 +11,8 @@ from support.sources import Copy
 
 from lidarops.catalog.store import Store
 from lidarops.run.archive import assess, reprocess, update_catalog
-from lidarops.run.staleness import Judge, Signature
+from lidarops.run.day_states import Signature
+from lidarops.run.staleness import Judge
 from lidarops.system import code_version as versions
 
 pytestmark = pytest.mark.usefixtures("quickly")

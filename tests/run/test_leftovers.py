@@ -24,7 +24,7 @@ from lidarops.cli import app
 from lidarops.errors import CatalogError
 from lidarops.reports import gallery, run_journal, run_record
 from lidarops.run import archive as pipeline
-from lidarops.run import session
+from lidarops.run import processing, session
 from lidarops.run.archive import (
     Options,
     Selection,
@@ -191,7 +191,7 @@ def test_unused_files_of_some_days_are_named_and_the_others_counted(
         archive.raw(f"poor/h-twin{day}", day * DAY + 600, seed=1)
     campaign = archive.write()
     assert len(bring_up_to_date(campaign).set_aside) == 4
-    monkeypatch.setattr(pipeline, "MOST_DAYS_JUDGED_AGAIN", 3)
+    monkeypatch.setattr(processing, "MOST_DAYS_JUDGED_AGAIN", 3)
     again = bring_up_to_date(campaign)
     assert (len(again.set_aside), again.more_unused, again.has_failures) == (3, 1, True)
 

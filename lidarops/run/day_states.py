@@ -1,0 +1,177 @@
+"""The state of each day: if it is that of the last verdict, nothing of the day is stale.
+
+A run with nothing to do imports this module, so it imports no numerics.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import defaultdict
+from collections.abc import Collection
+from functools import cached_property
+from math import ceil
+from typing import Any, Final, NamedTuple
+
+from lidarops.campaign.model import OPERATION, Campaign, as_settings
+from lidarops.catalog.ledger import RecordedProduct, Verdict
+from lidarops.catalog.rows import day_of
+from lidarops.catalog.store import Store
+from lidarops.errors import AncillaryError
+from lidarops.plan.channel_names import ChannelNames
+from lidarops.plan.outlying_headers import NEAR_DAYS
+from lidarops.plan.unused_files import Refused, dated
+from lidarops.plan.windows import DARK_REACH
+from lidarops.records import Role, UnusedFile, digest
+from lidarops.run.selection import Selection, requested_kinds
+from lidarops.system.code_version import joint_code_version
+from lidarops.system.files import sha256_of
+
+DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
+REACH: Final = NEAR_DAYS + DARK_DAYS
+"""Days before and after a file on which products may use it."""
+
+_PLANNING: Final = (
+    "lidarops.plan.channel_names",
+    "lidarops.plan.outlying_headers",
+    "lidarops.scene.plan",
+    "lidarops.plan.scenes",
+    "lidarops.plan.unused_files",
+    "lidarops.plan.windows",
+)
+"""Modules that decide which scenes and plans a day has. A product records its own scene and plan,
+so that a change of these modules makes it stale only if they changed."""
+
+
+class Signature(NamedTuple):
+    """State of one day without ancillary files: if it and they are unchanged, nothing is stale."""
+
+    sources: str
+    """Digest of what its products are made from."""
+    whole: str
+    """Digest of the sources and the products; empty if a product file is not as recorded."""
+
+
+class DayStates:
+    """States of the days of a campaign.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    store : Store
+    selection : Selection, optional
+        What to process; default everything.
+    """
+
+    def __init__(
+        self, campaign: Campaign, store: Store, selection: Selection | None = None
+    ) -> None:
+        self.campaign = campaign
+        self.store = store
+        self.selection = selection or Selection()
+        self._ancillaries: dict[str, str] = {}
+        self._problems: dict[tuple[str, Role], str] = {}
+
+    def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
+        """Return the state of every day.
+
+        Parameters
+        ----------
+        days : collection of int, optional
+            Days to return; default all days with granules or products.
+        """
+        files: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+        for day_sum in self.store.day_sums():
+            fingerprint = (day_sum.role.value, day_sum.good, day_sum.low, day_sum.high)
+            _add_to_days(files, day_sum.day, day_sum.role, fingerprint)
+        for file in self.refused:
+            unused = UnusedFile.of(file.granule)
+            _add_to_days(files, day_of(file.time), unused.role, unused)
+        root, base = str(self.campaign.products_root), self.base
+        products: dict[int, Any] = defaultdict(hashlib.sha256)
+        broken: set[int] = set()
+        with self.store.all_products() as rows:
+            for made in rows:
+                products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
+                if not _looks_right(root, made):
+                    broken.add(made.day)
+        signatures = {}
+        for day in sorted(files.keys() | products.keys()):
+            if days is None or day in days:
+                state = hashlib.sha256(f"{base}{day}{sorted(files[day], key=repr)}".encode())
+                sources = state.hexdigest()
+                state.update(products[day].digest() if day in products else b"")
+                signatures[day] = Signature(sources, "" if day in broken else state.hexdigest())
+        return signatures
+
+    @cached_property
+    def base(self) -> str:
+        """Digest of settings, code and recorders on which scenes, plans and products depend."""
+        settings, held = as_settings(self.campaign), self.names.holdings
+        return digest(
+            [
+                {key: value for key, value in settings.items() if key not in OPERATION},
+                [entry.what for entry in self.campaign.acknowledged if entry.holds],
+                joint_code_version(requested_kinds(self.campaign), *_PLANNING),
+                sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
+            ]
+        )
+
+    def is_settled(self, signature: Signature, verdict: Verdict | None) -> bool:
+        """Return whether nothing has changed on a day since its verdict."""
+        return (
+            verdict is not None
+            and bool(signature.whole)
+            and signature.whole == verdict.signature
+            and all(self.ancillary(name) == known for name, known in verdict.files.items())
+        )
+
+    @cached_property
+    def names(self) -> ChannelNames:
+        """Names of the channels of all files in the catalog."""
+        return ChannelNames(self.campaign, self.store)
+
+    @cached_property
+    def refused(self) -> tuple[Refused, ...]:
+        """Files that the catalog refuses, with times to which they belong."""
+        store = self.store
+        return tuple(dated(self.campaign, store.refused(), store.files_in, store.days_below))
+
+    def ancillary(self, name: str) -> str:
+        """Return the SHA-256 of an ancillary file when it was first needed."""
+        if name not in self._ancillaries:
+            try:
+                self._ancillaries[name] = sha256_of(self.campaign.folder / name)
+            except (OSError, ValueError):
+                # The processing of the scene reports the problem.
+                self._ancillaries[name] = "unreadable"
+        return self._ancillaries[name]
+
+    def file_problem(self, name: str, role: Role) -> str:
+        """Return why an ancillary file cannot be used; empty if it can."""
+        if (name, role) not in self._problems:
+            from lidarops.campaign.ancillary_files import Ancillaries  # noqa: PLC0415 - loads xarray
+
+            try:
+                Ancillaries.read(self.campaign.folder, {name: role})
+                self._problems[name, role] = ""
+            except AncillaryError as error:
+                self._problems[name, role] = str(error).removeprefix(f"{name}: ")
+        return self._problems[name, role]
+
+
+def _add_to_days(
+    files: dict[int, list[tuple[Any, ...]]], day: int, role: Role, known: tuple[Any, ...]
+) -> None:
+    """Add what is known of files of a day to all days whose products may use them."""
+    reach = REACH if role is Role.DARK else NEAR_DAYS
+    for offset in range(-reach, reach + 1):
+        files[day + offset].append((-offset, *known) if offset else known)
+
+
+def _looks_right(root: str, made: RecordedProduct) -> bool:
+    try:
+        status = os.stat(f"{root}/{made.path}")  # noqa: PTH116 - for each file, a Path is slow
+    except OSError:
+        return False
+    return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
