@@ -169,6 +169,11 @@ class UnusedFile(NamedTuple):
             reason = reason.partition(" (")[0]
         return cls(_one_line(refused.path), refused.role, _one_line(reason)[:LONGEST_REASON])
 
+    @classmethod
+    def lost(cls, path: str, role: Role) -> Self:
+        """Return what products state of a file that the archive had and no longer gives."""
+        return cls(_one_line(path), role, "no longer in the archive")
+
 
 def _one_line(text: str) -> str:
     """Return a text with escapes for what is no printable character."""

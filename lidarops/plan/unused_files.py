@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from bisect import bisect
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from operator import attrgetter
@@ -153,16 +153,25 @@ def _alike(one: str, other: str) -> int:
     return next((n for n, (a, b) in pairs if a != b), min(len(one), len(other)))
 
 
-def name_unused(scenes: Iterable[Scene], refused: Iterable[Refused]) -> tuple[Scene, ...]:
-    """Return scenes that name the refused files of their instruments and time as unused."""
+def name_unused(
+    scenes: Iterable[Scene],
+    refused: Iterable[Refused],
+    lost: Mapping[str, Iterable[UnusedFile]],
+) -> tuple[Scene, ...]:
+    """Return scenes that name as unused the refused files of their instruments and time.
+
+    So they name files that the archive has lost, which are given by the id of the scene.
+    """
     of_instrument: dict[str, list[Refused]] = defaultdict(list)
     for file in refused:
         of_instrument[file.granule.instrument].append(file)
-    return tuple(_named(scene, of_instrument) for scene in scenes) if of_instrument else (*scenes,)
+    return tuple(_named(scene, of_instrument, lost.get(scene.id, ())) for scene in scenes)
 
 
-def _named(scene: Scene, refused: dict[str, list[Refused]]) -> Scene:
-    unused = {*scene.unused} | {
+def _named(
+    scene: Scene, refused: Mapping[str, Iterable[Refused]], lost: Iterable[UnusedFile]
+) -> Scene:
+    unused = {*scene.unused, *lost} | {
         UnusedFile.of(file.granule)
         for member in scene.members or (scene,)
         for file in refused.get(member.instrument, ())

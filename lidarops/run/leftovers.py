@@ -9,8 +9,8 @@ incomplete, or a disk not mounted.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -21,7 +21,7 @@ from lidarops.catalog.store import Store
 from lidarops.netcdf.context import path_of_product
 from lidarops.plan.scenes import Cut
 from lidarops.plan.windows import parse_scene_id
-from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene
+from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene, UnusedFile
 from lidarops.scene import dependence
 from lidarops.scene.dependence import ProductKey
 from lidarops.scene.job import nothing_to_do
@@ -219,6 +219,8 @@ class Lost:
     """Products of which the campaign acknowledges lost files."""
     idle: tuple[FactsNote, ...] = ()
     """Entries of `acknowledged` that match no lost file, or have expired."""
+    unused: Mapping[str, Collection[UnusedFile]] = field(default_factory=dict)
+    """Lost files of each product, without acknowledged ones: a product made again states them."""
 
 
 def find_lost(campaign: Campaign, store: Store) -> Lost:
@@ -281,7 +283,23 @@ def find_lost(campaign: Campaign, store: Store) -> Lost:
         paths = tuple(path for path in unknown if owners[path] == owner)
         kept = len(products_with & protected)
         findings.append(LostFiles(owner, len(paths), total, paths[:_NAMES_SHOWN], kept))
-    return Lost(tuple(findings), protected, frozenset(excused), tuple(idle))
+    gone_of = ((path, sets[name].products) for name, path in inputs if path not in known)
+    unused = _unused(campaign, owners, gone_of)
+    return Lost(tuple(findings), protected, frozenset(excused), tuple(idle), unused)
+
+
+def _unused(
+    campaign: Campaign, owners: Mapping[str, str], lost: Iterable[tuple[str, Iterable[str]]]
+) -> dict[str, set[UnusedFile]]:
+    """Return the lost files of each product, by their owners."""
+    is_dark = {name: _matcher(each.dark_files) for name, each in campaign.instruments.items()}
+    unused = defaultdict[str, set[UnusedFile]](set)
+    for path, products in lost:
+        if path in owners:
+            role = Role.DARK if is_dark[owners[path]](path) else Role.SIGNAL
+            for product in products:
+                unused[product].add(UnusedFile.lost(path, role))
+    return unused
 
 
 def _matcher(patterns: Iterable[str]) -> Callable[[str], bool]:

@@ -231,7 +231,7 @@ class Judge(DayStates):
         first, last, within = days[0], days[-1], set(days)
         tried = self.store.last_tries(first, last)
         products = self.store.products_of_days(first, last)
-        cut = self._cut(first, last, within, {product.scene for product in products})
+        cut = self._cut(first, last, within, products)
         made = {product.path: product for product in products if product.day in within}
         self._touched, self._digests = {}, {}
         judgements = [self._judged(scene, made, tried.get(scene.id)) for scene in cut.scenes]
@@ -319,7 +319,9 @@ class Judge(DayStates):
         stays = orphan.path in self.lost.protected
         return replace(orphan, requested=True, lost=False) if stays else orphan
 
-    def _cut(self, first: int, last: int, days: set[int], recorded: set[str]) -> Cut:
+    def _cut(
+        self, first: int, last: int, days: set[int], products: Sequence[RecordedProduct]
+    ) -> Cut:
         stored = self.store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
@@ -334,10 +336,17 @@ class Judge(DayStates):
             ],
         )
         unused = [*self.refused, *(Refused(granule, _moment(granule)) for granule in refused)]
-        scenes = name_unused([as_recorded(scene, recorded) for scene in cut.scenes], unused)
+        recorded = defaultdict[str, list[RecordedProduct]](list)
+        for product in products:
+            recorded[product.scene].append(product)
+        known = [as_recorded(scene, recorded) for scene in cut.scenes]
+        lost = {
+            scene: [file for product in made for file in self.lost.unused.get(product.path, ())]
+            for scene, made in recorded.items()
+        }
         return replace(
             cut,
-            scenes=scenes,
+            scenes=name_unused(known, unused, lost),
             set_aside=(*cut.set_aside, *aside),
             file_notes=tuple(new_notes(granules, kept, days)),
         )
@@ -546,7 +555,10 @@ class Judge(DayStates):
         if recorded.plan_hash != closure.hash:
             return "its plan changed"
         if recorded.settings_hash != settings_digest(settings):
-            return "its settings in the campaign, or the files that are unused, changed"
+            unused = {file.path for file in judged.scene.unused}
+            gone = [used for used in self.store.inputs_of(known.path) if used.path in unused]
+            changed = "its settings in the campaign, or the files that are unused, changed"
+            return _difference(gone, []) if gone else changed
         # Last, because files may have to be read for it.
         granules = {
             granule.path: granule for granule in (*judged.scene.granules, *judged.scene.dark)

@@ -206,7 +206,7 @@ def test_a_bad_sounding_costs_only_the_products_that_need_it(archive: Archive) -
     sounding.write_text(good.split("\n", 1)[1])
     rich = archive.tree["instruments"]["rich"]
     rich["products"]["signal"]["background_range"] = [9000, 11000]
-    products = archive.folder / "out/products/rich"
+    products = archive.folder / "out/products/coast/rich"
     before = {path: path.read_bytes() for path in products.rglob("*.nc")}
     for command in ("plan", "reprocess"):
         shown = invoke(archive, command)
@@ -244,7 +244,7 @@ def test_a_file_of_lidar_ratios_is_checked_and_makes_elastic_stale(archive: Arch
     for value in (40, 60):
         ratio.write_text(f"{head}\n0,{value},5\n")
         assert invoke(archive, "reprocess").exit_code == 0
-        products = (archive.folder / "out/products/rich").rglob("*.nc")
+        products = (archive.folder / "out/products/coast/rich").rglob("*.nc")
         made[value] = {path: path.read_bytes() for path in products}
     changed = {path.name.split("_")[2] for path in made[40] if made[40][path] != made[60][path]}
     assert changed == {"elastic"}

@@ -41,6 +41,18 @@ def _run(archive: Archive, *options: str, command: str = "reprocess") -> tuple[i
     return done.exit_code, json.loads(done.stdout)
 
 
+def test_files_that_vanish_one_by_one_are_lost_together(archive: Archive) -> None:
+    _remove(archive, ["poor/h10"])
+    code, summary = _run(archive)
+    assert (code, len(summary["products"])) == (0, 2)
+    assert _run(archive)[1]["run"] is None
+    before = archive.contents("out/products")
+    _remove(archive, ["poor/h11"])
+    code, summary = _run(archive)
+    assert (code, summary["products"]) == (1, [])
+    assert archive.contents("out/products") == before
+
+
 def test_a_third_of_the_files_gone_worsens_no_product_until_it_is_acknowledged(
     archive: Archive,
 ) -> None:
