@@ -3,8 +3,8 @@
 A value of ``quality_flag`` is a bit mask; 0 means that no test failed. Bits that raw data, signals
 and background raise, and that mean the same in every kind of product, are in `Quality`; their
 places are the same in all kinds. A retrieval has an enum of its own bits beside it, at places from
-`FIRST_OWN` on, which the retrievals of other kinds use for other bits. ``products/KIND/flags.py``
-states by `Flags` which bits a kind of product can carry. The CF flag attributes follow from that.
+`FIRST_OWN` on, which the retrievals of other kinds use for other bits. `Flags` states which bits a
+kind of product can carry (``products/KIND/variables.py``). The CF flag attributes follow from that.
 
 Readers of files go by the ``flag_masks`` and ``flag_meanings`` of the file
 (`lidarops.netcdf.stored_flags`).

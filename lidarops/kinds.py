@@ -1,7 +1,7 @@
 """Registry of the kinds of product, which are found by entry point.
 
 A kind of product is one package: its ``__init__`` holds a `Kind`, and its modules ``settings``,
-``retrieval``, ``variables``, ``flags``, ``figures`` and ``draft`` hold everything else about it.
+``retrieval``, ``variables``, ``figures`` and ``draft`` hold everything else about it.
 Without ``figures``, its main variable is drawn; without ``draft``, no new campaign file requests
 it. A package outside lidarops adds a kind by an entry point of the group
 ``lidarops.product_kinds``::
@@ -148,10 +148,10 @@ def flags_of(name: str) -> Flags:
     """
     kind = kind_of(name)
     try:
-        flags: Flags = kind.part("flags", "FLAGS")
+        flags: Flags = kind.part("variables", "LAYOUT").flags
     except ValueError as error:
         raise LidarOpsError(
-            str(error), remedy=f"correct the bits in {kind.package}.flags"
+            str(error), remedy=f"correct the bits in {kind.package}.variables"
         ) from error
     return flags
 

@@ -15,9 +15,14 @@ from lidarops.aggregate._sums import Array, Sample
 from lidarops.aggregate.facts import Facts, opened, refuse_changed
 from lidarops.aggregate.means_variables import averaged, budget_of, states_clouds, systematic
 from lidarops.kinds import flags_of
-from lidarops.netcdf.cloud_rows import CLOUD_FRACTION, CLOUD_MASK
+from lidarops.netcdf.quantities import CLOUD_FRACTION, CLOUD_MASK
 from lidarops.netcdf.stored_flags import with_current_flags
-from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row, layout_of
+from lidarops.netcdf.variables import (
+    QUALITY_FLAG,
+    ErrorBudget,
+    Row,
+    layout_of,
+)
 from lidarops.system.files import within
 
 

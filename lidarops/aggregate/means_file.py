@@ -165,8 +165,8 @@ def _stored(row: Row, values: NDArray[Any]) -> NDArray[Any]:
     stored: NDArray[Any] = values.astype(row.dtype)
     if row.dtype != "f4":
         return stored
-    if row.significant_bits is not None:
-        stored = bitround(stored, row.significant_bits)
+    if row.bits is not None:
+        stored = bitround(stored, row.bits)
     stored[~np.isfinite(stored)] = rows.FILL_VALUE
     return stored
 

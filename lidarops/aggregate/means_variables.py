@@ -15,33 +15,35 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops import __version__
-from lidarops.netcdf.cloud_rows import CLOUD_FRACTION
 from lidarops.netcdf.global_attributes import UNUSED_INPUTS
+from lidarops.netcdf.quantities import CLOUD_FRACTION
 from lidarops.netcdf.variables import (
-    NO_STANDARD_NAME,
-    TIME,
     Coverage,
     ErrorBudget,
     ErrorKind,
     Layout,
     Row,
+    completed,
+    count,
     layout_of,
 )
 
 PRODUCT: Final = Row(
-    name="product",
-    dims=("product",),
+    "product",
+    ("product",),
+    None,
+    "identifier of the product, its global attribute id",
+    Coverage.REFERENCE,
     dtype="S1",
-    long_name="identifier of the product, its global attribute id",
-    coverage=Coverage.REFERENCE,
 )
 PRODUCT_INDEX: Final = Row(
-    name="product_index",
-    dims=("time",),
+    "product_index",
+    ("time",),
+    "1",
+    "index along dimension product of the product that contains the profile",
+    Coverage.REFERENCE,
+    comment="",
     dtype="i4",
-    units="1",
-    long_name="index along dimension product of the product that contains the profile",
-    coverage=Coverage.REFERENCE,
 )
 
 
@@ -92,13 +94,10 @@ def systematic(kind: str, name: str) -> tuple[str, ...]:
         Such as ``total_extinction_model_error``; variables of products or, for a quantity with an
         interval (`Row.lower_end`), of means only.
     """
-    table = layout_of(kind)
-    if table.row(name).lower_end:
+    row = layout_of(kind).row(name)
+    if row.lower_end:
         return (f"{name}_systematic_error",)
-    names = (row.name for row in table.data)
-    return tuple(
-        error for error in names if error.startswith(f"{name}_") and error.endswith("_error")
-    )
+    return tuple(error.name(name) for error in row.errors if not error.part)
 
 
 _INDEPENDENT: Final = (
@@ -154,7 +153,7 @@ def layout(kind: str, period: Period, weights: Weights) -> Layout:
         ``quality_flag`` and ``shots``.
     """
     source = layout_of(kind)
-    time = replace(TIME, long_name=f"middle of the {period.value}, UTC")
+    time = replace(source.row("time"), long_name=f"middle of the {period.value}, UTC")
     return replace(
         source,
         title=f"{_ADJECTIVE[period]} means: {source.title}",
@@ -168,7 +167,7 @@ def layout(kind: str, period: Period, weights: Weights) -> Layout:
         " time_coverage_duration is that from the first to the last bound. Comment of the"
         f" products: {source.comment}",
         coordinates=tuple(time if row.name == "time" else row for row in source.coordinates),
-        data=tuple(_rows(source, kind, weights)),
+        data=tuple(map(completed, _rows(source, kind, weights))),
     )
 
 
@@ -200,24 +199,24 @@ def _rows(source: Layout, kind: str, weights: Weights) -> Iterator[Row]:
 
 def _shares(source: Layout, flags: Row, *, clouds: bool) -> Iterator[Row]:
     """Yield the rows that tell of which profiles a mean is made."""
-    share = Row(
-        name="usable_share",
-        dims=flags.dims,
-        dtype="f4",
-        units="1",
-        long_name="share of the profiles of the period whose value no quality bit rejects",
-        coverage=Coverage.QUALITY,
-        valid_min=0.0,
-        valid_max=1.0,
-        comment=NO_STANDARD_NAME,
-    )
-    yield share
-    yield replace(
-        share,
-        name="good_share",
-        long_name="share of the profiles of the period whose value has no quality bit",
-        comment=f"The others of usable_share are to be used with care. {NO_STANDARD_NAME}",
-    )
+    for name, words, comment in (
+        ("usable_share", "no quality bit rejects", None),
+        (
+            "good_share",
+            "has no quality bit",
+            "The others of usable_share are to be used with care.",
+        ),
+    ):
+        yield Row(
+            name,
+            flags.dims,
+            "1",
+            f"share of the profiles of the period whose value {words}",
+            Coverage.QUALITY,
+            comment,
+            valid_min=0.0,
+            valid_max=1.0,
+        )
     if clouds:
         fraction = source.row(CLOUD_FRACTION)
         yield replace(
@@ -226,21 +225,20 @@ def _shares(source: Layout, flags: Row, *, clouds: bool) -> Iterator[Row]:
             cell_methods=_cell_methods(fraction, "mean"),
             comment="Of the profiles whose value no quality bit rejects, weighted by shots where"
             " the weights of values are their variances, else as values. One of which only the"
-            " mean shows a cloud is cloudy. Missing where no such profile was examined."
-            f" {NO_STANDARD_NAME}",
+            " mean shows a cloud is cloudy. Missing where no such profile was examined.",
         )
 
 
 def _mean_rows(row: Row, weights: Weights, further: Sequence[str]) -> Iterator[Row]:
     """Yield the rows of the mean of a quantity, with further ancillary variables."""
     weighting, errors = f"Weights: {weights.description}.", _error_comment(row)
-    count, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
-    ancillaries = (spread, count, *further)
+    number, spread = f"{row.name}_observations", f"{row.name}_standard_deviation"
     yield replace(
         row,
         long_name=f"mean over time of {row.long_name}",
         cell_methods=_cell_methods(row, "mean"),
-        ancillaries=ancillaries,
+        ancillaries=(spread, number, *further),
+        errors=(),
         comment=" ".join(text for text in (row.comment, weighting, errors) if text),
     )
     yield replace(
@@ -252,20 +250,14 @@ def _mean_rows(row: Row, weights: Weights, further: Sequence[str]) -> Iterator[R
         valid_max=None,
         ancillaries=(),
         uncertain=False,
+        errors=(),
+        budget=None,
         error_kind=None,
         comment="Unweighted, over the values in the mean, with n - 1; missing for fewer than two"
-        f" values.{'' if row.standard_name else ' ' + NO_STANDARD_NAME}",
+        " values.",
     )
-    yield Row(
-        name=count,
-        dims=row.dims,
-        dtype="i4",
-        units="1",
-        standard_name="number_of_observations",
-        long_name=f"number of profiles in the mean of {row.name}",
-        coverage=Coverage.QUALITY,
-        valid_min=0.0,
-    )
+    words = f"number of profiles in the mean of {row.name}"
+    yield count(number, row.dims, words, coverage=Coverage.QUALITY)
 
 
 def _cell_methods(row: Row, method: str) -> str:
@@ -276,7 +268,7 @@ def _cell_methods(row: Row, method: str) -> str:
 
 def _interval_error(row: Row, name: str) -> Row:
     """Return the row of the systematic error that follows from the interval of a quantity."""
-    return replace(
+    error = replace(
         row,
         name=name,
         long_name=f"model (systematic) uncertainty of {row.long_name}",
@@ -285,11 +277,13 @@ def _interval_error(row: Row, name: str) -> Row:
         valid_min=0.0,
         ancillaries=(),
         uncertain=False,
+        errors=(),
         error_kind=ErrorKind.SYSTEMATIC,
         comment=f"Not part of {row.name}_standard_error: {row.name} times the relative systematic"
         f" error of extinction, sqrt(({row.name} / {row.lower_end} - 1)^2 -"
-        f" ({row.name}_standard_error / {row.name})^2) in each profile. {NO_STANDARD_NAME}",
+        f" ({row.name}_standard_error / {row.name})^2) in each profile.",
     )
+    return completed(error)
 
 
 def _averaged_error(row: Row, quantity: Row) -> Row:

@@ -280,7 +280,7 @@ def _rounded(row: Row, values: Values) -> Values:
     # A value too large for the type becomes infinite, and counts as missing.
     with np.errstate(over="ignore"):
         stored = values.astype(row.dtype)
-    return stored if row.significant_bits is None else bitround(stored, row.significant_bits)
+    return stored if row.bits is None else bitround(stored, row.bits)
 
 
 def bitround(values: Values, bits: int) -> Values:

@@ -126,7 +126,7 @@ def check_flags(row: Row, values: Values) -> None:
         raise ProductError(
             f"holds bits that this kind of product does not have: {places(foreign)}",
             field=row.name,
-            remedy="add them to products/KIND/flags.py",
+            remedy="add them to products/KIND/variables.py",
         )
 
 

@@ -1,8 +1,9 @@
-"""Describe the variables of a product: one `Row` a variable, one `Layout` a kind of product.
+"""Describe the variables of a product: one `Row` a quantity, one `Layout` a kind of product.
 
-The CF and ACDD attributes of a variable follow from its row, and the row of a standard error from
-that of its quantity. `lidarops/products/KIND/variables.py` holds the rows of a kind, where a
-variable gets its CF standard name, long name and comment; this module holds what all kinds share.
+The CF and ACDD attributes of a variable follow from its row, and the rows of all its errors from
+that of their quantity. `lidarops/products/KIND/variables.py` holds the rows of a kind, where a
+variable gets its CF standard name, long name and comment, `lidarops.netcdf.quantities` those that
+some kinds share; this module holds those of all: time, place, quality, counts, background.
 Standard names are those of the CF table v93. A quantity without an entry there has no standard
 name, because none is better than a wrong one (`cf111`, section 3.3).
 """
@@ -10,20 +11,19 @@ name, because none is better than a wrong one (`cf111`, section 3.3).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from enum import IntFlag, StrEnum
 from functools import cache, cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops import __version__
-from lidarops.errors import LidarOpsError, ProductError
+from lidarops.errors import ProductError
 from lidarops.flags import Flags, Severity
-from lidarops.kinds import flags_of, kind_of, kinds
+from lidarops.kinds import kind_of, kinds
 from lidarops.records import DetectionMode
-from lidarops.retrieve.air.reference_window import Rejection
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
 STANDARD_NAME_TABLE: Final = "CF Standard Name Table v93"
@@ -40,19 +40,6 @@ NO_STANDARD_NAME: Final = f"The {STANDARD_NAME_TABLE} has no name for this quant
 MEASURED_SHARES: Final = (
     "The results in the documentation state the share of such values in simulated scenes."
 )
-AEROSOL_EXTINCTION: Final = (
-    "volume_extinction_coefficient_of_radiative_flux_in_air_due_to_ambient_aerosol_particles"
-)
-AEROSOL_BACKSCATTER: Final = (
-    "volume_backwards_scattering_coefficient_of_radiative_flux_by_ranging_instrument_in_air_due_to"
-    "_ambient_aerosol_particles"
-)
-AEROSOL_LIDAR_RATIO: Final = (
-    "ratio_of_volume_extinction_coefficient_to_volume_backwards_scattering_coefficient_by_ranging"
-    "_instrument_in_air_due_to_ambient_aerosol_particles"
-)
-"""Standard names of what several kinds retrieve."""
-
 QUALITY_FLAG: Final = "quality_flag"
 USABLE: Final = "usable"
 FLAG_LAYOUT: Final = "lidarops_flag_layout"
@@ -79,6 +66,29 @@ class Coverage(StrEnum):
     COORDINATE = "coordinate"
 
 
+class Error(NamedTuple):
+    """An error of a quantity by one cause, which has a variable of its own.
+
+    Its name, dimensions and unit follow from the quantity, for whose name ``{quantity}`` stands.
+    """
+
+    cause: str
+    long_name: str
+    kind: ErrorKind = ErrorKind.SYSTEMATIC
+    comment: str = ""
+    part: bool = False
+    """Whether it is part of the standard error: ``<quantity>_error_<cause>``, and signed; else it
+    is separate: ``<quantity>_<cause>_error``."""
+    signed: bool = False
+    """Whether it is the change of the quantity, which may be negative."""
+    optional: bool = False
+    """Whether a product with the quantity may lack it. Such errors are no ancillary variables."""
+
+    def name(self, quantity: str) -> str:
+        """Return the name of the variable."""
+        return f"{quantity}_error_{self.cause}" if self.part else f"{quantity}_{self.cause}_error"
+
+
 @dataclass(frozen=True, slots=True)
 class ErrorBudget:
     """Division of a standard error into a part independent between profiles and shared parts.
@@ -99,31 +109,56 @@ class ErrorBudget:
     """How the standard error of a mean follows; empty where all profiles share the error."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+def divided(quantity: str, errors: tuple[Error, ...], comment: str) -> ErrorBudget:
+    """Return the budget of a quantity by those of its errors that are part of its standard error.
+
+    Parameters
+    ----------
+    quantity : str
+        Name of the variable.
+    errors : tuple of Error
+    comment : str
+        How the standard error of a mean follows.
+    """
+    random, shared = (
+        tuple(error.name(quantity) for error in errors if error.part and error.kind is kind)
+        for kind in (ErrorKind.RANDOM, ErrorKind.SYSTEMATIC)
+    )
+    return ErrorBudget(random, shared, comment=comment)
+
+
+@dataclass(frozen=True, slots=True)
 class Row:
-    """Description of one variable of a product."""
+    """Description of one variable of a product, and of its errors."""
 
     name: str
     dims: tuple[str, ...]
-    dtype: str
-    """numpy type code as stored; ``S1`` for text."""
-    long_name: str
-    coverage: Coverage
-    units: str | None = None
+    units: str | None
     """``{signal}`` stands for mV in analog detection and MHz in photon counting."""
+    long_name: str
+    coverage: Coverage = Coverage.PHYSICAL
+    comment: str | None = None
+    """Without standard name, `NO_STANDARD_NAME` is added; not to coordinates or an empty text."""
+    _: KW_ONLY
+    dtype: str = ""
+    """numpy type code as stored, ``S1`` for text; by default ``f8`` of coordinates, else ``f4``."""
     standard_name: str | None = None
     axis: str | None = None
     positive: str | None = None
     bounds: str | None = None
     """Name of the variable with the cell bounds; it has one more dimension and no attributes."""
     cell_methods: str | None = None
+    """By default the mean over time and range of measured quantities."""
     valid_min: float | None = None
     valid_max: float | None = None
     ancillaries: tuple[str, ...] = ()
-    significant_bits: int | None = None
+    """Besides the variables of its errors."""
+    bits: int | None = None
     """Bits of the mantissa that are stored; None stores all."""
     uncertain: bool = False
     """Whether the product also holds ``<name>_standard_error``."""
+    errors: tuple[Error, ...] = ()
+    """Further errors, with a variable each."""
     optional: bool = False
     """Whether a product may lack it."""
     follows_beam: bool = False
@@ -137,7 +172,7 @@ class Row:
     summary: bool = False
     """Whether it is `usable`, which is computed from the flags and never passed in."""
     error_kind: ErrorKind | None = None
-    """Kind of the error that the variable holds, or else of the variable's standard error."""
+    """Kind of the error that it holds, or of its standard error; both by default with a budget."""
     budget: ErrorBudget | None = None
     """How the standard error averages over time. None: by its kind, which is independent between
     profiles if random, else shared by all."""
@@ -147,31 +182,67 @@ class Row:
     value divided by the lower end is 1 + sqrt(r^2 + s^2)."""
     cf_role: str | None = None
     algorithm: str | None = None
-    comment: str | None = None
 
     def code(self, state: str) -> int:
         """Return the number by which a variable with `states` holds one of them."""
         return self.states.index(state)
 
-    def standard_error(self) -> Row:
-        """Return the row of this quantity's standard error."""
-        return replace(
-            self,
-            name=f"{self.name}_standard_error",
-            long_name=f"standard error of {self.long_name}",
-            coverage=Coverage.QUALITY,
-            standard_name=self.standard_name and f"{self.standard_name} standard_error",
-            cell_methods=None,
-            valid_min=0.0,
-            valid_max=None,
-            ancillaries=(),
-            significant_bits=self.significant_bits and _ERROR_BITS,
-            uncertain=False,
-            error_kind=self.error_kind or ErrorKind.RANDOM,
-            budget=None,
-            lower_end=None,
-            comment=None if self.standard_name else NO_STANDARD_NAME,
-        )
+
+def completed(row: Row) -> Row:
+    """Return a row with what follows from its other fields: type, cell methods, comment, error."""
+    coordinate = row.coverage is Coverage.COORDINATE
+    derived: dict[str, Any] = {"dtype": row.dtype or ("f8" if coordinate else "f4")}
+    known = row.standard_name or coordinate or row.comment == ""
+    if row.units and not known and NO_STANDARD_NAME not in (row.comment or ""):
+        derived["comment"] = f"{row.comment or ''} {NO_STANDARD_NAME}".strip()
+    if row.coverage is Coverage.PHYSICAL and row.cell_methods is None:
+        methods = (f"{dim}: mean" for dim in row.dims if dim in ("time", "range"))
+        derived["cell_methods"] = " ".join(methods)
+    if row.budget is not None and row.error_kind is None:
+        derived["error_kind"] = ErrorKind.BOTH
+    return replace(row, **derived)
+
+
+def _variables(row: Row) -> Iterator[Row]:
+    """Yield a row with all its ancillary variables, then the rows that follow from it.
+
+    These are its standard error, its further errors, and the summary of flags.
+    """
+    derived = [_error(row, error) for error in row.errors]
+    if row.uncertain:
+        random = _error(row, Error("standard", f"standard error of {row.long_name}"))
+        name = row.standard_name and f"{row.standard_name} standard_error"
+        comment = None if name else NO_STANDARD_NAME
+        kind = row.error_kind or ErrorKind.RANDOM
+        standard = replace(random, standard_name=name, comment=comment, error_kind=kind)
+        derived.insert(0, standard)
+    certain = (error.name for error in derived if row.optional or not error.optional)
+    ancillaries = (*certain, *row.ancillaries)
+    if QUALITY_FLAG in ancillaries:
+        place = ancillaries.index(QUALITY_FLAG) + 1
+        ancillaries = (*ancillaries[:place], USABLE, *ancillaries[place:])
+    yield replace(row, ancillaries=ancillaries)
+    yield from derived
+    if row.flags is not None:
+        yield usable(row.dims)
+
+
+def _error(row: Row, error: Error) -> Row:
+    """Return the row of one of the errors of a quantity."""
+    comment = f"{error.comment.format(quantity=row.name)} {NO_STANDARD_NAME}".strip()
+    return Row(
+        error.name(row.name),
+        row.dims,
+        row.units,
+        error.long_name.format(quantity=row.name),
+        Coverage.QUALITY,
+        comment,
+        dtype=row.dtype,
+        valid_min=None if error.part or error.signed else 0.0,
+        bits=row.bits and _ERROR_BITS,
+        optional=row.optional or error.optional,
+        error_kind=error.kind,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,8 +266,8 @@ class Layout:
 
     @cached_property
     def variables(self) -> tuple[Row, ...]:
-        """Data rows, each followed by its derived rows: standard error, summary of flags."""
-        return tuple(_with_derived(self.data))
+        """Data rows, each followed by the rows that follow from it: errors, summary of flags."""
+        return tuple(variable for row in self.data for variable in _variables(row))
 
     @property
     def flags(self) -> Flags:
@@ -215,7 +286,7 @@ class Layout:
     @property
     def rounded(self) -> bool:
         """Whether any variable is stored with a shortened mantissa."""
-        return any(row.significant_bits for row in self.variables)
+        return any(row.bits for row in self.variables)
 
     @cached_property
     def _rows(self) -> dict[str, Row]:
@@ -245,17 +316,11 @@ def layout_of(kind: str) -> Layout:
     Raises
     ------
     LidarOpsError
-        If there is no such kind, or its ``variables`` and ``flags`` state different bits.
+        If there is no such kind, or it has no ``variables``.
     """
     layout: Layout = kind_of(kind).part("variables", "LAYOUT")
-    if layout.flags != flags_of(kind):
-        package = kind_of(kind).package
-        raise LidarOpsError(
-            f"kind of product {kind!r}: quality_flag has the bits {layout.flags.layout!r}, not"
-            f" those of {package}.flags",
-            remedy=f"write quality(dims, FLAGS) in {package}.variables",
-        )
-    return layout
+    coordinates, data = (tuple(map(completed, rows)) for rows in (layout.coordinates, layout.data))
+    return replace(layout, coordinates=coordinates, data=data)
 
 
 def is_retrieved(kind: str) -> bool:
@@ -266,40 +331,20 @@ def is_retrieved(kind: str) -> bool:
     return kind not in kinds() or not layout_of(kind).processing_level.startswith("L1")
 
 
-def _with_derived(rows: tuple[Row, ...]) -> Iterator[Row]:
-    for row in rows:
-        ancillaries = tuple(_with_summary(row.ancillaries))
-        if row.uncertain:
-            error = row.standard_error()
-            yield replace(row, ancillaries=(error.name, *ancillaries))
-            yield error
-        else:
-            yield replace(row, ancillaries=ancillaries)
-        if row.flags is not None:
-            yield usable(row)
-
-
-def _with_summary(names: tuple[str, ...]) -> Iterator[str]:
-    for name in names:
-        yield name
-        if name == QUALITY_FLAG:
-            yield USABLE
-
-
-def usable(flags: Row) -> Row:
+def usable(dims: tuple[str, ...]) -> Row:
     """Return the row of ``usable``, which summarizes the bits of ``quality_flag``."""
     return Row(
-        name=USABLE,
-        dims=flags.dims,
+        USABLE,
+        dims,
+        "1",
+        "usability of the value, from the bits of quality_flag",
+        Coverage.QUALITY,
+        "do_not_use: quality_flag has a bit of severity reject. use_with_care: it has bits of"
+        " severity care only. good: no test failed. The comment of quality_flag states the severity"
+        " of each bit.",
         dtype="i1",
-        units="1",
         standard_name="aggregate_quality_flag",
-        long_name="usability of the value, from the bits of quality_flag",
-        coverage=Coverage.QUALITY,
         summary=True,
-        comment="do_not_use: quality_flag has a bit of severity reject. use_with_care: it has bits"
-        " of severity care only. good: no test failed. The comment of quality_flag states the"
-        " severity of each bit.",
     )
 
 
@@ -338,6 +383,7 @@ def attributes(
     """
     stored = np.dtype(row.dtype)
     limit = stored.type if stored.kind in "if" else None
+    filled = stored.kind == "f" and row.coverage is not Coverage.COORDINATE
     attrs: dict[str, Any] = {
         "standard_name": row.standard_name,
         "long_name": row.long_name,
@@ -354,12 +400,12 @@ def attributes(
         "cf_role": row.cf_role,
         "algorithm": row.algorithm,
         "implementation": row.algorithm and f"lidarops {__version__} (numpy)",
-        "_FillValue": FILL_VALUE if _has_fill(row) else None,
+        "_FillValue": FILL_VALUE if filled else None,
         "_Encoding": "utf-8" if stored.kind == "S" else None,
     }
-    if row.significant_bits is not None:
+    if row.bits is not None:
         attrs["quantization"] = QUANTIZATION.name
-        attrs["quantization_nsb"] = np.int32(row.significant_bits)
+        attrs["quantization_nsb"] = np.int32(row.bits)
     if row.error_kind is not None and not row.uncertain:
         attrs["error_kind"] = row.error_kind.value
     if row.summary:
@@ -373,19 +419,14 @@ def attributes(
     if row.states:
         attrs["flag_values"] = np.arange(len(row.states), dtype=stored)
         attrs["flag_meanings"] = " ".join(row.states)
-    attrs["comment"] = (
-        " ".join(text for text in (attrs.get("comment"), row.comment) if text) or None
-    )
+    texts = (attrs.get("comment"), row.comment)
+    attrs["comment"] = " ".join(text for text in texts if text) or None
     return {key: value for key, value in attrs.items() if value is not None}
 
 
 def units(row: Row, mode: DetectionMode) -> str | None:
     """Return the unit of a variable in a channel of the given mode."""
     return row.units and row.units.format(signal=_SIGNAL_UNITS[mode])
-
-
-def _has_fill(row: Row) -> bool:
-    return np.dtype(row.dtype).kind == "f" and row.coverage is not Coverage.COORDINATE
 
 
 def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
@@ -400,149 +441,139 @@ def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
     }
 
 
-TIME = Row(
-    name="time",
-    dims=("time",),
-    dtype="f8",
-    units=TIME_UNITS,
+TIME: Final = Row(
+    "time",
+    ("time",),
+    TIME_UNITS,
+    "midpoint of the averaging interval, UTC",
+    Coverage.COORDINATE,
     standard_name="time",
-    long_name="midpoint of the averaging interval, UTC",
-    coverage=Coverage.COORDINATE,
     axis="T",
     bounds="time_bnds",
 )
-RANGE = Row(
-    name="range",
-    dims=("range",),
-    dtype="f8",
-    units="m",
-    long_name="distance from the lidar along the beam, centre of the range bin",
-    coverage=Coverage.COORDINATE,
+RANGE: Final = Row(
+    "range",
+    ("range",),
+    "m",
+    "distance from the lidar along the beam, centre of the range bin",
+    Coverage.COORDINATE,
     bounds="range_bnds",
 )
-SECTION = Row(
-    name="section",
-    dims=("section",),
-    dtype="i4",
-    units="1",
-    long_name="number of the range section",
-    coverage=Coverage.COORDINATE,
-)
-SECTION_RANGE = Row(
-    name="section_range",
-    dims=("section",),
-    dtype="f8",
-    units="m",
-    long_name="distance from the lidar along the beam, midpoint of the range section",
-    coverage=Coverage.COORDINATE,
-    bounds="section_bounds",
-)
+
+
+def numbered(name: str, long_name: str, comment: str | None = None, **more: Any) -> Row:
+    """Return the row of the coordinate of a dimension whose places have numbers."""
+    coverage = Coverage.COORDINATE
+    return replace(Row(name, (name,), "1", long_name, coverage, comment, dtype="i4"), **more)
 
 
 def altitude(along: str, bounds: str | None = None) -> Row:
     """Return the row of the altitude of values along a dimension."""
     return Row(
-        name="altitude",
-        dims=(along,),
+        "altitude",
+        (along,),
+        "m",
+        "altitude of the sounded air above the geoid",
+        Coverage.COORDINATE,
+        "Station altitude + range x cos(zenith angle), for a straight beam over a flat Earth."
+        " Curvature of the Earth adds (range x sin(zenith angle))^2 / 12742 km.",
         dtype="f4",
-        units="m",
         standard_name="altitude",
-        long_name="altitude of the sounded air above the geoid",
-        coverage=Coverage.COORDINATE,
         axis="Z",
         positive="up",
         bounds=bounds,
         follows_beam=True,
-        comment="Station altitude + range x cos(zenith angle), for a straight beam over a flat"
-        " Earth. Curvature of the Earth adds (range x sin(zenith angle))^2 / 12742 km.",
     )
 
 
-PLACE = (
+PLACE: Final = (
     Row(
-        name="zenith_angle",
-        dims=(),
-        dtype="f8",
-        units="degree",
+        "zenith_angle",
+        (),
+        "degree",
+        "zenith angle of the beam, 0 = up",
+        Coverage.COORDINATE,
         standard_name="zenith_angle",
-        long_name="zenith angle of the beam, 0 = up",
-        coverage=Coverage.COORDINATE,
         valid_min=0.0,
         valid_max=180.0,
         follows_beam=True,
     ),
     Row(
-        name="azimuth",
-        dims=(),
-        dtype="f8",
-        units="degree",
+        "azimuth",
+        (),
+        "degree",
+        "azimuth of the beam, clockwise from north",
+        Coverage.COORDINATE,
         standard_name="direction_of_radial_vector_away_from_instrument",
-        long_name="azimuth of the beam, clockwise from north",
-        coverage=Coverage.COORDINATE,
         follows_beam=True,
     ),
     Row(
-        name="latitude",
-        dims=(),
-        dtype="f8",
-        units="degrees_north",
+        "latitude",
+        (),
+        "degrees_north",
+        "latitude of the station",
+        Coverage.COORDINATE,
         standard_name="latitude",
-        long_name="latitude of the station",
-        coverage=Coverage.COORDINATE,
         valid_min=-90.0,
         valid_max=90.0,
     ),
     Row(
-        name="longitude",
-        dims=(),
-        dtype="f8",
-        units="degrees_east",
+        "longitude",
+        (),
+        "degrees_east",
+        "longitude of the station",
+        Coverage.COORDINATE,
         standard_name="longitude",
-        long_name="longitude of the station",
-        coverage=Coverage.COORDINATE,
         valid_min=-180.0,
         valid_max=180.0,
     ),
     Row(
-        name="station_altitude",
-        dims=(),
-        dtype="f8",
-        units="m",
+        "station_altitude",
+        (),
+        "m",
+        "altitude of the station above the geoid",
+        Coverage.COORDINATE,
         standard_name="surface_altitude",
-        long_name="altitude of the station above the geoid",
-        coverage=Coverage.COORDINATE,
     ),
     Row(
-        name="wavelength",
-        dims=(),
-        dtype="f8",
-        units="nm",
+        "wavelength",
+        (),
+        "nm",
+        "wavelength of the channel",
+        Coverage.COORDINATE,
         standard_name="radiation_wavelength",
-        long_name="wavelength of the channel",
-        coverage=Coverage.COORDINATE,
         valid_min=0.0,
     ),
 )
-SOUNDED = tuple(
-    Row(
+
+
+def place(name: str, /, **changes: Any) -> Row:
+    """Return the row of a part of `PLACE`, with some fields changed."""
+    return replace(completed(next(row for row in PLACE if row.name == name)), **changes)
+
+
+SOUNDED: Final = tuple(
+    place(
+        name,
         name=f"bin_{name}",
-        dims=(),
-        dtype="f4",
-        units=units,
-        standard_name=name,
         long_name=f"{name} of the sounded air",
-        coverage=Coverage.COORDINATE,
-        valid_min=-limit,
-        valid_max=limit,
+        dtype="f4",
         follows_beam=True,
         comment="For a straight beam, on the WGS 84 ellipsoid.",
     )
-    for name, units, limit in (
-        ("latitude", "degrees_north", 90.0),
-        ("longitude", "degrees_east", 180.0),
-    )
+    for name in ("latitude", "longitude")
 )
 """Position of the sounded air along a slant beam of known azimuth; `coordinates` sets `dims`."""
+
+
+def coordinates(along: tuple[Row, ...], altitude: Row) -> tuple[Row, ...]:
+    """Return the coordinates of a kind of product: time, along the beam, position."""
+    sounded = (replace(row, dims=altitude.dims) for row in SOUNDED)
+    return (TIME, *along, altitude, *sounded, *PLACE)
+
+
+ALONG_BEAM: Final = coordinates((RANGE,), altitude("range"))
+"""Coordinates of kinds whose values are those of range bins."""
 
 
 def deployment(row: Row) -> Row:
@@ -560,169 +591,94 @@ def deployment(row: Row) -> Row:
     )
 
 
-_STATION = Row(
-    name="station",
-    dims=("station_strlen",),
+_STATION: Final = Row(
+    "station",
+    ("station_strlen",),
+    None,
+    "name of the station, or of the network of lidars",
+    Coverage.REFERENCE,
     dtype="S1",
     standard_name="platform_name",
-    long_name="name of the station, or of the network of lidars",
-    coverage=Coverage.REFERENCE,
 )
 QUANTIZATION: Final = Row(
-    name="quantization_info",
-    dims=(),
+    "quantization_info",
+    (),
+    None,
+    "rounding of values to fewer significant bits",
+    Coverage.REFERENCE,
     dtype="i4",
-    long_name="rounding of values to fewer significant bits",
-    coverage=Coverage.REFERENCE,
     algorithm="bitround",
 )
 """Container variable of CF-1.12, section 8.4; its value has no meaning."""
 PROVENANCE: Final = Row(
-    name="provenance",
-    dims=("provenance_strlen",),
+    "provenance",
+    ("provenance_strlen",),
+    None,
+    "inputs, plan, settings and software of this product as W3C PROV-JSON",
+    Coverage.REFERENCE,
     dtype="S1",
-    long_name="inputs, plan, settings and software of this product as W3C PROV-JSON",
-    coverage=Coverage.REFERENCE,
 )
 
 
-SUBTRACTED_BACKGROUND: Final = Row(
-    name="background",
-    dims=("time",),
-    dtype="f4",
-    units="{signal}",
-    long_name="subtracted background: sky light, dark current and offset",
-    coverage=Coverage.PHYSICAL,
-    cell_methods="time: mean",
-    ancillaries=("shots",),
-    uncertain=True,
-    comment="Not calibrated. Missing where a glued signal is analog alone, less its unknown offset."
-    f" {NO_STANDARD_NAME}",
-)
-"""Background that was subtracted from the signal of a channel."""
-
-GLUING: Final = (
-    Row(
-        name="glue_lag",
-        dims=("time",),
-        dtype="f4",
-        units="1",
-        long_name="lag of the analog record behind the photon-counting record in range bins",
-        coverage=Coverage.AUXILIARY,
-        optional=True,
-        uncertain=True,
-        comment="The analog signal is shifted by this lag before gluing. The standard error is"
-        " missing where the lag is not estimated from the noise common to both records, or where"
-        f" their correlation is not significant. {NO_STANDARD_NAME}",
-    ),
-    Row(
-        name="glue_slope",
-        dims=("time",),
-        dtype="f4",
-        units="MHz mV-1",
-        long_name="slope of the photon-counting rate over the analog signal in the gluing window",
-        coverage=Coverage.AUXILIARY,
-        optional=True,
-        uncertain=True,
-        comment="Of analog alone that of the scene. Missing where none is known or used."
-        f" {NO_STANDARD_NAME}",
-    ),
-    *(
-        Row(
-            name=f"glue_{end}",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            long_name=f"range at which the gluing window {verb}",
-            coverage=Coverage.AUXILIARY,
-            optional=True,
-            comment="The glued signal is analog at shorter and photon counting at longer ranges."
-            " Both ends are that of the bins for analog alone, and 0 for photon counting alone."
-            f" {NO_STANDARD_NAME}",
-        )
-        for end, verb in (("bottom", "begins"), ("top", "ends"))
-    ),
-)
-"""Variables of a channel that is glued from an analog and a photon-counting one."""
+def station(*, profiles: bool) -> Row:
+    """Return the row of the station's name; with `profiles` it identifies the time series."""
+    return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION
 
 
-MOLECULAR_BACKSCATTER: Final = Row(
-    name="molecular_backscatter",
-    dims=("range",),
-    dtype="f4",
-    units="m-1 sr-1",
-    long_name="backscatter coefficient of molecules",
-    coverage=Coverage.REFERENCE,
-    comment=f"Rayleigh scattering including rotational Raman lines. {NO_STANDARD_NAME}",
-)
-
-REFERENCE_WINDOW: Final = (
-    *(
-        Row(
-            name=f"reference_{end}{ending}",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            long_name=f"{place} at which the reference window {verb}",
-            coverage=Coverage.AUXILIARY,
-            comment=f"Missing where no window passed the tests. {NO_STANDARD_NAME}",
-        )
-        for ending, place in (("", "range"), ("_altitude", "altitude above the geoid"))
-        for end, verb in (("bottom", "begins"), ("top", "ends"))
-    ),
-    Row(
-        name="reference_scattering_ratio",
-        dims=(),
-        dtype="f4",
-        units="1",
-        long_name="assumed ratio of backscatter of particles and molecules to that of molecules in"
-        " the reference window",
-        coverage=Coverage.REFERENCE,
-        uncertain=True,
-        error_kind=ErrorKind.SYSTEMATIC,
-        comment="Set by the campaign, as its standard error is: the value by which profiles are"
-        f" calibrated. {NO_STANDARD_NAME}",
-    ),
-    Row(
-        name="reference_detection_limit",
-        dims=("time",),
-        dtype="f4",
-        units="1",
-        long_name="least ratio of backscatter of particles to that of molecules that is"
-        " detected in the reference window with a probability of 0.95",
-        coverage=Coverage.AUXILIARY,
-        comment="By comparison with other windows. Fewer particles may remain undetected:"
-        " aerosol_backscatter_error_reference includes the noise of this comparison, and the ratio"
-        " of the window to air in excess of the lowest ratio. Missing where no window passed the"
-        f" tests, or none beside it is comparable. {NO_STANDARD_NAME}",
-    ),
-)
-"""Where a profile was compared with clean air, and how clean the air is taken to be."""
-
-
-def _coded(name: str, long_name: str, states: tuple[str, ...], comment: str) -> Row:
-    """Return the row of a number that stands for one of several states of the whole product."""
+def quality(dims: tuple[str, ...], flags: Flags) -> Row:
+    """Return the row of the quality bits of a kind of product."""
+    words = "quality bits of the value, one for each failed test"
     return Row(
-        name=name,
-        dims=(),
-        dtype="i1",
-        units="1",
-        long_name=long_name,
-        coverage=Coverage.AUXILIARY,
-        states=states,
-        comment=f"{comment} {NO_STANDARD_NAME}",
+        QUALITY_FLAG,
+        dims,
+        "1",
+        words,
+        Coverage.QUALITY,
+        dtype="i4",
+        standard_name="quality_flag",
+        flags=flags,
     )
 
 
-MOLECULAR_SOURCE: Final = _coded(
+def count(name: str, dims: tuple[str, ...], long_name: str, **more: Any) -> Row:
+    """Return the row of a number of things, such as of profiles in a mean."""
+    row = Row(
+        name,
+        dims,
+        "1",
+        long_name,
+        Coverage.AUXILIARY,
+        dtype="i4",
+        standard_name="number_of_observations",
+        valid_min=0.0,
+    )
+    return replace(row, **more)
+
+
+def shots(*, of: str) -> Row:
+    """Return the row of the number of laser shots."""
+    words = f"number of laser shots of {of}"
+    return count("shots", ("time",), words, cell_methods="time: sum")
+
+
+def coded(name: str, long_name: str, states: tuple[str, ...], comment: str) -> Row:
+    """Return the row of a number that stands for one of several states of the whole product."""
+    return Row(name, (), "1", long_name, Coverage.AUXILIARY, comment, dtype="i1", states=states)
+
+
+def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
+    """Return the row of the method by which a product was retrieved."""
+    return coded("retrieval_method", "method of the retrieval", states, comment)
+
+
+MOLECULAR_SOURCE: Final = coded(
     "molecular_source",
     "source of pressure and temperature of the molecular atmosphere",
     ("standard_atmosphere", "sounding"),
     "standard_atmosphere: US Standard Atmosphere 1976. sounding: the file of a sounding or model"
     " that the campaign gives; provenance names it.",
 )
-
-BACKGROUND_METHOD: Final = _coded(
+BACKGROUND_METHOD: Final = coded(
     "background_method",
     "method by which the background is estimated",
     ("tail_mean", "cubic", "known_shape"),
@@ -732,96 +688,57 @@ BACKGROUND_METHOD: Final = _coded(
     " trace in that fit: backgrounds in simulated haze with a scale height of 3 km deviate by more"
     f" than 4 standard errors. {MEASURED_SHARES}",
 )
-
-AVERAGED_PROFILES: Final = Row(
-    name="profiles",
-    dims=("time",),
-    dtype="i4",
-    units="1",
-    standard_name="number_of_observations",
-    long_name="number of raw profiles in the mean",
-    coverage=Coverage.AUXILIARY,
-    cell_methods="time: sum",
-    valid_min=0.0,
+SUBTRACTED_BACKGROUND: Final = Row(
+    "background",
+    ("time",),
+    "{signal}",
+    "subtracted background: sky light, dark current and offset",
+    comment="Not calibrated. Missing where a glued signal is analog alone, less its unknown"
+    " offset.",
+    ancillaries=("shots",),
+    uncertain=True,
 )
+"""Background that was subtracted from the signal of a channel."""
 
-LEFT_OUT_PROFILES: Final = Row(
-    name="profiles_left_out",
-    dims=("time",),
-    dtype="i4",
-    units="1",
-    standard_name="number_of_observations",
-    long_name="number of raw profiles that are left out of the mean as outlying",
-    coverage=Coverage.AUXILIARY,
-    cell_methods="time: sum",
-    valid_min=0.0,
-    comment="Profiles are left out where their signal, in any channel, exceeds that of all others"
-    " of the interval at some range by more than the contrast of a cloud and noise allow, or lies"
-    " below zero unlike that of all others, if they are at most a fifth of the interval: a"
-    " short cloud, a bird, an aircraft, interference.",
+ENDS: Final = (("bottom", "begins"), ("top", "ends"))
+GLUING: Final = (
+    Row(
+        "glue_lag",
+        ("time",),
+        "1",
+        "lag of the analog record behind the photon-counting record in range bins",
+        Coverage.AUXILIARY,
+        "The analog signal is shifted by this lag before gluing. The standard error is missing"
+        " where the lag is not estimated from the noise common to both records, or where their"
+        " correlation is not significant.",
+        optional=True,
+        uncertain=True,
+    ),
+    Row(
+        "glue_slope",
+        ("time",),
+        "MHz mV-1",
+        "slope of the photon-counting rate over the analog signal in the gluing window",
+        Coverage.AUXILIARY,
+        "Of analog alone that of the scene. Missing where none is known or used.",
+        optional=True,
+        uncertain=True,
+    ),
+    *(
+        Row(
+            f"glue_{end}",
+            ("time",),
+            "m",
+            f"range at which the gluing window {verb}",
+            Coverage.AUXILIARY,
+            "The glued signal is analog at shorter and photon counting at longer ranges. Both ends"
+            " are that of the bins for analog alone, and 0 for photon counting alone.",
+            optional=True,
+        )
+        for end, verb in ENDS
+    ),
 )
-
-
-def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
-    """Return the row of the method by which a product was retrieved."""
-    return _coded("retrieval_method", "method of the retrieval", states, comment)
-
-
-def reference_rejections(comment: str) -> Row:
-    """Return the row of the reasons for which candidates of the reference window failed."""
-    return Row(
-        name="reference_rejections",
-        dims=("time",),
-        dtype="i4",
-        units="1",
-        standard_name="status_flag",
-        long_name="reasons for which candidates of the reference window were rejected",
-        coverage=Coverage.AUXILIARY,
-        reasons=Rejection,
-        comment="Of all candidates together; where none passed, no_reference is raised in"
-        f" quality_flag. {comment}",
-    )
-
-
-def shots(*, of: str) -> Row:
-    """Return the row of the number of laser shots."""
-    return Row(
-        name="shots",
-        dims=("time",),
-        dtype="i4",
-        units="1",
-        standard_name="number_of_observations",
-        long_name=f"number of laser shots of {of}",
-        coverage=Coverage.AUXILIARY,
-        cell_methods="time: sum",
-        valid_min=0.0,
-    )
-
-
-def quality(dims: tuple[str, ...], flags: Flags) -> Row:
-    """Return the row of the quality bits of a kind of product."""
-    return Row(
-        name=QUALITY_FLAG,
-        dims=dims,
-        dtype="i4",
-        units="1",
-        standard_name="quality_flag",
-        long_name="quality bits of the value, one for each failed test",
-        coverage=Coverage.QUALITY,
-        flags=flags,
-    )
-
-
-def coordinates(along: tuple[Row, ...], altitude: Row) -> tuple[Row, ...]:
-    """Return the coordinates of a kind of product: time, along the beam, position."""
-    sounded = (replace(row, dims=altitude.dims) for row in SOUNDED)
-    return (TIME, *along, altitude, *sounded, *PLACE)
-
-
-def station(*, profiles: bool) -> Row:
-    """Return the row of the station's name; with `profiles` it identifies the time series."""
-    return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION
-
+"""Variables of a channel that is glued from an analog and a photon-counting one."""
 
 _SYSTEMATIC: Final = ("dead_time_error", "baseline_error")
 """Of the signal; those of other causes are limits, or part of the standard error."""

@@ -22,11 +22,11 @@ _EVERY_PRODUCT: Final = (
 """Modules that every product passes through."""
 _CATALOGUES: Final = "lidarops.catalog.headers"
 """Module that makes an entry of the catalog from the header of a raw file."""
-_OF_KIND: Final = ("settings", "retrieval", "variables", "flags")
+_OF_KIND: Final = ("settings", "retrieval", "variables")
 """Modules of a kind that make its products, as far as it has them."""
 _PAGES: Final = "lidarops.site.build"
 """Module that makes the pages of products."""
-_ON_PAGES: Final = ("figures", "flags", "variables")
+_ON_PAGES: Final = ("figures", "variables")
 """Modules of a kind that decide what its pages hold, as far as it has them."""
 _APART: Final = (
     # Fetches raw files, whose contents each product records.

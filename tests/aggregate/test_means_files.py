@@ -480,6 +480,6 @@ def test_every_systematic_error_is_averaged(kind: str):
     source = layout_of(kind)
     covered = {name for row in averaged(kind) for name in systematic(kind, row.name)}
     covered |= {name for row in averaged(kind) if row.budget for name in row.budget.shared}
-    for row in source.data:
+    for row in source.variables:
         if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:
             assert row.name in covered, row.name

@@ -16,17 +16,17 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 88_250,
-    "lines of code alone": 58_200,
-    "lines without bench": 78_450,
-    "modules": 440,
-    "dataclasses": 401,
-    "lines of dataclasses": 9_600,
+    "lines": 87_950,
+    "lines of code alone": 57_850,
+    "lines without bench": 78_150,
+    "modules": 433,
+    "dataclasses": 400,
+    "lines of dataclasses": 9_550,
     "tuning numbers": 254,
     "tuning numbers that are assumed": 87,
     "copied thresholds": 1,
     "most parameters": 24,
-    "lines of the largest package": 9_900,
+    "lines of the largest package": 9_850,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 94, "functions": 845, "changes": 442},

@@ -8,8 +8,8 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import lidar_ratio_profile
 from lidarops.flags import Quality, rejecting
-from lidarops.products.raman.flags import FLAGS
 from lidarops.products.raman.settings import RamanReferenceSettings
+from lidarops.products.raman.variables import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic.labeled import invert_elastic

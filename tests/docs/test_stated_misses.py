@@ -60,7 +60,7 @@ FLAGGED = {
 def test_comments_name_what_no_flag_shows(place: tuple[str, str, str]) -> None:
     kind, variable, words = STATED[place]
     layout = kinds()[kind].part("variables", "LAYOUT")
-    comment = ({row.name: row.comment for row in layout.data} | {"": layout.comment})[variable]
+    comment = ({row.name: row.comment for row in layout.variables} | {"": layout.comment})[variable]
     assert words in comment
     assert variable == "background" or MEASURED_SHARES in comment
 

@@ -57,7 +57,7 @@ def test_numbers_are_preserved(kind: str):
             continue
         if row.summary:
             continue
-        bits = 23 if row.significant_bits is None else row.significant_bits
+        bits = 23 if row.bits is None else row.bits
         np.testing.assert_allclose(
             product[row.name].to_numpy().astype(float),
             data[row.name].to_numpy().astype(float),

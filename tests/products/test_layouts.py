@@ -301,9 +301,9 @@ def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
 
 
 def test_retrieved_quantities_keep_all_their_bits_and_signals_13():
-    bits = {row.name: row.significant_bits for row in layout_of("signal").variables}
+    bits = {row.name: row.bits for row in layout_of("signal").variables}
     assert bits["signal"] == 13
-    assert all(row.significant_bits is None for row in layout_of("homogeneous").variables)
+    assert all(row.bits is None for row in layout_of("homogeneous").variables)
 
 
 def test_unknown_row_is_refused_with_the_choices():

@@ -36,7 +36,7 @@ KIND = Kind("smooth", "Smoothed extinction", __name__, ChannelProduct, rank=25)
 """
 FLAGS = """
 from lidarops.flags import FIRST_OWN, FlagBit, Flags, Quality, Severity
-from lidarops.products.homogeneous.flags import FLAGS as OTHER
+from lidarops.products.homogeneous.variables import FLAGS as OTHER
 
 
 class SmoothQuality(FlagBit):

@@ -1,120 +1,94 @@
-"""The variables of the ``elastic`` product."""
+"""The variables and quality bits of the ``elastic`` product."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
-from lidarops.netcdf.cloud_rows import CLOUDS
-from lidarops.netcdf.variables import (
-    AEROSOL_BACKSCATTER,
-    AEROSOL_EXTINCTION,
+from lidarops.flags import SIGNAL_BITS, Flags
+from lidarops.netcdf.quantities import (
     AEROSOL_LIDAR_RATIO,
-    AVERAGED_PROFILES,
+    AVERAGED,
+    BINS,
+    CLOUDS,
+    MOLECULAR_BACKSCATTER,
+    SUM_OF_SQUARES,
+    aerosol_backscatter,
+    aerosol_extinction,
+    mean_value,
+    reference_window,
+)
+from lidarops.netcdf.variables import (
+    ALONG_BEAM,
     BACKGROUND_METHOD,
     GLUING,
-    LEFT_OUT_PROFILES,
     MEASURED_SHARES,
-    MOLECULAR_BACKSCATTER,
     MOLECULAR_SOURCE,
-    NO_STANDARD_NAME,
-    RANGE,
-    REFERENCE_WINDOW,
     STANDARD_NAME_TABLE,
     SUBTRACTED_BACKGROUND,
     Coverage,
-    ErrorBudget,
+    Error,
     ErrorKind,
     Layout,
     Row,
-    altitude,
-    coordinates,
+    divided,
     quality,
-    reference_rejections,
-    shots,
 )
-from lidarops.products.elastic.flags import FLAGS
+from lidarops.retrieve.elastic.flags import ElasticQuality
 
-_BINS: Final = ("time", "range")
-_BITS: Final = 12
-"""Significant bits of a retrieved value: 1.2e-4 of it."""
-_BUDGET: Final = {
-    "noise": (
-        "the signal noise",
-        ErrorKind.RANDOM,
-        "Random: independent from profile to profile.",
-    ),
-    "background": (
-        "the background",
-        ErrorKind.RANDOM,
-        "Random in time, but common to all ranges of a profile.",
-    ),
-    "reference": (
-        "the reference value",
-        ErrorKind.SYSTEMATIC,
-        "Systematic: from the aerosol assumed in the reference window and the noise there.",
-    ),
-    "lidar_ratio": (
-        "the lidar ratio",
-        ErrorKind.SYSTEMATIC,
-        "Systematic: from the assumed lidar ratio.",
-    ),
-    "molecular": (
-        "the molecular backscatter",
-        ErrorKind.SYSTEMATIC,
-        "Systematic: from the molecular atmosphere.",
-    ),
-    "dead_time": (
-        "the dead time",
-        ErrorKind.SYSTEMATIC,
-        "Systematic: from the dead time of photon counting; 0 for analog signals.",
-    ),
-    "baseline": (
-        "the baseline",
-        ErrorKind.SYSTEMATIC,
-        "Systematic: from the baseline of analog signals; 0 for photon counting.",
-    ),
+FLAGS: Final = Flags(kind="elastic", version=3, bits=(*SIGNAL_BITS, *ElasticQuality))
+"""Published places are in `tests/products/test_flags.py`."""
+
+_BY_CAUSE: Final = {
+    ErrorKind.RANDOM: {
+        "noise": ("signal noise", "Random: independent from profile to profile."),
+        "background": (
+            "background",
+            "Random in time, but common to all ranges of a profile.",
+        ),
+    },
+    ErrorKind.SYSTEMATIC: {
+        "reference": (
+            "reference value",
+            "Systematic: from the aerosol assumed in the reference window and the noise there.",
+        ),
+        "lidar_ratio": ("lidar ratio", "Systematic: from the assumed lidar ratio."),
+        "molecular": ("molecular backscatter", "Systematic: from the molecular atmosphere."),
+        "dead_time": (
+            "dead time",
+            "Systematic: from the dead time of photon counting; 0 for analog signals.",
+        ),
+        "baseline": (
+            "baseline",
+            "Systematic: from the baseline of analog signals; 0 for photon counting.",
+        ),
+    },
 }
-"""Source of error -> its name in texts, its kind and a comment, in the order of
-`lidarops.retrieve.elastic.inversion.ErrorBudget`."""
-
-
-def _error_budget() -> Iterator[Row]:
-    """Yield the rows of the error budget of backscatter."""
-    for source, (words, kind, comment) in _BUDGET.items():
-        yield Row(
-            name=f"aerosol_backscatter_error_{source}",
-            dims=_BINS,
-            dtype="f4",
-            units="m-1 sr-1",
-            long_name=f"error of backscatter for one standard error of {words}",
-            coverage=Coverage.QUALITY,
-            significant_bits=8,
-            error_kind=kind,
-            comment=f"{comment} aerosol_backscatter_standard_error is the root of the sum of"
-            f" squares of the error budget. {NO_STANDARD_NAME}",
-        )
+"""In the order of `lidarops.retrieve.elastic.inversion.ErrorBudget`."""
+_ERRORS: Final = tuple(
+    Error(
+        cause,
+        f"error of backscatter for one standard error of the {words}",
+        kind,
+        f"{comment} {SUM_OF_SQUARES}",
+        part=True,
+    )
+    for kind, causes in _BY_CAUSE.items()
+    for cause, (words, comment) in causes.items()
+)
+_BUDGET: Final = divided(
+    "aerosol_backscatter",
+    _ERRORS,
+    "Errors from noise and background are independent between profiles. Errors from reference,"
+    " lidar ratio, molecules and dead time are assumed to be shared by all profiles, so that they"
+    " are averaged and do not decrease with the number of profiles.",
+)
 
 
 def sources(kind: ErrorKind) -> tuple[str, ...]:
     """Return the sources of error of this kind, fields of the error budget of the inversion."""
-    return tuple(source for source, (_, of_source, _) in _BUDGET.items() if of_source is kind)
+    return tuple(_BY_CAUSE[kind])
 
-
-def _terms(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the variables of the error budget of these sources."""
-    return tuple(f"aerosol_backscatter_error_{source}" for source in names)
-
-
-_BUDGET_TERMS: Final = _terms(_BUDGET)
-_SHARED: Final = _terms(sources(ErrorKind.SYSTEMATIC))
-_MEANS: Final = ErrorBudget(
-    random=_terms(sources(ErrorKind.RANDOM)),
-    comment="Errors from noise and background are independent between profiles. Errors from"
-    " reference, lidar ratio, molecules and dead time are assumed to be shared by all profiles, so"
-    " that they are averaged and do not decrease with the number of profiles.",
-)
 
 LAYOUT: Final = Layout(
     title="Aerosol backscatter and extinction from elastic signals",
@@ -143,116 +117,64 @@ LAYOUT: Final = Layout(
     " bin deviates from theirs by more than noise explains.",
     sampled="range",
     weighed=("aerosol_backscatter",),
-    coordinates=coordinates((RANGE,), altitude("range")),
+    coordinates=ALONG_BEAM,
     data=(
-        Row(
-            name="aerosol_backscatter",
-            dims=_BINS,
-            dtype="f4",
-            units="m-1 sr-1",
-            standard_name=AEROSOL_BACKSCATTER,
-            long_name="backscatter coefficient of aerosol particles",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean range: mean",
-            ancillaries=(*_BUDGET_TERMS, "quality_flag", "profiles", "shots"),
-            significant_bits=_BITS,
-            uncertain=True,
-            error_kind=ErrorKind.BOTH,
-            budget=replace(_MEANS, shared=_SHARED),
-        ),
-        *_error_budget(),
-        Row(
-            name="aerosol_extinction",
-            dims=_BINS,
-            dtype="f4",
-            units="m-1",
-            standard_name=AEROSOL_EXTINCTION,
-            long_name="extinction coefficient of aerosol particles",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean range: mean",
+        aerosol_backscatter(errors=_ERRORS, budget=_BUDGET),
+        aerosol_extinction(
+            "aerosol_backscatter times lidar_ratio.",
             # Readers do not follow the ancillaries of an ancillary: list the error here too.
-            ancillaries=(
-                "lidar_ratio",
-                "lidar_ratio_standard_error",
-                "quality_flag",
-                "profiles",
-                "shots",
-            ),
-            significant_bits=_BITS,
-            uncertain=True,
-            error_kind=ErrorKind.BOTH,
-            budget=replace(_MEANS, times="lidar_ratio"),
-            comment="aerosol_backscatter times lidar_ratio.",
+            ("lidar_ratio", "lidar_ratio_standard_error"),
+            budget=replace(_BUDGET, shared=(), times="lidar_ratio"),
         ),
-        Row(
-            name="scattering_ratio",
-            dims=_BINS,
-            dtype="f4",
-            units="1",
-            long_name="ratio of backscatter of particles and molecules to that of molecules",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean range: mean",
-            ancillaries=("quality_flag", "profiles", "shots"),
-            significant_bits=_BITS,
-            uncertain=True,
-            error_kind=ErrorKind.BOTH,
-            budget=replace(_MEANS, over="molecular_backscatter"),
-            comment="Free of attenuation, unlike backscattering_ratio_in_air of the"
-            f" {STANDARD_NAME_TABLE}. {NO_STANDARD_NAME}",
+        mean_value(
+            "scattering_ratio",
+            "1",
+            "ratio of backscatter of particles and molecules to that of molecules",
+            "Free of attenuation, unlike backscattering_ratio_in_air of the"
+            f" {STANDARD_NAME_TABLE}.",
+            budget=replace(_BUDGET, shared=(), over="molecular_backscatter"),
         ),
-        Row(
-            name="attenuated_backscatter",
-            dims=_BINS,
-            dtype="f4",
-            units="m-1 sr-1",
+        mean_value(
+            "attenuated_backscatter",
+            "m-1 sr-1",
+            "attenuated backscatter coefficient of particles and molecules",
+            "Calibrated in the reference window.",
             standard_name="volume_attenuated_backwards_scattering_coefficient_of_radiative_flux"
             "_in_air",
-            long_name="attenuated backscatter coefficient of particles and molecules",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean range: mean",
-            ancillaries=("quality_flag", "profiles", "shots"),
-            significant_bits=_BITS,
-            uncertain=True,
             # Noise of the calibration and noise of the bins are not stated separately.
             error_kind=ErrorKind.BOTH,
-            comment="Calibrated in the reference window.",
         ),
         Row(
-            name="vertical_resolution",
-            dims=(),
-            dtype="f4",
-            units="m",
-            long_name="effective resolution of all profiles along the beam",
-            coverage=Coverage.AUXILIARY,
-            comment=f"The width of a range bin: profiles are not smoothed. {NO_STANDARD_NAME}",
+            "vertical_resolution",
+            (),
+            "m",
+            "effective resolution of all profiles along the beam",
+            Coverage.AUXILIARY,
+            "The width of a range bin: profiles are not smoothed.",
         ),
         MOLECULAR_SOURCE,
         MOLECULAR_BACKSCATTER,
         Row(
-            name="molecular_extinction",
-            dims=("range",),
-            dtype="f4",
-            units="m-1",
-            long_name="extinction coefficient of molecules",
-            coverage=Coverage.REFERENCE,
-            comment=NO_STANDARD_NAME,
+            "molecular_extinction",
+            ("range",),
+            "m-1",
+            "extinction coefficient of molecules",
+            Coverage.REFERENCE,
         ),
         Row(
-            name="lidar_ratio",
-            dims=("range",),
-            dtype="f4",
-            units="sr",
+            "lidar_ratio",
+            ("range",),
+            "sr",
+            "assumed ratio of extinction to backscatter of aerosol particles",
+            Coverage.REFERENCE,
+            "Set by the campaign: a number, a profile, or the mean over time of a raman product"
+            " without values in clouds, which the provenance names. Its errors at all ranges are"
+            " one error.",
             standard_name=AEROSOL_LIDAR_RATIO,
-            long_name="assumed ratio of extinction to backscatter of aerosol particles",
-            coverage=Coverage.REFERENCE,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
-            comment="Set by the campaign: a number, a profile, or the mean over time of a raman"
-            " product without values in clouds, which the provenance names. Its errors at all"
-            " ranges are one error.",
         ),
-        *REFERENCE_WINDOW,
-        reference_rejections(
+        *reference_window(
             "too_few_bins: data in less than half of the bins; excluded: a cloud; low_signal: the"
             " signal does not exceed zero by 3 standard errors; slope, curvature, scatter: it"
             " departs from the shape of clean air; more_particles: another window has a lower ratio"
@@ -262,9 +184,7 @@ LAYOUT: Final = Layout(
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         *GLUING,
-        quality(_BINS, FLAGS),
-        AVERAGED_PROFILES,
-        LEFT_OUT_PROFILES,
-        shots(of="all profiles in the mean"),
+        quality(BINS, FLAGS),
+        *AVERAGED,
     ),
 )

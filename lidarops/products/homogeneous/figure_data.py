@@ -18,7 +18,7 @@ from lidarops.figures.series_data import (
     require,
 )
 from lidarops.figures.time_axis import Times
-from lidarops.products.homogeneous.flags import FLAGS
+from lidarops.products.homogeneous.variables import FLAGS
 
 Floats = NDArray[np.float64]
 

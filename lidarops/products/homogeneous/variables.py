@@ -1,31 +1,68 @@
-"""The variables of the ``homogeneous`` product."""
+"""The variables and quality bits of the ``homogeneous`` product."""
 
 from __future__ import annotations
 
 from typing import Final, get_args
 
+from lidarops.flags import Flags, Quality
+from lidarops.netcdf.quantities import total_extinction, visibility
 from lidarops.netcdf.variables import (
     MEASURED_SHARES,
-    NO_STANDARD_NAME,
-    SECTION,
-    SECTION_RANGE,
     Coverage,
-    ErrorKind,
+    Error,
     Layout,
     Row,
     altitude,
     coordinates,
+    count,
     quality,
     retrieval_method,
     shots,
 )
-from lidarops.netcdf.visibility_rows import visibility_rows
-from lidarops.products.homogeneous.flags import FLAGS
 from lidarops.products.homogeneous.settings import Method
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+
+FLAGS: Final = Flags(
+    kind="homogeneous",
+    version=2,
+    bits=(
+        Quality.INPUT_MISSING,
+        Quality.SATURATED,
+        Quality.PILE_UP,
+        Quality.INCOMPLETE_OVERLAP,
+        Quality.TOO_FEW_BINS,
+        Quality.NO_SIGNAL,
+        Quality.LOW_SIGNAL,
+        Quality.NEGATIVE_AMPLITUDE,
+        Quality.NOT_HOMOGENEOUS,
+        Quality.OUTLIER,
+        Quality.NO_REAL_SOLUTION,
+        Quality.BACKGROUND_UNCERTAIN,
+        *HomogeneousQuality,
+    ),
+)
+"""Published places are in `tests/products/test_flags.py`."""
 
 _SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
-_OF_EXTINCTION = ("total_extinction_model_error", *_OF_FIT)
+_ALONG = (
+    Row(
+        "section",
+        ("section",),
+        "1",
+        "number of the range section",
+        Coverage.COORDINATE,
+        dtype="i4",
+    ),
+    Row(
+        "section_range",
+        ("section",),
+        "m",
+        "distance from the lidar along the beam, midpoint of the range section",
+        Coverage.COORDINATE,
+        bounds="section_bounds",
+    ),
+)
 
 _CURVED_SIGNAL = (
     "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
@@ -57,108 +94,79 @@ LAYOUT: Final = Layout(
     " with range r. altitude, geospatial_vertical_min and geospatial_vertical_max refer to the"
     " midpoint of a section; altitude_bnds holds its ends where the beam is fixed.",
     sampled="section",
-    coordinates=coordinates((SECTION, SECTION_RANGE), altitude("section", "altitude_bnds")),
+    coordinates=coordinates(_ALONG, altitude("section", "altitude_bnds")),
     data=(
-        Row(
-            name="total_extinction",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="m-1",
-            long_name="extinction coefficient of molecules and particles",
-            coverage=Coverage.PHYSICAL,
+        total_extinction(
+            _SECTIONS,
             cell_methods="time: mean section: mean",
-            ancillaries=_OF_EXTINCTION,
-            uncertain=True,
-            comment=f"At the wavelength of the channel. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="total_extinction_model_error",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="m-1",
-            long_name="model (systematic) uncertainty of extinction",
-            coverage=Coverage.QUALITY,
-            valid_min=0.0,
-            error_kind=ErrorKind.SYSTEMATIC,
-            comment="Separate from the random error in total_extinction_standard_error. Root of the"
-            " sum of squares of 5 percent of (extinction + 1 / mean range), and of the extinction"
-            f" error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED} {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="total_extinction_baseline_error",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="m-1",
-            long_name="change of extinction with one standard error of the analog baseline",
-            coverage=Coverage.QUALITY,
-            valid_min=0.0,
-            optional=True,
-            error_kind=ErrorKind.SYSTEMATIC,
-            comment="Separate from the other errors. Of analog and glued channels, for a baseline"
-            f" that decays with range. {NO_STANDARD_NAME}",
-        ),
-        *visibility_rows(
-            _SECTIONS, place="along the section", ancillaries=_OF_EXTINCTION, optional=True
-        ),
-        Row(
-            name="amplitude",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="{signal} m2",
-            long_name="range-corrected signal of the section extrapolated to range 0",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean",
             ancillaries=_OF_FIT,
             uncertain=True,
-            comment="System constant times backscatter coefficient, not calibrated."
-            f" {NO_STANDARD_NAME}",
+            errors=(
+                Error(
+                    "model",
+                    "model (systematic) uncertainty of extinction",
+                    comment="Separate from the random error in {quantity}_standard_error. Root of"
+                    " the sum of squares of 5 percent of (extinction + 1 / mean range), and of the"
+                    f" extinction error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED}",
+                ),
+                Error(
+                    "baseline",
+                    "change of extinction with one standard error of the analog baseline",
+                    comment="Separate from the other errors. Of analog and glued channels, for a"
+                    " baseline that decays with range.",
+                    optional=True,
+                ),
+            ),
+        ),
+        *visibility(
+            _SECTIONS,
+            "along the section",
+            ("total_extinction_model_error", *_OF_FIT),
+            optional=True,
         ),
         Row(
-            name="background",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="{signal}",
-            long_name="background fitted in the section",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean",
-            ancillaries=("background_model_error", *_OF_FIT),
+            "amplitude",
+            _SECTIONS,
+            "{signal} m2",
+            "range-corrected signal of the section extrapolated to range 0",
+            comment="System constant times backscatter coefficient, not calibrated.",
+            ancillaries=_OF_FIT,
             uncertain=True,
+        ),
+        Row(
+            "background",
+            _SECTIONS,
+            "{signal}",
+            "background fitted in the section",
             comment="Not calibrated. Where extinction plus 1 / mean range is known to 10 to 15"
             " percent only, some simulated backgrounds deviate by more than 4 of their standard"
-            f" errors. {NO_STANDARD_NAME}",
+            " errors.",
+            ancillaries=_OF_FIT,
+            uncertain=True,
+            errors=(
+                Error(
+                    "model",
+                    "model (systematic) uncertainty of the background",
+                    comment="Separate from the random error in {quantity}_standard_error."
+                    f" Background error caused by a signal {_CURVED_SIGNAL}, as with backscatter"
+                    f" that is curved along the path. {_UNDETECTED}",
+                ),
+            ),
         ),
         Row(
-            name="background_model_error",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="{signal}",
-            long_name="model (systematic) uncertainty of the background",
-            coverage=Coverage.QUALITY,
+            "reduced_chi2",
+            _SECTIONS,
+            "1",
+            "reduced chi-square of the fit",
+            Coverage.QUALITY,
+            "Close to 1 where the model holds within the noise.",
             valid_min=0.0,
-            error_kind=ErrorKind.SYSTEMATIC,
-            comment="Separate from the random error in background_standard_error. Background error"
-            f" caused by a signal {_CURVED_SIGNAL}, as with backscatter that is curved along the"
-            f" path. {_UNDETECTED} {NO_STANDARD_NAME}",
         ),
-        Row(
-            name="reduced_chi2",
-            dims=_SECTIONS,
-            dtype="f4",
-            units="1",
-            long_name="reduced chi-square of the fit",
+        count(
+            "valid_bins",
+            _SECTIONS,
+            "number of fitted range bins of the section",
             coverage=Coverage.QUALITY,
-            valid_min=0.0,
-            comment=f"Close to 1 where the model holds within the noise. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="valid_bins",
-            dims=_SECTIONS,
-            dtype="i4",
-            units="1",
-            standard_name="number_of_observations",
-            long_name="number of fitted range bins of the section",
-            coverage=Coverage.QUALITY,
-            valid_min=0.0,
         ),
         retrieval_method(
             ("compressed", *(name for name in get_args(Method) if name != "auto")),
@@ -169,4 +177,3 @@ LAYOUT: Final = Layout(
         shots(of="the profile"),
     ),
 )
-"""Layout of the product."""

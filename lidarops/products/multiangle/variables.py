@@ -1,11 +1,12 @@
-"""The variables of the ``multiangle`` product."""
+"""The variables and quality bits of the ``multiangle`` product."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Final, get_args
+from typing import Any, Final, get_args
 
+from lidarops.flags import COMPARED_BITS, SIGNAL_BITS, Flags
+from lidarops.netcdf.quantities import VALUE_BITS, total_extinction
 from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
     MEASURED_SHARES,
@@ -13,174 +14,178 @@ from lidarops.netcdf.variables import (
     PLACE,
     TIME,
     Coverage,
+    Error,
     ErrorKind,
     Layout,
     Row,
+    altitude,
+    count,
+    numbered,
+    place,
     quality,
     retrieval_method,
     shots,
 )
-from lidarops.products.multiangle.flags import FLAGS
 from lidarops.products.multiangle.settings import Method
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
+FLAGS: Final = Flags(
+    kind="multiangle",
+    version=3,
+    bits=(*sorted(SIGNAL_BITS + COMPARED_BITS), *MultiAngleQuality),
+)
+"""Published places are in `tests/products/test_flags.py`."""
+
 _LEVELS: Final = ("time", "altitude")
-_BITS: Final = 12
-"""Significant bits of a retrieved value: 1.2e-4 of it."""
+_POINT: Final = "time: mean altitude: point"
+_MEAN: Final = "time: mean altitude: mean"
+_OF_VALUE: Final = ("data_share", "inhomogeneity", "quality_flag", "beams", "shots")
 
-_ALTITUDE: Final = Row(
-    name="altitude",
-    dims=("altitude",),
-    dtype="f8",
-    units="m",
-    standard_name="altitude",
-    long_name="altitude of the sounded air above the geoid",
-    coverage=Coverage.COORDINATE,
-    axis="Z",
-    positive="up",
-    bounds="altitude_bnds",
-    comment="Top of the layer given in altitude_bnds. Its bottom is the next lower altitude, or the"
-    " station.",
-)
-_BEAM: Final = Row(
-    name="beam",
-    dims=("beam",),
-    dtype="i4",
-    units="1",
-    long_name="number of the beam direction",
-    coverage=Coverage.COORDINATE,
-    comment="Ordered by azimuth of the vertical plane, and in each plane from one horizon over the"
-    " zenith to the other.",
-)
-_LAYER: Final = Row(
-    name="layer_altitude",
-    dims=("layer",),
-    dtype="f8",
-    units="m",
-    standard_name="altitude",
-    long_name="altitude of the midpoint of the layer above the geoid",
-    coverage=Coverage.COORDINATE,
-    positive="up",
-    bounds="layer_bnds",
-    optional=True,
-    comment="layer_bnds holds bottom and top, moved to the nearest altitude of the profile or to"
-    " the station.",
-)
 
-_PLANE: Final = Row(
-    name="plane",
-    dims=("plane",),
-    dtype="i4",
-    units="1",
-    long_name="number of the vertical plane",
-    coverage=Coverage.COORDINATE,
-    optional=True,
-    comment="The beams of a plane are a range-height scan (RHI), of a volume of several planes.",
-)
+def _direction(name: str, whose: str, **changes: Any) -> Row:
+    """Return the row of a pointing angle of beams, planes or blocked profiles."""
+    return place(name, name=f"{whose}_{name}", dims=(whose,), follows_beam=False, **changes)
 
-_BASELINE_RANGE: Final = Row(
-    name="baseline_range",
-    dims=("baseline_range",),
-    dtype="f8",
-    units="m",
-    long_name="range of the analog baseline",
-    coverage=Coverage.COORDINATE,
-    optional=True,
-    comment=f"Middles of the blocks over which it is averaged. {NO_STANDARD_NAME}",
+
+_ALONG: Final = (
+    replace(
+        altitude("altitude", "altitude_bnds"),
+        dtype="f8",
+        follows_beam=False,
+        comment="Top of the layer given in altitude_bnds. Its bottom is the next lower altitude, or"
+        " the station.",
+    ),
+    numbered(
+        "beam",
+        "number of the beam direction",
+        "Ordered by azimuth of the vertical plane, and in each plane from one horizon over the"
+        " zenith to the other.",
+    ),
+    _direction("zenith_angle", "beam"),
+    _direction("azimuth", "beam"),
+    Row(
+        "layer_altitude",
+        ("layer",),
+        "m",
+        "altitude of the midpoint of the layer above the geoid",
+        Coverage.COORDINATE,
+        "layer_bnds holds bottom and top, moved to the nearest altitude of the profile or to the"
+        " station.",
+        standard_name="altitude",
+        positive="up",
+        bounds="layer_bnds",
+        optional=True,
+    ),
+    numbered(
+        "plane",
+        "number of the vertical plane",
+        "The beams of a plane are a range-height scan (RHI), of a volume of several planes.",
+        optional=True,
+    ),
+    _direction(
+        "azimuth",
+        "plane",
+        long_name="azimuth of the lowest beam of the vertical plane",
+        optional=True,
+    ),
+    Row(
+        "baseline_range",
+        ("baseline_range",),
+        "m",
+        "range of the analog baseline",
+        Coverage.COORDINATE,
+        f"Middles of the blocks over which it is averaged. {NO_STANDARD_NAME}",
+        optional=True,
+    ),
 )
 
 
-def _direction(name: str) -> Row:
-    """Return the row of a pointing angle of the beams."""
-    angle = next(row for row in PLACE if row.name == name)
-    return replace(angle, name=f"beam_{name}", dims=("beam",), follows_beam=False)
-
-
-def _blocked_direction(name: str) -> Row:
+def _blocked(name: str) -> Row:
     """Return the row of a pointing angle of the blocked profiles."""
-    row = _direction(name)
-    words = f"{row.long_name}, of a profile that shows the analog baseline"
+    words = f"{place(name).long_name}, of a profile that shows the analog baseline"
+    auxiliary = Coverage.AUXILIARY
+    return _direction(name, "blocked", long_name=words, coverage=auxiliary, optional=True)
+
+
+def _gradient(words: str, comment: str = "") -> Error:
+    """Return the error by a horizontal gradient."""
+    return Error(
+        "gradient",
+        f"model (systematic) uncertainty of {words} from a horizontal gradient",
+        comment=comment
+        or "Separate from {quantity}_standard_error, which covers noise and smoothing. Error"
+        " that the largest horizontal gradient of ln(backscatter) declared in the settings would"
+        " cause. Close to 0 where beams point to all sides.",
+    )
+
+
+def _errors(words: str) -> tuple[Error, ...]:
+    """Return the errors of a quantity by a horizontal gradient, dead time and analog baseline."""
+    of_signal = (
+        Error(
+            cause.replace(" ", "_"),
+            f"calibration (systematic) uncertainty of {words} from the {cause}",
+            comment="Separate from {quantity}_standard_error. Change with one standard error of the"
+            f" {cause}, without smoothing. Missing for {missing}.",
+            optional=True,
+        )
+        for cause, missing in (("dead time", "analog signals"), ("baseline", "photon counting"))
+    )
+    return (_gradient(words), *of_signal)
+
+
+def _of_planes(row: Row) -> Row:
+    """Return the row of a quantity that is retrieved from the beams of each vertical plane."""
+    words = row.long_name.removesuffix(" from the station to the altitude")
+    gradient = _gradient(
+        f"{words} of a plane",
+        "Separate from {quantity}_standard_error. Where planes point to all sides, the error that"
+        " explains the scatter between planes, pooled over all scans of the file and"
+        f" {THRESHOLDS.pooled} altitudes; else as {row.name}_gradient_error.",
+    )
     return replace(
         row,
-        name=f"blocked_{name}",
-        dims=("blocked",),
-        long_name=words,
-        coverage=Coverage.AUXILIARY,
-        optional=True,
-    )
-
-
-def _plane_azimuth() -> Row:
-    """Return the row of the azimuth of planes."""
-    azimuth = _direction("azimuth")
-    words = "azimuth of the lowest beam of the vertical plane"
-    return replace(azimuth, name="plane_azimuth", dims=("plane",), long_name=words, optional=True)
-
-
-def _of_planes(quantity: str, words: str, units: str) -> tuple[Row, ...]:
-    """Return the rows of a quantity that is retrieved from the beams of each vertical plane."""
-    dims = ("time", "plane", "altitude")
-    method = "mean" if quantity == "total_extinction" else "point"
-    value = Row(
-        name=f"plane_{quantity}",
-        dims=dims,
-        dtype="f4",
-        units=units,
+        name=f"plane_{row.name}",
+        dims=("time", "plane", "altitude"),
         long_name=f"{words}, from the beams of a vertical plane",
-        coverage=Coverage.PHYSICAL,
-        cell_methods=f"time: mean altitude: {method}",
-        ancillaries=(f"plane_{quantity}_gradient_error",),
-        significant_bits=_BITS,
-        uncertain=True,
-        error_kind=ErrorKind.BOTH,
+        ancillaries=(),
+        errors=(gradient,),
         optional=True,
-        comment=f"As {quantity}, with an inhomogeneity of the plane. Its error by the dead time is"
-        f" not stated: see {quantity}_dead_time_error. Missing where a test of the plane alone"
+        comment=f"As {row.name}, with an inhomogeneity of the plane. Its error by the dead time is"
+        f" not stated: see {row.name}_dead_time_error. Missing where a test of the plane alone"
         " rejects the value; no flag grades the others. quality_flag and usable are those of all"
         " beams together: where they reject a value, leave out those of its planes too, unless"
-        f" differences between planes are of interest. {NO_STANDARD_NAME}",
-    )
-    error = _gradient_error(f"plane_{quantity}", f"{words} of a plane", units)
-    comment = (
-        f"Separate from plane_{quantity}_standard_error. Where planes point to all sides, the error"
-        " that explains the scatter between planes, pooled over all scans of the file and"
-        f" {THRESHOLDS.pooled} altitudes; else as {quantity}_gradient_error. {NO_STANDARD_NAME}"
-    )
-    return value, replace(error, dims=dims, optional=True, comment=comment)
-
-
-_STATION: Final = tuple(row for row in PLACE if row.name not in ("zenith_angle", "azimuth"))
-
-
-def _gradient_error(quantity: str, words: str, units: str) -> Row:
-    return Row(
-        name=f"{quantity}_gradient_error",
-        dims=_LEVELS,
-        dtype="f4",
-        units=units,
-        long_name=f"model (systematic) uncertainty of {words} from a horizontal gradient",
-        coverage=Coverage.QUALITY,
-        valid_min=0.0,
-        significant_bits=8,
-        error_kind=ErrorKind.SYSTEMATIC,
-        comment=f"Separate from {quantity}_standard_error, which covers noise and smoothing. Error"
-        " that the largest horizontal gradient of ln(backscatter) declared in the settings would"
-        f" cause. Close to 0 where beams point to all sides. {NO_STANDARD_NAME}",
+        " differences between planes are of interest.",
     )
 
 
-def _signal_errors(quantity: str, words: str, units: str) -> Iterator[Row]:
-    """Yield the rows of the errors by dead time and analog baseline."""
-    for cause, missing in (("dead time", "analog signals"), ("baseline", "photon counting")):
-        yield replace(
-            _gradient_error(quantity, words, units),
-            name=f"{quantity}_{cause.replace(' ', '_')}_error",
-            long_name=f"calibration (systematic) uncertainty of {words} from the {cause}",
-            optional=True,
-            comment=f"Separate from {quantity}_standard_error. Change with one standard error of"
-            f" the {cause}, without smoothing. Missing for {missing}. {NO_STANDARD_NAME}",
-        )
-
+# Noise, and smoothing error that profiles share, are not stated separately.
+_OPTICAL_DEPTH: Final = Row(
+    "vertical_optical_depth",
+    _LEVELS,
+    "1",
+    "optical depth of molecules and particles from the station to the altitude",
+    comment="Along the vertical, at the wavelength of the channel.",
+    cell_methods=_POINT,
+    ancillaries=_OF_VALUE,
+    bits=VALUE_BITS,
+    uncertain=True,
+    errors=_errors("optical depth"),
+    error_kind=ErrorKind.BOTH,
+)
+_EXTINCTION: Final = total_extinction(
+    _LEVELS,
+    "Mean over the layer in altitude_bnds, at the wavelength of the channel. The error by smoothing"
+    " is a mean over altitudes, too small in thin layers: within simulated layers of a few"
+    f" altitudes, some values differ by more than 4 standard errors. {MEASURED_SHARES}",
+    cell_methods=_MEAN,
+    ancillaries=_OF_VALUE,
+    bits=VALUE_BITS,
+    uncertain=True,
+    errors=_errors("extinction"),
+    error_kind=ErrorKind.BOTH,
+)
 
 LAYOUT: Final = Layout(
     title="Optical depth and extinction from scans over zenith angle",
@@ -209,247 +214,160 @@ LAYOUT: Final = Layout(
     weighed=("vertical_optical_depth", "total_extinction"),
     coordinates=(
         TIME,
-        _ALTITUDE,
-        _BEAM,
-        _direction("zenith_angle"),
-        _direction("azimuth"),
-        _LAYER,
-        _PLANE,
-        _plane_azimuth(),
-        _BASELINE_RANGE,
-        *_STATION,
+        *_ALONG,
+        *(row for row in PLACE if row.name not in ("zenith_angle", "azimuth")),
     ),
     data=(
+        _OPTICAL_DEPTH,
         Row(
-            name="vertical_optical_depth",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="optical depth of molecules and particles from the station to the altitude",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean altitude: point",
-            ancillaries=(
-                "vertical_optical_depth_gradient_error",
-                "data_share",
-                "inhomogeneity",
-                "quality_flag",
-                "beams",
-                "shots",
-            ),
-            significant_bits=_BITS,
-            uncertain=True,
-            # Noise, and smoothing error that profiles share, are not stated separately.
-            error_kind=ErrorKind.BOTH,
-            comment=f"Along the vertical, at the wavelength of the channel. {NO_STANDARD_NAME}",
-        ),
-        _gradient_error("vertical_optical_depth", "optical depth", "1"),
-        *_signal_errors("vertical_optical_depth", "optical depth", "1"),
-        Row(
-            name="monotone_vertical_optical_depth",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="profile nearest to vertical_optical_depth that nowhere decreases with"
-            " altitude",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean altitude: point",
-            ancillaries=("quality_flag",),
-            significant_bits=_BITS,
-            optional=True,
+            "monotone_vertical_optical_depth",
+            _LEVELS,
+            "1",
+            "profile nearest to vertical_optical_depth that nowhere decreases with altitude",
             comment="For figures of single profiles. Where the signal is weak, its means over many"
-            " profiles are biased high: average vertical_optical_depth instead."
-            f" {NO_STANDARD_NAME}",
+            " profiles are biased high: average vertical_optical_depth instead.",
+            cell_methods=_POINT,
+            ancillaries=("quality_flag",),
+            bits=VALUE_BITS,
+            optional=True,
         ),
+        _EXTINCTION,
         Row(
-            name="total_extinction",
-            dims=_LEVELS,
-            dtype="f4",
-            units="m-1",
-            long_name="extinction coefficient of molecules and particles",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean altitude: mean",
-            ancillaries=(
-                "total_extinction_gradient_error",
-                "data_share",
-                "inhomogeneity",
-                "quality_flag",
-                "beams",
-                "shots",
-            ),
-            significant_bits=_BITS,
-            uncertain=True,
-            # Noise, and smoothing error that profiles share, are not stated separately.
-            error_kind=ErrorKind.BOTH,
-            comment="Mean over the layer in altitude_bnds, at the wavelength of the channel. The"
-            " error by smoothing is a mean over altitudes, too small in thin layers: within"
-            " simulated layers of a few altitudes, some values differ by more than 4 standard"
-            f" errors. {MEASURED_SHARES} {NO_STANDARD_NAME}",
-        ),
-        _gradient_error("total_extinction", "extinction", "m-1"),
-        *_signal_errors("total_extinction", "extinction", "m-1"),
-        Row(
-            name="log_intercept",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="natural logarithm of the range-corrected signal at zero optical depth",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean altitude: point",
+            "log_intercept",
+            _LEVELS,
+            "1",
+            "natural logarithm of the range-corrected signal at zero optical depth",
+            comment="Logarithm of the signal in mV m2 (analog) or MHz m2 (photon counting): system"
+            " constant times backscatter coefficient, not calibrated.",
+            cell_methods=_POINT,
             ancillaries=("quality_flag", "beams", "shots"),
             uncertain=True,
-            comment="Logarithm of the signal in mV m2 (analog) or MHz m2 (photon counting): system"
-            f" constant times backscatter coefficient, not calibrated. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="data_share",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="share of the optical depth that the data determine",
-            coverage=Coverage.QUALITY,
-            significant_bits=8,
-            comment=f"1 where neither smoothness nor a prior has an effect. {NO_STANDARD_NAME}",
+            "data_share",
+            _LEVELS,
+            "1",
+            "share of the optical depth that the data determine",
+            Coverage.QUALITY,
+            "1 where neither smoothness nor a prior has an effect.",
+            bits=8,
         ),
         Row(
-            name="regularisation",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="strength of the penalty on the derivative along the slant path",
-            coverage=Coverage.AUXILIARY,
+            "regularisation",
+            _LEVELS,
+            "1",
+            "strength of the penalty on the derivative along the slant path",
+            Coverage.AUXILIARY,
+            "For slant paths scaled to a span of 1, and residuals scaled to their noise. Given by"
+            " the settings, or the largest one whose residuals are not larger than the noise.",
             valid_min=0.0,
-            significant_bits=_BITS,
+            bits=VALUE_BITS,
             optional=True,
-            comment="For slant paths scaled to a span of 1, and residuals scaled to their noise."
-            " Given by the settings, or the largest one whose residuals are not larger than the"
-            f" noise. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="prior_vertical_optical_depth",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="optical depth to which the penalty pulls",
-            coverage=Coverage.AUXILIARY,
-            significant_bits=_BITS,
+            "prior_vertical_optical_depth",
+            _LEVELS,
+            "1",
+            "optical depth to which the penalty pulls",
+            Coverage.AUXILIARY,
+            "0, or that of the altitude below. The share 1 - data_share of the optical depth comes"
+            " from it.",
+            bits=VALUE_BITS,
             optional=True,
-            comment="0, or that of the altitude below. The share 1 - data_share of the optical"
-            f" depth comes from it. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="inhomogeneity",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="standard deviation of ln(signal) between beams in excess of noise",
-            coverage=Coverage.QUALITY,
+            "inhomogeneity",
+            _LEVELS,
+            "1",
+            "standard deviation of ln(signal) between beams in excess of noise",
+            Coverage.QUALITY,
+            "Inhomogeneity of the air between the beams, common to all cycles of the file.",
             valid_min=0.0,
-            significant_bits=8,
-            comment="Inhomogeneity of the air between the beams, common to all cycles of the file."
-            f" {NO_STANDARD_NAME}",
+            bits=8,
         ),
         Row(
-            name="reduced_chi2",
-            dims=_LEVELS,
-            dtype="f4",
-            units="1",
-            long_name="reduced chi-square of the fit over the beams",
-            coverage=Coverage.QUALITY,
+            "reduced_chi2",
+            _LEVELS,
+            "1",
+            "reduced chi-square of the fit over the beams",
+            Coverage.QUALITY,
+            "Sum of squared residuals divided by their variances, per degree of freedom. About 1,"
+            " because the inhomogeneity is estimated from the residuals; less where the noise is"
+            " overstated. Missing where no beam is redundant.",
             valid_min=0.0,
-            significant_bits=8,
+            bits=8,
             optional=True,
-            comment="Sum of squared residuals divided by their variances, per degree of freedom."
-            " About 1, because the inhomogeneity is estimated from the residuals; less where the"
-            f" noise is overstated. Missing where no beam is redundant. {NO_STANDARD_NAME}",
         ),
-        Row(
+        replace(
+            _OPTICAL_DEPTH,
             name="layer_vertical_optical_depth",
             dims=("time", "layer"),
-            dtype="f4",
-            units="1",
             long_name="optical depth of molecules and particles between the bounds of the layer",
-            coverage=Coverage.PHYSICAL,
             cell_methods="time: mean",
-            ancillaries=("layer_vertical_optical_depth_gradient_error",),
-            significant_bits=_BITS,
-            uncertain=True,
-            # Noise, and smoothing error that profiles share, are not stated separately.
-            error_kind=ErrorKind.BOTH,
+            ancillaries=(),
+            errors=(_gradient("the optical depth of the layer"),),
             optional=True,
             comment="Along the vertical, at the wavelength of the channel. Its error by the dead"
             " time is not stated: see vertical_optical_depth_dead_time_error at its bounds. Missing"
-            f" where quality_flag rejects the value at a bound of the layer. {NO_STANDARD_NAME}",
+            " where quality_flag rejects the value at a bound of the layer.",
         ),
-        replace(
-            _gradient_error("layer_vertical_optical_depth", "the optical depth of the layer", "1"),
-            dims=("time", "layer"),
-            optional=True,
-        ),
-        *_of_planes("vertical_optical_depth", "optical depth of molecules and particles", "1"),
-        *_of_planes("total_extinction", "extinction coefficient of molecules and particles", "m-1"),
+        _of_planes(_OPTICAL_DEPTH),
+        _of_planes(_EXTINCTION),
         Row(
-            name="beam_signal",
-            dims=("time", "beam", "altitude"),
-            dtype="f4",
-            units="{signal} m2",
-            long_name="range-corrected signal of a beam in the altitude cell",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean altitude: mean",
-            significant_bits=8,
-            optional=True,
+            "beam_signal",
+            ("time", "beam", "altitude"),
+            "{signal} m2",
+            "range-corrected signal of a beam in the altitude cell",
             comment="Without background, divided by the overlap where one is given. Its noise is"
-            f" not stated; residual is missing where it is too large. {NO_STANDARD_NAME}",
+            " not stated; residual is missing where it is too large.",
+            cell_methods=_MEAN,
+            bits=8,
+            optional=True,
         ),
         Row(
-            name="beam_obstruction",
-            dims=("time", "beam"),
-            dtype="f4",
-            units="m",
-            long_name="range from which the beam is blocked by an obstruction or a dense cloud",
-            coverage=Coverage.QUALITY,
+            "beam_obstruction",
+            ("time", "beam"),
+            "m",
+            "range from which the beam is blocked by an obstruction or a dense cloud",
+            Coverage.QUALITY,
+            "Missing for a free beam. Farther bins are not used.",
             valid_min=0.0,
             optional=True,
-            comment=f"Missing for a free beam. Farther bins are not used. {NO_STANDARD_NAME}",
         ),
         Row(
-            name="analog_baseline",
-            dims=("baseline_range",),
-            dtype="f4",
-            units="{signal}",
-            long_name="analog signal without light, minus its mean in the range of the background",
-            coverage=Coverage.AUXILIARY,
-            uncertain=True,
-            error_kind=ErrorKind.SYSTEMATIC,
-            optional=True,
-            comment="From profiles that a tree or building blocks, at least"
+            "analog_baseline",
+            ("baseline_range",),
+            "{signal}",
+            "analog signal without light, minus its mean in the range of the background",
+            Coverage.AUXILIARY,
+            "From profiles that a tree or building blocks, at least"
             f" {THRESHOLDS.baseline_guard:g} m behind it; subtracted from all profiles,"
             " interpolated between ranges. Its standard error is that of noise and of the scatter"
             " between profiles, and part of the error of the backgrounds; it grows before the first"
-            " range."
-            f" {NO_STANDARD_NAME}",
+            " range.",
+            uncertain=True,
+            error_kind=ErrorKind.SYSTEMATIC,
+            optional=True,
         ),
         Row(
-            name="blocked_range",
-            dims=("blocked",),
-            dtype="f4",
-            units="m",
-            long_name="range from which a profile that shows the analog baseline is blocked",
-            coverage=Coverage.AUXILIARY,
+            "blocked_range",
+            ("blocked",),
+            "m",
+            "range from which a profile that shows the analog baseline is blocked",
+            Coverage.AUXILIARY,
             valid_min=0.0,
             optional=True,
-            comment=NO_STANDARD_NAME,
         ),
-        _blocked_direction("zenith_angle"),
-        _blocked_direction("azimuth"),
+        _blocked("zenith_angle"),
+        _blocked("azimuth"),
         Row(
-            name="residual",
-            dims=("time", "beam", "altitude"),
-            dtype="f4",
-            units="1",
-            long_name="natural logarithm of the signal of a beam minus the fit over the beams",
-            coverage=Coverage.QUALITY,
-            significant_bits=8,
-            comment=f"Missing where the beam has no usable signal. {NO_STANDARD_NAME}",
+            "residual",
+            ("time", "beam", "altitude"),
+            "1",
+            "natural logarithm of the signal of a beam minus the fit over the beams",
+            Coverage.QUALITY,
+            "Missing where the beam has no usable signal.",
+            bits=8,
         ),
         retrieval_method(
             tuple(name for name in get_args(Method) if name != "auto"),
@@ -459,34 +377,23 @@ LAYOUT: Final = Layout(
         BACKGROUND_METHOD,
         quality(_LEVELS, FLAGS),
         Row(
-            name="effective_degrees_of_freedom",
-            dims=("time",),
-            dtype="f4",
-            units="1",
-            long_name="number of independent values of the profile that the data determine",
-            coverage=Coverage.QUALITY,
-            valid_min=0.0,
-            comment=f"Missing where there is no profile. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="reach",
-            dims=("time",),
-            dtype="f4",
-            units="m",
-            long_name="highest altitude above the geoid with an estimate",
-            coverage=Coverage.AUXILIARY,
-            comment=f"Missing where there is no estimate. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="beams",
-            dims=("time",),
-            dtype="i4",
-            units="1",
-            standard_name="number_of_observations",
-            long_name="number of beam directions with a signal in the scan cycle",
-            coverage=Coverage.AUXILIARY,
+            "effective_degrees_of_freedom",
+            ("time",),
+            "1",
+            "number of independent values of the profile that the data determine",
+            Coverage.QUALITY,
+            "Missing where there is no profile.",
             valid_min=0.0,
         ),
+        Row(
+            "reach",
+            ("time",),
+            "m",
+            "highest altitude above the geoid with an estimate",
+            Coverage.AUXILIARY,
+            "Missing where there is no estimate.",
+        ),
+        count("beams", ("time",), "number of beam directions with a signal in the scan cycle"),
         shots(of="all beams of the scan cycle"),
     ),
 )

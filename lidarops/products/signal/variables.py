@@ -1,26 +1,40 @@
-"""The variables of the ``signal`` product."""
+"""The variables and quality bits of the ``signal`` product."""
 
 from __future__ import annotations
 
 from typing import Final
 
+from lidarops.flags import Flags, Quality
 from lidarops.netcdf.variables import (
+    ALONG_BEAM,
     BACKGROUND_METHOD,
     GLUING,
     MEASURED_SHARES,
-    NO_STANDARD_NAME,
-    RANGE,
     SUBTRACTED_BACKGROUND,
     Coverage,
-    ErrorKind,
+    Error,
     Layout,
     Row,
-    altitude,
-    coordinates,
     quality,
     shots,
 )
-from lidarops.products.signal.flags import FLAGS
+
+FLAGS: Final = Flags(
+    kind="signal",
+    version=2,
+    bits=(
+        Quality.INPUT_MISSING,
+        Quality.SATURATED,
+        Quality.PILE_UP,
+        Quality.INCOMPLETE_OVERLAP,
+        Quality.SINGLE_RECORD,
+        Quality.NO_REAL_SOLUTION,
+        Quality.LOW_SIGNAL_TO_NOISE,
+        Quality.BACKGROUND_UNCERTAIN,
+        Quality.NO_GLUING,
+    ),
+)
+"""Published places are in `tests/products/test_flags.py`."""
 
 LAYOUT: Final = Layout(
     title="Range-corrected lidar signals",
@@ -36,66 +50,52 @@ LAYOUT: Final = Layout(
     f" not. {MEASURED_SHARES}",
     sampled="range",
     weighed=("signal",),
-    coordinates=coordinates((RANGE,), altitude("range")),
+    coordinates=ALONG_BEAM,
     data=(
         Row(
-            name="signal",
-            dims=("time", "range"),
-            dtype="f4",
-            units="{signal} m2",
-            long_name="background-subtracted signal times range squared",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean range: mean",
+            "signal",
+            ("time", "range"),
+            "{signal} m2",
+            "background-subtracted signal times range squared",
+            comment="Not calibrated.",
             ancillaries=("quality_flag", "shots"),
-            significant_bits=13,
+            bits=13,
             uncertain=True,
-            comment=f"Not calibrated. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="signal_dead_time_error",
-            dims=("time", "range"),
-            dtype="f4",
-            units="{signal} m2",
-            long_name="change of the signal with one standard error of the dead time",
-            coverage=Coverage.QUALITY,
-            significant_bits=8,
-            optional=True,
-            error_kind=ErrorKind.SYSTEMATIC,
-            comment="Of channels with photon counting. All ranges and profiles share it. Not part"
-            f" of signal_standard_error. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="signal_baseline_error",
-            dims=("time", "range"),
-            dtype="f4",
-            units="{signal} m2",
-            long_name="change of the signal with one standard error of the analog baseline",
-            coverage=Coverage.QUALITY,
-            significant_bits=8,
-            optional=True,
-            error_kind=ErrorKind.SYSTEMATIC,
-            comment="Of analog and glued channels: a voltage without light that varies slowly with"
-            " range. All ranges and profiles share it, with a shape that is not known. Not part of"
-            f" signal_standard_error. {NO_STANDARD_NAME}",
+            errors=(
+                Error(
+                    "dead_time",
+                    "change of the signal with one standard error of the dead time",
+                    comment="Of channels with photon counting. All ranges and profiles share it."
+                    " Not part of signal_standard_error.",
+                    signed=True,
+                    optional=True,
+                ),
+                Error(
+                    "baseline",
+                    "change of the signal with one standard error of the analog baseline",
+                    comment="Of analog and glued channels: a voltage without light that varies"
+                    " slowly with range. All ranges and profiles share it, with a shape that is not"
+                    " known. Not part of signal_standard_error.",
+                    signed=True,
+                    optional=True,
+                ),
+            ),
         ),
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         Row(
-            name="noise_correlation_length",
-            dims=("time",),
-            dtype="f4",
-            units="1",
-            long_name="integral correlation length of noise along range in range bins",
-            coverage=Coverage.AUXILIARY,
-            comment="Of the far half of the profile; of glued channels at least that of the analog"
-            " record. 1 where bins are independent; missing where too few are complete, and"
-            " standard errors then assume independent bins. The standard error by noise of a mean"
-            " over many bins is that of a bin times the root of this number over their number."
-            f" {NO_STANDARD_NAME}",
+            "noise_correlation_length",
+            ("time",),
+            "1",
+            "integral correlation length of noise along range in range bins",
+            Coverage.AUXILIARY,
+            "Of the far half of the profile; of glued channels at least that of the analog record."
+            " 1 where bins are independent; missing where too few are complete, and standard errors"
+            " then assume independent bins. The standard error by noise of a mean over many bins is"
+            " that of a bin times the root of this number over their number.",
         ),
         *GLUING,
         quality(("time", "range"), FLAGS),
         shots(of="the profile"),
     ),
 )
-"""Layout of the product."""

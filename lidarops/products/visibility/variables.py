@@ -1,51 +1,59 @@
-"""The variables of the ``visibility`` product."""
+"""The variables and quality bits of the ``visibility`` product."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 from lidarops.constants import MULTIPOSITION_PAPER
+from lidarops.flags import Flags, Quality
+from lidarops.netcdf.quantities import VALUE_BITS, total_extinction, visibility
 from lidarops.netcdf.variables import (
     MEASURED_SHARES,
-    NO_STANDARD_NAME,
-    PLACE,
     TIME,
     Coverage,
+    Error,
     ErrorKind,
     Layout,
     Row,
+    altitude,
     deployment,
+    numbered,
+    place,
     quality,
     retrieval_method,
     shots,
 )
-from lidarops.netcdf.visibility_rows import visibility_rows
-from lidarops.products.visibility.flags import FLAGS
+from lidarops.retrieve.network.flags import NetworkQuality
+
+FLAGS: Final = Flags(
+    kind="visibility",
+    version=2,
+    bits=(
+        Quality.INPUT_MISSING,
+        Quality.PILE_UP,
+        Quality.LOW_SIGNAL,
+        Quality.SINGLE_RECORD,
+        Quality.OUTLIER,
+        Quality.NO_REAL_SOLUTION,
+        Quality.BACKGROUND_UNCERTAIN,
+        *NetworkQuality,
+    ),
+)
+"""Published places are in `tests/products/test_flags.py`."""
 
 _SERIES: Final = ("time", "crossing")
-_BITS: Final = 12
-"""Significant bits of a retrieved value: 1.2e-4 of it."""
-
 _METHODS: Final = ("beams_with_prior", "beams_without_prior", "triangles")
 _OF_VALUE: Final = ("condition", "quality_flag", "path_optical_depth", "reduced_chi2", "shots")
 
 
-def _place(name: str) -> Row:
-    return next(row for row in PLACE if row.name == name)
-
-
-def _crossing_position(name: str) -> Row:
+def _crossing(name: str) -> Row:
     """Return the row of the latitude or longitude of the crossings."""
-    return replace(_place(name), dims=("crossing",), long_name=f"{name} of the crossing of beams")
+    return place(name, dims=("crossing",), long_name=f"{name} of the crossing of beams")
 
 
-def _beam_row(name: str, source: str, long_name: str) -> Row:
+def _of_beams(row: Row, name: str, long_name: str) -> Row:
     """Return the row of a coordinate of the lidars, one value a beam."""
-    row = _place(source)
-    if name in ("latitude", "longitude"):
-        # The latitude of the values is that of the crossings.
-        row = replace(deployment(row), comment=None)
     return replace(
         row,
         name=f"beam_{name}",
@@ -56,52 +64,53 @@ def _beam_row(name: str, source: str, long_name: str) -> Row:
     )
 
 
-_ALTITUDE: Final = Row(
-    name="altitude",
-    dims=("crossing",),
-    dtype="f8",
-    units="m",
-    standard_name="altitude",
-    long_name="altitude of the crossing of beams above the geoid",
-    coverage=Coverage.COORDINATE,
-    axis="Z",
-    positive="up",
-    comment="For straight beams on the WGS 84 ellipsoid, to which the geoid is taken as parallel.",
-)
-_CROSSING: Final = Row(
-    name="crossing_id",
-    dims=("crossing",),
-    dtype="i4",
-    units="1",
-    long_name="number of the crossing in the network of beams",
-    coverage=Coverage.COORDINATE,
-    cf_role="timeseries_id",
-    comment="Ordered by the nearest range. A crossing that is the farthest one on all of its beams"
-    " has a number but no value, because nothing constrains the attenuation beyond it.",
-)
-_BEAM: Final = Row(
-    name="beam",
-    dims=("beam",),
-    dtype="i4",
-    units="1",
-    long_name="number of the beam",
-    coverage=Coverage.COORDINATE,
-    comment="lidarops_steps names the instrument of each beam and the crossings on it.",
+def _lidar(name: str) -> Row:
+    """Return the row of the latitude or longitude of the lidars: that of values is the crossing."""
+    station = replace(deployment(place(name)), comment=None)
+    return _of_beams(station, name, f"{name} of the lidar of the beam")
+
+
+_COORDINATES: Final = (
+    TIME,
+    numbered(
+        "crossing_id",
+        "number of the crossing in the network of beams",
+        "Ordered by the nearest range. A crossing that is the farthest one on all of its beams has"
+        " a number but no value, because nothing constrains the attenuation beyond it.",
+        dims=("crossing",),
+        cf_role="timeseries_id",
+    ),
+    _crossing("latitude"),
+    _crossing("longitude"),
+    replace(
+        altitude("crossing"),
+        dtype="f8",
+        long_name="altitude of the crossing of beams above the geoid",
+        follows_beam=False,
+        comment="For straight beams on the WGS 84 ellipsoid, to which the geoid is taken as"
+        " parallel.",
+    ),
+    numbered(
+        "beam",
+        "number of the beam",
+        "lidarops_steps names the instrument of each beam and the crossings on it.",
+    ),
+    _lidar("latitude"),
+    _lidar("longitude"),
+    _of_beams(
+        place("station_altitude"), "altitude", "altitude of the lidar of the beam above the geoid"
+    ),
+    _of_beams(place("zenith_angle"), "zenith_angle", "zenith angle of the beam, 0 = up"),
+    _of_beams(place("azimuth"), "azimuth", "azimuth of the beam, clockwise from north"),
+    place("wavelength"),
 )
 
 
-def _time_series(name: str, long_name: str, comment: str) -> Row:
-    return Row(
-        name=name,
-        dims=("time",),
-        dtype="f4",
-        units="1",
-        long_name=long_name,
-        coverage=Coverage.QUALITY,
-        valid_min=0.0,
-        significant_bits=8,
-        comment=f"{comment} {NO_STANDARD_NAME}",
-    )
+def _tested(name: str, long_name: str, comment: str, **changes: Any) -> Row:
+    """Return the row of what tells how well a network, or a value, is determined."""
+    coverage = Coverage.QUALITY
+    row = Row(name, ("time",), "1", long_name, coverage, comment, valid_min=0.0, bits=8)
+    return replace(row, **changes)
 
 
 LAYOUT: Final = Layout(
@@ -137,87 +146,50 @@ LAYOUT: Final = Layout(
     " declared.",
     sampled="crossing",
     feature_type="timeSeries",
-    coordinates=(
-        TIME,
-        _CROSSING,
-        _crossing_position("latitude"),
-        _crossing_position("longitude"),
-        _ALTITUDE,
-        _BEAM,
-        _beam_row("latitude", "latitude", "latitude of the lidar of the beam"),
-        _beam_row("longitude", "longitude", "longitude of the lidar of the beam"),
-        _beam_row(
-            "altitude", "station_altitude", "altitude of the lidar of the beam above the geoid"
-        ),
-        _beam_row("zenith_angle", "zenith_angle", "zenith angle of the beam, 0 = up"),
-        _beam_row("azimuth", "azimuth", "azimuth of the beam, clockwise from north"),
-        _place("wavelength"),
-    ),
+    coordinates=_COORDINATES,
     data=(
-        *(
+        *visibility(
+            _SERIES,
+            "at the crossing of beams",
+            ("total_extinction_systematic_error", *_OF_VALUE),
             # Most of the error comes from the prior, which all profiles share.
-            replace(row, error_kind=ErrorKind.BOTH) if row.uncertain else row
-            for row in visibility_rows(
-                _SERIES,
-                place="at the crossing of beams",
-                ancillaries=("total_extinction_systematic_error", *_OF_VALUE),
-                optional=False,
-            )
-        ),
-        Row(
-            name="total_extinction",
-            dims=_SERIES,
-            dtype="f4",
-            units="m-1",
-            long_name="extinction coefficient of molecules and particles",
-            coverage=Coverage.PHYSICAL,
-            cell_methods="time: mean",
-            ancillaries=("total_extinction_systematic_error", *_OF_VALUE),
-            significant_bits=_BITS,
-            uncertain=True,
             error_kind=ErrorKind.BOTH,
-            comment=f"At the wavelength of the channel. {NO_STANDARD_NAME}",
+        ),
+        total_extinction(
+            _SERIES,
+            ancillaries=_OF_VALUE,
+            bits=VALUE_BITS,
+            uncertain=True,
+            errors=(
+                Error(
+                    "systematic",
+                    "model (systematic) uncertainty of extinction",
+                    comment="Separate from {quantity}_standard_error, which covers noise and prior."
+                    " Effect of the errors of exponent, lidar ratio and overlap declared in the"
+                    " settings, of signal that may remain in the background, and of the multiplier"
+                    " where one is requested.",
+                ),
+            ),
+            error_kind=ErrorKind.BOTH,
+        ),
+        _tested(
+            "condition",
+            "relative change of extinction over that of the signals at the near ends of the beams",
+            "Root of the sum of squares over the beams. Larger values mean higher sensitivity to"
+            " overlap errors.",
+            dims=_SERIES,
         ),
         Row(
-            name="total_extinction_systematic_error",
-            dims=_SERIES,
-            dtype="f4",
-            units="m-1",
-            long_name="model (systematic) uncertainty of extinction",
-            coverage=Coverage.QUALITY,
-            valid_min=0.0,
-            significant_bits=8,
-            error_kind=ErrorKind.SYSTEMATIC,
-            comment="Separate from total_extinction_standard_error, which covers noise and prior."
-            " Effect of the errors of exponent, lidar ratio and overlap declared in the settings,"
-            " of signal that may remain in the background, and of the multiplier where one is"
-            f" requested. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="condition",
-            dims=_SERIES,
-            dtype="f4",
-            units="1",
-            long_name="relative change of extinction over that of the signals at the near ends of"
-            " the beams",
-            coverage=Coverage.QUALITY,
-            valid_min=0.0,
-            significant_bits=8,
-            comment="Root of the sum of squares over the beams. Larger values mean higher"
-            f" sensitivity to overlap errors. {NO_STANDARD_NAME}",
-        ),
-        Row(
-            name="multiplier",
-            dims=_SERIES,
-            dtype="f4",
-            units="1",
-            long_name="multiplier lambda of the equations of a triangle of beams",
-            coverage=Coverage.AUXILIARY,
+            "multiplier",
+            _SERIES,
+            "1",
+            "multiplier lambda of the equations of a triangle of beams",
+            Coverage.AUXILIARY,
+            "Row j of a cycle of three beams is multiplied by its power j - 1. 1 is exact; a"
+            " smaller one limits noise, and its bias in homogeneous air is part of"
+            " total_extinction_systematic_error.",
             valid_min=0.0,
             optional=True,
-            comment="Row j of a cycle of three beams is multiplied by its power j - 1. 1 is exact;"
-            " a smaller one limits noise, and its bias in homogeneous air is part of"
-            f" total_extinction_systematic_error. {NO_STANDARD_NAME}",
         ),
         retrieval_method(
             _METHODS,
@@ -239,35 +211,34 @@ LAYOUT: Final = Layout(
             " kept; the effect of these and of the bins between two edges is part of the standard"
             " error. The value is valid.",
         ),
-        _time_series(
+        _tested(
             "path_optical_depth",
             "optical depth along the longest beam section between crossings",
             "From the mean extinction at the crossings.",
         ),
-        _time_series(
+        _tested(
             "reduced_chi2",
             "reduced chi-square of the network",
             "From the beams alone, without the prior. Missing without degrees of freedom.",
         ),
-        _time_series(
+        _tested(
             "degrees_of_freedom",
             "number of equations of the network minus number of unknowns",
             "Missing where unknowns outnumber equations.",
         ),
-        _time_series(
+        _tested(
             "prior_deviation",
             "prior standard deviation of ln(extinction) about a linear field",
             "Most likely value for the block of profiles. Missing where there is no prior.",
         ),
         Row(
-            name="beam_range",
-            dims=("beam", "crossing"),
-            dtype="f4",
-            units="m",
-            long_name="distance of the crossing from the lidar along the beam",
-            coverage=Coverage.REFERENCE,
+            "beam_range",
+            ("beam", "crossing"),
+            "m",
+            "distance of the crossing from the lidar along the beam",
+            Coverage.REFERENCE,
+            "Missing where the crossing does not lie on the beam.",
             valid_min=0.0,
-            comment=f"Missing where the crossing does not lie on the beam. {NO_STANDARD_NAME}",
         ),
         shots(of="all beams of the interval"),
     ),

@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import WITHHELD, Quality
-from lidarops.products.elastic.flags import FLAGS
+from lidarops.products.elastic.variables import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.elastic.flags import ElasticQuality

@@ -8,7 +8,7 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.products.signal.flags import FLAGS
+from lidarops.products.signal.variables import FLAGS
 from lidarops.retrieve.signal.labeled import condition, correct_for_range
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 from lidarops.retrieve.signal.labeled_gluing import glue
