@@ -8,7 +8,9 @@ is not called again.
 
 from __future__ import annotations
 
+import importlib
 import json
+import pkgutil
 import sys
 from pathlib import Path
 from types import CodeType, FrameType
@@ -62,6 +64,10 @@ class Trace:
 
 def main(path: Path) -> None:
     """Trace a run over a campaign, and print the figures."""
+    # What is imported late would count as called.
+    for module in pkgutil.walk_packages(lidarops.__path__, "lidarops."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
     campaign = load_campaign(path)
     trace = Trace()
     sys.setprofile(trace)
