@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any, Final, NamedTuple
 
-import numba
 import numpy as np
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Indices
-from lidarops.retrieve.common.compiled_code import compiled, summing
+from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 
 GROUPS: Final = 16
 """Groups of neighbouring bins whose mean residuals are tested."""
@@ -54,10 +53,6 @@ class Limits(NamedTuple):
     """Limit of the curvature and of the differences of backgrounds, in standard errors."""
     aerosol: float
     """Odds that the next shorter window is the first one without aerosol."""
-
-
-# What calls a sum is inlined too: see `compiled_code.summing`.
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 
 @summing
@@ -118,7 +113,7 @@ def _fill_counts(
         weights[i] = usable[i] * exposure / (background + amplitude * phi[i])
 
 
-@_inlined
+@inlined
 def _weigh_counts(
     values: Array,
     phi: Array,
@@ -139,7 +134,7 @@ def _weigh_counts(
         _fill_counts(weights, phi, usable, exposure, max(background, least), amplitude)
 
 
-@_inlined
+@inlined
 def _test_residuals(
     residuals: Array, phi: Array, lever: Array, weights: Array, sums: Any, row: Array
 ) -> None:
@@ -197,7 +192,7 @@ def _is_constant(values: Array, usable: Array) -> bool:
     return True
 
 
-@_inlined
+@inlined
 def _fit(
     values: Array,
     phi: Array,
@@ -257,7 +252,7 @@ def _choose(rows: Array, limits: Limits) -> int:
     return int(shortest)
 
 
-@_inlined
+@inlined
 def _relative_odds(rows: Array, chosen: int, limits: Limits, odds: Array) -> None:
     """Fill how likely it is that the far range is clean from each window on, relative to others.
 

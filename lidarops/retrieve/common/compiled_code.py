@@ -18,6 +18,8 @@ _CONSTANTS: Final = ("constants.py", "flags.py")
 """Modules of lidarops beside the sources whose constants are compiled in."""
 
 compiled: Final = numba.njit(cache=True, nogil=True, error_model="numpy")
+inlined: Final = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+"""Compile what calls a sum and is called by compiled code, for the reason that `summing` gives."""
 summing: Final = numba.njit(
     cache=True,
     nogil=True,

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
-from lidarops.retrieve.common.compiled_code import compiled, summing
+from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _GAUSS: Final = 1.4826
@@ -120,7 +120,7 @@ def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float)
     return total
 
 
-@compiled
+@inlined
 def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
     """Return slope and level of the best of the zero line and the lines through two beams."""
     best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
