@@ -12,7 +12,7 @@ import pytest
 GROUPS = pytest.mark.parametrize(
     ("group", "command"),
     [
-        ("product_kinds", ["--help"]),
+        ("product_kinds", ["schema"]),
         ("product_kinds", ["plan", "campaign.yaml"]),
         ("raw_formats", ["inspect", "file"]),
     ],

@@ -18,7 +18,7 @@ from lidarops.netcdf.comparison import compare_products
 from lidarops.records import Grade
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.session import Session
-from lidarops.scene import scene
+from lidarops.scene import processing
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def test_products_before_a_failure_are_those_of_the_ledger(
 ) -> None:
     """A forced run read a file less, and then failed after it had replaced the first product."""
     assert len(made(reprocess(campaign))) == 2
-    read, created = Path.read_bytes, scene.create_product
+    read, created = Path.read_bytes, processing.create_product
 
     def failing(path: Path) -> bytes:
         if path.name == "h01":
@@ -116,7 +116,7 @@ def test_products_before_a_failure_are_those_of_the_ledger(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "read_bytes", failing)
-        patch.setattr(scene, "create_product", create)
+        patch.setattr(processing, "create_product", create)
         result = bring_up_to_date(campaign, options=Options(force=True))
     assert "Input/output error" in str(result.failures)
     assert made(result.record) == {"poor 1 signal analog"}

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidarops.process.context import recorded_settings
-from lidarops.process.job import Job
+from lidarops.scene.context import recorded_settings
+from lidarops.scene.job import Job
 from support import factories
 from support.archives.network_plans import campaign as network_campaign
 from support.archives.network_plans import granules as network_granules

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
-from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _GAUSS: Final = 1.4826
@@ -108,30 +108,41 @@ def start_residuals(y: Array, noise: Array, x: Array, residuals: Array) -> None:
                     residuals[t, a, k] = y[t, a, k] - level - slope * x[a, k]
 
 
-# Sums side by side take a fifth of the time.
-@summing
-def _agreement(y: Array, x: Array, per_width: Array, slope: float, level: float) -> float:
-    """Return the sum of (1 - square)^3 of Tukey's bounded squares about a line."""
-    total = 0.0
+@compiled
+def _agreement(
+    y: Array, x: Array, per_width: Array, tilts: Array, levels: Array, totals: Array
+) -> None:
+    """Fill the sums of (1 - square)^3 of Tukey's bounded squares about some lines.
+
+    The lines stand side by side, so that each sum has one order. Left to the compiler (`summing`),
+    last digits depended on what was compiled before, although all was inlined.
+    """
+    totals[:] = 0.0
     for i in range(y.size):
-        share = ((y[i] - level - slope * x[i]) * per_width[i]) ** 2
-        within = max(1.0 - share, 0.0)
-        total += within * within * within
-    return total
+        for k in range(tilts.size):
+            share = ((y[i] - levels[k] - tilts[k] * x[i]) * per_width[i]) ** 2
+            within = max(1.0 - share, 0.0)
+            totals[k] += within * within * within
 
 
-@inlined
+@compiled
 def _best_pair(y: Array, x: Array, per_width: Array) -> tuple[float, float]:
     """Return slope and level of the best of the zero line and the lines through two beams."""
-    best, slope, level = _agreement(y, x, per_width, 0.0, 0.0), 0.0, 0.0
+    tilts, levels, totals = np.zeros(y.size), np.zeros(y.size), np.zeros(y.size)
+    _agreement(y, x, per_width, tilts[:1], levels[:1], totals[:1])
+    best, slope, level = totals[0], 0.0, 0.0
     closest = THRESHOLDS.closest_paths * (np.max(x) - np.min(x))
     for i in range(y.size):
+        lines = 0
         for j in range(i):
             if abs(x[i] - x[j]) > closest:
-                tilt = (y[i] - y[j]) / (x[i] - x[j])
-                total = _agreement(y, x, per_width, tilt, y[i] - tilt * x[i])
-                if total > best:
-                    best, slope, level = total, tilt, y[i] - tilt * x[i]
+                tilts[lines] = (y[i] - y[j]) / (x[i] - x[j])
+                levels[lines] = y[i] - tilts[lines] * x[i]
+                lines += 1
+        _agreement(y, x, per_width, tilts[:lines], levels[:lines], totals[:lines])
+        for k in range(lines):
+            if totals[k] > best:
+                best, slope, level = totals[k], tilts[k], levels[k]
     return slope, level
 
 
