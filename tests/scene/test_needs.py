@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidarops.scene.context import recorded_settings
-from lidarops.scene.job import Job
 from support import factories
 from support.archives.network_plans import campaign as network_campaign
 from support.archives.network_plans import granules as network_granules
@@ -17,6 +15,8 @@ from support.archives.network_plans import granules as network_granules
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, PlannedStep, Role
 from lidarops.scene import dependence
+from lidarops.scene.context import recorded_settings
+from lidarops.scene.job import Job
 from lidarops.scene.plan import plan_scene
 from lidarops.scene.retrieval import settings_model
 
