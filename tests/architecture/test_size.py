@@ -29,8 +29,8 @@ MOST = {
     "lines of the largest package": 9_850,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 94, "functions": 845, "changes": 442},
-    "elastic": {"modules": 104, "functions": 990, "changes": 486},
+    "homogeneous": {"modules": 91, "functions": 790, "changes": 437},
+    "elastic": {"modules": 102, "functions": 925, "changes": 450},
 }
 
 
