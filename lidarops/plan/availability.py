@@ -14,10 +14,11 @@ from typing import Final
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
 from lidarops.raw.recorders import label_of
 from lidarops.records import ChannelLayout, FactsNote, Holding, LeftOut, Unmet, is_glued
-from lidarops.scene.channels import LAG_STEP, glued_parts
-from lidarops.scene.missing_channels import (
+from lidarops.scene.channels import (
     ABSENT,
+    LAG_STEP,
     UNMATCHED,
+    glued_parts,
     missing_channels,
     named_channels,
 )

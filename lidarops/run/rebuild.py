@@ -9,7 +9,7 @@ from datetime import datetime
 from functools import partial
 from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -26,10 +26,10 @@ from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.plan.windows import parse_scene_id
-from lidarops.records import Plan, ProductRecord, Role, SceneOutcome, digest
+from lidarops.records import ProductRecord, Role, SceneOutcome
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
-from lidarops.run.staleness import Judge, Judgement, settings_digest
+from lidarops.run.staleness import Judge, settings_digest
 from lidarops.scene import dependence
 from lidarops.system.files import sha256_of
 from lidarops.system.output_files import product_paths
@@ -94,17 +94,16 @@ def rebuild_ledger(
         read(days.pop(None, []))
         judge, run = Judge(campaign, store), None
         for batch in judge.batches(day for day in days if day is not None):
-            judgements = {judged.scene.id: judged for judged in judge.days(batch).judgements}
+            present = {judged.scene.id for judged in judge.days(batch).judgements}
             scenes = ((day, *group) for day in batch for group in groupby(read(days[day]), _scene))
             for day, scene, products in scenes:
                 if run is None:
                     run = new_run(campaign)
                     store.begin_run(run, lock.token)
-                judged = judgements.get(scene)
-                entry = _entry(judge, judged, day, tuple(products))
+                entry = _entry(day, tuple(products))
                 store.record(entry, run.id, lock.token)
                 rebuilt.entered += len(entry.products)
-                rebuilt.without_scene += len(entry.products) if judged is None else 0
+                rebuilt.without_scene += 0 if scene in present else len(entry.products)
         if run is not None:
             refused = len(store.refused())
             store.end_run(run.id, RunStatus.FINISHED, refused=refused, token=lock.token)
@@ -187,9 +186,7 @@ def _counts(file: Path, kind: str) -> tuple[int, int, int]:
     return flags.size, unflagged, usable
 
 
-def _entry(
-    judge: Judge, judged: Judgement | None, day: int, products: tuple[_ProductFile, ...]
-) -> SceneEntry:
+def _entry(day: int, products: tuple[_ProductFile, ...]) -> SceneEntry:
     recipe = products[0].recipe
     keys, scene = recipe.settings["keys"], recipe.plan.scene
     outcome = SceneOutcome(
@@ -205,7 +202,7 @@ def _entry(
         NewProduct(
             product.record,
             product.mtime_ns,
-            _dependence(judge, judged, product.recipe),
+            _dependence(product.recipe),
             (*product.recipe.inputs, *dependence.unused_inputs(product.recipe.unused)),
         )
         for product in products
@@ -213,34 +210,11 @@ def _entry(
     return SceneEntry(outcome=outcome, day=day, key="", final=False, products=new)
 
 
-def _dependence(judge: Judge, judged: Judgement | None, recipe: Recipe) -> Dependence:
-    """Return what a product depends on: the plan of now if it is the one that it carried out."""
-    plan, product = recipe.plan, (recipe.kind, recipe.channel)
-    if judged is not None and product in dependence.planned_products(judged.plan):
-        planned, settings = judge.plan_and_settings(judged.scene, judged.plan, product)
-        same_settings = digest(settings) == digest(recipe.settings)
-        plan = planned if same_settings and _became(planned, plan) else plan
+def _dependence(recipe: Recipe) -> Dependence:
+    """Return what a product depends on, as it states it."""
     return Dependence(
-        plan_hash=plan.hash,
+        plan_hash=recipe.plan.hash,
         settings_hash=settings_digest(recipe.settings),
         inputs_hash=dependence.inputs_digest(recipe.inputs),
         code_version=recipe.code_version,
     )
-
-
-def _became(planned: Plan, stated: Plan) -> bool:
-    """Return whether a plan became another one when the data were looked at.
-
-    That leaves out parts of products, and changes nothing else.
-    """
-    (steps, left_out), (stated_steps, stated_left_out) = map(_comparable, (planned, stated))
-    return steps == stated_steps and left_out == stated_left_out[: len(left_out)]
-
-
-def _comparable(plan: Plan) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return steps, without the settings of products, which a look may change, and omissions."""
-    steps = [
-        step.as_dict() | ({"settings": {}} if dependence.is_product(step) else {})
-        for step in plan.steps
-    ]
-    return steps, [omission.as_dict() for omission in plan.left_out]

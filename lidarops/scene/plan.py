@@ -19,10 +19,11 @@ from lidarops.scene.channels import (
     estimated_against,
     file_channels,
     joined_layout,
+    missing_channels,
+    named_channels,
     prepared_channels,
 )
 from lidarops.scene.dependence import is_product
-from lidarops.scene.missing_channels import missing_channels, named_channels
 from lidarops.scene.pipe import AIR, PIPE, plan_stages
 from lidarops.scene.retrieval import NetworkCase, making
 from lidarops.settings import ChannelProduct

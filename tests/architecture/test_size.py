@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 87_950,
+    "lines": 87_920,
     "lines of code alone": 57_850,
-    "lines without bench": 78_150,
-    "modules": 433,
+    "lines without bench": 78_110,
+    "modules": 432,
     "dataclasses": 400,
     "lines of dataclasses": 9_550,
     "tuning numbers": 254,
