@@ -15,3 +15,6 @@ The modules follow the light:
 Start with `campaign.simulate_campaign` for a whole campaign, or `pulse.pulsed_signal` for one
 signal.
 """
+
+# Sets the cache of compiled code, whichever module is imported first.
+import lidarops.retrieve  # noqa: F401

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pkgutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
@@ -44,6 +46,16 @@ def test_a_cache_folder_set_by_the_user_is_respected(
 ):
     monkeypatch.setattr(config, "CACHE_DIR", str(sources / "cache"))
     assert Path(keep_apart(sources)).parent == sources / "cache"
+
+
+@pytest.mark.parametrize("name", ["analog", "counting", "pulse"])
+def test_simulations_keep_compiled_code_where_retrievals_do(name: str):
+    # In a process that has not imported the retrievals.
+    program = f"import lidarops.simulate.{name}; from numba import config; print(config.CACHE_DIR)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert Path(done.stdout.strip()).name.startswith("lidarops-"), done.stderr
 
 
 def test_code_compiled_at_installation_is_shared(
