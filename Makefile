@@ -36,8 +36,8 @@ docs: .venv/.dev
 	$(BIN)/python -m sphinx --fail-on-warning --quiet -b html docs docs/_build/html
 
 # Error against run time of every retrieval, one page: bench/index.html.
-bench: .venv/.runtime
-	$(BIN)/lidarops bench accuracy --out bench
+bench: .venv/.dev
+	$(BIN)/python -m benchmarks accuracy --out bench
 
 .venv/.runtime: requirements.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

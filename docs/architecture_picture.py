@@ -20,7 +20,6 @@ PICTURE: Final = Path(__file__).with_name("architecture.svg")
 PURPOSES: Final = {
     "flows": "Prefect flows: schedules",
     "cli": "command line",
-    "bench": "accuracy, stability, throughput",
     "run": "stale products, runs, clusters",
     "site": "pages to browse an archive",
     "aggregate": "many products as one",

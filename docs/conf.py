@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 REPOSITORY = HERE.parent
-sys.path[:0] = [str(HERE / "_extensions"), str(REPOSITORY / "tests")]
+sys.path[:0] = [str(HERE / "_extensions"), str(REPOSITORY / "tests"), str(REPOSITORY)]
 
 project = "lidarops"
 author = "The lidarops developers"

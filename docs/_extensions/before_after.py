@@ -10,11 +10,11 @@ import benchmark_results
 import tables
 import verdicts
 
-from lidarops.bench.harness.figure import Figure, Unit, format_time, with_error
-from lidarops.bench.harness.rows import Row
-from lidarops.bench.harness.verdicts import Judgement, Target
-from lidarops.bench.stability.random_scenes import TARGETS
-from lidarops.bench.stability.reasons import Unmet
+from benchmarks.harness.figure import Figure, Unit, format_time, with_error
+from benchmarks.harness.rows import Row
+from benchmarks.harness.verdicts import Judgement, Target
+from benchmarks.stability.random_scenes import TARGETS
+from benchmarks.stability.reasons import Unmet
 
 RATIO: Final = "ratio"
 """Beginning of a place that names two figures, of which the first is divided by the second."""

@@ -1,7 +1,7 @@
 """The results of benchmarks as they are committed: tables of numbers and figures.
 
-``python docs/_extensions/benchmark_results.py NAME BENCH`` takes what ``lidarops bench ... --out
-BENCH`` wrote into ``docs/results/NAME.json``, and the figures that the page shows.
+``python docs/_extensions/benchmark_results.py NAME BENCH`` takes what ``python -m benchmarks ...
+--out BENCH`` wrote into ``docs/results/NAME.json``, and the figures that the page shows.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any, Final, NamedTuple
 
 import tables
 
-from lidarops.bench.harness.figure import Unit
-from lidarops.bench.harness.rows import Row
-from lidarops.bench.harness.tables import table
+from benchmarks.harness.figure import Unit
+from benchmarks.harness.rows import Row
+from benchmarks.harness.tables import table
 
 RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
 DIGITS: Final = 6
@@ -38,24 +38,26 @@ class Selection(NamedTuple):
 
 SELECTIONS: Final = {
     "accuracy": Selection(
-        "lidarops bench accuracy --quick --out bench",
+        "python -m benchmarks accuracy --quick --out bench",
         ("The most accurate", "Ours beside", "Homogeneous path:", "Elastic inversion:",
          "Scans over zenith", "Networks: Networks and scipy"),
         figures=("all-homogeneous-path", "all-elastic-inversion", "all-scans-over-zenith-angle",
                  "all-networks-of-lidars"),
     ),
     "background": Selection(
-        "lidarops bench accuracy --case homogeneous --quick --out bench",
+        "python -m benchmarks accuracy --case homogeneous --quick --out bench",
         ("Mean error of the background",),
         ("length of the section (km)", "lag 1", "direct", "scatter", "flagged", "published"),
     ),
-    "memory": Selection("lidarops bench throughput --case memory --out bench", ("Peak memory",)),
+    "memory": Selection(
+        "python -m benchmarks throughput --case memory --out bench", ("Peak memory",)
+    ),
     "published": Selection(
-        "lidarops bench accuracy --case elastic --quick --data boeckmann --out bench",
+        "python -m benchmarks accuracy --case elastic --quick --data boeckmann --out bench",
         ("Background of published files", "Backscatter of published files"),
     ),
     "stability": Selection(
-        "lidarops bench stability --out bench",
+        "python -m benchmarks stability --out bench",
         ("",),
         ("clusters", "values", "not rejected", "within 1.96", "95 % target", "within 1",
          "68 % target", "stated / median error", "false, random error", "and not uncertain",
@@ -64,7 +66,7 @@ SELECTIONS: Final = {
          "CPU time"),
     ),
     "throughput": Selection(
-        "lidarops bench throughput --quick --out bench", ("float32, dense", "float32, 30 %"),
+        "python -m benchmarks throughput --quick --out bench", ("float32, dense", "float32, 30 %"),
         figures=("time",),
     ),
 }  # fmt: skip

@@ -16,8 +16,14 @@ _EXAMPLE = re.compile(r"^Example: (.+)$", re.MULTILINE)
 
 def page() -> str:
     """Return a section for each command, in the order of the alphabet."""
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    return "\n".join(line for name in sorted(commands) for line in _section(name, commands[name]))
+    shown = commands()
+    return "\n".join(line for name in sorted(shown) for line in _section(name, shown[name]))
+
+
+def commands() -> dict[str, Any]:
+    """Return the commands of lidarops that its help lists."""
+    every = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    return {name: command for name, command in every.items() if not command.hidden}
 
 
 def _section(name: str, command: Any) -> Iterator[str]:

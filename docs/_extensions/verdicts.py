@@ -8,13 +8,13 @@ from typing import Final
 import benchmark_results
 import tables
 
-from lidarops.bench.harness.figure import share_text
-from lidarops.bench.harness.rows import CPU_TIME, Row
-from lidarops.bench.harness.tables import cell
-from lidarops.bench.harness.verdicts import Judgement, Verdict
-from lidarops.bench.stability import flag_rates, reasons
-from lidarops.bench.stability.random_scenes import SATISFIED, TARGET, TARGETS
-from lidarops.bench.stability.reasons import Unmet
+from benchmarks.harness.figure import share_text
+from benchmarks.harness.rows import CPU_TIME, Row
+from benchmarks.harness.tables import cell
+from benchmarks.harness.verdicts import Judgement, Verdict
+from benchmarks.stability import flag_rates, reasons
+from benchmarks.stability.random_scenes import SATISFIED, TARGET, TARGETS
+from benchmarks.stability.reasons import Unmet
 
 _WORDS: Final = {TARGET: "false", "needless target": "needless"}
 

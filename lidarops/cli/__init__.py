@@ -8,14 +8,13 @@ from lidarops.system.threads import use_one_thread
 
 use_one_thread()
 
-from lidarops.cli import aggregate, archive, bench, files, init, ledger, plan, preparation, site
+from lidarops.cli import aggregate, archive, files, init, ledger, plan, preparation, site
 from lidarops.cli.app import app
 
 __all__ = [
     "aggregate",
     "app",
     "archive",
-    "bench",
     "files",
     "init",
     "ledger",

@@ -94,7 +94,9 @@ def say(text: object) -> None:
     typer.echo(visible(str(text)))
 
 
-def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
+def command(
+    name: str | None = None, *, program: typer.Typer = app, **options: Any
+) -> Callable[[Callable[_P, None]], Callable[_P, None]]:
     """Register a function as a command that shows a lidarops error as a line, not a traceback."""
 
     def registered(function: Callable[_P, None]) -> Callable[_P, None]:
@@ -112,7 +114,7 @@ def command(name: str | None = None) -> Callable[[Callable[_P, None]], Callable[
                 show_error(_of_system(error))
                 raise typer.Exit(REFUSED) from error
 
-        return app.command(name, help=_paragraphs(function.__doc__ or ""))(wrapped)
+        return program.command(name, help=_paragraphs(function.__doc__ or ""), **options)(wrapped)
 
     return registered
 
@@ -300,3 +302,14 @@ def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list
     wanted = sum(whole) - sum(least)
     share = min(1.0, spare / wanted) if wanted else 0.0
     return [low + int(share * (high - low)) for low, high in zip(least, whole, strict=True)]
+
+
+@command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def bench() -> None:
+    """Say where the benchmarks are."""
+    raise LidarOpsError(
+        "the benchmarks are beside the package",
+        field="bench",
+        remedy="in a checkout, run: python -m benchmarks",
+        wrong_use=True,
+    )

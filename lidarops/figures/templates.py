@@ -1,4 +1,4 @@
-"""Page templates and the shared style of reports, benchmarks and the site."""
+"""Page templates and the shared style of reports and the site."""
 
 from __future__ import annotations
 

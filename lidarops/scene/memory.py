@@ -15,8 +15,8 @@ from lidarops.scene.profiles import CHUNK_BYTES
 from lidarops.scene.retrieval import Workload, making, product_settings
 
 PROCESS: Final = 420_000_000
-"""Bytes of a process with the code of all kinds loaded; above what ``lidarops bench throughput
---case memory`` measures, like all sizes here."""
+"""Bytes of a process with the code of all kinds loaded; above what ``benchmarks throughput --case
+memory`` measures, like all sizes here."""
 OF_A_COUNT: Final = 26.0
 """Bytes at the peak of a chunk of ``signal``, for each byte of its counts; other kinds take
 less."""

@@ -12,7 +12,7 @@ import python_api
 def test_every_public_name_is_used_or_belongs_to_the_api(repository: Path):
     used: set[str] = set()
     defined: dict[str, Path] = {}
-    for root in ("lidarops", "flows", "examples", "docs"):
+    for root in ("lidarops", "flows", "benchmarks", "examples", "docs"):
         for path in sorted((repository / root).rglob("*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"))
             for node in ast.walk(tree):

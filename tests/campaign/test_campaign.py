@@ -154,9 +154,6 @@ def test_a_url_for_output_is_refused(tmp_path: Path) -> None:
         message = CliRunner().invoke(app, [*command, "--out", "s3://bucket/out"])
         assert message.exit_code == 2
         assert "output: is a URL" in message.stderr
-    message = CliRunner().invoke(app, ["bench", "luck", "--out", "s3://bucket/out"])
-    assert message.exit_code == 2
-    assert "is a URL" in " ".join(message.stderr.split())
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Every code block of README and documentation runs, but for those that the build executes.
 
-Benchmarks take minutes: their arguments are parsed here, and tests/bench runs them.
+Benchmarks take minutes: their arguments are parsed here, and tests/benchmarks runs them.
 
 The blocks of a page run one after another in a folder of its own, with the campaign of
 `docs/howto/campaign.md`, its raw files and its products. Commands of lidarops run in this process.
@@ -21,6 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import command_line
 import pytest
 import typer
 import xarray as xr
@@ -28,8 +29,9 @@ import yaml
 from support.pages import REPOSITORY, Block, blocks, name_of, pages
 from typer.testing import CliRunner
 
-from lidarops.bench.harness.benchmark import BenchmarkKind
-from lidarops.bench.registry import Benchmark
+from benchmarks.__main__ import app as benchmarks
+from benchmarks.harness.benchmark import BenchmarkKind
+from benchmarks.registry import Benchmark
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.run.clusters import Scheduler
@@ -47,6 +49,8 @@ STAND_INS = (
 )  # fmt: skip
 FOLDERS = ("catalogs/", "deploy/", "docs/", "examples/", "flows/", "tests/")
 """Of the repository, whose files commands on pages name."""
+MODULES = ("benchmarks", "flows")
+"""Beginnings of names of modules that commands on pages run."""
 IN_SHELL = re.compile(r"[>|&;*]")
 ENDS_WITH_1 = {
     # Files of the demo are damaged on purpose.
@@ -73,12 +77,6 @@ OURS = [block for block in BLOCKS if block.page not in ELSEWHERE]
 
 def lidarops(*arguments: str) -> None:
     """Run a command, which ends with 0 but for those of `ENDS_WITH_1`."""
-    if arguments[0] == "bench":
-        command = typer.main.get_command(app).commands["bench"]
-        words = command.make_context("bench", list(arguments[1:])).params
-        assert words["what"] in list(BenchmarkKind)
-        assert words["case"] in [*Benchmark, None]
-        return
     result = CliRunner().invoke(app, list(arguments))
     assert result.exit_code == int(arguments in ENDS_WITH_1), (arguments, result.output)
     if arguments[0] == "reprocess":
@@ -198,8 +196,12 @@ def check_arguments(tool: str, arguments: list[str]) -> None:
         if argument.startswith(FOLDERS) and argument != "deploy/.env":
             in_cluster = argument == "deploy/lidarops-prefect-worker"
             assert in_cluster or (REPOSITORY / argument).exists(), argument
-    if tool == "python" and arguments[0] == "-m" and arguments[1].startswith("flows"):
+    if tool == "python" and arguments[0] == "-m" and arguments[1].startswith(MODULES):
         assert find_spec(arguments[1])
+    if tool == "python" and arguments[:2] == ["-m", "benchmarks"]:
+        words = typer.main.get_command(benchmarks).make_context("benchmarks", arguments[2:]).params
+        assert words["what"] in list(BenchmarkKind)
+        assert words["case"] in [*Benchmark, None]
     if tool == "pip":
         # One wheel, or a checkout: a name alone is that of any package of the index.
         assert arguments[0] == "install", arguments
@@ -253,7 +255,7 @@ def test_no_block_is_indented_only() -> None:
 
 
 def test_examples_of_the_help_fit_their_commands() -> None:
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in command_line.commands().items():
         examples = re.findall(r"^Example: lidarops (.+)$", command.help or "", re.MULTILINE)
         assert examples, name
         for example in examples:

@@ -16,14 +16,12 @@ import product_variables
 import pytest
 import python_api
 import stiff_cases
-import typer
 import yaml
 from support.pages import blocks, name_of, pages
 
 import flows
 import lidarops
 from lidarops.campaign.model import load_campaign
-from lidarops.cli import app
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kind_of
 
@@ -76,7 +74,7 @@ def test_modules_for_users_have_a_page_with_all_their_public_names(tmp_path) -> 
 
 def test_every_command_is_listed_with_its_options() -> None:
     page = command_line.page()
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in command_line.commands().items():
         section = page.partition(f"## `{name}`\n")[2].partition("\n## ")[0]
         assert f"lidarops {name} " in section
         for parameter in command.params:

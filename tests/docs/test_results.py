@@ -11,14 +11,14 @@ import pytest
 import typer
 import verdicts
 
-from lidarops.bench.harness.benchmark import BenchmarkKind
-from lidarops.bench.harness.figure import Figure, Unit
-from lidarops.bench.harness.verdicts import Judgement, Target, Verdict
-from lidarops.bench.registry import Benchmark
-from lidarops.bench.stability import study
-from lidarops.bench.stability.random_scenes import TARGETS
-from lidarops.bench.stability.reasons import Unmet
-from lidarops.cli import app
+from benchmarks.__main__ import app
+from benchmarks.harness.benchmark import BenchmarkKind
+from benchmarks.harness.figure import Figure, Unit
+from benchmarks.harness.verdicts import Judgement, Target, Verdict
+from benchmarks.registry import Benchmark
+from benchmarks.stability import study
+from benchmarks.stability.random_scenes import TARGETS
+from benchmarks.stability.reasons import Unmet
 
 
 @pytest.fixture
@@ -104,9 +104,9 @@ def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
     assert result["tables"]
     # What is committed was made by the command of today, which the command line accepts.
     assert result["command"] == benchmark_results.SELECTIONS[name].command
-    program, command, *words = result["command"].split()
-    assert (program, command) == ("lidarops", "bench")
-    values = typer.main.get_command(app).commands["bench"].make_context("bench", words).params
+    command, words = result["command"].split()[:3], result["command"].split()[3:]
+    assert command == ["python", "-m", "benchmarks"]
+    values = typer.main.get_command(app).make_context("benchmarks", words).params
     assert values["what"] in list(BenchmarkKind)
     assert values["case"] in [*Benchmark, None]
 
@@ -199,7 +199,7 @@ def test_the_page_shows_before_and_now_with_errors() -> None:
     for row in _rows_before():
         assert f"| {row['figure']} | {row['before']} |" in text
         assert row.get("note", "") in text
-    assert "`lidarops bench stability`" in text
+    assert "`python -m benchmarks stability`" in text
 
 
 def test_the_scoreboard_shows_ours_beside_all_others() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import verdicts
 
-from lidarops.bench.harness.verdicts import Verdict
-from lidarops.bench.stability.random_scenes import POOLED, TARGET
+from benchmarks.harness.verdicts import Verdict
+from benchmarks.stability.random_scenes import POOLED, TARGET
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import MEASURED_SHARES
 

@@ -14,6 +14,7 @@ from support import factories
 from support.archives import raw_archives
 from typer.testing import CliRunner
 
+from benchmarks.__main__ import app as benchmarks
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.store import Store
 from lidarops.cli import app
@@ -208,7 +209,7 @@ def test_the_command_line_reprocesses_and_reports(
         (["report", "/nowhere"], 2, "/nowhere"),
         (["report", "/"], 2, "run.json"),
         (["site", "/nowhere"], 2, "/nowhere"),
-        (["bench", "luck", "file"], 2, "throughput"),
+        (["bench", "throughput", "--quick"], 2, "python -m benchmarks"),
     ],
 )
 def test_wrong_use_is_reported(
@@ -239,7 +240,7 @@ def test_the_examples_of_the_help_name_files_that_the_demo_makes(
 
 def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:
     files = sorted(str(path) for path in (demo_archive / "hill").glob("v24921*"))[:4]
-    result = CliRunner().invoke(app, ["bench", "throughput", *files, "--repeats", "1"])
+    result = CliRunner().invoke(benchmarks, ["throughput", *files, "--repeats", "1"])
     assert result.exit_code == 0, result.output
     assert "header" in result.stdout
     assert "times floor" in result.stdout

@@ -11,7 +11,7 @@ from support.archives.scene_jobs import scene_jobs
 from support.archives.small_archive import Archive, made
 from typer.testing import CliRunner
 
-from lidarops.bench.throughput import memory as peaks
+from benchmarks.throughput import memory as peaks
 from lidarops.cli.app import app
 from lidarops.errors import SceneError
 from lidarops.run.archive import Options, reprocess

@@ -6,7 +6,7 @@ import tracemalloc
 
 import pytest
 
-from lidarops.bench.throughput.raman_night import night, night_signals, screened_average
+from benchmarks.throughput.raman_night import night, night_signals, screened_average
 from lidarops.products.raman.retrieval import bytes_held
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled

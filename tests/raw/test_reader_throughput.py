@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from support.licel_strategies import raw_file
 
-from lidarops.bench.harness.benchmark import Effort
-from lidarops.bench.throughput import readers
+from benchmarks.harness.benchmark import Effort
+from benchmarks.throughput import readers
 from lidarops.errors import RawFormatError
 
 

@@ -14,7 +14,6 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-BENCHMARKS = "lidarops/bench"
 
 
 @cache
@@ -134,7 +133,6 @@ def figures() -> dict[str, int]:
     return {
         "lines": lines(),
         "lines of code alone": code_lines(),
-        "lines without bench": lines() - lines(BENCHMARKS),
         "modules": len(sources()),
         "dataclasses": len(classes),
         "lines of dataclasses": sum((c.end_lineno or 0) - c.lineno + 1 for c in classes),

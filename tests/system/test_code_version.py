@@ -104,7 +104,7 @@ def test_a_change_of_a_kind_changes_its_version_and_no_other(growing: Copy, modu
 
 @pytest.mark.parametrize(
     "package",
-    ["aggregate", "bench", "catalog", "cli", "figures", "reports", "run", "simulate", "site",
+    ["aggregate", "catalog", "cli", "figures", "reports", "run", "simulate", "site",
      "system"],
 )  # fmt: skip
 def test_what_makes_no_product_changes_no_version(growing: Copy, package: str):

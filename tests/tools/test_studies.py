@@ -8,35 +8,35 @@ import sys
 from pathlib import Path
 
 import pytest
-from studies import path_guards
-from studies.ablation import BASE
+
+from benchmarks.studies import path_guards
+from benchmarks.studies.ablation import BASE
 
 STUDIES = sorted(
-    path
-    for path in (Path(__file__).resolve().parents[1] / "studies").glob("*.py")
+    path.stem
+    for path in (Path(__file__).resolve().parents[2] / "benchmarks/studies").glob("*.py")
     if "__main__" in path.read_text(encoding="utf-8")
 )
 
 
-# All in one process, which loads what they import once. A script's own folder comes first.
+# All in one process, which loads what they import once.
 HELP = """
 import contextlib, io, json, runpy, sys
-from pathlib import Path
-scripts, elsewhere, ends = sys.argv[1:], sys.path[1:], {}
-for script in map(Path, scripts):
-    sys.argv, sys.path[:] = [str(script), "--help"], [str(script.parent), *elsewhere]
+studies, ends = sys.argv[1:], {}
+for study in studies:
+    sys.argv = [study, "--help"]
     with contextlib.redirect_stdout(io.StringIO()) as output:
         try:
-            runpy.run_path(str(script), run_name="__main__")
+            runpy.run_module(f"benchmarks.studies.{study}", run_name="__main__")
         except SystemExit as end:
-            ends[script.stem] = [end.code, "usage" in output.getvalue()]
+            ends[study] = [end.code, "usage" in output.getvalue()]
 print(json.dumps(ends))
 """
 
 
 def test_a_study_states_its_arguments(repository: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", HELP, *map(str, STUDIES)],
+        [sys.executable, "-c", HELP, *STUDIES],
         cwd=repository,
         capture_output=True,
         text=True,
@@ -44,7 +44,7 @@ def test_a_study_states_its_arguments(repository: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == {path.stem: [0, True] for path in STUDIES}
+    assert json.loads(done.stdout) == {study: [0, True] for study in STUDIES}
 
 
 @pytest.mark.parametrize("mark", path_guards.TABLES)

@@ -146,8 +146,8 @@ def _held(settings: ElasticPlan, work: Workload) -> float:
 _BYTES_OF_PARTS: Final = 1500.0
 """Bytes per bin of the parts of the open average: 44 each of two records that are glued."""
 _BYTES_OF_A_BIN: Final = 240.0
-"""Bytes per bin of an average that is open or being inverted, from ``lidarops bench throughput
---case memory``."""
+"""Bytes per bin of an average that is open or being inverted, from ``benchmarks throughput --case
+memory``."""
 
 
 class _Inversion(RowProduct):

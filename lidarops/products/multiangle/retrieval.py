@@ -372,7 +372,7 @@ def _held(settings: MultiAnglePlan, work: Workload) -> float:
 
 
 _BYTES_OF_AN_ALTITUDE: Final = 430.0
-"""Bytes per altitude of a beam of a cycle at the peak of the retrieval, as ``lidarops bench
+"""Bytes per altitude of a beam of a cycle at the peak of the retrieval, as ``python -m benchmarks
 throughput --case memory`` measures."""
 
 

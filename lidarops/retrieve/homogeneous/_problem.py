@@ -120,7 +120,7 @@ class HomogeneousResult:
     shapes leaves no trace in the residuals: backscatter that decreases along the path as
     ``exp(-R / H)`` mimics an extinction of 1 / (2 H), on a vertical path as on any other.
     `extinction_model_error` and `background_model_error` allow for that, separately from the
-    random error; they are not bounds. ``lidarops bench stability`` gives the share of false values
+    random error; they are not bounds. ``benchmarks stability`` gives the share of false values
     for every kind of violation.
     """
 

@@ -128,7 +128,7 @@ class Thresholds(NamedTuple):
     """Standard deviation of ln extinction over the crossings by the curvature of a field: that of a
     gradient; the largest part of the errors of single profiles. With half of it and a `doubt` of
     1.5, or with at most the deviation of the prior, fewer than 94 percent of the 95 percent
-    intervals of plumes hold the truth in blocks of 1 (``lidarops bench stability``), and those of
+    intervals of plumes hold the truth in blocks of 1 (``benchmarks stability``), and those of
     homogeneous air are still too wide: what makes these right makes plumes false."""
     largest_deviation: float = 8.0
     """Limit of the deviation of a profile from the median, in median standard errors; assumed."""

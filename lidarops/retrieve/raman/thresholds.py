@@ -34,7 +34,7 @@ class Thresholds(NamedTuple):
     lidar_ratio_spread: float = 0.45
     """Standard deviation of the logarithm of true lidar ratios about the typical one, by which the
     errors of uncertain ones are stated: 95 percent from 21 to 121 sr, the plausible ones. In 1,200
-    skies of ``lidarops bench stability``, 95 and 68 percent intervals cover 96.4(4) and 73.2(9)
+    skies of ``benchmarks stability``, 95 and 68 percent intervals cover 96.4(4) and 73.2(9)
     percent, and 0.01(6) percent are off by more than 4 errors; with errors of the first order,
     93.5(5), 77.0(8) and 0.30(6). With 0.4, 95 percent intervals cover 86 instead of 89 percent of
     lidar ratios above 80 sr; with 0.5, 68 percent intervals cover 75 percent of all."""

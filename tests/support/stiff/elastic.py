@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from scipy import special
 
-from lidarops.bench.accuracy import elastic_cases
+from benchmarks.accuracy import elastic_cases
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.clouds import layers

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.bench.accuracy.homogeneous_cases import Scenario, least_errors
+from benchmarks.accuracy.homogeneous_cases import Scenario, least_errors
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, photon_counts
@@ -67,7 +67,7 @@ class Path:
 
     @property
     def scenario(self) -> Scenario:
-        """The path as a scenario of `lidarops.bench.accuracy.homogeneous_cases`."""
+        """The path as a scenario of `benchmarks.accuracy.homogeneous_cases`."""
         return Scenario(self.start, self.length, self.extinction, self.signal, self.background)
 
     def noisy(self, profiles: int = 200, seed: int = 1) -> Array:

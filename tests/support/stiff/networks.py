@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.bench.accuracy.network_cases import (
+from benchmarks.accuracy.network_cases import (
     AIRS,
     FULL_OVERLAP,
     THREE_BY_TWO,

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarops.bench.accuracy import multiangle_cases
-from lidarops.bench.accuracy.multiangle_cases import Scene
+from benchmarks.accuracy import multiangle_cases
+from benchmarks.accuracy.multiangle_cases import Scene
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import optical_depth

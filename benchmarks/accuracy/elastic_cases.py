@@ -1,0 +1,529 @@
+"""Vertical profiles with known truth, and methods that retrieve background and particles.
+
+The simulated set follows the EARLINET elastic intercomparison (boeckmann2004): 532 nm, no
+aerosol above 6 km, 1005 bins of 15 m, means of 1000 shots with Poisson noise over a constant
+background. The files of the intercomparison are read if given.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.harness.figure import Array, Mask
+from lidarops.errors import CampaignError, RawFormatError
+from lidarops.flags import Quality, rejecting
+from lidarops.raw import licel
+from lidarops.retrieve.air import MolecularProfile, reference_window
+from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
+from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
+from lidarops.retrieve.background.known_shape import KnownShapeResult
+from lidarops.retrieve.clouds import layers
+from lidarops.retrieve.elastic import inversion
+from lidarops.retrieve.homogeneous import path_fit
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
+from lidarops.simulate.signal import backscatter_signal, bin_centres
+
+WAVELENGTH: Final = 532e-9
+LIDAR_RATIO: Final = 39.0
+SHOTS: Final = 1000.0
+BRIGHTEST: Final = 1.9093e7
+"""Counts in the brightest bin, as in the intercomparison."""
+_BIN_WIDTH: Final = 15.0
+RANGE: Final = bin_centres(1005, _BIN_WIDTH)
+_CELLS: Final = 9
+"""Cells of a bin, over which the optical depth is summed."""
+LEVELS: Final = tuple(10.0**power for power in range(9))
+"""Backgrounds in counts per bin and shot."""
+CLEAN_FROM: Final = 6000.0
+"""m; no particles above."""
+OVERLAP: Final = 400.0
+"""m; the inversion uses the signal above."""
+COMPARED: Final = (500.0, 6000.0)
+"""m; backscatter is compared with the truth in this range."""
+GIVEN_WINDOW: Final = (7000.0, 8000.0)
+"""m; reference window that is given, not chosen."""
+CANDIDATES: Final = reference_window.candidate_windows(4000.0, 12000.0, 1000.0, 250.0)
+
+_SEED: Final = 20040101
+_FULL_SCALE: Final = 2.0**31 - 1.0
+_CHANNEL: Final = "analog_532o"
+_RAMP: Final = 15.0
+"""Bins of incomplete overlap, from which the signal rises to the brightest bin."""
+_FIRST_TRUE_BIN: Final = 60
+"""First usable bin of the published files; nearer bins hold a ramp."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedSky:
+    """One set of air, particles and noise-free signal."""
+
+    range: Array
+    """m."""
+    molecular_backscatter: Array
+    """m-1 sr-1."""
+    molecular_extinction: Array
+    """m-1."""
+    shape: Array
+    """Shape of the molecular signal, m-3 sr-1."""
+    signal: Array
+    """Counts per shot, without noise and background."""
+    backscatter: Array
+    """m-1 sr-1, true backscatter of the particles."""
+
+    @property
+    def compared(self) -> Mask:
+        """Bins whose backscatter is compared with the truth."""
+        return (self.range >= COMPARED[0]) & (self.range <= COMPARED[1])
+
+    @property
+    def inverted(self) -> Mask:
+        """Bins that the inversion uses."""
+        return self.range > OVERLAP
+
+    def counts(self, level: float, draws: int, *seed: int) -> Array:
+        """Return noisy profiles, mean counts of `SHOTS` shots; equal seeds give equal noise.
+
+        Parameters
+        ----------
+        level : float
+            Background in counts per shot.
+        draws : int
+        *seed : int
+
+        Returns
+        -------
+        (draw, range) float
+        """
+        rng = np.random.default_rng([_SEED, *seed])
+        mean = np.broadcast_to(SHOTS * (self.signal + level), (draws, self.range.size))
+        return np.asarray(rng.poisson(mean) / SHOTS)
+
+
+def _sky(air: MolecularProfile, signal: Array, backscatter: Array) -> SimulatedSky:
+    molecular = air.backscatter(RANGE, WAVELENGTH)
+    extinction = air.extinction(RANGE, WAVELENGTH)
+    return SimulatedSky(
+        range=RANGE,
+        molecular_backscatter=molecular,
+        molecular_extinction=extinction,
+        shape=known_shape.molecular_shape(molecular, extinction, RANGE),
+        signal=signal / signal.max() * BRIGHTEST,
+        backscatter=backscatter,
+    )
+
+
+def particles(height: npt.ArrayLike) -> Array:
+    """Return the backscatter of the particles of the simulated set, m-1 sr-1.
+
+    As turbid as the intercomparison (optical depth 1.4): a mixed layer with a soft top at
+    1.75 km, a tenuous layer from 3.9 to 5.7 km, no particles above 6 km.
+    """
+    z = np.asarray(height, dtype=np.float64)
+    mixed = 2e-5 / (1.0 + np.exp((z - 1750.0) / 120.0))
+    phase = np.clip((z - 4800.0) / 900.0, -1.0, 1.0)
+    aloft = 4e-7 * np.cos(0.5 * np.pi * phase) ** 2
+    return np.asarray(np.where(z < CLEAN_FROM, mixed + aloft, 0.0))
+
+
+def clean_signal(
+    extinction: Callable[[Array], Array], backscatter: Callable[[Array], Array]
+) -> Array:
+    """Return the signal of a short pulse in the bins of `RANGE`, in any unit.
+
+    The optical depth is summed over cells of a ninth of a bin, not by the trapezoids of the
+    inversion. The error of these is therefore part of the measured error.
+
+    Parameters
+    ----------
+    extinction, backscatter : callable
+        Return m-1 and m-1 sr-1 at ranges in m.
+    """
+    cells = bin_centres(_CELLS * RANGE.size, _BIN_WIDTH / _CELLS)
+    signal = backscatter_signal(
+        cells,
+        extinction=extinction(cells),
+        backscatter=backscatter(cells),
+        system_constant=1.0,
+    )
+    return signal[_CELLS // 2 :: _CELLS]
+
+
+@cache
+def simulated_sky() -> SimulatedSky:
+    """Return the simulated set."""
+    air = MolecularProfile.us_standard()
+    signal = clean_signal(
+        lambda z: LIDAR_RATIO * particles(z) + air.extinction(z, WAVELENGTH),
+        lambda z: particles(z) + air.backscatter(z, WAVELENGTH),
+    )
+    signal *= np.minimum((np.arange(RANGE.size) + 1.0) / _RAMP, 1.0) ** 3
+    return _sky(air, signal, particles(RANGE))
+
+
+# Background -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundEstimates:
+    """Backgrounds in counts, one per profile."""
+
+    background: Array
+    standard_error: Array
+    rejected: Mask
+    """Whether a quality bit rejects the value."""
+
+
+BackgroundMethod = Callable[[Array, SimulatedSky], BackgroundEstimates]
+"""Returns backgrounds, given counts (profile, range) and their simulated sky."""
+
+KNOWN_SHAPE: Final = "known_shape"
+KNOWN_CLEAN_RANGE: Final = "known_shape, from 6 km"
+TAIL_MEAN: Final = "tail_mean"
+HOMOGENEOUS: Final = "homogeneous"
+LINEAR: Final = "least squares {1, shape}"
+"""The peer: the range from 6 km is given, and the weights are those of the mean profile."""
+
+
+def background_methods() -> dict[str, BackgroundMethod]:
+    """Return the methods of the background by name.
+
+    `homogeneous` and `cubic` assume a homogeneous path, which a vertical one is not. They use the
+    range above 6 km, to show how large their errors are.
+    """
+    return {
+        KNOWN_SHAPE: _known_shape,
+        KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
+        TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
+        LINEAR: linear_backgrounds,
+        HOMOGENEOUS: _homogeneous,
+        "cubic": _cubic,
+    }
+
+
+def _known_shape(
+    counts: Array, sky: SimulatedSky, start: float | None = None
+) -> BackgroundEstimates:
+    return _estimates(
+        known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS, start=start)
+    )
+
+
+def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    far = sky.range >= CLEAN_FROM
+    variance = photon_counts.mean_profile_variance(counts[:, far], SHOTS)
+    fit = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
+    return _estimates(fit)
+
+
+def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    far = sky.range >= CLEAN_FROM
+    return _estimates(
+        cubic_and_tail.cubic(
+            counts[:, far],
+            sky.range[far],
+            variance=photon_counts.mean_profile_variance(counts[:, far], SHOTS),
+        )
+    )
+
+
+def _estimates(
+    result: KnownShapeResult | HomogeneousResult | BackgroundResult,
+) -> BackgroundEstimates:
+    return BackgroundEstimates(
+        result.background,
+        result.background_standard_error,
+        (result.quality & rejecting(Quality)) != 0,
+    )
+
+
+def least_error(sky: SimulatedSky, level: float) -> float:
+    r"""Return the Cramér-Rao bound of the background's standard error from 6 km on, in counts.
+
+    .. math:: \left[ (J^T V^{-1} J)^{-1} \right]_{00}^{1/2}, \quad J = [1, \varphi], \quad
+        V = \mathrm{diag}(s + b) / N
+
+    with the shape :math:`\varphi` of air and N shots (kay1993).
+    """
+    far = sky.range >= CLEAN_FROM
+    shape = sky.shape[far] / sky.shape[far][0]
+    slopes = np.stack([np.ones_like(shape), shape], axis=1)
+    fisher = slopes.T @ (slopes * (SHOTS / (sky.signal[far] + level))[:, np.newaxis])
+    return float(np.sqrt(np.linalg.inv(fisher)[0, 0]))
+
+
+# Inversion ------------------------------------------------------------------------------------
+
+
+def count_variance(counts: Array) -> Array:
+    """Return the variance of mean counts, estimated from the counts."""
+    # A bin without counts is treated as one count.
+    return np.maximum(counts, 1.0 / SHOTS) / SHOTS
+
+
+def subtract_background(counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates) -> Array:
+    """Return counts without background; NaN in bins that the inversion does not use."""
+    return np.where(sky.inverted, counts - estimates.background[:, np.newaxis], np.nan)
+
+
+def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
+    """Return the detected clouds; the sky has none."""
+    return layers.find_layers(power, sky.range, noise, molecular_attenuated=sky.shape)
+
+
+def choose_window(
+    power: Array,
+    noise: Array,
+    sky: SimulatedSky,
+    exclude: Mask | None = None,
+    *,
+    background_error: npt.ArrayLike = 0.0,
+    candidates: Array = CANDIDATES,
+) -> reference_window.ReferenceWindow:
+    """Return the reference windows chosen from the candidates."""
+    return reference_window.choose_reference(
+        power,
+        sky.range,
+        noise,
+        molecular_attenuated=sky.shape,
+        candidates=candidates,
+        background_standard_error=np.nan_to_num(background_error),
+        exclude=exclude,
+    )
+
+
+def invert_particles(
+    power: Array,
+    sky: SimulatedSky,
+    edges: tuple[npt.ArrayLike, npt.ArrayLike],
+    *,
+    noise: Array | None = None,
+    background_error: npt.ArrayLike = 0.0,
+    reference_error: npt.ArrayLike = 0.0,
+) -> inversion.ElasticResult:
+    """Invert with the true lidar ratio and air."""
+    return inversion.invert_elastic(
+        power,
+        sky.range,
+        molecular_backscatter=sky.molecular_backscatter,
+        molecular_extinction=sky.molecular_extinction,
+        lidar_ratio=LIDAR_RATIO,
+        reference=edges,
+        variance=noise,
+        background_standard_error=background_error,
+        reference_relative_error=reference_error,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Steps from counts to particles."""
+
+    method: str
+    """Method of the background."""
+    choose: bool = False
+    """Whether the reference window is chosen instead of `GIVEN_WINDOW`."""
+    carried: bool = False
+    """Whether particles that noise hides in a window are stated as error of the reference."""
+
+
+def chains() -> dict[str, Chain]:
+    """Return the chains by name."""
+    return {
+        "window given": Chain(KNOWN_SHAPE),
+        "window chosen": Chain(KNOWN_SHAPE, choose=True),
+        "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=True),
+        "tail_mean, given": Chain(TAIL_MEAN),
+    }
+
+
+def invert(
+    counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates, chain: Chain
+) -> inversion.ElasticResult:
+    """Return the particles of profiles.
+
+    Parameters
+    ----------
+    counts : (profile, range) float
+    sky : SimulatedSky
+    estimates : BackgroundEstimates
+        From the method of the chain.
+    chain : Chain
+    """
+    power, noise = subtract_background(counts, sky, estimates), count_variance(counts)
+    edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
+    hidden: npt.ArrayLike = 0.0
+    if chain.choose:
+        clouds = find_clouds(power, noise, sky).mask
+        window = choose_window(power, noise, sky, clouds, background_error=estimates.standard_error)
+        edges = window.edges
+        hidden = window.undetected_particles if chain.carried else 0.0
+    return invert_particles(
+        power,
+        sky,
+        edges,
+        noise=noise,
+        background_error=estimates.standard_error,
+        reference_error=hidden,
+    )
+
+
+# Peers ----------------------------------------------------------------------------------------
+
+
+def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+    """Return backgrounds by linear least squares with a constant and the shape of air."""
+    first = int(np.searchsorted(sky.range, CLEAN_FROM))
+    shape = sky.shape[first:] / sky.shape[first]
+    slopes = np.stack([np.ones_like(shape), shape], axis=1)
+    weighted = slopes * count_weight(counts[:, first:])[:, np.newaxis]
+    covariance = np.linalg.inv(weighted.T @ slopes)
+    background = counts[:, first:] @ (weighted @ covariance[:, 0])
+    error = np.full(len(counts), np.sqrt(covariance[0, 0]))
+    return BackgroundEstimates(background, error, np.zeros(len(counts), dtype=np.bool_))
+
+
+def count_weight(counts: Array) -> Array:
+    """Return inverse variances of mean counts, (range,), from the mean of the profiles."""
+    return np.asarray(SHOTS / np.maximum(counts.mean(axis=0), 1.0 / SHOTS))
+
+
+def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
+    """Return the backscatter of particles profile by profile, without errors.
+
+    fernald1984, backward and forward from the middle of `GIVEN_WINDOW`, by trapezoids.
+    """
+    inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
+    start = inside[inside.size // 2]
+    excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter
+    backscatter = np.empty(power.shape)
+    for row, profile in enumerate(power):
+        depth = _cumulated(excess, sky.range)
+        corrected = profile * sky.range**2 * np.exp(2.0 * (depth - depth[start]))
+        integral = _cumulated(LIDAR_RATIO * corrected, sky.range)
+        ratio = np.mean(corrected[inside] / sky.molecular_backscatter[inside])
+        total = corrected / (ratio - 2.0 * (integral - integral[start]))
+        backscatter[row] = total - sky.molecular_backscatter
+    return backscatter
+
+
+def _cumulated(values: Array, distance: Array) -> Array:
+    slices = 0.5 * (values[1:] + values[:-1]) * np.diff(distance)
+    return np.concatenate([[0.0], np.cumsum(slices)])
+
+
+# Published files ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """One file of the intercomparison."""
+
+    level: float
+    """Nominal background in counts per shot."""
+    counts: Array
+    """(1, range), counts per shot."""
+    background: float
+    """Truth, by a fit of the noise-free file to this one, because its scale is known only to
+    1e-5."""
+    background_error: float
+    """Standard error of that truth, counts."""
+
+
+def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]]:
+    """Return the files of the EARLINET elastic intercomparison at 532 nm.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds ``noise_free.licel``, ``molecular_profile_hPa.csv`` (hPa, K, m) and
+        ``background_1e*.licel``.
+
+    Returns
+    -------
+    SimulatedSky
+        The backscatter is that of the noise-free signal with the reference window `GIVEN_WINDOW`.
+    list of Published
+        In order of the background.
+
+    Raises
+    ------
+    CampaignError
+        If the folder holds no such files.
+    RawFormatError
+        If a file cannot be read, or holds another number of bins.
+    """
+    folder = Path(folder)
+    files = {_level(file): file for file in folder.glob("background_1e*.licel")}
+    if not files:
+        raise CampaignError(
+            "holds no files background_1e*.licel",
+            file=folder,
+            field="data",
+            remedy="give the folder of the intercomparison, or leave it out",
+        )
+    sky = _published_sky(folder)
+    return sky, [_published(files[level], level, sky) for level in sorted(files)]
+
+
+def _level(file: Path) -> float:
+    match = re.fullmatch(r"background_1e(\d+)\.licel", file.name)
+    if match is None:
+        raise CampaignError(
+            "names no background", file=file, remedy="name it background_1eN.licel, N in decades"
+        )
+    return float(f"1e{match[1]}")
+
+
+def _published_sky(folder: Path) -> SimulatedSky:
+    table = folder / "molecular_profile_hPa.csv"
+    try:
+        columns = np.loadtxt(table, delimiter=",", unpack=True, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise CampaignError(f"cannot be read: {error}", file=table, field="data") from error
+    if len(columns) != 3:
+        raise CampaignError(
+            f"has {len(columns)} columns", file=table, remedy="give pressure, temperature, height"
+        )
+    pressure, temperature, height = columns
+    air = MolecularProfile.from_profile(height, pressure, temperature, pressure_unit="hPa")
+    clean = _raw_counts(folder / "noise_free.licel")
+    sky = _sky(air, clean, np.full(RANGE.size, np.nan))
+    power = np.where(sky.inverted, sky.signal, np.nan)
+    return replace(sky, backscatter=invert_particles(power, sky, GIVEN_WINDOW).backscatter)
+
+
+def _published(file: Path, level: float, sky: SimulatedSky) -> Published:
+    counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
+    truth = known_shape.fit_known_shape(
+        counts,
+        sky.range,
+        sky.signal,
+        variance=(sky.signal + level) / SHOTS,
+        start=sky.range[_FIRST_TRUE_BIN],
+    )
+    return Published(
+        level,
+        counts[np.newaxis],
+        float(truth.background),
+        float(truth.background_standard_error),
+    )
+
+
+def _raw_counts(file: Path) -> Array:
+    counts = licel.read_counts(file, [_CHANNEL])[1][_CHANNEL].astype(np.float64)
+    if counts.size != RANGE.size or not counts.max() > 0:
+        raise RawFormatError(
+            f"holds {counts.size} bins with a maximum of {counts.max():g}",
+            file=file,
+            field=_CHANNEL,
+            remedy=f"give a file of the intercomparison, of {RANGE.size} bins",
+        )
+    return counts

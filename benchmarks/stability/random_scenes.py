@@ -1,0 +1,321 @@
+"""Rates of false values without a flag in random scenes.
+
+A random scene satisfies or violates the model of a retrieval in a known way. A value is false if
+it differs from the truth by more than 4 stated standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.harness.figure import Array, Figure, Mask
+from benchmarks.harness.rows import Score, Scores
+from benchmarks.harness.statistics import clustered_share, design_effect
+from benchmarks.harness.verdicts import Judgement, Target
+from lidarops.flags import FlagBit, Quality, rejecting
+
+FALSE: Final = 4.0
+"""Stated standard errors beyond which a value is false."""
+FINE: Final = 2.5
+"""Stated standard errors within which a value needed no flag."""
+COVERED: Final = 1.96
+"""Stated standard errors within which 95 percent of the values should be."""
+ONE: Final = 1.0
+"""Stated standard errors within which 68 percent of the values should be."""
+HALF: Final = 3.5
+"""Misfit, as `VISIBLE`, at which the best test sees half of the violations."""
+VISIBLE: Final = 5.0
+"""Least misfit, in standard deviations of the noise, at which the data reveal a violation. The
+misfit is what the model cannot absorb. The best test that knows the shape of the violation but
+not its sign uses the size of one number with that mean and unit variance. With one false alarm in
+2500, as in our tests, it misses half of the violations of 3.5 and 7 percent of those of 5 (5
+percent if the sign is known as well). A test that does not know the shape misses more."""
+HELD: Final = "all where the model holds"
+BROKEN: Final = "all violations"
+"""Classes of all scenes of a retrieval."""
+POOLED: Final = frozenset({HELD, BROKEN})
+_COUNTS: Final = (
+    "values",
+    "covered",
+    "covered by one",
+    "plain covered",
+    "kept",
+    "plain",
+    "bare",
+    "false random",
+    "false",
+    "false plain",
+    "plain hidden",
+    "false hidden",
+    "false half",
+    "false bare",
+    "rejected",
+    "fine rejected",
+    "solvable",
+    "solvable rejected",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One way in which scenes violate a model, or none."""
+
+    name: str
+    satisfied: bool = False
+    """Whether the model holds, so that random errors alone must cover the truth."""
+    unseen: str = ""
+    """Reason why the data cannot reveal the violation; empty where they can."""
+
+
+_Class = TypeVar("_Class", bound=tuple[Any, ...])
+
+
+def held_first(classes: Sequence[_Class]) -> list[tuple[int, _Class]]:
+    """Return classes with their numbers, those where the model holds first.
+
+    The number is part of the seed of a class, and `test_bench_false_values.py` stops behind those
+    where the model holds.
+
+    Parameters
+    ----------
+    classes : sequence of tuple
+        Each begins with its `Failure`.
+    """
+    return sorted(enumerate(classes), key=lambda numbered: not numbered[1][0].satisfied)
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredValues:
+    """Values of a chunk of scenes of one class, with truth and flags; arrays of equal shape."""
+
+    failure: Failure
+    quantity: str
+    error: Array
+    """NaN where there is no value."""
+    random: Array
+    """Stated standard error."""
+    systematic: Any
+    """Stated systematic error; 0 where none is stated."""
+    bits: npt.NDArray[np.int32]
+    own: Iterable[FlagBit]
+    """The retrieval's own bits, beside `lidarops.flags.Quality`."""
+    uncertain: Mask | None = None
+    """Where flags of the retrieval mark the stated error as uncertain; None: where rejected."""
+    solvable: Mask | None = None
+    """Where a flag is needless; None where unknown."""
+    misfit: Array | None = None
+    """Misfit of the violation, in standard deviations of the noise; None where unknown."""
+
+
+def joined(blocks: Sequence[ScoredValues]) -> ScoredValues:
+    """Return the values of several blocks of profiles of one class as one chunk."""
+
+    def stacked(name: str) -> Any:
+        parts = [np.broadcast_to(getattr(block, name), block.error.shape) for block in blocks]
+        return np.concatenate(parts)
+
+    names = [
+        name
+        for name in ("error", "random", "systematic", "bits", "uncertain", "solvable", "misfit")
+        if getattr(blocks[0], name) is not None
+    ]
+    return replace(blocks[0], **{name: stacked(name) for name in names})
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts by class and cluster; scenes of one cluster share their geometry."""
+
+    counts: dict[tuple[str, str], list[dict[str, Any]]] = field(default_factory=dict)
+    scenes: dict[tuple[str, str], int] = field(default_factory=dict)
+    failures: dict[str, Failure] = field(default_factory=dict)
+    measured: set[tuple[str, str]] = field(default_factory=set)
+    """Classes and quantities for which it is known which violations are detectable."""
+
+    def add(self, values: ScoredValues, scenes: int) -> None:
+        """Count the values of a chunk."""
+        self.failures[values.failure.name] = values.failure
+        pooled = HELD if values.failure.satisfied else BROKEN
+        self.failures[pooled] = Failure(pooled, values.failure.satisfied)
+        counts = _count(values)
+        for name in (values.failure.name, pooled):
+            key = (name, values.quantity)
+            self.counts.setdefault(key, []).append(counts)
+            self.scenes[key] = self.scenes.get(key, 0) + scenes
+            if values.misfit is not None:
+                self.measured.add(key)
+
+    def rates(self, needless: float | None, *, pooled: bool = True) -> Scores:
+        """Return the shares of kept, false and flagged values by quantity and class.
+
+        Parameters
+        ----------
+        needless : float, optional
+            Largest share of needless flags where the model holds, a target of our own.
+        pooled : bool
+            Whether to add all classes that satisfy the model together, and all that do not.
+        """
+        names = sorted(self.counts, key=lambda key: (key[1], key[0] in POOLED))
+        return {
+            (quantity, name): self._score(name, quantity, needless)
+            for name, quantity in names
+            if pooled or name not in POOLED
+        }
+
+    def _score(self, name: str, quantity: str, needless: float | None) -> Score:
+        chunks = self.counts[name, quantity]
+        column = {count: np.array([chunk[count] for chunk in chunks]) for count in _COUNTS}
+        holds = self.failures[name].satisfied
+        # Where false values are few, those beyond 1.96 errors show how values depend on each other.
+        inside, of = ("covered", "kept") if holds else ("plain covered", "plain")
+        effect = design_effect(column[of] - column[inside], column[of])
+
+        def part(events: str, trials: str) -> Figure | None:
+            some = column[trials].any()
+            return clustered_share(column[events], column[trials], effect) if some else None
+
+        covered, covered_by_one = part("covered", "kept"), part("covered by one", "kept")
+        false_random, false_plain = part("false random", "kept"), part("false plain", "plain")
+        flagged = part("solvable rejected", "solvable") if holds else None
+        measured = (name, quantity) in self.measured
+        # A class has intervals of its own; those of all classes together may hide it.
+        alone = holds and name not in POOLED
+        return {
+            "scenes": self.scenes[name, quantity],
+            "clusters": len(chunks),
+            "values": int(column["values"].sum()),
+            "not rejected": part("kept", "values"),
+            COVERED_SHARE: covered,
+            COVERED_TARGET: _judged(covered, COVERED_BY_95 if alone else None),
+            ONE_SHARE: covered_by_one,
+            ONE_TARGET: _judged(covered_by_one, COVERED_BY_68 if alone else None),
+            "stated / median error": _stated_over_median(chunks),
+            FALSE_RANDOM: false_random,
+            "false, with systematic": part("false", "kept"),
+            FALSE_PLAIN: false_plain,
+            # Where the model holds, random errors alone must cover the truth.
+            TARGET: _judged(false_random, Target(SATISFIED))
+            if holds
+            else _judged(false_plain, Target(VIOLATED)),
+            "of these undetectable": part("false hidden", "plain") if measured else None,
+            f"and below {HALF:g}": part("false half", "plain") if measured else None,
+            "share of the detectable": _detectable(column) if measured else None,
+            "without any flag": part("false bare", "bare"),
+            "rejected but accurate": part("fine rejected", "rejected"),
+            NEEDLESS: flagged,
+            NEEDLESS_TARGET: _judged(
+                flagged, None if needless is None else Target(needless, own=True)
+            ),
+            "detectable in the data": f"no: {self.failures[name].unseen}"
+            if self.failures[name].unseen
+            else "yes",
+        }
+
+
+def _judged(figure: Figure | None, target: Target | None) -> Judgement | None:
+    return None if figure is None or target is None else target.judged(figure)
+
+
+def _detectable(column: dict[str, Array]) -> Figure | None:
+    """Return the share of false values among those whose violation is detectable."""
+    seen = column["false plain"] - column["false hidden"]
+    visible = column["plain"] - column["plain hidden"]
+    return clustered_share(seen, visible) if visible.any() else None
+
+
+def _stated_over_median(chunks: list[dict[str, Any]]) -> float | None:
+    """Return one over the median error in stated errors, from the counts between `_EDGES`."""
+    below = np.cumsum(sum(chunk["sizes"] for chunk in chunks))
+    if below[-1] == 0:
+        return None
+    middle = np.interp(0.5 * below[-1], below, np.log(_EDGES[1:]))
+    return float(f"{np.exp(-middle):.3g}")
+
+
+SATISFIED: Final = 1e-3
+"""Largest share of false values where the model holds."""
+VIOLATED: Final = 5e-3
+"""Largest share where it does not."""
+COVERED_BY_95: Final = Target(0.97, 0.94)
+"""Share of the truths within 1.96 stated errors where the model holds."""
+COVERED_BY_68: Final = Target(0.72, 0.66)
+"""The same within one."""
+FALSE_RANDOM: Final = "false, random error"
+FALSE_PLAIN: Final = "and not uncertain"
+TARGET: Final = "target"
+"""Of false values, and of what else a table judges."""
+COVERED_SHARE: Final = "within 1.96"
+COVERED_TARGET: Final = "95 % target"
+ONE_SHARE: Final = "within 1"
+ONE_TARGET: Final = "68 % target"
+NEEDLESS: Final = "needlessly flagged"
+NEEDLESS_TARGET: Final = "needless target"
+TARGETS: Final = {
+    COVERED_TARGET: (COVERED_SHARE, COVERED_SHARE),
+    ONE_TARGET: (ONE_SHARE, ONE_SHARE),
+    TARGET: (FALSE_RANDOM, FALSE_PLAIN),
+    NEEDLESS_TARGET: (NEEDLESS, NEEDLESS),
+}
+"""Quantities with a verdict, and the shares that they judge where the model holds and elsewhere."""
+_EDGES: Final = np.concatenate([[1e-6], np.geomspace(1e-3, 1e2, 501), [1e6]])
+"""Sizes of errors, in stated ones, between which values are counted."""
+
+Generator = Callable[[int], Iterator[tuple[ScoredValues, int]]]
+"""Yields the values of the scenes of a cluster, given its number, and the number of scenes."""
+
+
+def collect(generator: Generator, clusters: int, progress: Callable[[int], object]) -> Tally:
+    """Count the values of that many clusters; the same numbers give the same scenes."""
+    tally = Tally()
+    for cluster in range(clusters):
+        for values, scenes in generator(cluster):
+            tally.add(values, scenes)
+        progress(1)
+    return tally
+
+
+def _count(values: ScoredValues) -> dict[str, Any]:
+    shape = values.error.shape
+    size = np.abs(values.error)
+    valued = np.isfinite(size)
+    bits = np.broadcast_to(values.bits, shape)
+    rejected = (bits & rejecting((*Quality, *values.own))) != 0
+    uncertain = rejected if values.uncertain is None else values.uncertain | rejected
+    solvable = np.zeros_like(valued) if values.solvable is None else values.solvable
+    misfit = np.full(shape, np.inf) if values.misfit is None else values.misfit
+    hidden, half = misfit < VISIBLE, misfit < HALF
+    random = np.broadcast_to(values.random, shape)
+    stated = np.hypot(random, values.systematic)
+    # A value without a stated error is false.
+    false_random, false = ~(size <= FALSE * random), ~(size <= FALSE * stated)
+    kept = valued & ~rejected
+    plain, bare = kept & ~uncertain, kept & (bits == 0)
+    masks = {
+        "values": valued,
+        "covered": kept & (size <= COVERED * random),
+        "covered by one": kept & (size <= ONE * random),
+        "plain covered": plain & (size <= COVERED * stated),
+        "kept": kept,
+        "plain": plain,
+        "bare": bare,
+        "false random": kept & false_random,
+        "false": kept & false,
+        "false plain": plain & false,
+        "plain hidden": plain & hidden,
+        "false hidden": plain & false & hidden,
+        "false half": plain & false & half,
+        "false bare": bare & false,
+        "rejected": valued & rejected,
+        "fine rejected": valued & rejected & (size <= FINE * stated),
+        "solvable": solvable,
+        "solvable rejected": solvable & ~plain,
+    }
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        sizes = np.clip(size[kept] / random[kept], _EDGES[0], _EDGES[-1])
+    counts: dict[str, Any] = {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
+    return counts | {"sizes": np.histogram(sizes[~np.isnan(sizes)], _EDGES)[0]}

@@ -1,0 +1,155 @@
+"""Ablation of the guards of the elastic inversion: ``python -m benchmarks.studies.elastic_guards``.
+
+It writes a table into ``docs/algorithms/elastic.md``.
+"""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+import numpy as np
+
+from benchmarks.stability import random_elastic
+from benchmarks.studies.ablation import Guard, cluster_count, measure, table, write_table
+from lidarops.flags import Quality
+from lidarops.retrieve.air import reference_window
+from lidarops.retrieve.air.reference_window import Rejection
+from lidarops.retrieve.clouds import layers, outlying_bins
+from lidarops.retrieve.elastic import inversion
+from lidarops.retrieve.elastic.flags import ElasticQuality
+from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+
+PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/elastic.md"
+CLUSTERS: Final = 60
+PROFILES: Final = 10
+
+
+@contextmanager
+def replaced(*changes: tuple[object, str, object]) -> Iterator[None]:
+    """Replace attributes of modules."""
+    with ExitStack() as stack:
+        for owner, name, value in changes:
+            stack.enter_context(mock.patch.object(owner, name, value))
+        yield
+
+
+def _same(power: Any, range_: Any, variance: Any, **_: Any) -> Any:
+    noise = np.broadcast_to(variance, np.shape(power))
+    return outlying_bins.BridgedProfiles(power, noise, np.zeros(np.shape(power), np.bool_))
+
+
+NO_BRIDGES: Final = (outlying_bins, "bridge_outliers", _same)
+
+
+@cache
+def _variant(old: str, new: str) -> types.ModuleType:
+    """Return the module of outlying bins with another text."""
+    source = Path(outlying_bins.__file__).read_text()
+    assert old in source, old
+    module = types.ModuleType("outlying_bins_variant")
+    sys.modules[module.__name__] = module
+    text = source.replace(old, new).replace("cache=True, ", "")
+    exec(compile(text, "<variant>", "exec"), module.__dict__)
+    return module
+
+
+@contextmanager
+def bridges(old: str, new: str) -> Iterator[None]:
+    """Replace a text in the detection of outlying bins."""
+    module = _variant(old, new)
+    with replaced((outlying_bins, "bridge_outliers", module.bridge_outliers)):
+        yield
+
+
+@contextmanager
+def without_layers() -> Iterator[None]:
+    """Detect no cloud."""
+    find = layers.find_layers
+
+    def none(*arguments: Any, **options: Any) -> Any:
+        found = find(*arguments, **options)
+        return replace(
+            found,
+            mask=np.zeros_like(found.mask),
+            cloudy=np.zeros_like(found.cloudy),
+            cloud_base_range=np.full_like(found.cloud_base_range, np.nan),
+        )
+
+    with mock.patch.object(layers, "find_layers", none):
+        yield
+
+
+def _no_error(window: reference_window.ReferenceWindow) -> Any:
+    return np.zeros_like(window.scale)
+
+
+@contextmanager
+def without_rejection(bit: Rejection) -> Iterator[None]:
+    """Skip one test of the reference windows."""
+    tests, pick = reference_window._rejections, reference_window._pick
+
+    def fewer_tests(*arguments: Any) -> Any:
+        return tests(*arguments) & ~np.int32(bit)
+
+    def any_passing(statistics: Any, rejections: Any, level_error: Any, noise: Any) -> Any:
+        kept = rejections.copy()
+        index, *_ = pick(statistics, kept, level_error, noise)
+        none = np.zeros(index.size)
+        precision = np.where(rejections == 0, statistics[..., reference_window.SCALE_ERROR], np.inf)
+        return np.where(index >= 0, np.argmin(precision, axis=-1), -1), none, none
+
+    changes = [(reference_window, "_rejections", fewer_tests)]
+    if bit is Rejection.MORE_PARTICLES:
+        changes.append((reference_window, "_pick", any_passing))
+    with replaced(*changes):
+        yield
+
+
+def threshold(**changes: Any) -> Any:
+    """Return the context in which thresholds have other values."""
+    changed = THRESHOLDS._replace(**changes)
+    return partial(replaced, (inversion, "THRESHOLDS", changed))
+
+
+GUARDS: Final = (
+    Guard("CLOUD", int(ElasticQuality.CLOUD)),
+    Guard("background NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
+    Guard("cloud detection", off=without_layers),
+    *(
+        Guard(f"window: {bit.name}", off=partial(without_rejection, bit))
+        for bit in Rejection
+        if bit is not Rejection.EXCLUDED
+    ),
+    Guard(
+        "error by undetected particles",
+        off=partial(
+            replaced,
+            (reference_window.ReferenceWindow, "undetected_particles", property(_no_error)),
+        ),
+    ),
+    Guard("least denominator", off=threshold(least_denominator=0.0)),
+    Guard("least certainty", off=threshold(least_certainty=0.0)),
+    Guard("skewed errors", off=threshold(skewed=0.0)),
+    Guard("longest gap", off=threshold(longest_gap=np.inf)),
+    Guard("bridging of outliers", off=partial(replaced, NO_BRIDGES)),
+    Guard("outlier: contrast", off=partial(bridges, "THRESHOLDS.least_contrast", "0.0")),
+    Guard("outlier: step", off=partial(bridges, "if not step <= allowed:", "if False:")),
+    Guard("outlier: equal counts", off=partial(bridges, "THRESHOLDS.most_equal", "9")),
+    Guard(
+        "outlier: one neighbour left out",
+        off=partial(bridges, "j, _farthest(j, q), usable_range", "j, -1, usable_range"),
+    ),
+)
+
+if __name__ == "__main__":
+    clusters = cluster_count(__doc__, CLUSTERS)
+    counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), range(clusters), GUARDS)
+    write_table(PAGE, "guards", table(counts))

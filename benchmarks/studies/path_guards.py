@@ -1,0 +1,90 @@
+"""Ablation of the guards of the homogeneous path: ``python -m benchmarks.studies.path_guards``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+import numpy as np
+
+from benchmarks.stability import random_homogeneous
+from benchmarks.studies.ablation import Guard, cluster_count, measure, table, write_table
+from lidarops.flags import Quality
+from lidarops.retrieve.homogeneous import _fit_quality, path_fit
+from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+
+PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/homogeneous.md"
+CLUSTERS: Final = 150
+PROFILES: Final = 60
+
+
+@contextmanager
+def limits(**changes: float) -> Iterator[None]:
+    """Replace limits of the tests, by name of `_Limits`."""
+    every = _fit_quality._limits
+
+    def changed(*arguments: Any, **options: Any) -> Any:
+        own = every(*arguments, **options)
+        return replace(own, **{k: np.full_like(own.widening, v) for k, v in changes.items()})
+
+    with mock.patch.object(_fit_quality, "_limits", changed):
+        yield
+
+
+@contextmanager
+def without_bend() -> Iterator[None]:
+    """Drop the part of the model errors by a signal that bends."""
+    fit = path_fit.fit_homogeneous_path
+
+    def straight(power: Any, range_: Any, **options: Any) -> Any:
+        result = fit(power, range_, **options)
+        mean = np.mean(range_)
+        slope = THRESHOLDS.model_error * (np.abs(result.extinction) + 1.0 / mean)
+        return replace(
+            result,
+            extinction_model_error=slope,
+            background_model_error=np.zeros_like(result.background),
+        )
+
+    with mock.patch.object(path_fit, "fit_homogeneous_path", straight):
+        yield
+
+
+def _off(**changes: float) -> Callable[[], Any]:
+    return lambda: limits(**changes)
+
+
+GUARDS: Final = (
+    Guard("NEGATIVE_AMPLITUDE", int(Quality.NEGATIVE_AMPLITUDE)),
+    Guard("LOW_SIGNAL", int(Quality.LOW_SIGNAL)),
+    Guard("POORLY_DETERMINED", int(HomogeneousQuality.POORLY_DETERMINED)),
+    Guard("both of these", int(Quality.LOW_SIGNAL | HomogeneousQuality.POORLY_DETERMINED)),
+    Guard("AT_BOUND", int(HomogeneousQuality.AT_BOUND)),
+    Guard("POOR_FIT", int(HomogeneousQuality.POOR_FIT)),
+    Guard("NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
+    Guard("OUTLIER", int(Quality.OUTLIER)),
+    Guard("widening of estimated noise", off=_off(widening=1.0)),
+    Guard("bend in the model error", off=without_bend),
+)
+
+SHORT: Final = (Guard("TOO_FEW_BINS", int(Quality.TOO_FEW_BINS)),)
+"""Guard of sections of fewer than 8 bins, all of which it withholds."""
+TABLES: Final = {
+    "guards": ((8, 800), GUARDS),
+    "guards of 4 to 7 bins": ((4, 7), SHORT),
+}
+"""Mark of the table in the page -> numbers of bins and guards."""
+
+if __name__ == "__main__":
+    clusters = cluster_count(__doc__, CLUSTERS)
+    for mark, (bins, guards) in TABLES.items():
+        with mock.patch.object(random_homogeneous, "_BINS", bins):
+            counts = measure(
+                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), range(clusters), guards
+            )
+        write_table(PAGE, mark, table(counts))

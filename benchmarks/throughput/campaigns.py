@@ -1,0 +1,375 @@
+"""CPU time of a campaign from raw files to report, by stage, and its growth with the size."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from scipy import stats
+
+from benchmarks.harness.benchmark import CAMPAIGN_FILE, Effort
+from benchmarks.harness.charts import chart, panel
+from benchmarks.harness.figure import share
+from benchmarks.harness.rows import Row, Scores, rows_of_scores
+from benchmarks.harness.study import Chapter, Results, Study
+from benchmarks.throughput import orchestration
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.errors import CampaignError
+from lidarops.netcdf.write import write_plain
+from lidarops.records import RunRecord
+from lidarops.run import archive
+from lidarops.simulate.campaign import plan_simulation, write_simulation
+
+_DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
+_INTERVAL: Final = 60
+"""s; duration of a file."""
+_CPU: Final = "CPU time (s)"
+_MILLI: Final = 1e3
+_SHORTEST: Final = 1e-4
+"""s; least time, because a coarse clock may not advance during a fast call."""
+
+
+class Stage(StrEnum):
+    """Stage of processing a campaign."""
+
+    SCAN = "scan"
+    READ = "read"
+    RETRIEVE = "retrieve"
+    WRITE = "write"
+    ORCHESTRATION = "orchestration"
+    REPORT = "report"
+    UNCHANGED = "all unchanged"
+
+
+_ABOUT: Final[Mapping[Stage, str]] = {
+    Stage.SCAN: "headers of all files into the catalog",
+    Stage.READ: "digest and header of each file of a scene",
+    Stage.RETRIEVE: "counts to results, including reading the channels",
+    Stage.WRITE: "products as NetCDF",
+    Stage.ORCHESTRATION: "scenes, plans, staleness, ledger",
+    Stage.REPORT: "page and figures",
+    Stage.UNCHANGED: "a second run without anything to process",
+}
+_SCENE_STAGES: Final = {"digest": Stage.READ, "retrieve": Stage.RETRIEVE, "write": Stage.WRITE}
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignSize:
+    """Size of a simulated campaign."""
+
+    scenes: int = 2
+    profiles: int = 30
+    """Files per scene; must divide 1440."""
+    bins: int = 1000
+    angles: int = 0
+    """Directions of a scan; 0 for a horizontal lidar."""
+    retrieved: bool = True
+    """Whether homogeneous paths are retrieved, or only signals kept."""
+
+    @property
+    def files(self) -> int:
+        """Number of raw files."""
+        return self.scenes * self.profiles
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignCost:
+    """CPU time of a campaign by stage."""
+
+    size: CampaignSize
+    seconds: Mapping[Stage, float]
+
+
+_ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
+    "scenes": tuple(CampaignSize(scenes=n) for n in (2, 4, 8, 16)),
+    "profiles": tuple(CampaignSize(profiles=n) for n in (15, 30, 60, 120)),
+    "bins": tuple(CampaignSize(bins=n) for n in (500, 1000, 2000, 4000)),
+    "angles": tuple(CampaignSize(angles=n, profiles=120, bins=2000) for n in (5, 9, 17)),
+}
+_QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
+    name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
+}
+_WORKER_SIZE: Final = CampaignSize(scenes=16, profiles=60)
+COMMAND_SIZES: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
+
+
+def measure_campaigns(
+    effort: Effort,
+    *,
+    along: Mapping[str, Sequence[CampaignSize]] | None = None,
+    workers: Sequence[int] | None = None,
+) -> Study:
+    """Simulate campaigns of several sizes in temporary folders, and time their processing.
+
+    Parameters
+    ----------
+    effort : Effort
+        A quick run has fewer and smaller campaigns, and one worker.
+    along : mapping of str to sequence of CampaignSize, optional
+        Sizes for each varied property, at least 2.
+    workers : sequence of int, optional
+        Numbers of processes to compare.
+    """
+    quick, progress = effort.quick, effort.progress
+    # The first campaign of a process includes imports and compilation; it is not counted.
+    _cost(CampaignSize(scenes=1, profiles=15), progress)
+    growths = {
+        name: [_cost(size, progress) for size in sizes]
+        for name, sizes in (along or (_QUICK if quick else _ALONG)).items()
+    }
+    counts = workers if workers is not None else (() if quick else (1, 2))
+    times = {count: _wall(count, progress) for count in counts}
+    chapters = [stages_chapter(growths)]
+    if times:
+        chapters.append(workers_chapter(times))
+    if workers is None and not quick:
+        chapters.append(_commands_chapter(progress))
+    return Study("Campaigns: CPU time by stage", effort.date, chapters)
+
+
+def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        campaign = simulate_campaign(size, Path(folder))
+        seconds = {Stage.SCAN: _timed(lambda: archive.update_catalog(campaign))}
+        begin, started = time.process_time(), time.perf_counter()
+        record = archive.reprocess(campaign)
+        cpu, wall = time.process_time() - begin, time.perf_counter() - started
+        if record is None:
+            raise CampaignError("the simulated campaign has nothing to process", field="simulation")
+        seconds |= _stage_times(record, cpu, wall)
+        seconds[Stage.REPORT] = _timed(lambda: archive.report_run(campaign, record))
+        seconds[Stage.UNCHANGED] = _timed(lambda: archive.reprocess(campaign))
+    progress(1)
+    return CampaignCost(size, seconds)
+
+
+def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[Stage, float]:
+    """Return the CPU time of a run by stage, in proportion to wall time."""
+    laps = dict.fromkeys(_SCENE_STAGES.values(), 0.0)
+    for outcome in record.scenes:
+        for name, lap in outcome.seconds.items():
+            if name in _SCENE_STAGES:
+                laps[_SCENE_STAGES[name]] += lap
+    laps[Stage.ORCHESTRATION] = wall - sum(laps.values())
+    return {stage: max(cpu * lap / wall, _SHORTEST) for stage, lap in laps.items()}
+
+
+def _wall(workers: int, progress: Callable[[int], object]) -> float:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        campaign = simulate_campaign(_WORKER_SIZE, Path(folder))
+        archive.update_catalog(campaign)
+        begin = time.perf_counter()
+        archive.reprocess(campaign, options=archive.Options(workers=workers))
+        seconds = time.perf_counter() - begin
+    progress(1)
+    return seconds
+
+
+def _commands_chapter(progress: Callable[[int], object]) -> Chapter:
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        files = []
+        for size in COMMAND_SIZES:
+            directory = Path(folder) / str(size.scenes)
+            directory.mkdir()
+            simulate_campaign(size, directory)
+            files.append(directory / CAMPAIGN_FILE)
+        modes = orchestration.measure_orchestration(files)
+    progress(1)
+    return orchestration.orchestration_chapter(modes, [size.scenes for size in COMMAND_SIZES])
+
+
+def _timed(call: Callable[[], object]) -> float:
+    begin = time.process_time()
+    call()
+    return max(time.process_time() - begin, _SHORTEST)
+
+
+def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
+    """Simulate a campaign of this size and write its raw files.
+
+    Returns
+    -------
+    Campaign
+        The campaign, not processed yet.
+    """
+    path = folder / CAMPAIGN_FILE
+    path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
+    campaign = load_campaign(path)
+    written = write_simulation(plan_simulation(campaign))
+    write_plain(written.truth, campaign.truth_path)
+    return campaign
+
+
+def campaign_settings(name: str, instruments: Mapping[str, Any], **others: Any) -> dict[str, Any]:
+    """Return the content of a campaign file of one station, ``here``, unless others are given."""
+    here = {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}
+    return {
+        "name": name,
+        "title": "Campaign of a benchmark",
+        "archive": "raw",
+        "output": "out",
+        "stations": {"here": here},
+        "instruments": dict(instruments),
+        **others,
+    }
+
+
+def _settings(size: CampaignSize) -> dict[str, Any]:
+    scans = size.angles > 0
+    channel = "photon_532o"
+    products: dict[str, Any] = {"signal": {}}
+    if scans:
+        products["multiangle"] = {"channels": [channel], "highest": 6000, "step": 60}
+    elif size.retrieved:
+        products["homogeneous"] = {
+            "channels": [channel],
+            "sections": [[750, 0.9 * 7.5 * size.bins]],
+        }
+    facts_of_lidar = {"full_overlap_range": 300, "channels": {channel: {"dead_time": 3e-9}}}
+    lidar = {
+        "station": "here",
+        "files": "here/h*",
+        "facts": [facts_of_lidar if scans else facts_of_lidar | {"zenith_angle": 90}],
+        "products": products,
+    }
+    simulation = {
+        "seed": 7,
+        "start": _DAY,
+        "duration": size.files * _INTERVAL,
+        "instruments": {"lidar": _scanning(size) if scans else _level(size)},
+    }
+    window = {"window": f"{size.profiles}min"}
+    return campaign_settings("measured", {"lidar": lidar}, scenes=window, simulation=simulation)
+
+
+def _level(size: CampaignSize) -> dict[str, Any]:
+    return {
+        "kind": "horizontal",
+        "aerosol_extinction": {"minimum": 5e-5, "maximum": 2e-4, "hour_of_maximum": 18},
+        "aerosol": {"lidar_ratio": 50},
+    } | _recorded(size)
+
+
+def _scanning(size: CampaignSize) -> dict[str, Any]:
+    angles = np.degrees(np.arccos(1.0 / np.linspace(1.0, 4.0, size.angles)))
+    return {
+        "kind": "lidar",
+        "atmosphere": {
+            "boundary_layer": {
+                "extinction": 1.5e-4,
+                "height": {"minimum": 600, "maximum": 1500, "hour_of_maximum": 14},
+                "aerosol": {"lidar_ratio": 50, "angstrom_exponent": 1.2},
+            }
+        },
+        "scan": {"zenith_angles": [round(float(angle), 1) for angle in angles], "azimuth": 90},
+    } | _recorded(size)
+
+
+def _recorded(size: CampaignSize) -> dict[str, Any]:
+    return {
+        "acquisition": {
+            "interval": _INTERVAL,
+            "shots": 1000,
+            "repetition_rate": 20,
+            "bins": size.bins,
+        },
+        "detectors": [
+            {
+                "wavelength": 532,
+                "signal_rate": 5.0,
+                "background": {"night": 0.05, "day": 0.5},
+                "photon": {},
+            }
+        ],
+    }
+
+
+def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
+    """Return the log-log slope of times, and half of its 95 percent interval."""
+    fit = stats.linregress(np.log(sizes), np.log(seconds))
+    half = stats.t.ppf(0.975, len(sizes) - 2) * fit.stderr if len(sizes) > 2 else 0.0
+    return float(fit.slope), float(half) if math.isfinite(half) else 0.0
+
+
+# Page -----------------------------------------------------------------------------------------
+
+
+def stages_chapter(growths: Mapping[str, Sequence[CampaignCost]]) -> Chapter:
+    """Return the chapter on the stages, by the property along which campaigns grow."""
+    return Chapter(
+        "Cost of each stage, and its growth",
+        "Simulated campaigns of one lidar, from raw files on disk to products and report, "
+        "in one process. CPU time; that of a run is divided among its stages in proportion to "
+        "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
+        "interval; 1 is linear.",
+        [_growth_results(along, costs) for along, costs in growths.items()],
+        [
+            chart(
+                "growth",
+                "CPU time of a campaign",
+                "One line per stage; a slope of 1 means a constant cost per item.",
+                [
+                    panel(
+                        along,
+                        [
+                            Row(f"{getattr(cost.size, along)}", stage, _CPU, seconds)
+                            for cost in costs
+                            for stage, seconds in cost.seconds.items()
+                        ],
+                        _CPU,
+                        x=f"number of {along}",
+                        joined=True,
+                    )
+                    for along, costs in growths.items()
+                ],
+            ),
+        ],
+    )
+
+
+def _growth_results(along: str, costs: Sequence[CampaignCost]) -> Results:
+    size, spent = costs[-1].size, costs[-1].seconds
+    sizes = [getattr(cost.size, along) for cost in costs]
+    total = sum(seconds for stage, seconds in spent.items() if stage is not Stage.UNCHANGED)
+    scores: Scores = {}
+    for stage, seconds in spent.items():
+        steepness, half = slope(sizes, [cost.seconds[stage] for cost in costs])
+        scores["", stage] = {
+            "work": _ABOUT[stage],
+            _CPU: seconds,
+            "share": None if stage is Stage.UNCHANGED else share(seconds / total),
+            "ms per file": _MILLI * seconds / size.files,
+            "slope": f"{steepness:.2f} ± {half:.2f}",
+        }
+    return Results(
+        f"By number of {along}; times at {getattr(size, along)}",
+        rows_of_scores(scores),
+        f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
+        + (f", {size.angles} directions." if size.angles else "."),
+        method="stage",
+    )
+
+
+def workers_chapter(times: Mapping[int, float]) -> Chapter:
+    """Return the chapter on the wall time in s, by the number of processes."""
+    single, size = times.get(1), _WORKER_SIZE
+    scores: Scores = {
+        ("", f"{count}"): {"s": seconds, "speedup": single / seconds if single else None}
+        for count, seconds in times.items()
+    }
+    results = Results(
+        "Wall time by number of processes",
+        rows_of_scores(scores),
+        f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
+        method="processes",
+    )
+    return Chapter("Processes", "The same campaign on one machine.", [results])

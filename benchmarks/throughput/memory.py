@@ -1,0 +1,245 @@
+"""Peak memory of processes that process scenes of several sizes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+
+from benchmarks.harness.benchmark import CAMPAIGN_FILE, Effort
+from benchmarks.harness.rows import Scores, rows_of_scores
+from benchmarks.harness.study import Chapter, Results, Study
+from benchmarks.harness.timing import in_fresh_process, peak_memory
+from benchmarks.throughput.campaigns import campaign_settings
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.errors import CampaignError
+from lidarops.raw import licel_write
+from lidarops.raw.licel_header import DatasetKind, Laser
+from lidarops.run import archive
+
+BINS: Final = 16_000
+SIZES: Final = (26, 101, 400)
+"""MB of raw counts of a scene."""
+_TINY: Final = 1
+"""MB of the scene that loads the code of a process before the measurement."""
+_SHOTS: Final = 400
+_INTERVAL: Final = timedelta(seconds=20)
+_DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
+_BIN_WIDTH: Final = 3.75
+_VARIANTS: Final = 4
+"""Number of different profiles; files repeat them."""
+_ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
+"""degree, in the headers of consecutive files: one cycle of a scan."""
+_SLANTED: Final = 80.0
+"""degree; sections may be retrieved, and the beam reaches the reference window of ``elastic``."""
+_DARK_SHARE: Final = 0.1
+"""Dark files for each file of the scene."""
+_DARK: Final = {"dark_files": "d*"}
+_ANALOG: Final = ["analog_532o"]
+_PHOTON: Final = ["photon_532o"]
+_HOMOGENEOUS: Final[Mapping[str, Any]] = {"channels": _PHOTON, "sections": [[750, 6000]]}
+_NETWORK: Final = {
+    "west": ("012", 47.25, 11.3, 70.0),
+    "east": ("345", 47.25, 11.353, 310.0),
+    "north": ("6789", 47.2811, 11.3265, 190.0),
+}
+"""Last digits of the files, latitude, longitude and azimuth of each lidar; all are level."""
+
+
+def _of_one(
+    zenith_angle: float | None, products: Mapping[str, Any], **instrument: Any
+) -> dict[str, Any]:
+    """Return the part of a campaign file with one lidar; without an angle, it scans."""
+    facts: dict[str, float] = {"full_overlap_range": 300}
+    if zenith_angle is not None:
+        facts |= {"zenith_angle": zenith_angle}
+    lidar = {"station": "here", "files": "h*", "facts": [facts], "products": dict(products)}
+    return {"instruments": {"lidar": lidar | instrument}}
+
+
+def _network() -> dict[str, Any]:
+    """Return the part of a campaign file with a network."""
+    return {
+        "stations": {
+            name: {"name": name, "latitude": latitude, "longitude": longitude, "altitude": 600}
+            for name, (_, latitude, longitude, _) in _NETWORK.items()
+        },
+        "instruments": {
+            name: {
+                "station": name,
+                "files": [f"h*{digit}" for digit in digits],
+                "facts": [{"full_overlap_range": 150, "zenith_angle": 90.0, "azimuth": azimuth}],
+                "products": {},
+            }
+            for name, (digits, _, _, azimuth) in _NETWORK.items()
+        },
+        "networks": {
+            "valley": {
+                "instruments": list(_NETWORK),
+                "visibility": {"channel": "photon_532o"},
+            }
+        },
+    }
+
+
+CASES: Final[Mapping[str, Mapping[str, Any]]] = {
+    "signal": _of_one(0, {"signal": {}}),
+    "signal, dark files": _of_one(0, {"signal": {"channels": _ANALOG}}, **_DARK),
+    "homogeneous": _of_one(90, {"homogeneous": _HOMOGENEOUS}),
+    "elastic": _of_one(0, {"elastic": {"channels": _ANALOG}}),
+    "elastic, 1 min": _of_one(0, {"elastic": {"channels": _ANALOG, "average": "1min"}}),
+    "elastic, 1 min, dark files": _of_one(
+        0, {"elastic": {"channels": _ANALOG, "average": "1min"}}, **_DARK
+    ),
+    "elastic, glued": _of_one(0, {"elastic": {"channels": ["glued_532o"]}}),
+    "signal, homogeneous and elastic": _of_one(
+        _SLANTED,
+        {
+            "signal": {},
+            "homogeneous": {"channels": _PHOTON, "sections": [[750, 1250]]},
+            "elastic": {"channels": _PHOTON, "reference": {"lowest": 1000, "highest": 4000}},
+        },
+    ),
+    "multiangle": _of_one(None, {"multiangle": {"channels": _PHOTON, "step": 15}}),
+    "visibility": _network(),
+}
+"""Part of the campaign file of each row of the table; all have the same files."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """Peak memory of one process."""
+
+    case: str
+    raw: float
+    """MB of raw counts of the scene."""
+    base: float
+    """MB at the peak of a tiny scene of the same case."""
+    above: float
+    """MB above the base at the peak of the scene."""
+
+
+def measure_memory(effort: Effort) -> Study:
+    """Measure the peak memory of processes, by size of the scene and products."""
+    peaks = []
+    for peak in measure_peaks(SIZES[:2] if effort.quick else SIZES, tuple(CASES)):
+        peaks.append(peak)
+        effort.progress(1)
+    return memory_study(effort.date, peaks)
+
+
+def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
+    """Yield the peak memory of a fresh process for each case and size, MB of raw counts."""
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        root = Path(folder)
+        for size in (_TINY, *sizes):
+            write_files(root / str(size), size)
+        for name in cases:
+            # The first process compiles what is not cached, which takes memory of its own.
+            in_fresh_process(_peak, root, name, _TINY)
+            for size in sizes:
+                yield in_fresh_process(_peak, root, name, size)
+
+
+def _peak(root: Path, case: str, size: int) -> Peak:
+    with tempfile.TemporaryDirectory(dir=root) as out:
+        base = _peak_of_scene(root / str(_TINY), case, Path(out) / "tiny")
+        above = _peak_of_scene(root / str(size), case, Path(out) / "scene") - base
+    return Peak(case, float(size), base, above)
+
+
+def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
+    """Process a scene; return the peak memory of this process so far, MB."""
+    record = archive.reprocess(campaign_of(folder, case, out))
+    if record is None or any(scene.error for scene in record.scenes):
+        raise CampaignError("a scene of the benchmark gave no product", field=case)
+    return peak_memory() / 1e6
+
+
+def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
+    """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
+    out.mkdir()
+    file = out / CAMPAIGN_FILE
+    settings = campaign_settings("memory", **CASES[case])
+    file.write_text(yaml.safe_dump(settings), encoding="utf-8")
+    return load_campaign(file, archive=str(folder), output=str(out))
+
+
+def write_files(folder: Path, size: float) -> int:
+    """Write raw files with `size` MB of counts, and dark files; return the number without these."""
+    folder.mkdir(parents=True)
+    layout: dict[str, Any] = {
+        "wavelength": 532e-9,
+        "bins": BINS,
+        "bin_width": _BIN_WIDTH,
+        "shots": _SHOTS,
+    }
+    kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
+    datasets = [licel_write.new_dataset(kind=kind, **layout) for kind in kinds]
+    counts = _counts()
+    number = round(size * 1e6 / (4 * BINS * len(kinds)))
+    dark = max(1, round(_DARK_SHARE * number))
+    for index in range(-dark, number):
+        start = _DAY + index * _INTERVAL
+        name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
+        header = licel_write.new_header(
+            name=name,
+            site="Here",
+            start=start,
+            stop=start + _INTERVAL,
+            altitude=100,
+            longitude=10,
+            latitude=50,
+            zenith_angle=_ZENITH_ANGLES[index % len(_ZENITH_ANGLES)],
+            datasets=datasets,
+            lasers=[Laser(_SHOTS, 20), Laser(0, 0)],
+        )
+        signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
+        values = {dataset.name: signal for dataset in header.datasets}
+        (folder / name).write_bytes(licel_write.encode(header, values))
+    return number
+
+
+def _counts() -> np.ndarray[Any, Any]:
+    """Return noisy counts of a decaying signal, (profile, bin)."""
+    distance = _BIN_WIDTH * (np.arange(BINS) + 0.5)
+    expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
+    return np.random.default_rng(7).poisson(expected, (_VARIANTS, BINS))
+
+
+# Page -----------------------------------------------------------------------------------------
+
+
+def memory_study(date: str, peaks: Sequence[Peak]) -> Study:
+    """Return the study of peaks, each compared with the smallest scene of its case."""
+    smallest = {peak.case: peak for peak in reversed(peaks)}
+    scores: Scores = {}
+    for peak in peaks:
+        first = smallest[peak.case]
+        grown, more = peak.above - first.above, peak.raw - first.raw
+        scores[peak.case, f"{peak.raw:.0f}"] = {
+            "base MB": round(peak.base),
+            "above base MB": round(peak.above),
+            "slope": grown / more if more else None,
+        }
+    chapter = Chapter(
+        "Peak memory above the base of a process",
+        f"Scenes of one analog and one photon-counting channel with {BINS:,} bins, each in a fresh "
+        "process. The base is the peak after a tiny scene of the same case, with imports and "
+        "compiled code.",
+        [
+            Results(
+                "Peak memory",
+                rows_of_scores(scores),
+                "Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
+                method="raw MB",
+            )
+        ],
+    )
+    return Study("Memory of a process, by size of the scene", date, [chapter])

@@ -1,0 +1,388 @@
+"""The elastic benchmark: signals, bounds, scores, peers and pages."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from typer.testing import CliRunner
+
+from benchmarks import registry
+from benchmarks.__main__ import app
+from benchmarks.accuracy import elastic, elastic_cases
+from benchmarks.accuracy.elastic import ALL_STEPS, background_score, inversion_score
+from benchmarks.harness.benchmark import Effort
+from benchmarks.harness.rows import CPU_TIME
+from benchmarks.harness.timing import READ
+from benchmarks.throughput import retrievals
+from lidarops.errors import CampaignError, RawFormatError
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.background.known_shape import fit_known_shape
+
+DRAWS = 60
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return elastic_cases.simulated_sky()
+
+
+@pytest.fixture(scope="module")
+def accuracy(request):
+    """Return the accuracy benchmark, with the published files where they are."""
+    try:
+        folder = request.getfixturevalue("data_root") / "synthetic" / "boeckmann"
+    except pytest.skip.Exception:
+        folder = None
+    effort = Effort(quick=True, date="2024-01-01")
+    return elastic.measure_elastic_accuracy(effort, draws=DRAWS, data=folder)
+
+
+@pytest.fixture(scope="module")
+def timed():
+    return retrievals.measure_elastic(Effort(date="2024-01-01", repeats=1), batches=(1, 20))
+
+
+# Signals --------------------------------------------------------------------------------------
+
+
+def test_the_signal_obeys_the_lidar_equation(sky):
+    """Two bins differ by backscatter, range and an optical depth that scipy integrates."""
+    air = MolecularProfile.us_standard()
+    near, far = 60, 700
+
+    def extinction(z):
+        loss = elastic_cases.LIDAR_RATIO * float(elastic_cases.particles(z))
+        return loss + float(air.extinction(z, elastic_cases.WAVELENGTH))
+
+    bends = [1750.0, 3900.0, 5700.0, 6000.0]
+    depth = quad(extinction, sky.range[near], sky.range[far], points=bends, epsrel=1e-9)[0]
+    total = sky.backscatter + sky.molecular_backscatter
+    expected = total[far] / total[near] * (sky.range[near] / sky.range[far]) ** 2
+    ratio = sky.signal[far] / sky.signal[near]
+    assert ratio == pytest.approx(expected * math.exp(-2.0 * depth), rel=1e-4)
+
+
+def test_the_set_is_like_the_intercomparison(sky):
+    assert sky.signal.max() == pytest.approx(elastic_cases.BRIGHTEST)
+    clean = sky.range >= elastic_cases.CLEAN_FROM
+    assert not np.any(sky.backscatter[clean])
+    assert np.all(sky.backscatter[sky.range < 2000.0] > 1e-6)
+    depth = elastic_cases.LIDAR_RATIO * np.sum(sky.backscatter) * 15.0
+    assert depth == pytest.approx(1.4, abs=0.05)
+    assert sky.signal[-1] == pytest.approx(2.15, rel=0.8)
+
+
+def test_counts_are_means_of_poisson_counts_and_repeat(sky):
+    level, draws = 50.0, 4000
+    counts = sky.counts(level, draws, 3)
+    assert np.array_equal(counts, sky.counts(level, draws, 3))
+    assert not np.array_equal(counts[:5], sky.counts(level, 5, 4))
+    assert np.allclose(counts * elastic_cases.SHOTS, np.round(counts * elastic_cases.SHOTS))
+    mean = sky.signal + level
+    error = np.sqrt(mean / elastic_cases.SHOTS / draws)
+    deviation = (counts.mean(axis=0) - mean) / error
+    assert np.std(deviation) == pytest.approx(1.0, abs=0.1)
+    spread = counts.var(axis=0) / (mean / elastic_cases.SHOTS)
+    assert spread.mean() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("level", [1.0, 1e4, 1e8])
+def test_the_bound_is_that_of_a_weighted_straight_line(sky, level):
+    """The bound is the textbook variance of an intercept, and the scatter of fits above 6 km."""
+    far = sky.range >= elastic_cases.CLEAN_FROM
+    x, w = sky.shape[far] * 1e15, elastic_cases.SHOTS / (sky.signal[far] + level)
+    determinant = w.sum() * (w * x * x).sum() - (w * x).sum() ** 2
+    bound = elastic_cases.least_error(sky, level)
+    assert bound == pytest.approx(math.sqrt((w * x * x).sum() / determinant), rel=1e-6)
+    estimates = elastic_cases.background_methods()[elastic_cases.KNOWN_CLEAN_RANGE](
+        sky.counts(level, 400, 9), sky
+    )
+    assert np.std(estimates.background) == pytest.approx(bound, rel=0.15)
+
+
+# Peers ----------------------------------------------------------------------------------------
+
+
+def klett_python(power, sky):
+    """Return the backscatter of particles by loops over profiles and bins (fernald1984)."""
+    distance = sky.range.tolist()
+    air, loss = sky.molecular_backscatter.tolist(), sky.molecular_extinction.tolist()
+    low, high = elastic_cases.GIVEN_WINDOW
+    inside = [k for k, r in enumerate(distance) if low <= r <= high]
+    rows = [_klett(row, distance, air, loss, inside) for row in power.tolist()]
+    return np.asarray(rows)
+
+
+def _klett(power, distance, air, loss, inside):
+    start, size = inside[len(inside) // 2], len(power)
+    excess = [a - elastic_cases.LIDAR_RATIO * b for a, b in zip(loss, air, strict=True)]
+    corrected, integral = [0.0] * size, [0.0] * size
+    for step in (1, -1):
+        depth = total = 0.0
+        last = start
+        corrected[start] = power[start] * distance[start] ** 2
+        for k in range(start + step, size if step > 0 else -1, step):
+            width = distance[k] - distance[last]
+            depth += 0.5 * width * (excess[k] + excess[last])
+            corrected[k] = power[k] * distance[k] ** 2 * math.exp(2.0 * depth)
+            total += 0.5 * width * elastic_cases.LIDAR_RATIO * (corrected[k] + corrected[last])
+            integral[k] = total
+            last = k
+    ratio = sum(corrected[k] / air[k] for k in inside) / len(inside)
+    return [q / (ratio - 2.0 * i) - b for q, i, b in zip(corrected, integral, air, strict=True)]
+
+
+def test_the_peers_agree(sky):
+    counts = sky.counts(1e3, 3, 1)
+    estimates = elastic_cases.background_methods()[elastic_cases.KNOWN_CLEAN_RANGE](counts, sky)
+    difference = elastic_cases.linear_backgrounds(counts, sky).background - estimates.background
+    # Its weights are those of the mean of all profiles.
+    assert np.abs(difference).max() < 0.1 * elastic_cases.least_error(sky, 1e3)
+    clean = sky.signal[np.newaxis]
+    looped, summed = klett_python(clean, sky), elastic_cases.klett_numpy(clean, sky)
+    assert np.abs(looped - summed).max() < 1e-9 * np.abs(summed).max()
+    power = np.where(sky.inverted, clean, np.nan)
+    ours = elastic_cases.invert_particles(power, sky, elastic_cases.GIVEN_WINDOW).backscatter
+    difference = np.abs(looped - ours)[:, sky.compared]
+    # They treat the window as one point, with attenuation linear across it.
+    assert difference.max() < 3e-3 * sky.backscatter[sky.compared].mean()
+
+
+# Scores ---------------------------------------------------------------------------------------
+
+
+def test_background_scores_of_known_errors():
+    error = np.array([3.0, -1.0, 1.0, 50.0, np.nan])
+    rejected = np.array([False, False, False, True, False])
+    score = background_score(error, np.array([1.0, 2.0, 0.8, 1.0, 1.0]), rejected)
+    assert score["mean error"].value == pytest.approx(1.0)
+    assert score["mean error"].error == pytest.approx(math.sqrt(8 / 3 / 3))
+    assert score["RMSE"].value == pytest.approx(math.sqrt(11 / 3))
+    assert score["stated"] == pytest.approx(1.0)
+    assert score["mean / stated"].value == pytest.approx((3.0 - 0.5 + 1.25) / 3)
+    assert score["RMS / stated"].value == pytest.approx(math.sqrt((9 + 0.25 + 1.5625) / 3))
+    assert score["within 1"].value == pytest.approx(1 / 3)
+    assert score["within 1.96"].value == pytest.approx(2 / 3)
+    assert set(background_score(error[:1], np.ones(1), rejected[:1]).values()) == {None}
+
+
+def test_inversion_scores_of_known_errors():
+    error = np.array([[2.0, -1.0], [np.nan, 3.0], [np.nan, np.nan], [1.0, 1.0]])
+    stated = np.array([[1.0, 1.5], [1.0, 4.0], [1.0, 1.0], [0.6, np.nan]])
+    score = {name: figure.value for name, figure in inversion_score(error, stated, 10.0).items()}
+    biases = np.array([0.05, 0.3, 0.1])
+    assert score == pytest.approx(
+        {
+            "solved": 4 / 8,
+            "mean error": biases.mean(),
+            "scatter": biases.std(),
+            "RMSE": math.sqrt((2.5 + 9.0 + 1.0) / 3) / 10,
+            "stated": math.sqrt((3.25 / 2 + 16.0 + 0.36) / 3) / 10,
+            "within 1": 0.5,
+            "within 1.96": 2.5 / 3,
+        }
+    )
+    assert set(inversion_score(error[1:3], stated[1:3], 10.0).values()) == {None}
+    assert inversion_score(error[1:2], stated[1:2], 10.0)["solved"].value == 0.5
+
+
+# Results --------------------------------------------------------------------------------------
+
+
+def _backgrounds(study, method):
+    return study.figures(f"Background by {method}, counts per shot")
+
+
+def _backscatter(study, chain):
+    return study.figures(f"Backscatter by {chain}, percent of its mean")
+
+
+LEVELS = {f"1e{power}": 10.0**power for power in range(9)}
+
+
+def test_the_tail_is_biased_by_its_signal_and_the_shape_is_not(accuracy, sky):
+    tail = sky.signal[-(sky.range.size // 10) :].mean()
+    known = _backgrounds(accuracy, elastic_cases.KNOWN_CLEAN_RANGE)
+    mean = _backgrounds(accuracy, elastic_cases.TAIL_MEAN)
+    free = _backgrounds(accuracy, elastic_cases.KNOWN_SHAPE)
+    assert {level for level, _, _ in known} == set(LEVELS)
+    for name, level in LEVELS.items():
+        bias, method = known[name, elastic_cases.KNOWN_CLEAN_RANGE, "mean error"], known
+        assert abs(bias.value) < 4.5 * bias.error
+        line = {quantity: row.value for (case, _, quantity), row in method.items() if case == name}
+        assert line["stated"] == pytest.approx(line["bound"], rel=0.05)
+        assert line["RMS / stated"] == pytest.approx(1.0, abs=0.4)
+        bias = mean[name, elastic_cases.TAIL_MEAN, "mean error"]
+        assert abs(bias.value - tail) < 4.5 * bias.error
+        bias = free[name, elastic_cases.KNOWN_SHAPE, "mean error"]
+        assert level > 1e6 or abs(bias.value) < 4.5 * bias.error
+
+
+def test_backscatter_has_the_stated_error_with_a_given_window(accuracy):
+    for name, level in LEVELS.items():
+        score = {
+            chain: {q: row for (case, _, q), row in _backscatter(accuracy, chain).items()
+                    if case == name}
+            for chain in elastic_cases.chains()
+        }  # fmt: skip
+        given_window = {quantity: row.value for quantity, row in score["window given"].items()}
+        if level <= 1e5:
+            assert given_window["solved"] == 1.0
+            assert abs(given_window["mean error"]) < 0.01
+            assert given_window["RMSE"] == pytest.approx(given_window["stated"], rel=0.35)
+            assert given_window["within 1"] == pytest.approx(0.68, abs=0.15)
+        if level <= 1e3:
+            tail = score["tail_mean, given"]
+            assert tail["mean error"].value > 0.03
+            assert tail["within 1.96"].value < 0.1
+        if level == 1e8:
+            assert given_window["solved"] < 0.3
+        chosen, carried = score["window chosen"], score["chosen, error carried"]
+        # The error changes which values are solved, but none of them.
+        if level <= 1e5:
+            assert carried["solved"].value == chosen["solved"].value
+            assert carried["mean error"].value == chosen["mean error"].value
+        if chosen["stated"].value is not None:
+            assert carried["stated"].value > chosen["stated"].value
+
+
+def test_errors_without_noise_are_small(accuracy):
+    rows = accuracy.figures("Closed loop without noise")
+    assert list(dict.fromkeys(level for level, _, _ in rows)) == ["none", "1e0", "1e4", "1e8"]
+    for level in ("none", "1e0", "1e4", "1e8"):
+        assert abs(rows[level, "", "its error (counts)"].value) < 1e-6
+        bias, largest = (rows[level, "", f"{name} error"].value for name in ("mean", "largest"))
+        assert abs(bias) < 2e-4
+        assert abs(bias) <= largest < 1e-3
+
+
+def test_published_files_are_reproduced(data_root, accuracy):
+    titles = [chapter.title for chapter in accuracy.chapters]
+    assert titles.count("Files of the intercomparison") == 1
+    sky, files = elastic_cases.read_published_profiles(data_root / "synthetic" / "boeckmann")
+    truths = {file.level: file for file in files}
+    assert sorted(truths) == [file.level for file in files]
+    noisiest = truths[1e8]
+    assert noisiest.background - 1e8 == pytest.approx(250.0, abs=2.0)
+    assert noisiest.background_error == pytest.approx(math.sqrt(1e8 / 1000 / 945), rel=0.05)
+    assert np.all(np.isfinite(sky.backscatter[sky.inverted]))
+    backgrounds = accuracy.figures("Background of published files, counts per shot")
+    inversions = accuracy.figures("Backscatter of published files, percent of its mean")
+    for level in truths:
+        name = f"1e{round(math.log10(level))}"
+        assert abs(backgrounds[name, elastic_cases.KNOWN_SHAPE, "error / stated"].value) < 3.0
+        error = backgrounds[name, elastic_cases.KNOWN_SHAPE, "error"].value
+        assert level > 1e5 or abs(error) < 1.0
+        assert level > 1e5 or abs(inversions[name, "window given", "mean error"].value) < 0.01
+        tail = backgrounds[name, elastic_cases.TAIL_MEAN, "error"].value
+        assert level > 1e4 or tail == pytest.approx(2.75, abs=0.1)
+
+
+def test_times_are_multiples_of_the_read_of_their_batch(timed):
+    for batch in ("1 profile a call", "20 profiles a call"):
+        rows = timed.figures(batch)
+        read = rows[batch, READ, CPU_TIME].value
+        steps = {method for _, method, _ in rows}
+        assert (rows[batch, READ, "reads"].value, rows[batch, READ, "lidarops"].value) == (1, False)
+        assert {"known_shape", "layers.screen", "reference.choose", "elastic.solve"} <= steps
+        assert rows[batch, ALL_STEPS, "lidarops"].value
+        assert not rows[batch, "Klett, numpy", "lidarops"].value
+        for step in steps:
+            time = rows[batch, step, CPU_TIME].value
+            assert rows[batch, step, "reads"].value == pytest.approx(time / read)
+            assert 1 <= rows[batch, step, "profiles"].value <= 20
+
+
+# Pages and the command ------------------------------------------------------------------------
+
+
+def test_pages_hold_tables_and_figures(accuracy, timed, tmp_path):
+    reports = {"accuracy": accuracy, "throughput": timed}
+    for name, report in reports.items():
+        folder = tmp_path / name
+        text = report.write(folder).read_text()
+        for chapter in report.chapters:
+            for chart in chapter.charts:
+                assert (folder / f"{chart.name}.svg").read_bytes().startswith(b"<svg")
+            for table in (results.table for results in chapter.results):
+                assert table.title in text
+                assert table.rows
+                assert all(len(row) == len(table.columns) for row in table.rows)
+
+
+@pytest.mark.parametrize(
+    ("what", "data", "message"),
+    [("luck", None, "accuracy or throughput"), ("throughput", "folder", "leave it out")],
+)
+def test_wrong_use_is_refused(what, data, message):
+    with pytest.raises(CampaignError, match=message):
+        registry.run_benchmark(what, "elastic", [], Effort(), data=data)
+
+
+def test_folders_without_the_published_files_are_refused(tmp_path):
+    with pytest.raises(CampaignError, match="no files background_1e"):
+        elastic_cases.read_published_profiles(tmp_path)
+    named = tmp_path / "background_1ex.licel"
+    named.write_text("")
+    with pytest.raises(CampaignError, match="names no background"):
+        elastic_cases.read_published_profiles(tmp_path)
+    named.rename(tmp_path / "background_1e2.licel")
+    table = tmp_path / "molecular_profile_hPa.csv"
+    for content, message in (
+        (None, "cannot be read"),
+        ("a,b,c\n", "cannot be read"),
+        ("1013,288\n500,250\n", "2 columns"),
+    ):
+        if content is not None:
+            table.write_text(content)
+        with pytest.raises(CampaignError, match=message):
+            elastic_cases.read_published_profiles(tmp_path)
+    table.write_text("1013.25,288.15,0\n540.2,255.65,5000\n")
+    (tmp_path / "noise_free.licel").write_bytes(b"no licel file")
+    with pytest.raises(RawFormatError):
+        elastic_cases.read_published_profiles(tmp_path)
+
+
+def test_the_command_prints_writes_and_refuses(monkeypatch, accuracy, tmp_path):
+    passed = []
+
+    def measure(effort, *, data):
+        passed.append((effort.quick, data))
+        return accuracy
+
+    monkeypatch.setattr(elastic, "measure_elastic_accuracy", measure)
+    words = ["accuracy", "--case", "elastic", "--quick", "--data", str(tmp_path)]
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    assert passed == [(True, tmp_path)]
+    assert json.loads(result.stdout) == json.loads((tmp_path / "result.json").read_text())
+    for wrong in (
+        ["accuracy", "--case", "homogeneous", "--data", str(tmp_path)],
+        ["accuracy", str(tmp_path / "result.json"), "--case", "elastic"],
+    ):
+        refused = CliRunner().invoke(app, wrong)
+        assert refused.exit_code == 2
+        assert "elastic" in refused.output
+
+
+@pytest.mark.parametrize("background", [1e5, 3e6])
+def test_noisy_windows_state_what_they_cannot_see(sky, background):
+    counts = sky.counts(background, 300, 7)
+    noise = elastic_cases.count_variance(counts)
+    fit = fit_known_shape(counts, sky.range, sky.shape, variance=noise)
+    power = np.where(sky.inverted, counts - fit.background[:, np.newaxis], np.nan)
+    error = fit.background_standard_error
+    window = elastic_cases.choose_window(power, noise, sky, background_error=error)
+    assert np.mean(window.chosen) > 0.95
+    result = elastic_cases.invert_particles(
+        power, sky, window.edges, noise=noise, background_error=error,
+        reference_error=window.undetected_particles,
+    )  # fmt: skip
+    compared = result.valid & sky.compared
+    score = (result.backscatter - sky.backscatter) / result.backscatter_standard_error
+    assert np.mean(compared[:, sky.compared]) > 0.7
+    assert np.mean(np.abs(score[compared]) > 4.0) < 3e-3

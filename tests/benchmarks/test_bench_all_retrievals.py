@@ -1,0 +1,111 @@
+"""The page of all retrievals: complete, without name clashes, with the results of its parts."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from benchmarks import all_retrievals
+from benchmarks.accuracy import elastic, homogeneous, multiangle, multiangle_cases, network
+from benchmarks.accuracy.multiangle import StudySize
+from benchmarks.harness.benchmark import Effort
+from benchmarks.harness.figure import Figure, cpu_time
+from benchmarks.harness.study import Work
+
+SMALL = StudySize(blocks=2, profiles=4, slow=1, published=20)
+
+
+@pytest.fixture(scope="module")
+def study():
+    """Return the study of few profiles."""
+    steps = []
+    small = {
+        (homogeneous, "measure_homogeneous"): {"profiles": 64},
+        (elastic, "measure_elastic_accuracy"): {"draws": 4},
+        (multiangle, "measure_multiangle"): {"size": SMALL},
+        (network, "measure_network"): {"profiles": 25, "peer_profiles": 4},
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for (module, name), size in small.items():
+            patch.setattr(module, name, partial(getattr(module, name), **size))
+        scenes = (multiangle_cases.clear(3000.0, bins=25), multiangle_cases.cloud())
+        patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
+        effort = Effort(quick=True, repeats=1, date="2024-01-01", progress=steps.append)
+        result = all_retrievals.measure_all(effort)
+    assert len(steps) > 40
+    return result
+
+
+def _all_methods(study, retrieval):
+    return study.figures(f"{retrieval.capitalize()}: all methods")
+
+
+@pytest.mark.parametrize(
+    "retrieval", ["homogeneous path", "elastic inversion", "scans over zenith angle"]
+)
+def test_every_retrieval_has_our_methods_and_peers(study, retrieval):
+    rows = _all_methods(study, retrieval)
+    methods = {method for _, method, _ in rows}
+    assert {method.startswith("peer: ") for method in methods} == {True, False}
+    assert all(row.value > 0 for (_, _, name), row in rows.items() if name == "RMSE")
+
+
+def test_rows_hold_the_figures_of_the_retrievals(study):
+    rows = _all_methods(study, "scans over zenith angle")
+    scene = multiangle_cases.clear(3000.0).label
+    joint = study.figures(f"Scans: {scene}")[scene, "joint", "RMSE where all have a value"]
+    compared = rows[f"optical depth; {scene}", "joint", "RMSE"]
+    assert (compared.value, compared.error) == (joint.value, joint.error)
+
+
+def test_the_first_table_shows_the_best_method_without_prior_knowledge(study):
+    best = study.figures("The most accurate of our methods and of the peers")
+    methods = [method for _, method, _ in best]
+    assert any(method.startswith("peer: ") for method in methods)
+    names = [method.removeprefix("known_shape") for method in methods]
+    assert not any("known_" in name or "from 6 km" in name for name in names)
+
+
+def test_of_equally_accurate_methods_the_first_table_shows_the_fastest():
+    def work(method: str, error: float, nanoseconds: float) -> Work:
+        return Work("all", "extinction", method, Figure(error, 0.01), None, cpu_time(nanoseconds))
+
+    works = [work("slow", 1.0, 90.0), work("fast", 1.02, 9.0), work("rough", 1.2, 1.0)]
+    assert {row.method for row in all_retrievals.best_methods({"paths": works})} == {"fast"}
+
+
+def test_where_a_peer_is_ahead_the_table_says_so():
+    def work(method: str, error: float, nanoseconds: float, *, ours: bool = True) -> Work:
+        time = cpu_time(nanoseconds)
+        return Work("all", "depth", method, Figure(error, 0.02), None, time, ours=ours)
+
+    def beside(*works: Work) -> dict[str, object]:
+        return {row.quantity: row.value for row in all_retrievals.against_peers({"x": works})}
+
+    ours, peer = work("ours", 1.0, 50.0), work("peer", 1.02, 10.0, ours=False)
+    row = beside(ours, peer)
+    assert row["ours is"] == "equal error, slower"
+    assert row["time, ratio"] == pytest.approx(5.0)
+    assert beside(ours, work("peer", 0.8, 60.0, ours=False))["ours is"] == "less accurate, faster"
+    assert beside(ours, work("peer", 1.4, 60.0, ours=False))["ours is"] == "more accurate, faster"
+    assert beside(ours) == {}
+
+
+def test_page_and_figures_are_written_once_each(study, tmp_path):
+    page = study.write(tmp_path)
+    text = page.read_text(encoding="utf-8")
+    titles = [chapter.title for chapter in study.chapters]
+    charts = [chart.name for chapter in study.chapters for chart in chapter.charts]
+    tables = [results.title for chapter in study.chapters for results in chapter.results]
+    assert len(set(titles)) == len(titles)
+    assert len(set(charts)) == len(charts)
+    assert len(set(tables)) == len(tables)
+    assert all(f"{name}.svg" in text and (tmp_path / f"{name}.svg").is_file() for name in charts)
+    assert "http://" not in text
+    assert "https://" not in text
+
+
+def test_minimal_operations_are_measured(study):
+    rows = study.figures("Minimal operations, measured in the same run")
+    assert [row.value > 0 for row in rows.values()] == [True, True]
