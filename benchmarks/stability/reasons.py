@@ -11,8 +11,7 @@ from typing import Final
 
 from benchmarks.harness.verdicts import Judgement
 
-FILE: Final = Path(__file__).parents[3] / "docs/results/reasons.json"
-"""Not in an installed package."""
+FILE: Final = Path(__file__).parents[2] / "docs/results/reasons.json"
 
 
 @dataclass(frozen=True, slots=True)
