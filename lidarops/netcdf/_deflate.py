@@ -71,42 +71,6 @@ def _deflate(part: NDArray[Any]) -> bytes:
     return b"".join((*pieces, compressor.flush()))
 
 
-def inflate_chunk(data: bytes, chunk: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values of a chunk that `deflate_chunks` compressed.
-
-    Parameters
-    ----------
-    data : bytes
-        A zlib stream.
-    chunk : tuple of int
-        Elements of a chunk along each axis.
-    dtype : dtype
-        In the byte order of the file.
-
-    Returns
-    -------
-    ndarray, shape `chunk`
-
-    Raises
-    ------
-    ValueError
-        If the stream is damaged, or holds more or less than the chunk.
-    """
-    whole = np.empty(chunk, dtype)
-    try:
-        # The initial size of the buffer, which grows if needed.
-        data = isal_zlib.decompress(data, bufsize=max(whole.nbytes, 1))
-    # The type stubs declare the error class as an instance.
-    except isal_zlib.IsalError as error:  # type: ignore[misc]
-        raise ValueError(f"a chunk cannot be inflated: {error}") from error
-    if len(data) != whole.nbytes:
-        raise ValueError(f"a chunk holds {len(data)} bytes, not {whole.nbytes}")
-    elements = whole.reshape(-1).view(np.uint8).reshape(-1, dtype.itemsize)
-    for number, plane in enumerate(np.frombuffer(data, np.uint8).reshape(dtype.itemsize, -1)):
-        elements[:, number] = plane
-    return whole
-
-
 def _planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:
     """Yield the first bytes of all elements, then the second bytes: the order of HDF5's `shuffle`.
 

@@ -28,7 +28,6 @@ from lidarops.errors import ProductError
 from lidarops.netcdf._deflate import deflate_chunks
 from lidarops.netcdf._quiet_file import QuietFile
 from lidarops.netcdf._row_blocks import Block, RowBlocks
-from lidarops.netcdf.sizes import OTHER_DIMENSION
 from lidarops.netcdf.skeleton import Skeleton
 
 COMPRESSION_LEVEL: Final = 4
@@ -39,6 +38,8 @@ CONTIGUOUS_BYTES: Final = 2048
 """
 
 _TYPES: Final = {"S1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"}
+_OTHER_DIMENSION: Final = "_nc4_non_coord_"
+"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 _Array = NDArray[Any]
 _Format = Literal["NETCDF4", "NETCDF4_CLASSIC"]
 
@@ -242,7 +243,7 @@ class RowFile:
         """Return the HDF5 dataset of a variable, with its final length."""
         variable = self._variables[name]
         other = name in dimensions and variable.dims[0] != name
-        inside = unicodedata.normalize("NFC", f"{OTHER_DIMENSION if other else ''}{name}")
+        inside = unicodedata.normalize("NFC", f"{_OTHER_DIMENSION if other else ''}{name}")
         target = h5py.h5d.open(self._file.id, inside.encode())
         target.set_extent(variable.shape)
         return target

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarops.netcdf._deflate import _planes, deflate_chunks, inflate_chunk
+from lidarops.netcdf._deflate import _planes, deflate_chunks
 
 DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
 
@@ -55,31 +55,6 @@ def test_chunks_hold_the_array_and_beyond_its_edge_the_fill_value(cut):
     assert whole[inside].tobytes() == values.tobytes()
     whole[inside] = fill_value
     assert (whole == fill_value).all()
-
-
-@settings(deadline=None)
-@given(cut=cut_arrays())
-def test_inflating_restores_the_values(cut):
-    values, chunk = cut
-    for offset, data in deflate_chunks(values, chunk, values.dtype.type(77)):
-        whole = inflate_chunk(data, chunk, values.dtype)
-        assert whole.tobytes() == unshuffled(data, values.dtype, chunk).tobytes()
-        assert whole[(0,) * whole.ndim].tobytes() == values[offset].tobytes()
-
-
-@pytest.mark.parametrize("damage", ["cut", "flipped", "longer", "shorter", "empty"])
-def test_damaged_chunks_are_refused(damage):
-    values = np.random.default_rng(2).normal(size=1000)
-    ((_, data),) = deflate_chunks(values, (1000,), 0.0)
-    damaged = {
-        "cut": data[:-6],
-        "flipped": data[:3000] + bytes([data[3000] ^ 0xFF]) + data[3001:],
-        "longer": zlib.compress(values.tobytes() + b"12345678"),
-        "shorter": zlib.compress(values.tobytes()[:-8]),
-        "empty": b"",
-    }
-    with pytest.raises(ValueError, match="a chunk"):
-        inflate_chunk(damaged[damage], (1000,), values.dtype)
 
 
 def test_text_is_cut_into_chunks_like_numbers():

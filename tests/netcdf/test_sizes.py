@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import ProductError
-from lidarops.netcdf import sizes
-from lidarops.netcdf.sizes import check_sizes
+from lidarops.netcdf import read
+from lidarops.netcdf.read import check_sizes
 
 
 def _unwritten(file: Path) -> None:
@@ -137,7 +137,7 @@ def test_honest_files_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     zeros.isel(t=slice(9)).to_netcdf(tmp_path / "old.nc", format="NETCDF3_64BIT")
     check_sizes(tmp_path / "old.nc")
     # On a machine of little memory.
-    monkeypatch.setattr(sizes, "_MEMORY_SHARE", 1e-6)
+    monkeypatch.setattr(read, "_MEMORY_SHARE", 1e-6)
     with pytest.raises(ProductError, match=r"x: .*on this machine"):
         check_sizes(tmp_path / "zeros.nc")
 
