@@ -229,6 +229,18 @@ class Flags:
         return f"{self.kind} {self.version}"
 
     @property
+    def words(self) -> str:
+        """Names of the bits, as in ``flag_meanings``."""
+        return " ".join(bit.word for bit in self.bits)
+
+    @property
+    def explanation(self) -> str:
+        """Severity and meaning of each bit."""
+        return "; ".join(
+            f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in self.bits
+        )
+
+    @property
     def rejecting(self) -> int:
         """Union of the bits that reject a value."""
         return rejecting(self.bits)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarops.aggregate.means_variables import PERIOD
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
-from lidarops.netcdf.global_attributes import RECORDERS
+from lidarops.netcdf.context import RECORDERS
 from lidarops.netcdf.read import opened_product
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of

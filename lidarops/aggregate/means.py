@@ -28,7 +28,7 @@ from lidarops.aggregate.means_variables import MeansDescription, Period, Weights
 from lidarops.errors import ProductError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
-from lidarops.netcdf.global_attributes import UNUSED_INPUTS
+from lidarops.netcdf.context import UNUSED_INPUTS
 from lidarops.netcdf.quantities import CLOUD_FRACTION
 from lidarops.netcdf.variables import layout_of, whole_error
 from lidarops.netcdf.write import write_product

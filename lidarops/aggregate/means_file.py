@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
-from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 import xarray as xr
@@ -23,8 +21,8 @@ from lidarops.aggregate.means_variables import (
     layout,
 )
 from lidarops.netcdf import variables as rows
-from lidarops.netcdf.build import bitround
-from lidarops.netcdf.provenance import NAMESPACE, package_versions
+from lidarops.netcdf.encoding import as_stored, as_text
+from lidarops.netcdf.provenance import identifier, package_versions, prov_document, prov_type
 from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
 from lidarops.records import DetectionMode
 from lidarops.system.code_version import code_version
@@ -113,7 +111,7 @@ def encode_means(
         Encoded, for `lidarops.netcdf.write.write_product`.
     """
     table = layout(frame.kind, about.period, about.weights)
-    texts = {rows.PROVENANCE.name: _text(rows.PROVENANCE, provenance, frame.mode)}
+    texts = {rows.PROVENANCE.name: as_text(rows.PROVENANCE, provenance, frame.mode)}
     variables = {
         **dict(_times(table, periods.bounds, frame.mode)),
         **{name: values for name, values in frame.variables.items() if name != "station"},
@@ -147,7 +145,7 @@ def _data(table: Layout, periods: Periods, frame: Frame) -> Iterator[tuple[str, 
         elif row.name == rows.QUALITY_FLAG:
             values = flags
         else:
-            values = _stored(row, np.stack([record[row.name] for record in periods.records]))
+            values = as_stored(row, np.stack([record[row.name] for record in periods.records]))
         ancillaries = tuple(name for name in row.ancillaries if name in names)
         attrs = _attributes(replace(row, ancillaries=ancillaries), frame)
         yield row.name, xr.Variable(row.dims, values, attrs)
@@ -159,20 +157,6 @@ def _attributes(row: Row, frame: Frame) -> dict[str, Any]:
         # A sum that is never missing; the fill value is for 4 bytes only.
         del attrs["_FillValue"]
     return attrs
-
-
-def _stored(row: Row, values: NDArray[Any]) -> NDArray[Any]:
-    stored: NDArray[Any] = values.astype(row.dtype)
-    if row.dtype != "f4":
-        return stored
-    if row.bits is not None:
-        stored = bitround(stored, row.bits)
-    stored[~np.isfinite(stored)] = rows.FILL_VALUE
-    return stored
-
-
-def _text(row: Row, text: str, mode: DetectionMode) -> xr.Variable:
-    return xr.Variable(row.dims, np.frombuffer(text.encode(), "S1"), attributes(row, mode=mode))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,35 +172,32 @@ class Lineage:
     @property
     def id(self) -> str:
         """UUID version 5 of the inputs' sha256, period, weights, time and code version."""
-        content = {
-            "means": {"period": self.period.value, "weights": self.weights.value},
-            "inputs": sorted(facts.sha256 for facts in self.inputs),
-            "time": [self.start.isoformat(), self.stop.isoformat()],
-            "code_version": means_version(self.inputs[0].group.kind),
-        }
-        return str(uuid5(NAMESPACE_URL, NAMESPACE + _canonical(content)))
+        return identifier(
+            {
+                "means": {"period": self.period.value, "weights": self.weights.value},
+                "inputs": sorted(facts.sha256 for facts in self.inputs),
+                "time": [self.start.isoformat(), self.stop.isoformat()],
+                "code_version": means_version(self.inputs[0].kind),
+            }
+        )
 
 
 def means_provenance(lineage: Lineage) -> str:
-    """Return the provenance of means as W3C PROV-JSON (`provo2013`).
-
-    Parameters
-    ----------
-    lineage : Lineage
-
-    Returns
-    -------
-    str
-        ASCII with sorted keys; does not depend on the order of inputs.
-    """
+    """Return the provenance of means as W3C PROV-JSON, whatever the order of inputs."""
     inputs = sorted(lineage.inputs, key=lambda facts: (facts.sha256, facts.path))
     group = inputs[0].group
-    software = [f"{name} {number}" for name, number in sorted(package_versions().items())]
-    document = {
-        "prefix": {"lidarops": NAMESPACE, "sha256": "urn:sha256:"},
-        "entity": {
+    averaging = {
+        "lidarops:period": lineage.period.value,
+        "lidarops:weights": lineage.weights.value,
+        "prov:startTime": lineage.start.isoformat(),
+        "prov:endTime": lineage.stop.isoformat(),
+    }
+    return prov_document(
+        "lidarops:means",
+        ("lidarops:averaging", averaging),
+        {
             "lidarops:means": {
-                "prov:type": _type("lidarops:Means"),
+                "prov:type": prov_type("lidarops:Means"),
                 "lidarops:id": lineage.id,
                 "lidarops:kind": group.kind,
                 "lidarops:channel": group.channel,
@@ -224,7 +205,7 @@ def means_provenance(lineage: Lineage) -> str:
             },
             **{
                 f"sha256:{facts.sha256}": {
-                    "prov:type": _type("lidarops:Product"),
+                    "prov:type": prov_type("lidarops:Product"),
                     "lidarops:id": facts.id,
                     "lidarops:path": facts.path,
                     "lidarops:sha256": facts.sha256,
@@ -232,52 +213,12 @@ def means_provenance(lineage: Lineage) -> str:
                 for facts in inputs
             },
         },
-        "activity": {
-            "lidarops:averaging": {
-                "lidarops:period": lineage.period.value,
-                "lidarops:weights": lineage.weights.value,
-                "prov:startTime": lineage.start.isoformat(),
-                "prov:endTime": lineage.stop.isoformat(),
-            }
-        },
-        "agent": {
-            "lidarops:software": {
-                "prov:type": _type("prov:SoftwareAgent"),
-                "lidarops:code_version": means_version(group.kind),
-                "lidarops:versions": software,
-            }
-        },
-        "wasGeneratedBy": {
-            "_:generation": {
-                "prov:entity": "lidarops:means",
-                "prov:activity": "lidarops:averaging",
-            }
-        },
-        "used": {
-            f"_:use{number}": {
-                "prov:activity": "lidarops:averaging",
-                "prov:entity": f"sha256:{facts.sha256}",
-            }
-            for number, facts in enumerate(inputs, start=1)
-        },
-        "wasAssociatedWith": {
-            "_:association": {
-                "prov:activity": "lidarops:averaging",
-                "prov:agent": "lidarops:software",
-            }
-        },
-    }
-    return _canonical(document)
+        ({"prov:entity": f"sha256:{facts.sha256}"} for facts in inputs),
+        (means_version(group.kind), package_versions()),
+        {},
+    )
 
 
 def means_version(kind: str) -> str:
     """Return a digest of the code that makes products of a kind and their means."""
     return code_version(kind, "lidarops.aggregate.means")
-
-
-def _type(name: str) -> dict[str, str]:
-    return {"$": name, "type": "prov:QUALIFIED_NAME"}
-
-
-def _canonical(value: Any) -> str:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
 
 from lidarops import __version__
-from lidarops.netcdf.global_attributes import UNUSED_INPUTS
+from lidarops.netcdf.context import UNUSED_INPUTS, iso
 from lidarops.netcdf.quantities import CLOUD_FRACTION
 from lidarops.netcdf.variables import (
     Coverage,
@@ -336,8 +336,8 @@ def global_attributes(
         " products, so that equal inputs give equal files: it grows with each product that is added"
         " or replaced.",
         # As ACDD has it: the times of the first and last value, which are middles of periods.
-        "time_coverage_start": _iso(about.first),
-        "time_coverage_end": _iso(about.last),
+        "time_coverage_start": iso(about.first),
+        "time_coverage_end": iso(about.last),
         "time_coverage_duration": f"P{(about.stop - about.start).days}D",
         "time_coverage_resolution": about.period.duration,
         **dict.fromkeys(dates, about.modified),
@@ -389,7 +389,3 @@ class MeansDescription:
 def _replaced(text: str, old: str, new: str) -> str:
     """Return a text with the text of the product kind replaced by that of means."""
     return text.replace(old, new) if old in text else new
-
-
-def _iso(moment: datetime) -> str:
-    return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")

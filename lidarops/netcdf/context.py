@@ -1,17 +1,41 @@
-"""The context of a product: everything that its file states besides numbers; and its path."""
+"""The context of a product: its path, and all that its file states besides numbers.
+
+The global attributes follow from it, after ACDD-1.3 (`acdd13`).
+"""
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import cast
+from typing import Any, Final, cast
 
+import numpy as np
+
+from lidarops import __version__
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
-from lidarops.netcdf.provenance import writing_time
-from lidarops.records import DetectionMode, Provenance, Stamp, UnusedFile
+from lidarops.netcdf.provenance import product_id, writing_time
+from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
+from lidarops.raw.recorders import POLARISATIONS, label_of
+from lidarops.records import (
+    GLUED,
+    DetectionMode,
+    LeftOut,
+    PlannedStep,
+    Provenance,
+    Role,
+    Stamp,
+    UnusedFile,
+    is_glued,
+)
 
+RECORDERS: Final = "lidarops_recorder"
+UNUSED_INPUTS: Final = "lidarops_unused_inputs"
+MOST_UNUSED: Final = 20
+"""Unused files that a product names; its provenance names all."""
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -56,6 +80,11 @@ class Context:
         """When the product is written, UTC."""
         return cast("datetime", self.stamp.written)
 
+    @property
+    def detection(self) -> str:
+        """``analog``, ``photon``, or ``glued`` of both."""
+        return GLUED.rstrip("_") if is_glued(self.channel) else self.mode.value
+
 
 def product_path(context: Context) -> str:
     """Return the path of a product's file.
@@ -99,3 +128,258 @@ def path_of_product(names: tuple[str, str, str, str], scene: str, start: datetim
             )
     folder = "/".join((*parts[:3], f"{start.astimezone(UTC):%Y}"))
     return f"{folder}/{'_'.join(parts)}.nc"
+
+
+@dataclass(frozen=True, slots=True)
+class Extents:
+    """Extents of a product in time and space, computed from its coordinates."""
+
+    start: datetime
+    stop: datetime
+    interval: float
+    """s, between profiles."""
+    latitudes: tuple[float, float]
+    """degree, smallest and largest of the sounded air."""
+    longitudes: tuple[float, float]
+    lowest: float
+    """m above the geoid."""
+    highest: float
+    step: float | None
+    """m, vertical distance of neighbouring values; None where it is not constant."""
+    vertical: bool
+    """Whether the beam is fixed and near the vertical, as CF profiles require."""
+
+
+def global_attributes(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
+    """Return the global attributes of a product, in the order in which they are written."""
+    feature_type = layout.feature_type or ("timeSeriesProfile" if extents.vertical else "")
+    attributes = {
+        "Conventions": CONVENTIONS,
+        "featureType": feature_type,
+        **_description(context, layout),
+        **_people(context),
+        **_place(context, layout, extents),
+        **_times(extents, context.written),
+        **_processing(context),
+    }
+    # What is not known is left out.
+    return {name: value for name, value in attributes.items() if not _is_empty(value)}
+
+
+def _is_empty(value: Any) -> bool:
+    return isinstance(value, str) and not value
+
+
+_DETECTION: Final = {
+    "analog": "analog detection",
+    "photon": "photon counting",
+    "glued": "analog detection glued to photon counting",
+}
+
+
+def _description(context: Context, layout: Layout) -> dict[str, Any]:
+    metadata = context.metadata
+    station = context.station.name
+    known = math.isfinite(context.wavelength)
+    wavelength = f"{context.wavelength * 1e9:.6g} nm" if known else "wavelength unknown"
+    summary = (
+        f"{layout.summary} Channel {context.channel} ({wavelength},"
+        f" {_DETECTION[context.detection]}) of {context.instrument_name} at {station}."
+    )
+    references = (metadata.references, *layout.references)
+    return {
+        "title": f"{context.title}: {layout.title}, channel {context.channel}, {station}",
+        "summary": _sentences(context.summary, summary),
+        "keywords": ", ".join(layout.keywords),
+        "keywords_vocabulary": "GCMD Science Keywords",
+        "id": product_id(context.provenance),
+        "naming_authority": metadata.naming_authority,
+        "source": f"surface observation: {context.raw_format} raw files of the lidar"
+        f" {context.instrument_name}",
+        "processing_level": layout.processing_level,
+        # As the templates of NCEI name time series of profiles at stations.
+        "cdm_data_type": "Station",
+        "product_version": str(context.stamp.version),
+        "history": _history(context),
+        "references": "\n".join(text for text in references if text),
+        "comment": _sentences(metadata.comment, layout.comment),
+        "acknowledgement": metadata.acknowledgement,
+        "license": metadata.license,
+        "standard_name_vocabulary": STANDARD_NAME_TABLE,
+    }
+
+
+def _sentences(*texts: str) -> str:
+    return " ".join(text.strip() for text in texts if text.strip())
+
+
+def _history(context: Context) -> str:
+    """Return one line for each step, as CF requires: date, step, program."""
+    program = f"lidarops {__version__} ({context.provenance.code_version})"
+    plan = context.provenance.plan
+
+    def name(entry: PlannedStep | LeftOut) -> str:
+        """Return the name of a step, with its channel where the product has another."""
+        other = entry.channel not in ("", context.channel)
+        return f"{entry.name} of {entry.channel}" if other else entry.name
+
+    # The plan of a product holds what it depends on, such as the corrections of glued channels.
+    done = [f"{name(step)}: {step.words}" for step in plan.steps]
+    omitted = [f"left out {name(omission)}: {omission.reason}" for omission in plan.left_out]
+    lines = [*done, *omitted, f"wrote the {context.kind} product"]
+    return "\n".join(
+        f"{iso(context.written)} {' '.join(line.split())} [{program}]" for line in lines
+    )
+
+
+def _people(context: Context) -> dict[str, str]:
+    metadata = context.metadata
+    institution = metadata.institution
+    publisher = metadata.publisher_name or metadata.creator_name
+    return {
+        "institution": institution,
+        "project": metadata.project,
+        "program": metadata.program or metadata.project,
+        "creator_name": metadata.creator_name,
+        "creator_type": _kind_of(metadata.creator_name, institution),
+        "creator_institution": institution,
+        "creator_email": metadata.creator_email,
+        "creator_url": metadata.creator_url,
+        # As in files of EARLINET.
+        "PI": metadata.principal_investigator,
+        "publisher_name": publisher,
+        "publisher_type": _kind_of(publisher, institution),
+        "publisher_institution": institution,
+        "publisher_email": metadata.publisher_email or metadata.creator_email,
+        "publisher_url": metadata.publisher_url or metadata.creator_url,
+        "contributor_name": "The lidarops developers",
+        "contributor_role": "processing software",
+        "metadata_link": metadata.creator_url,
+    }
+
+
+def _kind_of(name: str, institution: str) -> str:
+    if not name:
+        return ""
+    return "institution" if name == institution else "person"
+
+
+def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
+    station = context.station
+    (south, north), (west, east) = extents.latitudes, extents.longitudes
+    spread = "not applicable: single position"
+    if (south, west) != (north, east):
+        spread = _SPREADS.get(layout.sampled, "along the beam")
+    return {
+        "platform": station.name,
+        "platform_vocabulary": "station names of the campaign",
+        # Identifiers as in files of EARLINET and E-PROFILE.
+        "station_ID": context.station_key,
+        "wigos_station_id": station.wigos_station_id,
+        "measurement_ID": context.scene,
+        "instrument": context.instrument_name,
+        "instrument_vocabulary": "instrument names of the campaign",
+        # Latitude first: the order of axes that EPSG:4326 defines.
+        "geospatial_bounds": _bounds(extents),
+        "geospatial_bounds_crs": "EPSG:4326",
+        "geospatial_bounds_vertical_crs": "EPSG:5714",
+        "geospatial_lat_min": south,
+        "geospatial_lat_max": north,
+        "geospatial_lat_units": "degrees_north",
+        "geospatial_lat_resolution": spread,
+        "geospatial_lon_min": west,
+        "geospatial_lon_max": east,
+        "geospatial_lon_units": "degrees_east",
+        "geospatial_lon_resolution": spread,
+        "geospatial_vertical_min": extents.lowest,
+        "geospatial_vertical_max": extents.highest,
+        "geospatial_vertical_units": "m",
+        "geospatial_vertical_positive": "up",
+        "geospatial_vertical_resolution": _vertical_resolution(extents.step),
+    }
+
+
+def _vertical_resolution(step: float | None) -> str:
+    if step is None:
+        return "not constant"
+    # ACDD wants the attribute in every file.
+    return f"{step:.6g} m" if step else "none: the beam is level"
+
+
+_SPREADS = {"crossing": "irregular: crossings of beams"}
+
+
+def _bounds(extents: Extents) -> str:
+    """Return the area of the sounded air as WKT: a point, or the bounding rectangle."""
+    (south, north), (west, east) = extents.latitudes, extents.longitudes
+    if (south, west) == (north, east):
+        return f"POINT ({south!r} {west!r})"
+    corners = ((south, west), (south, east), (north, east), (north, west), (south, west))
+    return f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
+
+
+def _times(extents: Extents, date: datetime) -> dict[str, str]:
+    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
+    return {
+        "time_coverage_start": iso(extents.start),
+        "time_coverage_end": iso(extents.stop),
+        "time_coverage_duration": _duration((extents.stop - extents.start).total_seconds()),
+        "time_coverage_resolution": _duration(extents.interval),
+        **dict.fromkeys(dates, iso(date)),
+    }
+
+
+def _processing(context: Context) -> dict[str, Any]:
+    """Return the attributes that lidarops itself reads."""
+    provenance = context.provenance
+    return {
+        "lidarops_campaign": context.campaign,
+        "lidarops_scene": context.scene,
+        "lidarops_window_start": iso(context.start),
+        "lidarops_window_end": iso(context.stop),
+        "lidarops_kind": context.kind,
+        "lidarops_station": context.station_key,
+        "lidarops_instrument": context.instrument_key,
+        "lidarops_channel": context.channel,
+        "lidarops_detection_mode": context.detection,
+        RECORDERS: ", ".join(
+            step.settings["recorder"]
+            for step in provenance.plan.steps
+            if step.settings.get("recorder") and not is_glued(step.channel)
+        ),
+        "lidarops_polarisation": POLARISATIONS.get(label_of(context.channel)[-1:], ""),
+        "lidarops_plan_sha256": provenance.plan.hash,
+        "lidarops_code_version": provenance.code_version,
+        "lidarops_input_count": np.int32(len(provenance.inputs)),
+        "lidarops_input_notes": "\n".join(context.notes),
+        UNUSED_INPUTS: "\n".join(_unused(context)),
+    }
+
+
+def _unused(context: Context) -> Iterator[str]:
+    files = context.unused
+    for path, role, reason in files[:MOST_UNUSED]:
+        dark = "dark file " if role is Role.DARK else ""
+        yield f"{dark}{path}: {reason}"
+    if len(files) > MOST_UNUSED:
+        yield f"{len(files) - MOST_UNUSED} other raw files"
+
+
+def iso(moment: datetime) -> str:
+    """Return a time as ISO 8601 text in UTC."""
+    return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
+
+
+def _duration(seconds: float) -> str:
+    """Return an ISO 8601 duration, such as ``P1DT2H30M0.5S``."""
+    whole, milliseconds = divmod(round(seconds * 1000), 1000)
+    minutes, second = divmod(whole, 60)
+    hours, minute = divmod(minutes, 60)
+    days, hour = divmod(hours, 24)
+    fraction = f".{milliseconds:03d}".rstrip("0") if milliseconds else ""
+    parts = ((hour, "H", ""), (minute, "M", ""), (second, "S", fraction))
+    clock = "".join(f"{n}{end}{unit}" for n, unit, end in parts if n or end)
+    date = f"{days}D" if days else ""
+    if not date and not clock:
+        clock = "0S"
+    return f"P{date}{'T' + clock if clock else ''}"

@@ -1,19 +1,17 @@
-"""Coordinates of a product in time and space, and their extents."""
+"""Coordinates of a product in time and space, of the air along a beam too, and their extents."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.context import Context
-from lidarops.netcdf.global_attributes import Extents
-from lidarops.netcdf.input_checks import CheckedInput, Values, check_range, whole_numbers
-from lidarops.netcdf.sounded_air import beam_positions
+from lidarops.netcdf.context import Context, Extents
+from lidarops.netcdf.encoding import CheckedInput, Values, check_range, whole_numbers
 from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
 
 NEAR_VERTICAL: Final = 10.0
@@ -24,36 +22,11 @@ _SAME_STEP: Final = 1e-6
 _LEVEL: Final = 1e-6
 """m; vertical step of a level beam: cos(90 degrees) is 6e-17, and 1e-3 degree more gives 1e-4 m."""
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-
-
-@dataclass(frozen=True, slots=True)
-class BeamAltitude:
-    """Altitude of the air along a beam."""
-
-    station: float
-    """m above the geoid."""
-    rise: Values
-    """Cosine of the zenith angle: one number, or one for every profile."""
-    along: Values
-    """m along the beam."""
-
-    def exact(self, along: Values, profiles: slice | None = None) -> Values:
-        """Return altitudes before rounding, m: at `along`, for all or some profiles."""
-        rise = self.rise if profiles is None else self.rise[profiles]
-        altitude: Values = self.station + rise[..., np.newaxis] * along
-        return altitude
-
-    def extremes(self) -> Values:
-        """Return the lowest and highest altitude, and others between them."""
-        # Rounding keeps the order, so the extremes lie at those of both factors.
-        rise, along = self.rise, self.along
-        ends = np.array([rise.min(), rise.max()])[:, np.newaxis] * [along.min(), along.max()]
-        extremes: Values = self.station + ends
-        return extremes
-
-    def step(self) -> float | None:
-        """Return the vertical distance of neighbouring values, m; None where it varies."""
-        return _common_step(self.station + rise * self.along for rise in self.rise.flat)
+EQUATOR: Final = 6_378_137.0
+"""m, semi-major axis of WGS 84."""
+_FLATTENING: Final = 1.0 / 298.257223563
+_ECCENTRICITY: Final = _FLATTENING * (2.0 - _FLATTENING)
+"""Square of the first eccentricity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +37,13 @@ class Coordinate:
     dims: tuple[str, ...]
     values: Values
     bounds: Values | None = None
-    moving: BeamAltitude | None = None
-    """Where the beam moves: what gives the values, of which `values` has only shape and type."""
+    moving: Callable[[slice], Values] | None = None
+    """Where the beam moves: what gives the values of some profiles. Of these, `values` has only
+    shape and type."""
 
     def profiles(self, which: slice) -> Values:
         """Return the values of some profiles, for a coordinate over time."""
-        if self.moving is None:
-            return self.values[which]
-        return self.moving.exact(self.moving.along, which).astype(self.values.dtype)
+        return self.values[which] if self.moving is None else self.moving(which)
 
     @property
     def auxiliary(self) -> bool:
@@ -89,7 +61,8 @@ def locate_product(
     ProductError
         If a coordinate is missing, not finite, not rising, or outside its cell bounds.
     """
-    time = _time(source, layout.row("time"))
+    moments, bounds = (_moments(source, name) for name in ("time", "time_bnds"))
+    time = _time(layout.row("time"), moments, bounds)
     place = _PLACES.get(layout.sampled, _beam_place)
     by_name, vertical = place(source, layout, context.station.altitude, time.values.size)
     by_name["time"] = time
@@ -110,11 +83,10 @@ def locate_product(
         bins[f"bin_{name}"].values if bins else by_name[name].values
         for name in ("latitude", "longitude")
     ]
-    return ordered, _extents(source, vertical, horizontal)
+    return ordered, _extents(moments, bounds, vertical, horizontal)
 
 
-@dataclass(frozen=True, slots=True)
-class _Vertical:
+class _Vertical(NamedTuple):
     """Vertical coverage of a product."""
 
     altitude: Values
@@ -158,12 +130,11 @@ def _air_positions(
     positions = beam_positions(
         station.latitude, station.longitude, station.altitude, ahead, azimuth, up
     )
-    bins = {}
-    for name, values in zip(("bin_latitude", "bin_longitude"), positions, strict=True):
-        row = layout.row(name)
-        stored = values.astype(row.dtype)
-        bins[name] = Coordinate(row, row.dims, stored)
-    return bins
+    rows = (layout.row(name) for name in ("bin_latitude", "bin_longitude"))
+    return {
+        row.name: Coordinate(row, row.dims, values.astype(row.dtype))
+        for row, values in zip(rows, positions, strict=True)
+    }
 
 
 def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles: int) -> _Place:
@@ -216,8 +187,7 @@ def _names_along(layout: Layout) -> list[str]:
     return [row.name for row in along if not row.follows_beam]
 
 
-def _time(source: CheckedInput, row: Row) -> Coordinate:
-    moments, bounds = _moments(source)
+def _time(row: Row, moments: Values, bounds: Values) -> Coordinate:
     if np.isnat(moments).any() or np.isnat(bounds).any():
         raise ProductError("holds missing times", field=row.name)
     if (np.diff(moments) <= np.timedelta64(0)).any():
@@ -226,22 +196,15 @@ def _time(source: CheckedInput, row: Row) -> Coordinate:
             field=row.name,
             remedy="sort the profiles by time, and keep one of those at the same time",
         )
-    return _with_bounds(row, _seconds(moments), _seconds(bounds))
+    seconds = ((times - _EPOCH) / np.timedelta64(1, "s") for times in (moments, bounds))
+    return _with_bounds(row, *seconds)
 
 
-def _moments(source: CheckedInput) -> tuple[Values, Values]:
-    values = []
-    for name, dims in (("time", ("time",)), ("time_bnds", ("time", BOUNDS_DIM))):
-        times = source.take(name, dims)
-        if times.dtype.kind != "M":
-            raise ProductError(f"has data of type {times.dtype}, not datetime64", field=name)
-        values.append(times.astype("datetime64[ns]"))
-    return values[0], values[1]
-
-
-def _seconds(moments: Values) -> Values:
-    seconds: Values = (moments - _EPOCH) / np.timedelta64(1, "s")
-    return seconds
+def _moments(source: CheckedInput, name: str) -> Values:
+    times = source.take(name, ("time",) if name == "time" else ("time", BOUNDS_DIM))
+    if times.dtype.kind != "M":
+        raise ProductError(f"has data of type {times.dtype}, not datetime64", field=name)
+    return times.astype("datetime64[ns]")
 
 
 def _along(source: CheckedInput, row: Row) -> Coordinate:
@@ -304,24 +267,30 @@ def _altitude(
     row: Row, along: Coordinate, zenith: Coordinate, station: float
 ) -> tuple[Coordinate, _Vertical]:
     """Return the altitude along a beam, and its vertical coverage."""
-    rise = np.asarray(np.cos(np.deg2rad(zenith.values)))
-    beam = BeamAltitude(station, rise, along.values)
-    extremes = beam.extremes().astype(row.dtype)
+    ranges, rise = along.values, np.asarray(np.cos(np.deg2rad(zenith.values)))
+    # Rounding keeps the order, so the extremes lie at those of both factors.
+    ends = np.multiply.outer([rise.min(), rise.max()], [ranges.min(), ranges.max()])
+    extremes = (station + ends).astype(row.dtype)
+    step = _common_step(station + cosine * ranges for cosine in rise.flat)
     if zenith.dims:
         # Cell bounds that also change with time would have to be polygons (CF, section 7.1).
         row = replace(row, bounds=None)
-        shape = (*zenith.values.shape, *along.values.shape)
-        declared = np.broadcast_to(np.zeros((), row.dtype), shape)
-        altitude = Coordinate(row, (*zenith.dims, *row.dims), declared, moving=beam)
-        return altitude, _Vertical(extremes, beam.step(), profiles=False)
+
+        def moving(profiles: slice) -> Values:
+            altitude: Values = station + rise[profiles, np.newaxis] * ranges
+            return altitude.astype(row.dtype)
+
+        declared = np.broadcast_to(np.zeros((), row.dtype), (*rise.shape, *ranges.shape))
+        altitude = Coordinate(row, (*zenith.dims, *row.dims), declared, moving=moving)
+        return altitude, _Vertical(extremes, step, profiles=False)
     bounds = None
     if row.bounds and along.bounds is not None:
-        bounds = beam.exact(along.bounds).astype(row.dtype)
+        bounds = (station + rise * along.bounds).astype(row.dtype)
     else:
         row = replace(row, bounds=None)
     tilt = min(zenith.values.flat[0], 180.0 - zenith.values.flat[0])
-    altitude = Coordinate(row, row.dims, beam.exact(along.values).astype(row.dtype), bounds)
-    return altitude, _Vertical(extremes, beam.step(), profiles=bool(tilt <= NEAR_VERTICAL))
+    altitude = Coordinate(row, row.dims, (station + rise * ranges).astype(row.dtype), bounds)
+    return altitude, _Vertical(extremes, step, profiles=bool(tilt <= NEAR_VERTICAL))
 
 
 def _common_step(profiles: Iterable[Values]) -> float | None:
@@ -341,8 +310,9 @@ def _common_step(profiles: Iterable[Values]) -> float | None:
     return first if largest > _LEVEL else 0.0
 
 
-def _extents(source: CheckedInput, vertical: _Vertical, horizontal: list[Values]) -> Extents:
-    moments, bounds = _moments(source)
+def _extents(
+    moments: Values, bounds: Values, vertical: _Vertical, horizontal: list[Values]
+) -> Extents:
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
     return Extents(
         start=_datetime(bounds[:, 0].min()),
@@ -360,3 +330,54 @@ def _extents(source: CheckedInput, vertical: _Vertical, horizontal: list[Values]
 def _datetime(moment: np.datetime64) -> datetime:
     plain: datetime = moment.astype("datetime64[us]").item()
     return plain.replace(tzinfo=UTC)
+
+
+def beam_positions(
+    latitude: float, longitude: float, altitude: float, ahead: Values, azimuth: Values, up: Values
+) -> tuple[Values, Values]:
+    r"""Return latitude and longitude of points on a straight beam.
+
+    .. math:: x = x_0 + E (s \sin a,\; s \cos a,\; u)^T
+
+    in Cartesian coordinates of the Earth, with the matrix E of the directions east, north and up
+    at the station, horizontal distance s and height u of the point, and azimuth a; then converted
+    to geodetic latitude by Bowring's formula, with an error below 1 mm.
+
+    Parameters
+    ----------
+    latitude, longitude : float
+        Position of the station, degree.
+    altitude : float
+        Altitude of the station, m; the geoid is taken as the ellipsoid.
+    ahead : ndarray
+        Horizontal distance from the station, in its tangent plane, m.
+    azimuth : ndarray
+        degree, clockwise from north; broadcast against `ahead`.
+    up : ndarray
+        Distance above the tangent plane of the station, m; broadcast against `ahead`.
+
+    Returns
+    -------
+    latitude, longitude : ndarray
+        degree; longitude from -180 to 180.
+    """
+    lat, lon, direction = np.deg2rad(latitude), np.deg2rad(longitude), np.deg2rad(azimuth)
+    east, north = ahead * np.sin(direction), ahead * np.cos(direction)
+    curvature = EQUATOR / np.sqrt(1.0 - _ECCENTRICITY * np.sin(lat) ** 2)
+    # Relative to the meridian of the station, so that the longitude difference is small.
+    outward = (curvature + altitude) * np.cos(lat) - north * np.sin(lat) + up * np.cos(lat)
+    axis = (
+        (curvature * (1.0 - _ECCENTRICITY) + altitude) * np.sin(lat)
+        + north * np.cos(lat)
+        + up * np.sin(lat)
+    )
+    across = np.hypot(outward, east)
+    polar = EQUATOR * (1.0 - _FLATTENING)
+    reduced = np.arctan2(axis * EQUATOR, across * polar)
+    second = _ECCENTRICITY / (1.0 - _ECCENTRICITY)
+    geodetic = np.arctan2(
+        axis + second * polar * np.sin(reduced) ** 3,
+        across - _ECCENTRICITY * EQUATOR * np.cos(reduced) ** 3,
+    )
+    turned = np.rad2deg(lon + np.arctan2(east, outward))
+    return np.rad2deg(geodetic), (turned + 180.0) % 360.0 - 180.0

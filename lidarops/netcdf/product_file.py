@@ -1,27 +1,45 @@
-"""Write a product some profiles at a time, so that memory does not grow with its scene."""
+"""Write a product after CF some profiles at a time, so that memory does not grow with its scene.
+
+Arrays and context fix everything in the file: order, types, fill values, attributes and extents.
+Data that do not match the layout of the kind are refused.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.flags import FlagBit
-from lidarops.kinds import flags_of
-from lidarops.netcdf.build import ProductEncoder
+from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
-from lidarops.netcdf.context import Context
-from lidarops.netcdf.input_checks import Values
-from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.netcdf.write import RowFile, Written, create_file, written_file
+from lidarops.netcdf.context import Context, global_attributes
+from lidarops.netcdf.coordinates import locate_product
+from lidarops.netcdf.encoding import (
+    CheckedInput,
+    Values,
+    as_stored,
+    as_text,
+    check_flagged,
+    check_flags,
+    check_range,
+    whole_numbers,
+)
+from lidarops.netcdf.provenance import prov_json
+from lidarops.netcdf.variables import Row, attributes, layout_of
+from lidarops.netcdf.write import RowFile, Skeleton, Written, create_file
 from lidarops.records import Change, Grade
 from lidarops.system.files import sha256_of
+
+_TIME: Final = rows.TIME.name
+_BEAMS: Final = ("time", "beam")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +71,11 @@ def create_product(
     Parameters
     ----------
     frame : xr.Dataset
-        Coordinates of all profiles, and variables without time; see
-        `lidarops.netcdf.build.ProductEncoder`.
+        What is known before the first profile, in memory: ``time`` and ``time_bnds`` (datetime64,
+        UTC) of all profiles, ``zenith_angle`` and optionally ``azimuth`` (degree; scalar or over
+        time), and the coordinates and variables of the layout without time, in its units. An
+        attribute ``steps`` becomes ``lidarops_steps``; ``references`` adds to those of the kind.
+        NaN is missing. Other variables of the layout are not used.
     context : Context
         Kind, channel, station, instrument, campaign, scene and provenance of the product.
     path : Path
@@ -66,8 +87,10 @@ def create_product(
     Raises
     ------
     ProductError
-        If data do not match the layout, profiles are missing at the end, or the file cannot be
-        written. Other errors of the ``with`` block are raised as they are.
+        If a variable is missing, unknown, lazy, or has wrong dimensions or type; if a value is out
+        of its valid range; if coordinates are not finite or not rising; if profiles are missing at
+        the end, or the file cannot be written. Other errors of the ``with`` block are raised as
+        they are.
     """
     with ExitStack() as until_complete:
         writer = ProductWriter(frame, context, path, until_complete, former)
@@ -85,18 +108,39 @@ class ProductWriter:
         context: Context,
         path: Path,
         until_complete: ExitStack,
-        former: str,
+        former: str = "",
     ) -> None:
-        self._encoder = ProductEncoder(frame, context)
+        _refuse_mismatch(context)
+        layout = layout_of(context.kind)
+        source = CheckedInput(frame, layout)
+        self._layout = layout
+        self._context = context
         self._path = path
+        self._until_complete = until_complete
         self._former = former
         self._change: Change | None = None
-        self._until_complete = until_complete
-        self._values = 0
-        self._unflagged = 0
-        self._rejected = 0
-        self._flags = flags_of(context.kind)
+        self._coordinates, self._extents = locate_product(source, layout, context)
+        self._frame_texts = frame.attrs
+        self._times = frame.variables[_TIME].values
+        self._profiles = 0
+        self._names: frozenset[str] = frozenset()
+        self._fixed = {
+            row.name: _stored(source, row)
+            for row in layout.variables
+            if not _over_time(row.dims) and not (row.optional and row.name not in source)
+        }
+        shapes = [(coordinate.dims, coordinate.values) for coordinate in self._coordinates]
+        shapes += [(layout.row(name).dims, values) for name, values in self._fixed.items()]
+        self._sizes = {
+            dim: size
+            for dims, values in shapes
+            for dim, size in zip(dims, values.shape, strict=True)
+        }
+        self._flags = layout.flags
+        self._known_bits = sum(self._flags.bits)
         self._flagged: Counter[FlagBit] = Counter()
+        self._verdicts = np.zeros(3, np.int64)
+        """Numbers of good values, of those to be used with care, and of rejected ones."""
         self.file: RowFile | None = None
         """None until the first profiles, which decide on optional variables."""
 
@@ -106,21 +150,155 @@ class ProductWriter:
         Parameters
         ----------
         profiles : xr.Dataset
-            At least one, in memory, with every variable of the layout that has time.
+            At least one, in memory, with every variable of the layout that has time. Optional
+            variables are in all profiles or in none. Variables without time are not used.
 
         Raises
         ------
         ProductError
-            If they do not match the layout or the profiles before, or cannot be written.
+            If a variable is missing, unknown, lazy, or has wrong dimensions or type; if a value is
+            out of its valid range, carries a bit that the kind does not have, or is missing
+            without a quality bit; if there are more profiles than times, or others; if an optional
+            variable comes without its ancillary variables; if they cannot be written.
         """
-        encoded = self._encoder.encode(profiles)
+        encoded = self.encode(profiles)
         if self.file is None:
-            skeleton = self._encoder.skeleton(encoded)
             self.file = self._until_complete.enter_context(
-                create_file(skeleton, self._path, replaces=self._replaces)
+                create_file(self.skeleton(encoded), self._path, replaces=self._replaces)
             )
         self.file.add(encoded)
-        self._count(encoded[QUALITY_FLAG])
+        self._count(encoded[rows.QUALITY_FLAG], encoded[rows.USABLE])
+
+    def encode(self, profiles: xr.Dataset) -> dict[str, Values]:
+        """Return the next profiles as they are stored, with their coordinates; see `add`."""
+        span = self._span(profiles)
+        measured = self._measured(CheckedInput(profiles, self._layout))
+        self._names = self._names or frozenset(measured)
+        for name in sorted(self._names ^ measured.keys()):
+            raise ProductError("is in some profiles, but not in others", field=name)
+        self._profiles = span.stop
+        return dict(self._located(span)) | measured
+
+    def _span(self, profiles: xr.Dataset) -> slice:
+        first = self._profiles
+        span = slice(first, first + profiles.sizes.get(_TIME, 0))
+        if span.stop > self._times.size:
+            raise ProductError(
+                f"has {self._times.size} values, but there are more profiles", field=_TIME
+            )
+        times = profiles.variables.get(_TIME)
+        if times is not None and not np.array_equal(times.values, self._times[span]):
+            raise ProductError(
+                f"of profiles does not continue after the first {first}",
+                field=_TIME,
+                remedy="add all profiles in the order of time",
+            )
+        return span
+
+    def _located(self, span: slice) -> Iterator[tuple[str, Values]]:
+        for coordinate in self._coordinates:
+            row = coordinate.row
+            if _over_time(coordinate.dims):
+                yield row.name, coordinate.profiles(span)
+                if row.bounds and coordinate.bounds is not None:
+                    yield row.bounds, coordinate.bounds[span]
+
+    def _measured(self, source: CheckedInput) -> dict[str, Values]:
+        judged = self._layout.row(rows.QUALITY_FLAG)
+        flags = whole_numbers(judged, source.take(judged.name, judged.dims))
+        check_flags(flags, self._known_bits)
+        encoded: dict[str, Values] = {}
+        for row in self._layout.variables:
+            if not _over_time(row.dims) or (row.optional and row.name not in source):
+                continue
+            if row.summary:
+                encoded[row.name] = rows.summarize_flags(flags, self._flags)
+                continue
+            # Bits refer to retrieved values; an optional derived or an auxiliary value may be
+            # missing without one.
+            spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
+            judging = row.dims == judged.dims and not spared
+            encoded[row.name] = _stored(source, row, flags if judging else None)
+            self._refuse_other_sizes(row, encoded[row.name])
+        return encoded
+
+    def _refuse_other_sizes(self, row: Row, values: Values) -> None:
+        for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
+            if dim not in self._sizes:
+                along = (other.name for other in self._layout.coordinates if other.dims == (dim,))
+                raise ProductError("is missing", field=next(along, dim))
+            if size != self._sizes[dim]:
+                raise ProductError(
+                    f"has {size} values along {dim}, not {self._sizes[dim]}", field=row.name
+                )
+
+    def skeleton(self, encoded: Mapping[str, Values]) -> Skeleton:
+        """Return all of the file except the values of profiles.
+
+        Parameters
+        ----------
+        encoded : mapping of str to ndarray
+            The first profiles, from `encode`; which variables they have and of what type counts.
+
+        Raises
+        ------
+        ProductError
+            If an optional variable is present without its ancillary variables.
+        """
+        attrs = global_attributes(self._context, self._layout, self._extents)
+        if self._frame_texts.get("steps"):
+            attrs["lidarops_steps"] = str(self._frame_texts["steps"])
+        if self._frame_texts.get("references"):
+            attrs["references"] = f"{attrs['references']}\n{self._frame_texts['references']}"
+        variables = dict(self._variables(encoded))
+        for row in self._layout.variables:
+            missing = [name for name in row.ancillaries if name not in variables]
+            if row.name in variables and missing:
+                raise ProductError("is missing", field=missing[0], remedy=f"{row.name} needs it")
+        return Skeleton(variables, attrs, _TIME)
+
+    def _variables(self, encoded: Mapping[str, Values]) -> Iterator[tuple[str, xr.Variable]]:
+        """Yield the variables in the order of the file."""
+        mode = self._context.mode
+        for coordinate in self._coordinates:
+            row, dims = coordinate.row, coordinate.dims
+            yield row.name, xr.Variable(dims, coordinate.values, attributes(row, mode=mode))
+            if row.bounds and coordinate.bounds is not None:
+                yield row.bounds, xr.Variable((*dims, rows.BOUNDS_DIM), coordinate.bounds)
+        for row in self._layout.variables:
+            if row.name in encoded:
+                first = encoded[row.name]
+                shape = (self._times.size, *first.shape[1:])
+                values = np.broadcast_to(np.zeros((), first.dtype), shape)
+            elif row.name in self._fixed:
+                values = self._fixed[row.name]
+            else:
+                continue
+            attrs = attributes(row, mode=mode, coordinates=self._auxiliary_names(row))
+            yield row.name, xr.Variable(row.dims, values, attrs)
+        station = rows.station(profiles=self._extents.vertical)
+        name = self._context.station.name or self._context.station_key
+        yield station.name, as_text(station, name, mode)
+        provenance = prov_json(self._context.provenance)
+        yield rows.PROVENANCE.name, as_text(rows.PROVENANCE, provenance, mode)
+        if self._layout.rounded:
+            row = rows.QUANTIZATION
+            yield row.name, xr.Variable((), np.int32(0), attributes(row, mode=mode))
+
+    def _auxiliary_names(self, row: Row) -> tuple[str, ...]:
+        """Return the names of the auxiliary coordinates of a variable."""
+        # CDO 2.1 cannot read a position that changes along a beam, nor a variable of three
+        # dimensions with a scalar position, nor one over beams beside another with a scalar
+        # position.
+        excluded = tuple(position.name for position in rows.SOUNDED)
+        excluded += ("latitude", "longitude") if len(row.dims) > 2 or row.dims == _BEAMS else ()
+        return tuple(
+            coordinate.row.name
+            for coordinate in self._coordinates
+            if coordinate.dims != (coordinate.row.name,)
+            and set(coordinate.dims) <= set(row.dims)
+            and coordinate.row.name not in excluded
+        )
 
     def _replaces(self, new: Path) -> bool:
         """Return whether the new file differs from the former one."""
@@ -129,10 +307,8 @@ class ProductWriter:
         self._change = compare_products(self._path, new)
         return self._change.grade is not Grade.NONE
 
-    def _count(self, flags: Values) -> None:
-        self._values += flags.size
-        self._unflagged += flags.size - int(np.count_nonzero(flags))
-        self._rejected += int(np.count_nonzero(flags & np.int32(self._flags.rejecting)))
+    def _count(self, flags: Values, usable: Values) -> None:
+        self._verdicts += np.bincount(usable.reshape(-1), minlength=3)
         # Few bits occur in a product: count only these.
         for bit in self._flags.raised(int(np.bitwise_or.reduce(flags, axis=None))):
             self._flagged[bit] += int(np.count_nonzero(flags & np.int32(bit)))
@@ -147,16 +323,46 @@ class ProductWriter:
             If it is not written.
         """
         change = self._change
+        if self.file is None:
+            raise ProductError("is not written", file=self._path)
         if change is not None and change.grade is Grade.NONE:
             file = Written(self._former, self._path.stat().st_size)
         else:
-            file = written_file(self.file, self._path)
+            file = self.file.written
+        good, care, reject = self._verdicts.tolist()
         return WrittenProduct(
             sha256=file.sha256,
             size=file.size,
-            values=self._values,
+            values=good + care + reject,
             flagged={str(bit.name): self._flagged[bit] for bit in sorted(self._flagged)},
-            unflagged=self._unflagged,
-            usable=self._values - self._rejected,
+            unflagged=good,
+            usable=good + care,
             change=change,
         )
+
+
+def _over_time(dims: tuple[str, ...]) -> bool:
+    return dims[:1] == (_TIME,)
+
+
+def _refuse_mismatch(context: Context) -> None:
+    provenance = context.provenance
+    recorded = (provenance.kind, provenance.channel, provenance.scene)
+    if recorded != (context.kind, context.channel, context.scene):
+        raise ProductError(
+            f"is that of {' '.join(recorded)}, not of"
+            f" {context.kind} {context.channel} {context.scene}",
+            field="provenance",
+        )
+
+
+def _stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Values:
+    """Return a variable as stored; with `flags`, a missing value must carry a bit."""
+    values = source.take(row.name, row.dims)
+    check_range(row, values)
+    if row.dtype.startswith("i"):
+        return whole_numbers(row, values)
+    stored = as_stored(row, values)
+    if flags is not None:
+        check_flagged(row, stored == rows.FILL_VALUE, flags)
+    return stored

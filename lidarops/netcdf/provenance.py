@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -15,12 +15,10 @@ from typing import Any, Final
 from uuid import NAMESPACE_URL, uuid5
 
 from lidarops.errors import ProductError
-from lidarops.records import InputRecord, LeftOut, Provenance
+from lidarops.records import LeftOut, Provenance
 
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
-
-_quoted: Final = json.JSONEncoder().encode
 
 _PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
 
@@ -36,76 +34,95 @@ def prov_json(provenance: Provenance) -> str:
         ASCII, with sorted keys; independent of the order of the inputs.
     """
     inputs = sorted(provenance.inputs, key=attrgetter("sha256", "path", "role"))
-    entities = {
-        "lidarops:product": _canonical(_product(provenance)),
-        "lidarops:plan": _canonical(_plan(provenance)),
-        **{
-            f"sha256:{digest}": _input(list(records))
-            for digest, records in groupby(inputs, key=attrgetter("sha256"))
+    return prov_document(
+        "lidarops:product",
+        ("lidarops:processing", {"lidarops:scene": provenance.scene}),
+        {
+            "lidarops:product": {
+                "prov:type": prov_type("lidarops:Product"),
+                "lidarops:id": product_id(provenance),
+                "lidarops:campaign": provenance.campaign,
+                "lidarops:scene": provenance.scene,
+                "lidarops:kind": provenance.kind,
+                "lidarops:channel": provenance.channel,
+                "lidarops:settings": canonical(dict(provenance.settings)),
+            },
+            "lidarops:plan": _plan(provenance),
+            **{
+                f"sha256:{digest}": _input(digest, [record.path for record in records])
+                for digest, records in groupby(inputs, key=attrgetter("sha256"))
+            },
         },
-    }
-    uses = {
-        f"_:use{number}": '{"prov:activity":"lidarops:processing",'
-        f'"prov:entity":"sha256:{record.sha256}","prov:role":"{record.role}"}}'
-        for number, record in enumerate(inputs, start=1)
-    }
-    others = {
+        ({"prov:entity": f"sha256:{record.sha256}", "prov:role": record.role} for record in inputs),
+        (provenance.code_version, provenance.versions),
+        {"prov:plan": "lidarops:plan"},
+    )
+
+
+def prov_document(
+    result: str,
+    activity: tuple[str, Mapping[str, str]],
+    entities: Mapping[str, Any],
+    uses: Iterable[Mapping[str, str]],
+    software: tuple[str, Mapping[str, str]],
+    association: Mapping[str, str],
+) -> str:
+    """Return how a file was made as W3C PROV-JSON: ASCII, with sorted keys.
+
+    Parameters
+    ----------
+    result : str
+        Name of the entity that was made.
+    activity : (str, mapping of str to str)
+        Name of what made it, and what is stated of that.
+    entities : mapping of str to dict
+    uses : iterable of mapping of str to str
+        What was used, besides the activity.
+    software : (str, mapping of str to str)
+        Code version, and the versions of packages.
+    association : mapping of str to str
+        What is stated of how the software did it.
+    """
+    name, stated = activity
+    code_version, versions = software
+    of_activity = {"prov:activity": name}
+    document = {
         "prefix": {"lidarops": NAMESPACE, "sha256": "urn:sha256:"},
-        "activity": {"lidarops:processing": {"lidarops:scene": provenance.scene}},
-        "agent": {"lidarops:software": _software(provenance)},
-        "wasGeneratedBy": {
-            "_:generation": {
-                "prov:entity": "lidarops:product",
-                "prov:activity": "lidarops:processing",
+        "entity": entities,
+        "activity": {name: stated},
+        "agent": {
+            "lidarops:software": {
+                "prov:type": prov_type("prov:SoftwareAgent"),
+                "lidarops:code_version": code_version,
+                "lidarops:versions": [f"{key} {versions[key]}" for key in sorted(versions)],
             }
         },
+        "wasGeneratedBy": {"_:generation": {"prov:entity": result, **of_activity}},
         "wasAssociatedWith": {
-            "_:association": {
-                "prov:activity": "lidarops:processing",
-                "prov:agent": "lidarops:software",
-                "prov:plan": "lidarops:plan",
-            }
+            "_:association": {"prov:agent": "lidarops:software", **of_activity, **association}
         },
+        "used": {f"_:use{number}": {**of_activity, **use} for number, use in enumerate(uses, 1)},
     }
-    members = {key: _canonical(value) for key, value in others.items()}
-    return _object({**members, "entity": _object(entities), "used": _object(uses)})
+    return canonical(document)
 
 
-def _canonical(value: Any) -> str:
+def canonical(value: Any) -> str:
+    """Return JSON with sorted keys, without spaces."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
-def _object(members: Mapping[str, str]) -> str:
-    """Return a canonical JSON object of members that are JSON texts already.
-
-    For thousands of inputs, `json` would take longer than writing the product.
-    """
-    return f"{{{','.join([f'{_quoted(key)}:{members[key]}' for key in sorted(members)])}}}"
-
-
-def _type(name: str) -> dict[str, str]:
+def prov_type(name: str) -> dict[str, str]:
+    """Return the type of an entity or agent."""
     return {"$": name, "type": "prov:QUALIFIED_NAME"}
-
-
-def _product(provenance: Provenance) -> dict[str, Any]:
-    return {
-        "prov:type": _type("lidarops:Product"),
-        "lidarops:id": product_id(provenance),
-        "lidarops:campaign": provenance.campaign,
-        "lidarops:scene": provenance.scene,
-        "lidarops:kind": provenance.kind,
-        "lidarops:channel": provenance.channel,
-        "lidarops:settings": _canonical(dict(provenance.settings)),
-    }
 
 
 def _plan(provenance: Provenance) -> dict[str, Any]:
     plan = provenance.plan
     return {
-        "prov:type": _type("prov:Plan"),
+        "prov:type": prov_type("prov:Plan"),
         "lidarops:sha256": plan.hash,
         # The text of this digest.
-        "lidarops:json": _canonical(plan.as_dict()),
+        "lidarops:json": canonical(plan.as_dict()),
         "lidarops:left_out": [
             f"{omission.name} of {omission.channel}: {omission.reason}{_rule(omission)}"
             for omission in plan.left_out
@@ -119,22 +136,11 @@ def _rule(omission: LeftOut) -> str:
     return f" [{omission.rule}{number}]" if omission.rule else ""
 
 
-def _input(records: list[InputRecord]) -> str:
-    paths = [_quoted(record.path) for record in records]
-    path = paths[0] if len(paths) == 1 else f"[{','.join(paths)}]"
-    return (
-        f'{{"lidarops:path":{path},"lidarops:sha256":"{records[0].sha256}",'
-        '"prov:type":{"$":"lidarops:RawFile","type":"prov:QUALIFIED_NAME"}}'
-    )
-
-
-def _software(provenance: Provenance) -> dict[str, Any]:
+def _input(digest: str, paths: list[str]) -> dict[str, Any]:
     return {
-        "prov:type": _type("prov:SoftwareAgent"),
-        "lidarops:code_version": provenance.code_version,
-        "lidarops:versions": [
-            f"{name} {number}" for name, number in sorted(provenance.versions.items())
-        ],
+        "prov:type": prov_type("lidarops:RawFile"),
+        "lidarops:path": paths[0] if len(paths) == 1 else paths,
+        "lidarops:sha256": digest,
     }
 
 
@@ -146,17 +152,21 @@ def product_id(provenance: Provenance) -> str:
     str
         UUID version 5 of kind, channel, inputs' sha256, plan hash, settings and code version.
     """
-    content = {
-        "kind": provenance.kind,
-        "channel": provenance.channel,
-        "plan": provenance.plan.hash,
-        "settings": dict(provenance.settings),
-        "code_version": provenance.code_version,
-    }
-    inputs = sorted([f'["{record.role}","{record.sha256}"]' for record in provenance.inputs])
-    members = {key: _canonical(value) for key, value in content.items()}
-    text = _object({**members, "inputs": f"[{','.join(inputs)}]"})
-    return str(uuid5(NAMESPACE_URL, NAMESPACE + text))
+    return identifier(
+        {
+            "kind": provenance.kind,
+            "channel": provenance.channel,
+            "inputs": sorted([record.role, record.sha256] for record in provenance.inputs),
+            "plan": provenance.plan.hash,
+            "settings": dict(provenance.settings),
+            "code_version": provenance.code_version,
+        }
+    )
+
+
+def identifier(content: Mapping[str, Any]) -> str:
+    """Return the UUID version 5 of plain JSON types."""
+    return str(uuid5(NAMESPACE_URL, NAMESPACE + canonical(content)))
 
 
 @cache

@@ -42,6 +42,8 @@ UNREADABLE: Final = (*_OF_LIBRARIES, LidarOpsError)
 """What is raised where a part of a damaged or foreign product is read and drawn."""
 _MOST_WORDS: Final = 300
 """Characters of the message of a library that are shown."""
+# Not annotated by xarray.
+_STORE: Final[Any] = xr.backends.NetCDF4DataStore
 _HDF5: Final = NETCDF_MAGIC[-1]
 _DEFLATE_LIMIT: Final = 1032
 """Largest factor by which deflate, the only compression of our products, shrinks data (zlib)."""
@@ -177,8 +179,7 @@ def open_product(path: str | Path, names: Iterable[str]) -> Iterator[xr.Dataset]
     """
     with ExitStack() as until_closed:
         with reading(path):
-            opened = xr.backends.NetCDF4DataStore.open(os.fspath(path))
-            store = until_closed.enter_context(opened)
+            store = until_closed.enter_context(_STORE.open(os.fspath(path)))
             stored = {
                 name: store.open_store_variable(name, store.ds.variables[name])
                 for name in names

@@ -414,7 +414,7 @@ def attributes(
     if row.flags is not None:
         attrs |= _flag_attributes(row.flags, stored)
     if row.reasons is not None:
-        attrs["flag_masks"] = np.array([int(reason) for reason in row.reasons], dtype=stored)
+        attrs["flag_masks"] = np.array([*row.reasons], dtype=stored)
         attrs["flag_meanings"] = " ".join(str(reason.name).lower() for reason in row.reasons)
     if row.states:
         attrs["flag_values"] = np.arange(len(row.states), dtype=stored)
@@ -432,12 +432,11 @@ def units(row: Row, mode: DetectionMode) -> str | None:
 def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
     return {
         FLAG_LAYOUT: flags.layout,
-        "flag_masks": np.array([int(bit) for bit in flags], dtype=stored),
-        "flag_meanings": " ".join(bit.word for bit in flags),
-        "comment": "0: no test failed. "
-        + "; ".join(f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in flags)
-        + ". reject: do not use the value; care: the value is valid, but its stated uncertainty"
-        " may be too small, or as large as the value.",
+        "flag_masks": np.array(flags.bits, dtype=stored),
+        "flag_meanings": flags.words,
+        "comment": f"0: no test failed. {flags.explanation}. reject: do not use the value; care:"
+        " the value is valid, but its stated uncertainty may be too small, or as large as the"
+        " value.",
     }
 
 

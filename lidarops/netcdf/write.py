@@ -6,16 +6,16 @@ grow with the file. Their order depends on the data only, not on how many rows c
 
 from __future__ import annotations
 
-import hashlib
+import io
 import math
 import os
 import secrets
 import unicodedata
-from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import h5py
 import netCDF4
@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.netcdf._deflate import deflate_chunks
-from lidarops.netcdf._quiet_file import QuietFile
-from lidarops.netcdf._row_blocks import Block, RowBlocks
-from lidarops.netcdf.skeleton import Skeleton
+from lidarops.netcdf._chunks import Block, RowBlocks, deflate_chunks
+from lidarops.system.files import sha256_of
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
@@ -155,7 +156,104 @@ def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Forma
         rows = {name: variable.values for name, variable in skeleton.with_rows().items()}
         if rows:
             file.add(rows)
-    return written_file(file, path)
+    return file.written
+
+
+@dataclass(frozen=True, slots=True)
+class Skeleton:
+    """All of a file except the values of its rows, which may come later, some at a time.
+
+    The rows are those along the unlimited dimension, of the variables that have it first.
+    """
+
+    variables: Mapping[str, xr.Variable]
+    """Encoded, in the order of the file. Of variables with rows, the values are not used."""
+    attributes: Mapping[str, Any]
+    unlimited: str | None
+
+    def sizes(self) -> dict[str, int]:
+        """Return the length of every dimension, in the order of the file."""
+        return {
+            str(dim): size
+            for variable in self.variables.values()
+            for dim, size in variable.sizes.items()
+        }
+
+    def with_rows(self) -> dict[str, xr.Variable]:
+        """Return the variables that have rows."""
+        return {
+            name: variable
+            for name, variable in self.variables.items()
+            if self.unlimited is not None and variable.dims[:1] == (self.unlimited,)
+        }
+
+    def chunks(self) -> dict[str, tuple[int, ...]]:
+        """Return the chunk shapes of the variables that are not stored as they are."""
+        return {
+            name: chunk_sizes(variable.shape, variable.dtype.itemsize)
+            for name, variable in self.variables.items()
+            if self.unlimited in variable.dims
+            or (variable.dims and variable.nbytes > CONTIGUOUS_BYTES)
+        }
+
+
+class QuietFile(io.FileIO):
+    """A local file for HDF5, which may crash where it cannot write.
+
+    It keeps its first error, and from then on drops what is written.
+
+    Parameters
+    ----------
+    path : Path
+        An existing file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "r+")
+        self._error: OSError | None = None
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """Write all of `data`, and return its length even where it was dropped."""
+        rest = memoryview(data)
+        size = rest.nbytes
+        try:
+            while rest and self._error is None:
+                rest = rest[self._write_some(rest) :]
+        except OSError as error:
+            self._error = error
+        return size
+
+    def _write_some(self, data: memoryview) -> int:
+        """Write as much as the disk takes at once, and return its length."""
+        return super().write(data)
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Set the size of the file, unless it failed before."""
+        try:
+            return super().truncate(size) if self._error is None else 0
+        except OSError as error:
+            self._error = error
+            return 0
+
+    def discard(self) -> None:
+        """Drop all that is written from now on: the file will be removed."""
+        self._error = self._error or OSError("the file is discarded")
+
+    def check(self) -> None:
+        """Raise the first error.
+
+        Raises
+        ------
+        OSError
+            If the file is not as it was written.
+        """
+        if self._error is not None:
+            raise self._error
 
 
 @contextmanager
@@ -208,7 +306,7 @@ def create_file(
         with _disk_errors(path):
             temporary.replace(path)
             _sync(path.parent)
-        file.written = written
+        file.settled = written
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -222,13 +320,8 @@ class RowFile:
         self._path = path
         self._stream = stream
         self._rows = 0
-        self.written: Written | None = None
-        """The file, when it is complete and has its name."""
-        self._chunks = {
-            name: _chunk(variable)
-            for name, variable in skeleton.variables.items()
-            if is_chunked(variable, skeleton.unlimited)
-        }
+        self.settled: Written | None = None
+        self._chunks = skeleton.chunks()
         self._columns = {
             name: RowBlocks(name, variable.shape[0], self._chunks[name][0])
             for name, variable in skeleton.with_rows().items()
@@ -237,12 +330,25 @@ class RowFile:
         self._total = sizes[str(skeleton.unlimited)] if self._columns else 0
         with _disk_errors(path), NETCDF4_PYTHON_LOCK:
             self._file = h5py.File(stream, "r+")
-            self._targets = {name: self._open_target(name, sizes) for name in self._chunks}
+            self._targets = {name: self._open(name, sizes) for name in self._chunks}
 
-    def _open_target(self, name: str, dimensions: Container[str]) -> Any:
+    @property
+    def written(self) -> Written:
+        """The file, when it is complete and has its name.
+
+        Raises
+        ------
+        ProductError
+            If it is not.
+        """
+        if self.settled is None:
+            raise ProductError("is not written", file=self._path)
+        return self.settled
+
+    def _open(self, name: str, sizes: Mapping[str, int]) -> Any:
         """Return the HDF5 dataset of a variable, with its final length."""
         variable = self._variables[name]
-        other = name in dimensions and variable.dims[0] != name
+        other = name in sizes and variable.dims[0] != name
         inside = unicodedata.normalize("NFC", f"{_OTHER_DIMENSION if other else ''}{name}")
         target = h5py.h5d.open(self._file.id, inside.encode())
         target.set_extent(variable.shape)
@@ -253,7 +359,7 @@ class RowFile:
         with _disk_errors(self._path):
             self._write(
                 Block(name, 0, self._variables[name].values)
-                for name in self._targets
+                for name in self._chunks
                 if name not in self._columns
             )
 
@@ -309,37 +415,6 @@ class RowFile:
             self._file.close()
 
 
-def written_file(file: RowFile | None, path: Path) -> Written:
-    """Return a file that is complete and has its name.
-
-    Raises
-    ------
-    ProductError
-        If it is not, or was never begun.
-    """
-    if file is None or file.written is None:
-        raise ProductError("is not written", file=path)
-    return file.written
-
-
-def is_chunked(variable: xr.Variable, unlimited: Hashable | None) -> bool:
-    """Return whether a variable is stored in deflated chunks, and not as it is.
-
-    Parameters
-    ----------
-    variable : xr.Variable
-    unlimited : hashable, optional
-        The dimension of rows, of which there may be more.
-    """
-    if unlimited in variable.dims:
-        return True
-    return bool(variable.dims) and variable.nbytes > CONTIGUOUS_BYTES
-
-
-def _chunk(variable: xr.Variable) -> tuple[int, ...]:
-    return chunk_sizes(variable.shape, variable.dtype.itemsize)
-
-
 def _refuse_unstorable(skeleton: Skeleton, path: Path) -> None:
     for name, variable in skeleton.variables.items():
         if variable.dtype.str[1:] not in _TYPES:
@@ -376,9 +451,7 @@ def _sync(path: Path) -> None:
 
 def _settle(path: Path) -> Written:
     _sync(path)
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256")
-    return Written(digest.hexdigest(), path.stat().st_size)
+    return Written(sha256_of(path), path.stat().st_size)
 
 
 class _DefinedAtOnce(netCDF4.Dataset):
@@ -398,11 +471,7 @@ class _DefinedAtOnce(netCDF4.Dataset):
 
 def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
     """Write all definitions and the variables without chunks."""
-    chunked = {
-        name
-        for name, variable in skeleton.variables.items()
-        if is_chunked(variable, skeleton.unlimited)
-    }
+    chunks = skeleton.chunks()
     # In memory until the end, because HDF5 may crash on a full disk.
     with _DefinedAtOnce(
         path, "w", format=model, clobber=False, diskless=True, persist=True
@@ -411,24 +480,26 @@ def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
         for name, size in skeleton.sizes().items():
             file.createDimension(name, None if name == skeleton.unlimited else size)
         targets = {
-            name: _define(file, name, variable, chunked=name in chunked)
+            name: _define(file, name, variable, chunks.get(name))
             for name, variable in skeleton.variables.items()
         }
         file.end_definitions()
         for name, target in targets.items():
-            if name not in chunked:
+            if name not in chunks:
                 target[...] = skeleton.variables[name].values
 
 
-def _define(file: netCDF4.Dataset, name: str, variable: xr.Variable, *, chunked: bool) -> Any:
+def _define(
+    file: netCDF4.Dataset, name: str, variable: xr.Variable, chunk: tuple[int, ...] | None
+) -> Any:
     attributes = dict(variable.attrs)
     storage: dict[str, Any] = {}
-    if chunked:
+    if chunk is not None:
         storage = {
             "compression": "zlib",
             "complevel": COMPRESSION_LEVEL,
             "shuffle": True,
-            "chunksizes": _chunk(variable),
+            "chunksizes": chunk,
         }
     target = file.createVariable(
         name,

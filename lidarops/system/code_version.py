@@ -16,7 +16,7 @@ from lidarops.system.source_closure import Sources
 
 _EVERY_PRODUCT: Final = (
     "lidarops.scene.processing",
-    "lidarops.netcdf.build",
+    "lidarops.netcdf.product_file",
     "lidarops.netcdf.write",
 )
 """Modules that every product passes through."""

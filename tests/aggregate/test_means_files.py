@@ -25,7 +25,7 @@ from lidarops.aggregate.means_variables import (
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.global_attributes import UNUSED_INPUTS
+from lidarops.netcdf.context import UNUSED_INPUTS
 from lidarops.netcdf.variables import ErrorKind, layout_of
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.labeled import VisibilityDefinition, visibility_of_extinction

@@ -33,8 +33,8 @@ from support.products.made_products import (
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
-from lidarops.netcdf.build import bitround, product_path
-from lidarops.netcdf.global_attributes import _duration
+from lidarops.netcdf.context import _duration, product_path
+from lidarops.netcdf.encoding import bitround
 from lidarops.netcdf.variables import layout_of
 from lidarops.records import DetectionMode, Stamp
 from lidarops.retrieve.elastic.flags import ElasticQuality

@@ -10,7 +10,7 @@ from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, STATION, context
 
 from lidarops.campaign.model import Station
-from lidarops.netcdf.sounded_air import beam_positions
+from lidarops.netcdf.coordinates import beam_positions
 
 SEMI_MAJOR, INVERSE_FLATTENING = 6378137.0, 298.257223563
 

@@ -15,7 +15,7 @@ from support.damage import Damage
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.netcdf.comparison import compare_products
-from lidarops.netcdf.global_attributes import UNUSED_INPUTS
+from lidarops.netcdf.context import UNUSED_INPUTS
 from lidarops.netcdf.read import read_provenance
 from lidarops.records import Grade
 from lidarops.reports import run_tables

@@ -17,7 +17,7 @@ from support.archives.small_archive import Archive
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
 from lidarops.netcdf.comparison import compare_products
-from lidarops.netcdf.global_attributes import MOST_UNUSED, UNUSED_INPUTS
+from lidarops.netcdf.context import MOST_UNUSED, UNUSED_INPUTS
 from lidarops.plan.unused_files import MOST_IN_DOUBT, dated
 from lidarops.records import Grade, Granule, Role, Status
 from lidarops.reports import run_tables

@@ -17,7 +17,7 @@ from support.products.encoded_products import build_product
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, Metadata
 from lidarops.flags import Quality
-from lidarops.netcdf.build import Context
+from lidarops.netcdf.context import Context
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidarops.netcdf.build import product_path
+from lidarops.netcdf.context import product_path
 from lidarops.netcdf.write import write_product
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, START, context, provenance

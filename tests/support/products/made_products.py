@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidarops.campaign.model import Metadata, Station
 from lidarops.flags import Quality
-from lidarops.netcdf.build import Context
+from lidarops.netcdf.context import Context
 from lidarops.records import (
     DetectionMode,
     InputRecord,

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from lidarops.netcdf._deflate import _planes, deflate_chunks
+from lidarops.netcdf._chunks import _planes, deflate_chunks
 
 DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
 

@@ -1,4 +1,4 @@
-"""Shuffle and deflate chunks of HDF5 datasets, faster than the HDF5 library does.
+"""Cut the rows of variables into chunks, and shuffle and deflate them faster than HDF5 does.
 
 The result is in the format of HDF5's filters `shuffle` and `deflate`, so any NetCDF reader can
 read it.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -24,6 +25,62 @@ _SMALL: Final = 1 << 13
 """Bytes up to which zlib is faster than ISA-L, which takes longer to begin."""
 
 Offset = tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Consecutive rows that fill the chunks at one place along the first axis."""
+
+    name: str
+    first: int
+    """Number of the first row."""
+    values: NDArray[Any]
+
+    @property
+    def end(self) -> int:
+        """Number of the row after the last."""
+        return self.first + len(self.values)
+
+
+class RowBlocks:
+    """The rows of one variable, cut into the blocks that its chunks hold.
+
+    Parameters
+    ----------
+    name : str
+    total : int
+        Number of rows that will come.
+    step : int
+        Rows of a block; the last block may have fewer.
+    """
+
+    def __init__(self, name: str, total: int, step: int) -> None:
+        self._name = name
+        self._total = total
+        self._step = step
+        self._first = 0
+        self._held: list[NDArray[Any]] = []
+
+    def take(self, rows: NDArray[Any]) -> Iterator[Block]:
+        """Take the next rows, and yield the blocks that are complete with them.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n, ...)
+            No more than are still to come. A copy is kept of rows whose block is incomplete.
+        """
+        while len(rows):
+            size = min(self._step, self._total - self._first)
+            missing = size - sum(map(len, self._held))
+            if len(rows) < missing:
+                self._held.append(rows.copy())
+                return
+            pieces = [*self._held, rows[:missing]]
+            rows = rows[missing:]
+            values = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+            yield Block(self._name, self._first, values)
+            self._held = []
+            self._first += size
 
 
 def deflate_chunks(

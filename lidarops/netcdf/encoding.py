@@ -1,8 +1,8 @@
-"""Check the data of a product against its layout."""
+"""Check the data of a product against its layout, and encode them as they are stored."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +10,11 @@ import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.netcdf.stored_flags import places
-from lidarops.netcdf.variables import Layout, Row
+from lidarops.netcdf.variables import FILL_VALUE, QUALITY_FLAG, Layout, Row, attributes
+from lidarops.records import DetectionMode
 
 Values = npt.NDArray[Any]
+_MANTISSA_BITS: Final = 23
 
 
 class CheckedInput:
@@ -113,19 +115,19 @@ def check_range(row: Row, values: Values) -> None:
         )
 
 
-def check_flags(row: Row, values: Values) -> None:
-    """Check that all quality bits belong to the kind of product.
+def check_flags(values: Values, known: int) -> None:
+    """Check that all quality bits belong to the kind of product, whose bits are `known`.
 
     Raises
     ------
     ProductError
         If any other bit is set.
     """
-    foreign = int(np.bitwise_or.reduce(values & ~np.int32(sum(row.flags or ())), axis=None))
+    foreign = int(np.bitwise_or.reduce(values & ~np.int32(known), axis=None))
     if foreign:
         raise ProductError(
             f"holds bits that this kind of product does not have: {places(foreign)}",
-            field=row.name,
+            field=QUALITY_FLAG,
             remedy="add them to products/KIND/variables.py",
         )
 
@@ -154,3 +156,51 @@ def check_flagged(row: Row, missing: Values, flags: Values) -> None:
             field=row.name,
             remedy="raise a bit in quality_flag where a value is missing",
         )
+
+
+def as_stored(row: Row, values: Values) -> Values:
+    """Return values in the type of their row.
+
+    Floats are rounded to the bits of the row; those that are not finite get the fill value.
+    """
+    # A value too large for the type becomes infinite, and counts as missing.
+    with np.errstate(over="ignore"):
+        stored = values.astype(row.dtype)
+    if stored.dtype.kind == "f":
+        if row.bits is not None:
+            stored = bitround(stored, row.bits)
+        stored[~np.isfinite(stored)] = FILL_VALUE
+    return stored
+
+
+def bitround(values: Values, bits: int) -> Values:
+    """Round to fewer bits of the mantissa, half to even, so that the values compress better.
+
+    Parameters
+    ----------
+    values : ndarray of float32
+    bits : int
+        Explicit bits of the mantissa to keep; the relative error is at most 2^-(bits + 1).
+
+    Returns
+    -------
+    ndarray of float32
+        NaN stays NaN; a value beyond the largest float becomes infinite.
+    """
+    drop = _MANTISSA_BITS - bits
+    if drop <= 0:
+        return values.copy()
+    whole = values.view(np.uint32)
+    odd = (whole >> np.uint32(drop)) & np.uint32(1)
+    rounded = whole + odd
+    rounded += np.uint32((1 << (drop - 1)) - 1)
+    rounded &= np.uint32(0xFFFFFFFF & ~((1 << drop) - 1))
+    result: Values = rounded.view(np.float32)
+    missing = np.isnan(values)
+    result[missing] = np.nan
+    return result
+
+
+def as_text(row: Row, text: str, mode: DetectionMode) -> xr.Variable:
+    """Return a text as the variable of its row."""
+    return xr.Variable(row.dims, np.frombuffer(text.encode(), "S1"), attributes(row, mode=mode))
