@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 from lidarops.aggregate.facts import (
-    EVERYTHING,
     Facts,
-    ProductSelection,
     Refused,
     grid_notes,
     groups,
@@ -20,6 +18,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.means import MeansFile, write_means
 from lidarops.aggregate.means_variables import Period, Weights
+from lidarops.aggregate.selection import EVERYTHING, ProductSelection
 from lidarops.aggregate.stac import write_stac
 from lidarops.aggregate.versioned_store import StoreUpdate, stored_kinds, update_store
 from lidarops.errors import ProductError
@@ -102,12 +101,21 @@ def make_aggregates(
     else:
         made.notes.append("the index lists all products; run without a selection to update it")
     if options.period is not None:
-        for group_products in by_group.values():
-            _try(made, partial(_means, made, group_products, options.period, options.weights))
+        for alike in by_group.values():
+            with _failures(made):
+                done = write_means(root, alike, options.period, weights=options.weights)
+                made.means += done.files
+                made.refused += done.refused
+                made.notes += [done.note] if done.note else []
     if options.store:
-        _try(made, partial(_stores, made, products, options))
+        with _failures(made):
+            _update_stores(made, products, options)
     if options.stac:
-        _try(made, partial(_stac, made, products, options))
+        with _failures(made):
+            if options.selection != EVERYTHING:
+                remedy = "run without a selection"
+                raise ProductError("the STAC catalog lists all products", remedy=remedy)
+            made.stac = write_stac(root, products, options.products_at)
     return made
 
 
@@ -150,43 +158,27 @@ def _remedy(made: AggregateResult) -> str:
     return "process scenes first, or select less strictly"
 
 
-def _try(made: AggregateResult, step: Callable[[], None]) -> None:
+@contextmanager
+def _failures(made: AggregateResult) -> Iterator[None]:
+    """Report what fails, so that the others are made."""
     try:
-        step()
+        yield
     except ProductError as error:
         made.failed.append(str(error))
 
 
-def _means(
-    made: AggregateResult, products: Sequence[Facts], period: Period, weights: Weights
+def _update_stores(
+    made: AggregateResult, products: Sequence[Facts], options: AggregateOptions
 ) -> None:
-    done = write_means(made.root, products, period, weights=weights)
-    made.means += done.files
-    made.refused += done.refused
-    made.notes += [done.note] if done.note else []
-
-
-def _stores(made: AggregateResult, products: Sequence[Facts], options: AggregateOptions) -> None:
     selection = options.selection
     if selection.since is not None or selection.until is not None:
         raise ProductError("a store holds all times", remedy="run without --since and --until")
     for kind in sorted({product.kind for product in products} | set(stored_kinds(made.root))):
-        if selection.kind in (None, kind):
-            _try(made, partial(_store, made, kind, products, options))
-
-
-def _store(
-    made: AggregateResult, kind: str, products: Sequence[Facts], options: AggregateOptions
-) -> None:
-    selection = options.selection
-    alike = [product for product in products if product.kind == kind]
-    done = update_store(made.root, kind, alike, selection, options.runs)
-    made.stores.append(done)
-    made.refused += done.refused
-    made.failed += done.failed
-
-
-def _stac(made: AggregateResult, products: Sequence[Facts], options: AggregateOptions) -> None:
-    if options.selection != EVERYTHING:
-        raise ProductError("the STAC catalog lists all products", remedy="run without a selection")
-    made.stac = write_stac(made.root, products, options.products_at)
+        if selection.kind not in (None, kind):
+            continue
+        with _failures(made):
+            alike = [product for product in products if product.kind == kind]
+            done = update_store(made.root, kind, alike, selection, options.runs)
+            made.stores.append(done)
+            made.refused += done.refused
+            made.failed += done.failed

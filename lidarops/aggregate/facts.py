@@ -7,14 +7,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate.means_variables import PERIOD
+from lidarops.aggregate.selection import EVERYTHING, NAMES, ProductSelection
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import RECORDERS
@@ -27,6 +29,8 @@ from lidarops.system.output_files import product_paths
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""
+PERIOD: Final = "lidarops_period"
+"""Global attribute that only means have, not products."""
 UNSHARED: Final = frozenset({PROVENANCE.name, "station", "quantization_info"})
 """Variables of single products that aggregates do not contain."""
 
@@ -88,12 +92,10 @@ class Facts:
     @property
     def group(self) -> Group:
         """Group of products that this one can be joined with."""
-        series = (self.station, self.instrument, self.kind, self.channel)
-        return Group(*series, self.grid, self.recorder)
+        return Group(*(getattr(self, name) for name in Group._fields))
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Group:
+class Group(NamedTuple):
     """Products that can be joined along time: one instrument, kind, channel and grid."""
 
     station: str
@@ -120,41 +122,6 @@ class Refused:
 
     path: str
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class ProductSelection:
-    """Selection of products; None selects all."""
-
-    kind: str | None = None
-    channel: str | None = None
-    station: str | None = None
-    instrument: str | None = None
-    since: datetime | None = None
-    """Select products that end after this time."""
-    until: datetime | None = None
-    """Select products that start before this time."""
-
-    def admits(
-        self,
-        kind: str,
-        station: str,
-        instrument: str,
-        channel: str,
-        start: datetime,
-        stop: datetime,
-    ) -> bool:
-        """Return whether a product is selected."""
-        selected = (self.kind, self.station, self.instrument, self.channel)
-        stated = (kind, station, instrument, channel)
-        return (
-            all(name is None or name == own for name, own in zip(selected, stated, strict=True))
-            and (self.since is None or stop > self.since)
-            and (self.until is None or start < self.until)
-        )
-
-
-EVERYTHING: Final = ProductSelection()
 
 
 def list_products(root: Path) -> list[str]:
@@ -204,22 +171,17 @@ def read_product_facts(
     """
     for path in paths:
         try:
-            if _is_selected(within(root, path), selection):
-                yield read_facts(root, path)
+            file = within(root, path)
+            with opened(file) as product:
+                kind, start, stop = _kind_of(product, file), *_times(product)
+                names = {name: product.attrs[f"lidarops_{name}"] for name in NAMES}
+                selected = selection.admits({**names, "kind": kind}, start, stop)
+                facts = _facts(product, file, path) if selected else None
         except ProductError as error:
             yield Refused(path, error.problem)
-
-
-def _is_selected(file: Path, selection: ProductSelection) -> bool:
-    """Return whether a product is selected, from its attributes alone."""
-    if selection == EVERYTHING:
-        return True
-    with opened(file) as product:
-        attributes = product.attrs
-        names = ("station", "instrument", "channel")
-        start, stop = (_moment(attributes[f"time_coverage_{end}"]) for end in ("start", "end"))
-        station, instrument, channel = (attributes[f"lidarops_{name}"] for name in names)
-        return selection.admits(_kind_of(product, file), station, instrument, channel, start, stop)
+        else:
+            if facts is not None:
+                yield facts
 
 
 def read_facts(root: Path, path: str) -> Facts:
@@ -231,10 +193,6 @@ def read_facts(root: Path, path: str) -> Facts:
     path : str
         Relative to `root`.
 
-    Returns
-    -------
-    Facts
-
     Raises
     ------
     ProductError
@@ -242,38 +200,43 @@ def read_facts(root: Path, path: str) -> Facts:
     """
     file = within(root, path)
     with opened(file) as product:
-        attributes = product.attrs
-        kind = _kind_of(product, file)
-        flags = product[QUALITY_FLAG].values
-        bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
-        rejecting = np.int32(rejecting_mask(bits))
-        height = "station_altitude" if "station_altitude" in product else "altitude"
-        return Facts(
-            path=path,
-            id=attributes["id"],
-            kind=kind,
-            campaign=attributes["lidarops_campaign"],
-            station=attributes["lidarops_station"],
-            instrument=attributes["lidarops_instrument"],
-            channel=attributes["lidarops_channel"],
-            mode=attributes["lidarops_detection_mode"],
-            wavelength=_middle(product, "wavelength") * 1e-9,
-            start=_moment(attributes["time_coverage_start"]),
-            stop=_moment(attributes["time_coverage_end"]),
-            latitude=_middle(product, "latitude"),
-            longitude=_middle(product, "longitude"),
-            altitude=_middle(product, height),
-            sha256=sha256_of(file),
-            size=file.stat().st_size,
-            profiles=product.sizes["time"],
-            values=flags.size,
-            usable=flags.size - int(np.count_nonzero(flags & rejecting)),
-            unflagged=flags.size - int(np.count_nonzero(flags)),
-            grid=_grid_digest(product, kind),
-            code_version=attributes["lidarops_code_version"],
-            recorder=attributes.get(RECORDERS, ""),
-            flagged={bit.word.upper(): n for bit, n in count_bits(flags, bits).items()},
-        )
+        return _facts(product, file, path)
+
+
+def _facts(product: xr.Dataset, file: Path, path: str) -> Facts:
+    attributes = product.attrs
+    kind = _kind_of(product, file)
+    start, stop = _times(product)
+    flags = product[QUALITY_FLAG].values
+    bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
+    rejecting = np.int32(rejecting_mask(bits))
+    height = "station_altitude" if "station_altitude" in product else "altitude"
+    return Facts(
+        path=path,
+        id=attributes["id"],
+        kind=kind,
+        campaign=attributes["lidarops_campaign"],
+        station=attributes["lidarops_station"],
+        instrument=attributes["lidarops_instrument"],
+        channel=attributes["lidarops_channel"],
+        mode=attributes["lidarops_detection_mode"],
+        wavelength=_middle(product, "wavelength") * 1e-9,
+        start=start,
+        stop=stop,
+        latitude=_middle(product, "latitude"),
+        longitude=_middle(product, "longitude"),
+        altitude=_middle(product, height),
+        sha256=sha256_of(file),
+        size=file.stat().st_size,
+        profiles=product.sizes["time"],
+        values=flags.size,
+        usable=flags.size - int(np.count_nonzero(flags & rejecting)),
+        unflagged=flags.size - int(np.count_nonzero(flags)),
+        grid=_grid_digest(product, kind),
+        code_version=attributes["lidarops_code_version"],
+        recorder=attributes.get(RECORDERS, ""),
+        flagged={bit.word.upper(): n for bit, n in count_bits(flags, bits).items()},
+    )
 
 
 @contextmanager
@@ -398,43 +361,42 @@ def grid_notes(all_groups: Iterable[Group]) -> list[str]:
     Parameters
     ----------
     all_groups : iterable of Group
+        Sorted.
 
     Returns
     -------
     list of str
         One sentence each.
     """
-    grids: dict[tuple[str, str, str, str], list[str]] = {}
-    for group in all_groups:
-        series = (group.station, group.instrument, group.kind, group.channel)
-        grids.setdefault(series, []).append(group.grid_words)
-    return [
-        f"{' '.join(series)}: products of {len(names)} grids, which are not joined:"
-        f" {', '.join(names)}"
-        for series, names in grids.items()
-        if len(names) > 1
-    ]
+    notes = []
+    for series, alike in groupby(all_groups, key=itemgetter(slice(4))):
+        names = [group.grid_words for group in alike]
+        if len(names) > 1:
+            grids = f"products of {len(names)} grids, which are not joined: {', '.join(names)}"
+            notes.append(f"{' '.join(series)}: {grids}")
+    return notes
 
 
-def refuse_duplicates(times: NDArray[np.float64], owners: list[str]) -> None:
+def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> None:
     """Refuse several profiles at the same time, naming their products.
 
     Parameters
     ----------
-    times : ndarray, shape (time,)
-        In any order.
-    owners : list of str
-        Product path of each time.
+    profiles : iterable of (str, ndarray)
+        Path of each product, and times of its profiles.
 
     Raises
     ------
     ProductError
         If a time occurs twice.
     """
+    paths, parts = zip(*profiles, strict=True)
+    times = np.concatenate(parts)
+    owners = np.repeat(np.arange(len(paths)), [part.size for part in parts])
     order = np.argsort(times, kind="stable")
     same = np.flatnonzero(np.diff(times[order]) == 0)
     if same.size:
-        first, second = (owners[order[at]] for at in (same[0], same[0] + 1))
+        first, second = (paths[owners[order[at]]] for at in (same[0], same[0] + 1))
         moment = datetime.fromtimestamp(float(times[order[same[0]]]), UTC)
         raise ProductError(
             f"holds a profile at {moment:%Y-%m-%dT%H:%M:%SZ} that is also in {second}",
@@ -443,8 +405,11 @@ def refuse_duplicates(times: NDArray[np.float64], owners: list[str]) -> None:
         )
 
 
-def _moment(text: str) -> datetime:
-    return datetime.fromisoformat(text).astimezone(UTC)
+def _times(product: xr.Dataset) -> tuple[datetime, datetime]:
+    """Return the start of the first profile and the end of the last one."""
+    texts = (product.attrs[f"time_coverage_{end}"] for end in ("start", "end"))
+    start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in texts)
+    return start, stop
 
 
 def _middle(product: xr.Dataset, name: str) -> float:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -17,9 +17,9 @@ from uuid import UUID
 
 import pandas as pd
 
-from lidarops.aggregate._optional_packages import need
-from lidarops.aggregate.facts import FOLDER, Facts, ProductSelection
-from lidarops.aggregate.selection import parse_selection
+from lidarops.aggregate import need
+from lidarops.aggregate.facts import FOLDER, Facts
+from lidarops.aggregate.selection import ProductSelection, parse_selection
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of, kinds
 from lidarops.system.files import write_atomically
@@ -41,42 +41,33 @@ _ENCODINGS: Final = {
     "sha256_prefix": "PLAIN",
 }
 
-_Cell = Callable[[Facts], Any]
-_COLUMNS: Final[Mapping[str, tuple[str, _Cell]]] = {
-    "kind": ("dictionary", lambda facts: facts.kind),
-    "campaign": ("dictionary", lambda facts: facts.campaign),
-    "station": ("dictionary", lambda facts: facts.station),
-    "instrument": ("dictionary", lambda facts: facts.instrument),
-    "channel": ("dictionary", lambda facts: facts.channel),
-    "mode": ("dictionary", lambda facts: facts.mode),
-    "recorder": ("dictionary", lambda facts: facts.recorder),
-    "wavelength": ("float64", lambda facts: facts.wavelength),
-    "start": ("time", lambda facts: facts.start),
-    "stop": ("time", lambda facts: facts.stop),
-    "latitude": ("float64", lambda facts: facts.latitude),
-    "longitude": ("float64", lambda facts: facts.longitude),
-    "altitude": ("float64", lambda facts: facts.altitude),
-    "path": ("string", lambda facts: facts.path),
-    "id": ("bytes", lambda facts: UUID(facts.id).bytes),
-    "sha256_prefix": ("bytes", lambda facts: bytes.fromhex(facts.sha256)[:_PREFIX_BYTES]),
-    "size": ("int64", lambda facts: facts.size),
-    "profiles": ("int32", lambda facts: facts.profiles),
-    "values": ("int64", lambda facts: facts.values),
-    "good": ("int64", lambda facts: facts.verdicts.good),
-    "care": ("int64", lambda facts: facts.verdicts.care),
-    "reject": ("int64", lambda facts: facts.verdicts.reject),
-    "grid": ("dictionary", lambda facts: facts.grid),
-    "code_version": ("dictionary", lambda facts: facts.code_version),
+_COLUMNS: Final = {
+    "kind": "dictionary",
+    "campaign": "dictionary",
+    "station": "dictionary",
+    "instrument": "dictionary",
+    "channel": "dictionary",
+    "mode": "dictionary",
+    "recorder": "dictionary",
+    "wavelength": "float64",
+    "start": "time",
+    "stop": "time",
+    "latitude": "float64",
+    "longitude": "float64",
+    "altitude": "float64",
+    "path": "string",
+    "id": "bytes",
+    "sha256_prefix": "bytes",
+    "size": "int64",
+    "profiles": "int32",
+    "values": "int64",
+    "good": "int64",
+    "care": "int64",
+    "reject": "int64",
+    "grid": "dictionary",
+    "code_version": "dictionary",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class IndexedPaths:
-    """Paths of selected products in an index."""
-
-    root: Path
-    """Folder that the paths are relative to."""
-    paths: tuple[str, ...]
+"""Column -> type."""
 
 
 def write_index(root: Path, products: Iterable[Facts]) -> str:
@@ -103,9 +94,10 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     arrow, parquet = need("pyarrow"), need("pyarrow.parquet")
     rows = sorted(products, key=lambda facts: facts.path)
     types = _types(arrow)
+    cells = [_cells(facts) for facts in rows]
     arrays = {
-        name: arrow.array([cell(facts) for facts in rows], types[kind])
-        for name, (kind, cell) in _COLUMNS.items()
+        name: arrow.array([row[name] for row in cells], types[kind])
+        for name, kind in _COLUMNS.items()
     }
     for name in _flag_names(rows):
         counts = [facts.flagged.get(name, 0) for facts in rows]
@@ -124,6 +116,17 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, stream.getvalue())
     return target.relative_to(root).as_posix()
+
+
+def _cells(facts: Facts) -> dict[str, Any]:
+    """Return the values of the columns of a product, by name."""
+    stated = {item.name: getattr(facts, item.name) for item in fields(facts)}
+    return {
+        **stated,
+        **facts.verdicts._asdict(),
+        "id": UUID(facts.id).bytes,
+        "sha256_prefix": bytes.fromhex(facts.sha256)[:_PREFIX_BYTES],
+    }
 
 
 def _types(arrow: Any) -> dict[str, Any]:
@@ -198,8 +201,8 @@ def find_products(
     return found
 
 
-def find_in_index(index: Path, selection: ProductSelection) -> IndexedPaths:
-    """Return the paths of selected products in an index.
+def find_in_index(index: Path, selection: ProductSelection) -> tuple[Path, list[str]]:
+    """Return the paths of selected products in an index, and the folder they are relative to.
 
     Raises
     ------
@@ -209,7 +212,7 @@ def find_in_index(index: Path, selection: ProductSelection) -> IndexedPaths:
         If pyarrow is not installed.
     """
     paths = _read(index, selection, ["path"]).column("path").to_pylist()
-    return IndexedPaths(_root(index), tuple(sorted(paths)))
+    return _root(index), sorted(paths)
 
 
 def _root(index: Path) -> Path:
@@ -232,10 +235,9 @@ def _read(index: Path, selection: ProductSelection, columns: list[str] | None) -
 
 
 def _filters(selection: ProductSelection) -> list[tuple[str, str, Any]] | None:
-    names = ("channel", "station", "instrument")
-    filters = [(name, "==", getattr(selection, name)) for name in names if getattr(selection, name)]
-    if selection.kind is not None:
-        filters.append(("kind", "==", selection.kind))
+    filters: list[tuple[str, str, Any]] = [
+        (name, "==", value) for name, value in selection.names.items()
+    ]
     if selection.since is not None:
         filters.append(("stop", ">", selection.since))
     if selection.until is not None:

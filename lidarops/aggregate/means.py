@@ -3,43 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate._join import shared_attributes
-from lidarops.aggregate._samples import Profiles, read_profiles
-from lidarops.aggregate._sums import Array, Sample, Sums
-from lidarops.aggregate.facts import FOLDER, Facts, Group, Refused, refuse_duplicates
-from lidarops.aggregate.means_file import (
-    Frame,
-    Lineage,
-    Periods,
-    encode_means,
-    means_provenance,
-    means_version,
-    read_frame,
+from lidarops.aggregate._sums import Array, PeriodSums, Profiles, read_profiles
+from lidarops.aggregate.facts import (
+    FOLDER,
+    Facts,
+    Group,
+    Refused,
+    coordinate_names,
+    opened,
+    refuse_duplicates,
 )
-from lidarops.aggregate.means_variables import MeansDescription, Period, Weights
+from lidarops.aggregate.means_variables import (
+    MeansDescription,
+    Period,
+    Weights,
+    global_attributes,
+    layout,
+)
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
-from lidarops.kinds import flags_of
+from lidarops.netcdf import variables as rows
 from lidarops.netcdf.context import UNUSED_INPUTS
-from lidarops.netcdf.quantities import CLOUD_FRACTION
-from lidarops.netcdf.variables import layout_of, whole_error
+from lidarops.netcdf.encoding import as_stored, as_text
+from lidarops.netcdf.provenance import package_versions, prov_document, prov_type
+from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
 from lidarops.netcdf.write import write_product
+from lidarops.records import DetectionMode
+from lidarops.system.files import within
 
 _UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
-
-Record = Mapping[str, NDArray[Any]]
-
-
-_ALL_BITS: Final = np.int32(-1)
-_WEIGHED: Final = np.int32(Quality.LOW_SIGNAL_TO_NOISE)
+_MOVING: Final = ("zenith_angle", "azimuth")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +97,11 @@ def write_means(
         written.
     """
     averaging = _Averaging(period, weights)
-    frame: Frame | None = None
+    frame: _Frame | None = None
     refused = []
     for facts in products:
         try:
-            group_frame = frame or read_frame(root, facts)
+            group_frame = frame or _read_frame(root, facts)
             profiles = read_profiles(root, facts)
         except ProductError as error:
             refused.append(Refused(facts.path, error.problem))
@@ -116,123 +117,11 @@ def write_means(
 
 
 @dataclass(slots=True)
-class _PeriodSums:
-    """Sums of all quantities over one period."""
-
-    kind: str
-    weights: Weights
-    quantities: dict[str, Sums] = field(default_factory=dict)
-    profiles: int = 0
-    usable: Any = 0
-    """Number of usable profiles, with the shape of the flags without time."""
-    good: Any = 0
-    """Number of profiles whose value has no bit."""
-    flags: Any = 0
-    """Bits of all values."""
-    usable_flags: Any = 0
-    """Bits of the usable values."""
-    common_flags: Any = _ALL_BITS
-    """Bits that all usable values have."""
-    shots: float = 0.0
-    clouds: _CloudSums | None = None
-
-    def add(self, profiles: Profiles, chosen: NDArray[np.intp]) -> None:
-        for name, sample in profiles.samples.items():
-            part = sample.take(chosen)
-            if name not in self.quantities:
-                self.quantities[name] = Sums.like(part)
-            self.quantities[name].add(part, _weights(self.weights, part, profiles.shots[chosen]))
-        flags = profiles.flags[chosen]
-        usable = (flags & np.int32(flags_of(self.kind).rejecting)) == 0
-        self.profiles += chosen.size
-        self.usable = self.usable + usable.sum(axis=0)
-        self.good = self.good + (flags == 0).sum(axis=0)
-        self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)
-        # Of the mean, not of its members: see `record`.
-        kept = np.where(usable, flags & ~_WEIGHED, np.int32(0))
-        self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
-        common = np.bitwise_and.reduce(np.where(usable, flags, _ALL_BITS), axis=0)
-        self.common_flags = self.common_flags & common
-        shots = profiles.shots[chosen]
-        self.shots += float(shots.sum())
-        if profiles.cloud_fraction is not None:
-            self.clouds = self.clouds or _CloudSums()
-            weights = np.ones(shots.size) if self.weights is Weights.PLAIN else shots
-            self.clouds.add(profiles.cloud_fraction[chosen], usable, weights)
-
-    def record(self) -> dict[str, NDArray[Any]]:
-        """Return the variables of the period, without dimension time."""
-        usable_flags = self.usable_flags
-        if self.clouds is not None:
-            usable_flags = _cloudy_flags(self.kind, usable_flags, self.common_flags)
-        flags = np.where(self.usable > 0, usable_flags, self.flags)
-        weighed = layout_of(self.kind).weighed
-        variables: dict[str, NDArray[Any]] = {
-            "usable_share": self.usable / np.float64(self.profiles),
-            "good_share": self.good / np.float64(self.profiles),
-            "shots": np.asarray(self.shots),
-        }
-        if self.clouds is not None:
-            variables[CLOUD_FRACTION] = self.clouds.mean()
-        for name, sums in self.quantities.items():
-            mean = sums.mean()
-            variables[name] = mean.mean
-            variables[f"{name}_standard_error"] = mean.standard_error
-            variables[f"{name}_standard_deviation"] = mean.standard_deviation
-            variables[f"{name}_observations"] = mean.observations
-            variables |= mean.systematic
-            if name in weighed:
-                error = whole_error(variables, name)
-                flags = flags | np.where(np.abs(mean.mean) < error, _WEIGHED, np.int32(0))
-            if mean.mean.shape == flags.shape:
-                # Usable values without an error for weighting give no mean: flag it as missing.
-                unflagged = ~np.isfinite(mean.mean) & (flags == 0)
-                flags = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags)
-        return {**variables, "quality_flag": flags}
-
-
-@dataclass(slots=True)
-class _CloudSums:
-    """Weighted sums of the share of cloudy profiles of usable values."""
-
-    value: Any = 0.0
-    weight: Any = 0.0
-
-    def add(self, fraction: Array, usable: NDArray[np.bool_], weights: Array) -> None:
-        used = usable & np.isfinite(fraction)
-        of_values = np.where(used, weights.reshape(-1, *(1,) * (fraction.ndim - 1)), 0.0)
-        self.value = self.value + (of_values * np.where(used, fraction, 0.0)).sum(axis=0)
-        self.weight = self.weight + of_values.sum(axis=0)
-
-    def mean(self) -> Array:
-        known = self.weight > 0.0
-        return np.where(known, self.value / np.where(known, self.weight, 1.0), np.nan)
-
-
-def _cloudy_flags(kind: str, flags: Any, common: Any) -> Any:
-    """Return the bits of a mean, of which some values or all in it are those of clouds."""
-    bits = (flags_of(kind).named(word) for word in ("cloud", "partly_cloudy"))
-    cloud, partly = (np.int32(bit or 0) for bit in bits)
-    some = ((flags & (cloud | partly)) != 0) & ((common & cloud) == 0)
-    return np.where(some, flags & ~cloud | partly, flags)
-
-
-def _weights(weights: Weights, sample: Sample, shots: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of the values of a sample."""
-    if weights is Weights.INVERSE_VARIANCE:
-        with np.errstate(divide="ignore"):
-            return np.asarray(sample.errors**-2.0)
-    of_profiles = shots if weights is Weights.SHOTS else np.ones(shots.size)
-    along = of_profiles.reshape(-1, *(1,) * (sample.values.ndim - 1))
-    return np.broadcast_to(along, sample.values.shape)
-
-
-@dataclass(slots=True)
 class _Year:
     """Means of one calendar year and their inputs."""
 
     keys: list[np.datetime64] = field(default_factory=list)
-    records: list[Record] = field(default_factory=list)
+    records: list[dict[str, NDArray[Any]]] = field(default_factory=list)
     inputs: dict[str, Facts] = field(default_factory=dict)
     shared: dict[str, Any] | None = None
     """Attributes that are equal in all products so far."""
@@ -253,10 +142,6 @@ class _Year:
             self.partial += UNUSED_INPUTS in profiles.attributes
             self.modified = max(self.modified, str(profiles.attributes.get("date_modified", "")))
 
-    def close(self, key: np.datetime64, sums: _PeriodSums) -> None:
-        self.keys.append(key)
-        self.records.append(sums.record())
-
 
 @dataclass(slots=True)
 class _Averaging:
@@ -265,19 +150,17 @@ class _Averaging:
     period: Period
     weights: Weights
     years: dict[int, _Year] = field(default_factory=dict)
-    _open: dict[np.datetime64, _PeriodSums] = field(default_factory=dict)
-    _times: list[Array] = field(default_factory=list)
-    _owners: list[str] = field(default_factory=list)
+    _open: dict[np.datetime64, PeriodSums] = field(default_factory=dict)
+    _times: list[tuple[str, Array]] = field(default_factory=list)
 
     def add(self, profiles: Profiles) -> None:
         """Add a product; products must be added in order of their start."""
         facts = profiles.facts
         self._close(before=np.datetime64(facts.start.replace(tzinfo=None), "ms"))
-        self._times.append(profiles.times)
-        self._owners += [facts.path] * profiles.times.size
+        self._times.append((facts.path, profiles.times))
         for key, chosen in self._periods(profiles.times):
             self.years.setdefault(_year(key), _Year()).note(profiles)
-            sums = self._open.setdefault(key, _PeriodSums(facts.kind, self.weights))
+            sums = self._open.setdefault(key, PeriodSums(facts.kind, self.weights))
             sums.add(profiles, chosen)
 
     def finish(self) -> None:
@@ -289,13 +172,15 @@ class _Averaging:
             If two products have a profile at the same time.
         """
         if self._times:
-            refuse_duplicates(np.concatenate(self._times), self._owners)
+            refuse_duplicates(self._times)
         self._close(before=None)
 
     def _close(self, *, before: np.datetime64 | None) -> None:
         done = [key for key in self._open if before is None or key + 1 <= before]
         for key in sorted(done):
-            self.years[_year(key)].close(key, self._open.pop(key))
+            year = self.years[_year(key)]
+            year.keys.append(key)
+            year.records.append(self._open.pop(key).record())
 
     def _periods(self, times: Array) -> Iterator[tuple[np.datetime64, NDArray[np.intp]]]:
         # Rounded to milliseconds, the accuracy of the middle of a profile.
@@ -309,32 +194,59 @@ def _year(key: np.datetime64) -> int:
     return int(key.astype("datetime64[Y]").astype(int)) + 1970
 
 
-def _written(root: Path, group: Group, frame: Frame, averaging: _Averaging) -> Iterator[MeansFile]:
-    period, weights = averaging.period, averaging.weights
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """Coordinates and attributes of means that are equal in all products of a group."""
+
+    kind: str
+    mode: DetectionMode
+    variables: Mapping[str, xr.Variable]
+    """Coordinates that do not change with time, and the station; in memory."""
+    listed: Mapping[tuple[str, ...], tuple[str, ...]]
+    """Dimensions -> auxiliary coordinates of the data that have them."""
+    moving: tuple[str, ...]
+    """Names of beam angles that change with time."""
+
+
+def _read_frame(root: Path, facts: Facts) -> _Frame:
+    """Read static coordinates and attributes from a product."""
+    with opened(within(root, facts.path)) as product:
+        static = coordinate_names(facts.kind)
+        kept = [
+            str(name)
+            for name, variable in product.variables.items()
+            if (name in static and "time" not in variable.dims)
+            or name in ("station", QUANTIZATION.name)
+        ]
+        return _Frame(
+            facts.kind,
+            facts.counting,
+            {name: product.variables[name].load() for name in kept},
+            {
+                tuple(str(dim) for dim in variable.dims): tuple(
+                    variable.attrs["coordinates"].split()
+                )
+                for variable in product.variables.values()
+                if "coordinates" in variable.attrs
+            },
+            tuple(name for name in _MOVING if name in product and product[name].dims),
+        )
+
+
+def _written(root: Path, group: Group, frame: _Frame, averaging: _Averaging) -> Iterator[MeansFile]:
     for number, year in sorted(averaging.years.items()):
         keys = np.array(year.keys)
-        bounds = np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]")
-        start, stop = (_datetime(moment) for moment in (bounds[0, 0], bounds[-1, 1]))
-        lineage = Lineage(tuple(year.inputs.values()), period, weights, start, stop)
-        first, last = (_datetime(pair[0] + (pair[1] - pair[0]) // 2) for pair in bounds[[0, -1]])
         about = MeansDescription(
-            lineage.id,
-            period,
-            weights,
-            start,
-            stop,
-            first,
-            last,
-            len(year.inputs),
+            tuple(year.inputs.values()),
+            averaging.period,
+            averaging.weights,
+            np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]"),
             year.partial,
             year.modified,
             year.version,
-            means_version(group.kind),
         )
-        periods = Periods(bounds.astype(np.float64), year.records)
-        dataset = encode_means(frame, periods, year.shared or {}, about, means_provenance(lineage))
-        path = _path(group, period, weights, number)
-        done = write_product(dataset, root / path)
+        path = _path(group, averaging.period, averaging.weights, number)
+        done = write_product(_encoded(frame, year, about), root / path)
         yield MeansFile(path, done.sha256, done.size, len(keys), len(year.inputs))
 
 
@@ -344,5 +256,86 @@ def _path(group: Group, period: Period, weights: Weights, year: int) -> str:
     return f"{FOLDER}/means/{folder}/{group.name}_{period.value}{weighted}_{year}.nc"
 
 
-def _datetime(moment: np.datetime64) -> datetime:
-    return datetime.fromtimestamp(int(moment.astype(np.int64)), UTC)
+def _encoded(frame: _Frame, year: _Year, about: MeansDescription) -> xr.Dataset:
+    """Return the dataset of a file of means, for `lidarops.netcdf.write.write_product`."""
+    table = layout(about.kind, about.period, about.weights)
+    time = table.row("time")
+    bounds = about.bounds.astype(np.float64)
+    provenance = as_text(rows.PROVENANCE, _provenance(about), frame.mode)
+    variables = {
+        time.name: xr.Variable(time.dims, bounds.mean(axis=1), attributes(time, mode=frame.mode)),
+        f"{time.bounds}": xr.Variable((*time.dims, rows.BOUNDS_DIM), bounds),
+        **{name: values for name, values in frame.variables.items() if name != "station"},
+        **dict(_data(table, year.records, frame)),
+        "station": frame.variables["station"],
+        rows.PROVENANCE.name: provenance,
+    }
+    dataset = xr.Dataset(variables, attrs=global_attributes(year.shared or {}, table, about))
+    dataset.encoding["unlimited_dims"] = {"time"}
+    return dataset
+
+
+def _data(
+    table: Layout, records: Sequence[Mapping[str, NDArray[Any]]], frame: _Frame
+) -> Iterator[tuple[str, xr.Variable]]:
+    """Yield the variables of means, from their values in each period."""
+    flags = np.stack([record[rows.QUALITY_FLAG] for record in records]).astype(np.int32)
+    # An optional variable may be in no product.
+    present = [row for row in table.variables if row.summary or row.name in records[0]]
+    names = {row.name for row in present}
+    for row in present:
+        values: NDArray[Any]
+        if row.summary:
+            values = rows.summarize_flags(flags, table.flags)
+        elif row.name == rows.QUALITY_FLAG:
+            values = flags
+        else:
+            values = as_stored(row, np.stack([record[row.name] for record in records]))
+        ancillaries = tuple(name for name in row.ancillaries if name in names)
+        attrs = _attributes(replace(row, ancillaries=ancillaries), frame)
+        yield row.name, xr.Variable(row.dims, values, attrs)
+
+
+def _attributes(row: Row, frame: _Frame) -> dict[str, Any]:
+    attrs = attributes(row, mode=frame.mode, coordinates=frame.listed.get(row.dims, ()))
+    if row.dtype == "f8":
+        # A sum that is never missing; the fill value is for 4 bytes only.
+        del attrs["_FillValue"]
+    return attrs
+
+
+def _provenance(about: MeansDescription) -> str:
+    """Return the provenance of means as W3C PROV-JSON, whatever the order of inputs."""
+    inputs = sorted(about.inputs, key=lambda facts: (facts.sha256, facts.path))
+    group = inputs[0].group
+    averaging = {
+        "lidarops:period": about.period.value,
+        "lidarops:weights": about.weights.value,
+        "prov:startTime": about.start.isoformat(),
+        "prov:endTime": about.stop.isoformat(),
+    }
+    return prov_document(
+        "lidarops:means",
+        ("lidarops:averaging", averaging),
+        {
+            "lidarops:means": {
+                "prov:type": prov_type("lidarops:Means"),
+                "lidarops:id": about.id,
+                "lidarops:kind": group.kind,
+                "lidarops:channel": group.channel,
+                "lidarops:grid": group.grid,
+            },
+            **{
+                f"sha256:{facts.sha256}": {
+                    "prov:type": prov_type("lidarops:Product"),
+                    "lidarops:id": facts.id,
+                    "lidarops:path": facts.path,
+                    "lidarops:sha256": facts.sha256,
+                }
+                for facts in inputs
+            },
+        },
+        ({"prov:entity": f"sha256:{facts.sha256}"} for facts in inputs),
+        (about.code_version, package_versions()),
+        {},
+    )

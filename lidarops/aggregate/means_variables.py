@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarops import __version__
+from lidarops.aggregate.facts import PERIOD, Facts
 from lidarops.netcdf.context import UNUSED_INPUTS, iso
+from lidarops.netcdf.provenance import identifier
 from lidarops.netcdf.quantities import CLOUD_FRACTION
 from lidarops.netcdf.variables import (
     Coverage,
@@ -27,6 +30,7 @@ from lidarops.netcdf.variables import (
     count,
     layout_of,
 )
+from lidarops.system.code_version import code_version
 
 PRODUCT: Final = Row(
     "product",
@@ -296,8 +300,62 @@ def _averaged_error(row: Row, quantity: Row) -> Row:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class MeansDescription:
+    """Inputs, settings and periods of means: what their attributes and provenance state."""
+
+    inputs: tuple[Facts, ...]
+    period: Period
+    weights: Weights
+    bounds: NDArray[np.datetime64]
+    """(time, 2), start and end of each period."""
+    partial: int
+    """Number of products that lack raw files of their scenes."""
+    modified: str
+    """``date_modified`` of the newest product."""
+    version: int
+    """Sum of the versions of the products."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the products."""
+        return self.inputs[0].kind
+
+    @property
+    def start(self) -> datetime:
+        """Start of the first period."""
+        return _datetime(self.bounds[0, 0])
+
+    @property
+    def stop(self) -> datetime:
+        """End of the last period."""
+        return _datetime(self.bounds[-1, 1])
+
+    @property
+    def code_version(self) -> str:
+        """Digest of the code that makes products of the kind and their means."""
+        return code_version(self.kind, "lidarops.aggregate.means")
+
+    @property
+    def id(self) -> str:
+        """UUID version 5 of the inputs' sha256, period, weights, time and code version."""
+        return identifier(
+            {
+                "means": {"period": self.period.value, "weights": self.weights.value},
+                "inputs": sorted(facts.sha256 for facts in self.inputs),
+                "time": [self.start.isoformat(), self.stop.isoformat()],
+                "code_version": self.code_version,
+            }
+        )
+
+
+def _datetime(moment: np.datetime64) -> datetime:
+    plain: datetime = moment.astype("datetime64[us]").item()
+    return plain.replace(tzinfo=UTC)
+
+
 def global_attributes(
-    shared: Mapping[str, Any], table: Layout, about: MeansDescription, kind: str
+    shared: Mapping[str, Any], table: Layout, about: MeansDescription
 ) -> dict[str, Any]:
     """Return the global attributes of means, in the order in which they are written.
 
@@ -308,82 +366,46 @@ def global_attributes(
     table : Layout
         From `layout`.
     about : MeansDescription
-    kind : str
 
     Returns
     -------
     dict of str to str, float or numpy scalar
     """
-    source = layout_of(kind)
+    source = layout_of(about.kind)
     # The comment of a product ends with a sentence on its dates, which is replaced.
     comment = shared.get("comment", "").partition(" Dates of creation")[0]
     program = f"lidarops {__version__} ({about.code_version})"
-    texts = {
+    count = len(about.inputs)
+    first, last = (_datetime(pair[0] + (pair[1] - pair[0]) // 2) for pair in about.bounds[[0, -1]])
+    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
+    attributes = {
+        **shared,
         "title": _replaced(shared.get("title", ""), source.title, table.title),
         "summary": _replaced(shared.get("summary", ""), source.summary, table.summary),
-    }
-    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
-    return {
-        **shared,
-        **texts,
         "id": about.id,
         "processing_level": table.processing_level,
         "product_version": str(about.version),
-        "history": f"{about.modified} averaged {about.inputs} products over UTC"
+        "history": f"{about.modified} averaged {count} products over UTC"
         f" {about.period.value}s, weights {about.weights.value} [{program}]",
         "comment": f"{_replaced(comment, source.comment, table.comment)} Dates of creation and"
         " change are those of the newest product, and product_version is the sum of those of the"
         " products, so that equal inputs give equal files: it grows with each product that is added"
         " or replaced.",
         # As ACDD has it: the times of the first and last value, which are middles of periods.
-        "time_coverage_start": iso(about.first),
-        "time_coverage_end": iso(about.last),
+        "time_coverage_start": iso(first),
+        "time_coverage_end": iso(last),
         "time_coverage_duration": f"P{(about.stop - about.start).days}D",
         "time_coverage_resolution": about.period.duration,
         **dict.fromkeys(dates, about.modified),
         PERIOD: about.period.value,
         "lidarops_weights": about.weights.value,
         "lidarops_code_version": about.code_version,
-        "lidarops_input_count": np.int32(about.inputs),
-        **_partial(about),
+        "lidarops_input_count": np.int32(count),
     }
-
-
-def _partial(about: MeansDescription) -> dict[str, str]:
-    if not about.partial:
-        return {}
-    return {
-        UNUSED_INPUTS: f"{about.partial} of {about.inputs} products lack raw files, and name them"
-    }
-
-
-PERIOD: Final = "lidarops_period"
-"""Global attribute that only means have, not products."""
-
-
-@dataclass(frozen=True, slots=True)
-class MeansDescription:
-    """Identity and period of means, for their global attributes."""
-
-    id: str
-    period: Period
-    weights: Weights
-    start: datetime
-    """Start of the first period."""
-    stop: datetime
-    first: datetime
-    """Middle of the first period."""
-    last: datetime
-    """Middle of the last period."""
-    inputs: int
-    """Number of products."""
-    partial: int
-    """Number of products that lack raw files of their scenes."""
-    modified: str
-    """``date_modified`` of the newest product."""
-    version: int
-    """Sum of the versions of the products."""
-    code_version: str
+    if about.partial:
+        words = f"{about.partial} of {count} products lack raw files, and name them"
+        attributes[UNUSED_INPUTS] = words
+    return attributes
 
 
 def _replaced(text: str, old: str, new: str) -> str:

@@ -8,14 +8,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import xarray as xr
 
 from lidarops.aggregate._join import join, open_piece, shared_attributes
 from lidarops.aggregate.facts import (
     Facts,
     Group,
-    ProductSelection,
     Refused,
     groups,
     list_products,
@@ -23,8 +21,8 @@ from lidarops.aggregate.facts import (
     read_product_facts,
     refuse_duplicates,
 )
-from lidarops.aggregate.index import INDEX, IndexedPaths, find_in_index
-from lidarops.aggregate.selection import parse_selection
+from lidarops.aggregate.index import INDEX, find_in_index
+from lidarops.aggregate.selection import ProductSelection, parse_selection
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.netcdf.read import reading
@@ -136,7 +134,9 @@ def _find(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]
         return _from_files([Path(file) for file in source], selection)
     path = Path(source)
     if path.name == INDEX:
-        return _from_index(find_in_index(path, selection))
+        root, paths = find_in_index(path, selection)
+        # The facts are read again from the files, because the index may be outdated.
+        return root, [read_facts(root, indexed) for indexed in paths]
     if path.is_dir():
         return path, _strictly(read_product_facts(path, list_products(path), selection))
     return _from_files([path], selection)
@@ -160,19 +160,13 @@ def _strictly(scanned: Iterator[Facts | Refused]) -> list[Facts]:
     return products
 
 
-def _from_index(indexed: IndexedPaths) -> tuple[Path, list[Facts]]:
-    # The facts are read again from the files, because the index may be outdated.
-    return indexed.root, [read_facts(indexed.root, path) for path in indexed.paths]
-
-
 def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
     pieces = [open_piece(within(root, facts.path), facts, dask=True) for facts in products]
-    owners = [facts.path for facts in products for _ in range(facts.profiles)]
     times = []
     for facts, piece in zip(products, pieces, strict=True):
         with reading(facts.path):
-            times.append(piece["time"].values)
-    refuse_duplicates(np.concatenate(times), owners)
+            times.append((facts.path, piece["time"].values))
+    refuse_duplicates(times)
     joined = join(pieces)
     joined.attrs = shared_attributes([piece.attrs for piece in pieces])
     # Decoded once, which is much faster than decoding each piece.

@@ -1,14 +1,48 @@
-"""Parses a selection of products as given by a user."""
+"""Which products are meant: a selection, and how a user gives it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import TypeVar
+from typing import Final, TypeVar
 
-from lidarops.aggregate.facts import ProductSelection
 from lidarops.errors import RetrievalInputError
 from lidarops.kinds import kinds
+
+NAMES: Final = ("kind", "station", "instrument", "channel")
+
+
+@dataclass(frozen=True, slots=True)
+class ProductSelection:
+    """Selection of products; None selects all."""
+
+    kind: str | None = None
+    channel: str | None = None
+    station: str | None = None
+    instrument: str | None = None
+    since: datetime | None = None
+    """Select products that end after this time."""
+    until: datetime | None = None
+    """Select products that start before this time."""
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Names that a product must have, by what they name."""
+        names = {name: getattr(self, name) for name in NAMES}
+        return {name: value for name, value in names.items() if value is not None}
+
+    def admits(self, stated: Mapping[str, str], start: datetime, stop: datetime) -> bool:
+        """Return whether a product with these names and times is selected."""
+        return (
+            all(stated.get(name) == value for name, value in self.names.items())
+            and (self.since is None or stop > self.since)
+            and (self.until is None or start < self.until)
+        )
+
+
+EVERYTHING: Final = ProductSelection()
 
 
 def parse_selection(
@@ -26,39 +60,16 @@ def parse_selection(
     RetrievalInputError
         If the kind is unknown or a time is not ISO 8601.
     """
-    return ProductSelection(
-        None if kind is None else _known_kind(kind),
-        channel,
-        station,
-        instrument,
-        _parse_time(since, "since"),
-        _parse_time(until, "until"),
-    )
-
-
-def _known_kind(name: str) -> str:
-    """Return the name of a kind of product.
-
-    Raises
-    ------
-    RetrievalInputError
-        If there is no such kind.
-    """
-    if name not in kinds():
+    if kind is not None and kind not in kinds():
         raise RetrievalInputError(
-            f"is {name!r}", field="kind", remedy=f"choose one of {', '.join(kinds())}"
+            f"is {kind!r}", field="kind", remedy=f"choose one of {', '.join(kinds())}"
         )
-    return name
+    times = (_parse_time(since, "since"), _parse_time(until, "until"))
+    return ProductSelection(kind, channel, station, instrument, *times)
 
 
 def _parse_time(text: datetime | str | None, name: str) -> datetime | None:
-    """Return a time; without a time zone it is UTC.
-
-    Raises
-    ------
-    RetrievalInputError
-        If it is not ISO 8601.
-    """
+    """Return a time; without a time zone it is UTC."""
     if text is None:
         return None
     try:

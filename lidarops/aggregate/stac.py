@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 from urllib.parse import quote
 
-from lidarops.aggregate._optional_packages import need
+from lidarops.aggregate import need
 from lidarops.aggregate.facts import FOLDER, Facts
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds

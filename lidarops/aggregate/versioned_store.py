@@ -9,37 +9,43 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from lidarops.aggregate._join import join
-from lidarops.aggregate._optional_packages import need
-from lidarops.aggregate._store_group import (
-    Changes,
-    UnreadableProductError,
-    root_of,
-    write_group,
-)
+from lidarops.aggregate import need
+from lidarops.aggregate._join import join, open_piece, shared_attributes
 from lidarops.aggregate.facts import (
     Facts,
-    ProductSelection,
     Refused,
     groups,
+    opened,
+    plain,
+    refuse_changed,
+    refuse_duplicates,
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
+from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError
-from lidarops.system.files import only_one
+from lidarops.netcdf.read import reading
+from lidarops.system.files import only_one, within
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
 
 _BRANCH: Final = "main"
-_NAMES: Final = ("kind", "station", "instrument", "channel")
+_ROWS: Final = 256
+"""Rows of a chunk, whatever the products: an update copies the rows of its last chunk again."""
+_LEAST_CHUNK: Final = 2**14
+"""Bytes: times of a year of minutes, which opening reads, are 257 chunks; of `_ROWS`, 2054."""
+_LARGEST_CHUNK: Final = 2**20
+"""Bytes: as in products."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +65,25 @@ class StoreUpdate:
     """Products that could not be read and are not in the newest snapshot."""
     failed: tuple[str, ...] = ()
     """Groups that stay as they were, one sentence each."""
+
+
+@dataclass(slots=True)
+class Changes:
+    """What an update changes."""
+
+    added: list[tuple[str, str]] = field(default_factory=list)
+    """Path and version of products."""
+    dropped: int = 0
+    failed: list[str] = field(default_factory=list)
+
+
+class UnreadableProductError(Exception):
+    """A product that cannot be read or has changed, though its facts could be read."""
+
+    def __init__(self, facts: Facts, reason: str) -> None:
+        super().__init__(reason)
+        self.facts = facts
+        self.reason = reason
 
 
 def store_path(root: Path, kind: str) -> Path:
@@ -188,10 +213,10 @@ def _write_groups(
     stored = dict(_stored_groups(store, selection))
     for name in stored.keys() - by_name.keys():
         changes.dropped += stored[name][PRODUCT.name].shape[0]
-        del root_of(store)[name]
+        del _root(store)[name]
     for name, alike in by_name.items():
         try:
-            write_group(store, name, root, alike, changes)
+            _write_group(store, name, root, alike, changes)
         except ProductError as error:
             changes.failed.append(str(error))
     return changes
@@ -199,13 +224,215 @@ def _write_groups(
 
 def _stored_groups(store: Any, selection: ProductSelection) -> Iterator[tuple[str, Any]]:
     """Yield the groups of a store that are selected by their names."""
-    now = datetime.now(UTC)
-    by_names = replace(selection, since=None, until=None)
-    for name, group in sorted(root_of(store).groups()):
-        names = (group.attrs.get(f"lidarops_{key}") for key in _NAMES)
-        kind, station, instrument, channel = names
-        if kind and by_names.admits(kind, station, instrument, channel, now, now):
+    for name, group in sorted(_root(store).groups()):
+        stated = group.attrs
+        names = selection.names.items()
+        if "lidarops_kind" in stated and all(
+            stated.get(f"lidarops_{key}") == value for key, value in names
+        ):
             yield name, group
+
+
+def _root(store: Any) -> Any:
+    """Return the root group of a store."""
+    return need("zarr").open_group(store, mode="r" if store.read_only else "a")
+
+
+def _write_group(
+    store: Any, name: str, root: Path, products: Sequence[Facts], changes: Changes
+) -> None:
+    """Write the products that a group lacks; one whose rows are at their place stays.
+
+    Parameters
+    ----------
+    store : icechunk.IcechunkStore
+        Of a writable session.
+    name : str
+        Of the group.
+    root : path
+    products : sequence of Facts
+        All of the group, in order of time.
+    changes : Changes
+        Gets what changes.
+
+    Raises
+    ------
+    ProductError
+        If a time occurs twice. Nothing is written then.
+    UnreadableProductError
+        If a product cannot be read or has changed since. Part of the group may be written then.
+    """
+    held = _held(store, name)
+    ids = [product.id for product in products]
+    starts = np.cumsum([0, *(product.profiles for product in products)]).tolist()
+    lacking = [at for at in range(len(ids)) if held.places.get(ids[at]) != (at, starts[at])]
+    gone = held.places.keys() - set(ids)
+    if not lacking and not gone:
+        return
+    if 0 in lacking:
+        # The first product gives the attributes of variables.
+        lacking = list(range(len(ids)))
+    # What all have in common is known of those that stay, unless others go.
+    read = range(len(ids)) if gone else lacking
+    about = {at: _about(root, products[at]) for at in read}
+    times = [
+        about[at].times if at in about else held.times[slice(*rows)]
+        for at, rows in enumerate(pairwise(starts))
+    ]
+    refuse_duplicates(zip((product.path for product in products), times, strict=True))
+    known = [] if gone or 0 in lacking else [held.attributes]
+    shared = shared_attributes([*known, *(stated.attributes for stated in about.values())])
+    if 0 in lacking:
+        with _piece(root, products[0]) as piece:
+            _create(store, name, piece)
+    group = _root(store)[name]
+    group.attrs.put({key: plain(value) for key, value in shared.items()})
+    _write_rows(group, root, products, lacking, starts)
+    new = [at for at in lacking if ids[at] not in held.places]
+    changes.added += [(products[at].path, about[at].attributes["product_version"]) for at in new]
+    changes.dropped += len(gone)
+
+
+class _Held(NamedTuple):
+    """What a group holds before an update."""
+
+    attributes: Mapping[str, Any]
+    times: NDArray[np.float64]
+    places: Mapping[str, tuple[int, int]]
+    """Id -> number and first row of each product."""
+
+
+def _held(store: Any, name: str) -> _Held:
+    root = _root(store)
+    if name not in root:
+        return _Held({}, np.empty(0), {})
+    group = root[name]
+    ids = group[PRODUCT.name][:].tolist()
+    lengths = np.bincount(group[PRODUCT_INDEX.name][:], minlength=len(ids))
+    starts = np.cumsum([0, *lengths]).tolist()
+    places = {product: (at, starts[at]) for at, product in enumerate(ids)}
+    return _Held(group.attrs.asdict(), group["time"][:], places)
+
+
+class _About(NamedTuple):
+    """What the file of a product states."""
+
+    attributes: Mapping[str, Any]
+    times: NDArray[np.float64]
+
+
+def _about(root: Path, facts: Facts) -> _About:
+    with _readable(facts), opened(within(root, facts.path)) as product:
+        refuse_changed(product, facts)
+        return _About(dict(product.attrs), product["time"].values)
+
+
+@contextmanager
+def _readable(facts: Facts) -> Iterator[None]:
+    """Raise `UnreadableProductError` where a product cannot be read."""
+    try:
+        yield
+    except ProductError as error:
+        raise UnreadableProductError(facts, error.problem) from error
+
+
+def _write_rows(
+    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
+) -> None:
+    length = {"time": starts[-1], PRODUCT.name: len(products)}
+    rows = {}
+    for name, array in group.arrays():
+        dims = array.metadata.dimension_names or ()
+        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
+        rows[name] = _Rows(array)
+    for at in lacking:
+        _write_product(rows, root, products[at], at, starts[at])
+    for array in rows.values():
+        array.flush()
+
+
+def _create(store: Any, name: str, piece: xr.Dataset) -> None:
+    """Write a group like a product, but without its rows."""
+    # Of variable length, which all readers of Zarr know.
+    text = piece[PRODUCT.name].astype(np.dtypes.StringDType(), keep_attrs=True)
+    like = piece.reset_coords().assign_coords({PRODUCT.name: text})
+    encoding = {}
+    for key, variable in like.variables.items():
+        variable.encoding = {}
+        if key != PRODUCT.name:
+            encoding[key] = {"chunks": _chunk(variable), "compressors": _compressor()}
+    like.isel(time=slice(0), product=slice(0)).drop_attrs(deep=False).to_zarr(
+        store, group=name, mode="w", encoding=encoding, zarr_format=3, consolidated=False
+    )
+
+
+def _chunk(variable: xr.Variable) -> tuple[int, ...]:
+    if not _is_long(variable):
+        return variable.shape
+    row = variable.dtype.itemsize * int(np.prod(variable.shape[1:]))
+    rows = min(max(_ROWS, _LEAST_CHUNK // row), max(1, _LARGEST_CHUNK // row))
+    return (rows, *variable.shape[1:])
+
+
+def _is_long(variable: xr.Variable) -> bool:
+    return bool({"time", PRODUCT.name} & set(variable.dims))
+
+
+def _compressor() -> Any:
+    return need("zarr.codecs").BloscCodec(cname="zstd", clevel=5, shuffle="shuffle")
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Rows of an array that wait until their chunk is complete, because each write keeps a copy."""
+
+    array: Any
+    first: int = 0
+    stop: int = 0
+    waiting: list[NDArray[Any]] = field(default_factory=list)
+
+    def add(self, first: int, values: NDArray[Any]) -> None:
+        """Write rows of one chunk, at the latest when the next one begins."""
+        if first != self.stop:
+            self.flush()
+            self.first = first
+        self.waiting.append(values)
+        self.stop = first + len(values)
+        if self.stop % self.array.chunks[0] == 0:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write all rows that wait."""
+        if self.waiting:
+            self.array[self.first : self.stop] = np.concatenate(self.waiting)
+        self.waiting.clear()
+        self.first = self.stop
+
+
+def _write_product(
+    rows: Mapping[str, _Rows], root: Path, facts: Facts, number: int, start: int
+) -> None:
+    with _piece(root, facts) as piece:
+        piece[PRODUCT_INDEX.name] = piece[PRODUCT_INDEX.name] + np.int32(number)
+        for name, variable in piece.variables.items():
+            if not _is_long(variable):
+                continue
+            array = rows[str(name)]
+            first = start if "time" in variable.dims else number
+            for low, high in _blocks(first, first + variable.shape[0], array.array.chunks[0]):
+                with _readable(facts), reading(facts.path):
+                    values = variable[low - first : high - first].values
+                array.add(low, values)
+
+
+def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:
+    """Yield the rows from `start` to `stop` in blocks within chunks, so that memory holds few."""
+    return pairwise((start, *range((start // chunk + 1) * chunk, stop, chunk), stop))
+
+
+def _piece(root: Path, facts: Facts) -> xr.Dataset:
+    with _readable(facts):
+        return open_piece(within(root, facts.path), facts, dask=False)
 
 
 def open_store(path: Path, selection: ProductSelection, version: str | None) -> xr.Dataset:

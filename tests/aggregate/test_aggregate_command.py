@@ -11,7 +11,7 @@ import pytest
 from support.archives.aggregate_archive import add_day
 from typer.testing import CliRunner
 
-from lidarops.aggregate._optional_packages import need
+from lidarops.aggregate import need
 from lidarops.cli import aggregate as _command  # noqa: F401  # registers the command
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError

@@ -14,7 +14,6 @@ from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import (
     Facts,
-    ProductSelection,
     Refused,
     grid_notes,
     groups,
@@ -23,6 +22,7 @@ from lidarops.aggregate.facts import (
     read_product_facts,
     within,
 )
+from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_plain

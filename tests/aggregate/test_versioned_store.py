@@ -17,9 +17,10 @@ import xarray as xr
 from support.archives.aggregate_archive import add_day, facts_of
 from support.products.made_products import MAKERS
 
-from lidarops.aggregate import _store_group, versioned_store
-from lidarops.aggregate.facts import EVERYTHING, UNSHARED, ProductSelection, Refused
+from lidarops.aggregate import versioned_store
+from lidarops.aggregate.facts import UNSHARED, Refused
 from lidarops.aggregate.open_products import open_products
+from lidarops.aggregate.selection import EVERYTHING, ProductSelection
 from lidarops.aggregate.versioned_store import StoreUpdate, store_path, update_store
 from lidarops.errors import ProductError, RetrievalInputError
 
@@ -191,14 +192,14 @@ def test_a_killed_update_leaves_the_snapshot_before_and_the_next_one_completes(t
     killed = f"""
 import os, signal
 from pathlib import Path
-from lidarops.aggregate import _store_group
+from lidarops.aggregate import versioned_store
 from lidarops.aggregate.aggregates import AggregateOptions, make_aggregates
-flush = _store_group._Rows.flush
+flush = versioned_store._Rows.flush
 def flush_and_die(rows):
     flush(rows)
     if rows.array.basename == "signal" and rows.stop == 10:
         os.kill(os.getpid(), signal.SIGKILL)
-_store_group._Rows.flush = flush_and_die
+versioned_store._Rows.flush = flush_and_die
 make_aggregates(Path({str(tmp_path)!r}), AggregateOptions(store=True))
 """
     process = subprocess.run([sys.executable, "-c", killed], check=False)
@@ -262,14 +263,14 @@ def test_a_product_that_changes_while_it_is_copied_is_left_out(
     profiles: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     paths = [add_day(tmp_path, day, KIND) for day in range(3)]
-    refuse_duplicates = _store_group.refuse_duplicates
+    refuse_duplicates = versioned_store.refuse_duplicates
 
     def replace_a_product(*known: Any) -> None:
         refuse_duplicates(*known)
         add_day(tmp_path, 1, KIND, version=2, profiles=profiles)
 
     # The last that happens before rows are copied.
-    monkeypatch.setattr(_store_group, "refuse_duplicates", replace_a_product)
+    monkeypatch.setattr(versioned_store, "refuse_duplicates", replace_a_product)
     done = update(tmp_path)
     monkeypatch.undo()
     assert done.refused == (Refused(paths[1], "changed while it was read"),)
