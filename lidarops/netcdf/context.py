@@ -41,10 +41,8 @@ _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Kind, channel, station, instrument, campaign, scene and provenance of a product."""
+    """Station, instrument and provenance of a product, and texts of its campaign."""
 
-    kind: str
-    channel: str
     mode: DetectionMode
     wavelength: float
     """m; NaN where it is not known."""
@@ -53,10 +51,8 @@ class Context:
     instrument_key: str
     instrument_name: str
     metadata: Metadata
-    campaign: str
     title: str
     summary: str
-    scene: str
     start: datetime
     """Start of the scene's window, not of its first profile."""
     stop: datetime
@@ -74,6 +70,21 @@ class Context:
         """Take the time once: several attributes of the file state it."""
         if self.stamp.written is None:
             object.__setattr__(self, "stamp", replace(self.stamp, written=writing_time()))
+
+    @property
+    def kind(self) -> str:
+        """Kind of the product."""
+        return self.provenance.kind
+
+    @property
+    def channel(self) -> str:
+        """Its channel."""
+        return self.provenance.channel
+
+    @property
+    def scene(self) -> str:
+        """Id of its scene."""
+        return self.provenance.scene
 
     @property
     def written(self) -> datetime:
@@ -333,7 +344,7 @@ def _processing(context: Context) -> dict[str, Any]:
     """Return the attributes that lidarops itself reads."""
     provenance = context.provenance
     return {
-        "lidarops_campaign": context.campaign,
+        "lidarops_campaign": provenance.campaign,
         "lidarops_scene": context.scene,
         "lidarops_window_start": iso(context.start),
         "lidarops_window_end": iso(context.stop),

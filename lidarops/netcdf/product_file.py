@@ -77,7 +77,7 @@ def create_product(
         attribute ``steps`` becomes ``lidarops_steps``; ``references`` adds to those of the kind.
         NaN is missing. Other variables of the layout are not used.
     context : Context
-        Kind, channel, station, instrument, campaign, scene and provenance of the product.
+        Station, instrument and provenance of the product, and texts of its campaign.
     path : Path
         Missing folders are created. A former file is replaced at the end, and stays if anything
         fails.
@@ -110,7 +110,6 @@ class ProductWriter:
         until_complete: ExitStack,
         former: str = "",
     ) -> None:
-        _refuse_mismatch(context)
         layout = layout_of(context.kind)
         source = CheckedInput(frame, layout)
         self._layout = layout
@@ -281,7 +280,7 @@ class ProductWriter:
         yield station.name, as_text(station, name, mode)
         provenance = prov_json(self._context.provenance)
         yield rows.PROVENANCE.name, as_text(rows.PROVENANCE, provenance, mode)
-        if self._layout.rounded:
+        if any(row.bits for row in self._layout.variables):
             row = rows.QUANTIZATION
             yield row.name, xr.Variable((), np.int32(0), attributes(row, mode=mode))
 
@@ -343,17 +342,6 @@ class ProductWriter:
 
 def _over_time(dims: tuple[str, ...]) -> bool:
     return dims[:1] == (_TIME,)
-
-
-def _refuse_mismatch(context: Context) -> None:
-    provenance = context.provenance
-    recorded = (provenance.kind, provenance.channel, provenance.scene)
-    if recorded != (context.kind, context.channel, context.scene):
-        raise ProductError(
-            f"is that of {' '.join(recorded)}, not of"
-            f" {context.kind} {context.channel} {context.scene}",
-            field="provenance",
-        )
 
 
 def _stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Values:

@@ -283,11 +283,6 @@ class Layout:
             raise ProductError("states no flags", field=QUALITY_FLAG, remedy="use `quality`")
         return flags
 
-    @property
-    def rounded(self) -> bool:
-        """Whether any variable is stored with a shortened mantissa."""
-        return any(row.bits for row in self.variables)
-
     @cached_property
     def _rows(self) -> dict[str, Row]:
         return {row.name: row for row in (*self.coordinates, *self.variables)}
@@ -387,7 +382,7 @@ def attributes(
     attrs: dict[str, Any] = {
         "standard_name": row.standard_name,
         "long_name": row.long_name,
-        "units": units(row, mode),
+        "units": row.units and row.units.format(signal=_SIGNAL_UNITS[mode]),
         "axis": row.axis,
         "positive": row.positive,
         "bounds": row.bounds,
@@ -422,11 +417,6 @@ def attributes(
     texts = (attrs.get("comment"), row.comment)
     attrs["comment"] = " ".join(text for text in texts if text) or None
     return {key: value for key, value in attrs.items() if value is not None}
-
-
-def units(row: Row, mode: DetectionMode) -> str | None:
-    """Return the unit of a variable in a channel of the given mode."""
-    return row.units and row.units.format(signal=_SIGNAL_UNITS[mode])
 
 
 def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:

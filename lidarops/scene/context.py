@@ -50,8 +50,6 @@ def product_context(
     closure = dependence.plan_closure(job.plan, [(kind, channel.name)])
     notes = dependence.product_notes(scene, closure, channel.name)
     return Context(
-        kind=kind,
-        channel=channel.name,
         mode=DetectionMode(channel.mode),
         wavelength=wavelength,
         station_key=scene.station,
@@ -59,10 +57,8 @@ def product_context(
         instrument_key=scene.instrument,
         instrument_name=_instrument_name(campaign, scene),
         metadata=campaign.metadata,
-        campaign=campaign.name,
         title=campaign.title,
         summary=campaign.summary,
-        scene=scene.id,
         start=scene.start,
         stop=scene.stop,
         notes=notes,

@@ -26,7 +26,6 @@ from support.products.made_products import (
     context,
     homogeneous,
     multiangle,
-    provenance,
     signal,
 )
 
@@ -280,7 +279,7 @@ def test_the_history_of_a_glued_channel_names_the_steps_of_its_parts():
     of_glued = replace(
         about.provenance, channel="glued_532o", plan=replace(plan, steps=(part, *own))
     )
-    about = replace(about, channel="glued_532o", provenance=of_glued)
+    about = replace(about, provenance=of_glued)
     history = build_product(MAKERS["elastic"](), about).attrs["history"]
     assert f"dead_time of photon_532o: {part.words}" in history
     assert "left out dark of photon_532o: photon counting has no dark signal" in history
@@ -292,8 +291,7 @@ def test_the_summary_states_the_detection():
         ("glued_532o", "analog detection glued to photon counting) of"),
     ):
         about = context("elastic")
-        of_channel = replace(about.provenance, channel=channel)
-        about = replace(about, channel=channel, provenance=of_channel)
+        about = replace(about, provenance=replace(about.provenance, channel=channel))
         attrs = build_product(MAKERS["elastic"](), about).attrs
         assert words in attrs["summary"]
 
@@ -326,8 +324,7 @@ def test_identifiers_and_the_principal_investigator_are_stated_as_networks_do():
 
 @pytest.mark.parametrize(("channel", "mode"), [("glued_532o", "glued"), ("photon_532o", "photon")])
 def test_the_detection_mode_of_glued_channels_is_stated(channel: str, mode: str):
-    of = provenance("homogeneous", channel=channel)
-    product = build_product(homogeneous(), context(channel=channel, provenance=of))
+    product = build_product(homogeneous(), context(channel=channel))
     assert product.attrs["lidarops_detection_mode"] == mode
 
 
@@ -530,14 +527,6 @@ def test_a_single_bin_may_have_given_bounds():
     data = data.assign_coords(range_bnds=(("range", "nv"), [[15.0, 22.5]]))
     product = build_product(data, context("signal"))
     np.testing.assert_array_equal(product["range_bnds"], [[15.0, 22.5]])
-
-
-@pytest.mark.parametrize(
-    "changes", [{"kind": "signal"}, {"channel": "analog_355o"}, {"scene": "scene-2"}]
-)
-def test_provenance_of_another_product_is_refused(changes):
-    with pytest.raises(ProductError, match="provenance"):
-        build_product(homogeneous(), context(provenance=provenance(**changes)))
 
 
 def test_a_missing_value_with_a_bit_is_written_as_missing():

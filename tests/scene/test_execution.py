@@ -291,8 +291,6 @@ def test_results_can_be_built_into_products(channel: str) -> None:
     plan = planned(campaign({"elastic": ELASTIC}))
     retrieved = elastic_products()[channel]
     settings = {
-        "kind": "elastic",
-        "channel": channel,
         "mode": DetectionMode.PHOTON,
         "wavelength": 532e-9,
         "station_key": "coast",
@@ -300,10 +298,8 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "instrument_key": "lidar",
         "instrument_name": "",
         "metadata": Metadata(),
-        "campaign": "test",
         "title": "Test",
         "summary": "",
-        "scene": plan.scene,
         "start": datetime(2026, 3, 1, tzinfo=UTC),
         "stop": datetime(2026, 3, 1, tzinfo=UTC) + timedelta(days=1),
         "provenance": Provenance("test", plan.scene, "elastic", channel, (), plan, {}, {}, "0"),

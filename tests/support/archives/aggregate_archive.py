@@ -44,7 +44,6 @@ def add_day(
     scene = f"{SCENE.rpartition('_')[0]}_{start:%Y%m%dT%H%M%S}"
     about = context(
         kind,
-        scene=scene,
         start=start,
         stop=start + timedelta(days=1),
         provenance=provenance(kind, scene=scene, settings=settings),

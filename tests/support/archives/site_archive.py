@@ -34,7 +34,7 @@ def add(output: Path, kind: str, days: int = 0, **changes: Any) -> Path:
     start = START + timedelta(days=days)
     scene = f"lidar-1_{start:%Y%m%dT%H%M%S}"
     record = provenance(kind, scene=scene)
-    about = {"scene": scene, "start": start, "stop": start + timedelta(days=1)}
+    about = {"start": start, "stop": start + timedelta(days=1)}
     whole = context(kind, **(about | {"provenance": record} | changes))
     data = MAKERS[kind]()
     shift = np.timedelta64(days, "D")

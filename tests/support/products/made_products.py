@@ -78,9 +78,8 @@ def provenance(kind: str = "homogeneous", **changes: Any) -> Provenance:
 
 
 def context(kind: str = "homogeneous", **changes: Any) -> Context:
+    about = {name: changes.pop(name) for name in ("channel", "scene") if name in changes}
     fields = {
-        "kind": kind,
-        "channel": "photon_532o",
         "mode": DetectionMode.PHOTON,
         "wavelength": 532e-9,
         "station_key": "odesa",
@@ -88,13 +87,11 @@ def context(kind: str = "homogeneous", **changes: Any) -> Context:
         "instrument_key": "lidar-1",
         "instrument_name": "Lidar One",
         "metadata": METADATA,
-        "campaign": "demo",
         "title": "Demo campaign",
         "summary": "What the campaign is about.",
-        "scene": SCENE,
         "start": START,
         "stop": START + timedelta(days=1),
-        "provenance": provenance(kind),
+        "provenance": provenance(kind, **about),
         "raw_format": "Licel",
         "notes": (),
         "stamp": Stamp(1, START + timedelta(days=2)),
