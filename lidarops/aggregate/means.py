@@ -39,7 +39,6 @@ from lidarops.netcdf.write import write_product
 from lidarops.records import DetectionMode
 from lidarops.system.files import within
 
-_UNITS: Final = {Period.DAY: "D", Period.MONTH: "M"}
 _MOVING: Final = ("zenith_angle", "azimuth")
 
 
@@ -185,7 +184,7 @@ class _Averaging:
     def _periods(self, times: Array) -> Iterator[tuple[np.datetime64, NDArray[np.intp]]]:
         # Rounded to milliseconds, the accuracy of the middle of a profile.
         moments = np.datetime64(0, "ms") + np.rint(times * 1e3).astype("timedelta64[ms]")
-        keys = moments.astype(f"datetime64[{_UNITS[self.period]}]")
+        keys = moments.astype(f"datetime64[{self.period.unit}]")
         for key in np.unique(keys):
             yield key, np.flatnonzero(keys == key)
 

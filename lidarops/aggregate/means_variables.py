@@ -58,9 +58,9 @@ class Period(StrEnum):
     MONTH = "month"
 
     @property
-    def duration(self) -> str:
-        """ISO 8601."""
-        return {"day": "P1D", "month": "P1M"}[self.value]
+    def unit(self) -> str:
+        """Unit of numpy and of durations in ISO 8601."""
+        return self.value[0].upper()
 
 
 class Weights(StrEnum):
@@ -395,7 +395,7 @@ def global_attributes(
         "time_coverage_start": iso(first),
         "time_coverage_end": iso(last),
         "time_coverage_duration": f"P{(about.stop - about.start).days}D",
-        "time_coverage_resolution": about.period.duration,
+        "time_coverage_resolution": f"P1{about.period.unit}",
         **dict.fromkeys(dates, about.modified),
         PERIOD: about.period.value,
         "lidarops_weights": about.weights.value,

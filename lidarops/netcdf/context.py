@@ -174,11 +174,9 @@ def global_attributes(context: Context, layout: Layout, extents: Extents) -> dic
         **_processing(context),
     }
     # What is not known is left out.
-    return {name: value for name, value in attributes.items() if not _is_empty(value)}
-
-
-def _is_empty(value: Any) -> bool:
-    return isinstance(value, str) and not value
+    return {
+        name: value for name, value in attributes.items() if value or not isinstance(value, str)
+    }
 
 
 _DETECTION: Final = {

@@ -183,14 +183,9 @@ def writing_time() -> datetime:
     ProductError
         If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
     """
-    return _epoch() or datetime.now(UTC).replace(microsecond=0)
-
-
-def _epoch() -> datetime | None:
-    """Return the time of ``SOURCE_DATE_EPOCH``; None where it is not set."""
     epoch = os.environ.get(EPOCH_VARIABLE, "")
     if not epoch:
-        return None
+        return datetime.now(UTC).replace(microsecond=0)
     try:
         return datetime.fromtimestamp(int(epoch), UTC)
     except (ValueError, OverflowError, OSError) as error:

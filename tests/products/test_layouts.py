@@ -18,7 +18,6 @@ from lidarops.netcdf.variables import (
     attributes,
     layout_of,
     station,
-    units,
 )
 from lidarops.records import DetectionMode
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
@@ -56,7 +55,7 @@ def test_standard_names_exist_and_their_units_convert(
     canonical = standard_names[name]
     if canonical:
         # The canonical unit of time is s; a time coordinate counts from an epoch.
-        unit = units(row, DetectionMode.ANALOG).split(" since ")[0]
+        unit = attributes(row, mode=DetectionMode.ANALOG)["units"].split(" since ")[0]
         assert Unit(unit).is_convertible(Unit(canonical))
     else:
         assert row.units is None
