@@ -65,26 +65,17 @@ class Context:
     """Raw files of its scene from which it is not made."""
     stamp: Stamp = field(default_factory=Stamp)
     """Version of its content, and when it is written; now, where it has no time."""
+    kind: str = field(init=False)
+    """That of the provenance, as the two that follow."""
+    channel: str = field(init=False)
+    scene: str = field(init=False)
 
     def __post_init__(self) -> None:
-        """Take the time once: several attributes of the file state it."""
+        """Take what the provenance states; and the time once: several attributes state it."""
+        for name in ("kind", "channel", "scene"):
+            object.__setattr__(self, name, getattr(self.provenance, name))
         if self.stamp.written is None:
             object.__setattr__(self, "stamp", replace(self.stamp, written=writing_time()))
-
-    @property
-    def kind(self) -> str:
-        """Kind of the product."""
-        return self.provenance.kind
-
-    @property
-    def channel(self) -> str:
-        """Its channel."""
-        return self.provenance.channel
-
-    @property
-    def scene(self) -> str:
-        """Id of its scene."""
-        return self.provenance.scene
 
     @property
     def written(self) -> datetime:
