@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 77_860,
-    "lines of code alone": 50_740,
-    "modules": 382,
-    "dataclasses": 347,
-    "lines of dataclasses": 8_590,
+    "lines": 77_110,
+    "lines of code alone": 50_280,
+    "modules": 371,
+    "dataclasses": 338,
+    "lines of dataclasses": 8_510,
     "tuning numbers": 254,
     "tuning numbers that are assumed": 87,
     "copied thresholds": 1,
     "most parameters": 24,
-    "lines of the largest package": 6_450,
+    "lines of the largest package": 6_440,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 91, "functions": 790, "changes": 437},
-    "elastic": {"modules": 102, "functions": 925, "changes": 450},
+    "homogeneous": {"modules": 86, "functions": 747, "changes": 398},
+    "elastic": {"modules": 97, "functions": 885, "changes": 425},
 }
 
 
