@@ -47,11 +47,8 @@ MODULES: Final = (
     "lidarops.simulate.campaign",
     "lidarops.simulate.signal",
     "lidarops.simulate.pulse",
-    "lidarops.simulate.overlap",
-    "lidarops.simulate.mie",
     "lidarops.simulate.counting",
     "lidarops.simulate.analog",
-    "lidarops.simulate.lidar",
 )
 """Modules whose public functions and classes users may call."""
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import LidarOpsError
-
-SHORTEST: Final = 1.0e-7
-"""m. Air absorbs light of less than 100 nm."""
-LONGEST: Final = 2.0e-5
-"""m."""
 
 
 class SimulationInputError(LidarOpsError, ValueError):
@@ -36,18 +31,6 @@ def between(field: str, value: float, low: float, high: float, unit: str = "") -
     """Raise unless `value` lies between `low` and `high`, ends included."""
     if not low <= value <= high:
         raise _refusal(field, value, unit, f"lie between {low:g} and {high:g}")
-
-
-def wavelength_in_metres(field: str, value: float) -> None:
-    """Raise unless a wavelength lies in the optical window; outside, it is mostly in nm."""
-    if SHORTEST <= value <= LONGEST:
-        return
-    remedy = f"{value:g} nm are {value * 1e-9:g} m" if 100.0 <= value <= 20_000.0 else None
-    raise SimulationInputError(
-        f"a wavelength must lie between {SHORTEST:g} and {LONGEST:g} m, not {value:g}",
-        field=field,
-        remedy=remedy,
-    )
 
 
 def profile(field: str, values: NDArray[np.float64], shape: tuple[int, ...], unit: str) -> None:

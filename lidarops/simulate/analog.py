@@ -25,9 +25,7 @@ from numpy.typing import NDArray
 from lidarops.campaign.simulated_instrument import AnalogRecorder
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.photoelectrons import Array, Counts, Photoelectrons, limited_rate
-
-FastCounts = NDArray[np.int32]
+from lidarops.simulate.counting import Array, Counts, FastCounts, Photoelectrons, limited_rate
 
 _NEGLIGIBLE: Final = 20.0
 """Harmonics of less than exp(-20) = 2e-9 steps are left out."""

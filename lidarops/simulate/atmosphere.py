@@ -1,11 +1,11 @@
-"""The air that a campaign file describes: extinction and backscatter along a beam."""
+"""The air that a campaign file describes, along a beam, and the brightness of the clear sky."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -32,6 +32,8 @@ from lidarops.retrieve.air.molecular import (
     us_standard,
 )
 from lidarops.retrieve.raman.scattering import MASS_RATIO, NITROGEN_SHARE
+from lidarops.simulate import _checks
+from lidarops.simulate._checks import SimulationInputError
 
 Array = NDArray[np.float64]
 
@@ -46,6 +48,10 @@ _WATER_OVER_NITROGEN: Final = 2.5
 """Cross section of the lines of water vapour over that of nitrogen (`whiteman2003`)."""
 _MODES: Final = 256
 """Number of plane waves in the turbulence."""
+_TWILIGHT_AT_HORIZON: Final = 0.02
+"""Brightness with the sun at the horizon, relative to the zenith."""
+_DEGREES_PER_DECADE: Final = 3.0
+"""Depression of the sun in which the sky darkens tenfold."""
 
 
 class Beam(NamedTuple):
@@ -293,3 +299,69 @@ def _profile(sounding: Sounding) -> MolecularProfile:
     return MolecularProfile(
         np.array(sounding.altitude), np.array(sounding.pressure), np.array(sounding.temperature)
     )
+
+
+def solar_elevation(moment: datetime, latitude: float, longitude: float) -> float:
+    r"""Return the elevation of the sun above the horizon, degree, to within half a degree.
+
+    Parameters
+    ----------
+    moment : datetime
+        With time zone.
+    latitude, longitude : float, degree
+        North and east positive.
+
+    Raises
+    ------
+    SimulationInputError
+        If the time has no zone, or the place is not on Earth.
+
+    Notes
+    -----
+    :math:`\sin h = \sin\phi \sin\delta + \cos\phi \cos\delta \cos H` with the declination
+    :math:`\delta` and the equation of time, part of the hour angle H, as Fourier series of the
+    day of the year. Refraction is neglected.
+
+    References
+    ----------
+    `spencer1971`.
+    """
+    if moment.utcoffset() is None:
+        raise SimulationInputError(
+            f"of {moment} has no time zone", field="moment", remedy="add tzinfo=UTC"
+        )
+    _checks.between("latitude", latitude, -90.0, 90.0, "degree")
+    _checks.between("longitude", longitude, -360.0, 360.0, "degree")
+    utc = moment.astimezone(UTC)
+    hours = utc.hour + utc.minute / 60.0 + utc.second / 3600.0
+    days = utc.timetuple().tm_yday - 1 + (hours - 12.0) / 24.0
+    year = 2.0 * math.pi * days / 365.25
+    declination = _series(
+        year, 0.006918, (-0.399912, -0.006758, -0.002697), (0.070257, 0.000907, 0.00148)
+    )
+    equation = _series(year, 0.000075, (0.001868, -0.014615), (-0.032077, -0.040849))
+    hour_angle = math.radians(15.0 * (hours - 12.0) + longitude) + equation
+    phi = math.radians(latitude)
+    sine = math.sin(phi) * math.sin(declination)
+    sine += math.cos(phi) * math.cos(declination) * math.cos(hour_angle)
+    return math.degrees(math.asin(max(-1.0, min(1.0, sine))))
+
+
+def _series(
+    angle: float, mean: float, cosines: tuple[float, ...], sines: tuple[float, ...]
+) -> float:
+    total = mean
+    for order, (even, odd) in enumerate(zip(cosines, sines, strict=True), start=1):
+        total += even * math.cos(order * angle) + odd * math.sin(order * angle)
+    return total
+
+
+def sky_brightness(elevation: float) -> float:
+    """Return the brightness of the clear sky relative to that with the sun at the zenith.
+
+    By day it follows the sine of the solar elevation (degree). In twilight it falls by a decade
+    every 3 degrees, about as measured between sunset and the end of nautical twilight.
+    """
+    day = math.sin(math.radians(max(elevation, 0.0))) + _TWILIGHT_AT_HORIZON
+    night: float = 10.0 ** (min(elevation, 0.0) / _DEGREES_PER_DECADE)
+    return day / (1.0 + _TWILIGHT_AT_HORIZON) * night

@@ -23,16 +23,22 @@ from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSE
 from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset, new_header
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.analog import digitise, digitise_fast
-from lidarops.simulate.atmosphere import Air, Beam, BeamPath
-from lidarops.simulate.counting import count_fast, count_photons
-from lidarops.simulate.damage import damage_file
-from lidarops.simulate.dialects import scan_grid
-from lidarops.simulate.photoelectrons import (
+from lidarops.simulate.atmosphere import (
+    Air,
+    Beam,
+    BeamPath,
+    sky_brightness,
+    solar_elevation,
+)
+from lidarops.simulate.counting import (
     BRIGHTEST,
     Photoelectrons,
+    count_fast,
+    count_photons,
     delay_recorder,
     release,
 )
+from lidarops.simulate.damage import damage_file
 from lidarops.simulate.planned_files import (
     PlannedFile,
     SimulatedInstrument,
@@ -40,10 +46,10 @@ from lidarops.simulate.planned_files import (
     modes,
     photon_dead_time,
     random_stream,
+    scan_grid,
 )
 from lidarops.simulate.pulse import pulse_echo
 from lidarops.simulate.signal import backscatter_signal, bin_centres
-from lidarops.simulate.sun import sky_brightness, solar_elevation
 from lidarops.simulate.truth import (
     ChannelTruth,
     FileTruth,

@@ -30,7 +30,6 @@ from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.atmosphere import BeamPath
-from lidarops.simulate.overlap import Overlap, SineOverlap, finite_at_lidar
 from lidarops.simulate.signal import bin_centres
 
 Array = NDArray[np.float64]
@@ -256,7 +255,6 @@ def pulsed_signal(
     pulse: Pulse | None,
     bin_width: float | None = None,
     full_overlap_range: float = 0.0,
-    overlap: Overlap | None = None,
     returning_extinction: Array | None = None,
     path: Array | None = None,
     resolution: float | None = None,
@@ -276,8 +274,7 @@ def pulsed_signal(
     bin_width : float, m, optional
         Over which the detector averages; None for the power at the range itself.
     full_overlap_range : float, m
-        Of `SineOverlap`; used where no overlap is given.
-    overlap : Overlap, optional
+        Of `signal.sine_overlap`.
     returning_extinction : ndarray, m-1, shape (points,), optional
         At the wavelength of the detector (Raman); by default that of the laser.
     path : ndarray, m, shape (points,), optional
@@ -290,24 +287,20 @@ def pulsed_signal(
     ------
     SimulationInputError
         If a property is negative, the pulse is as long as the range, or the signal would be
-        infinite: light returns while the pulse still leaves, and the overlap does not vanish
-        with the square of the range.
+        infinite: light returns while the pulse still leaves, and the overlap is complete at the
+        lidar.
 
     References
     ----------
     `vasylkivskyi2009`, equations 10, 14 and 20.
     """
     _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
-    shape = overlap or SineOverlap(full_overlap_range)
+    _checks.not_negative("full_overlap_range", full_overlap_range, "m")
     cells = response(pulse, bin_width=bin_width, resolution=resolution)
-    _refuse_near(distance, cells, shape)
+    _refuse_near(distance, cells, full_overlap_range)
     grid = distance if path is None else path
     points = _points(grid, extinction, backscatter, returning_extinction)
-    if isinstance(shape, SineOverlap):
-        full, cell_overlap = shape.full_overlap_range, np.empty((0, 0))
-    else:
-        full, cell_overlap = math.nan, shape(_positions(distance, cells.edges))
-    signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full, cell_overlap)
+    signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full_overlap_range)
     return system_constant * signal
 
 
@@ -365,7 +358,7 @@ _SHAPES: Final[Mapping[str, Callable[[float], tuple[Pulse, float]]]] = {
 """Shape in a campaign file -> width in s -> the pulse, and the time of its centroid, s."""
 
 
-def _refuse_near(distance: Array, cells: Response, shape: Overlap) -> None:
+def _refuse_near(distance: Array, cells: Response, full_overlap_range: float) -> None:
     _checks.ascending("distance", distance)
     if cells.edges[-1] >= distance[-1]:
         raise SimulationInputError(
@@ -374,12 +367,11 @@ def _refuse_near(distance: Array, cells: Response, shape: Overlap) -> None:
             remedy="give a shorter pulse (in s) or a longer range",
         )
     reached = (distance > cells.edges[0]) & (distance <= cells.edges[-1])
-    if reached.any() and not finite_at_lidar(shape):
+    if reached.any() and full_overlap_range == 0.0:
         raise SimulationInputError(
-            f"must vanish with the square of the range, or the signal within the pulse"
-            f" ({cells.edges[-1]:g} m) is infinite",
-            field="overlap",
-            remedy="give a full_overlap_range, or ranges behind the pulse",
+            f"must be positive, or the signal within the pulse ({cells.edges[-1]:g} m) is infinite",
+            field="full_overlap_range",
+            remedy="give the range of full overlap, or ranges behind the pulse",
         )
 
 
@@ -402,13 +394,6 @@ def _points(
     return grid, two_way, depth, backscatter[ahead][np.r_[0, 0 : ahead.sum()]]
 
 
-def _positions(distance: Array, edges: Array) -> Array:
-    """Return the range at which `_sum_cells` evaluates each cell, m, shape (bins, cells)."""
-    far = distance[:, None] - edges[:-1]
-    near = distance[:, None] - edges[1:]
-    return np.where(near > 0.0, np.sqrt(np.abs(near * far)), 0.5 * np.maximum(far, 0.0))
-
-
 def _density(z: Array) -> Array:
     density: Array = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
     return density
@@ -424,7 +409,6 @@ def _sum_cells(
     depth: Any,
     backscatter: Any,
     full: float,
-    cell_overlap: Any,
 ) -> Any:
     signal = np.zeros(distance.size)
     inverse = 1.0 / (grid[1:] - grid[:-1])
@@ -456,9 +440,7 @@ def _sum_cells(
                 + (x - inside) * two_way[k + 1]
             )
             value = backscatter[k] + (backscatter[k + 1] - backscatter[k]) * share
-            if cell_overlap.size:
-                value *= cell_overlap[j, i]
-            elif r < full:
+            if r < full:
                 value *= math.sin(0.5 * math.pi * r / full) ** 2
             total += density[i] * weight * value * math.exp(-tau)
         signal[j] = total

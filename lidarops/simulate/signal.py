@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.overlap import Overlap, SineOverlap
 
 Array = NDArray[np.float64]
 
@@ -30,6 +29,27 @@ def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
     _checks.positive("bin_width", bin_width, "m")
     _checks.between("offset", offset, -_FARTHEST, _FARTHEST, "m")
     return (np.arange(bins, dtype=np.float64) + 0.5) * bin_width + offset
+
+
+def sine_overlap(distance: Array, full_overlap_range: float) -> Array:
+    r"""Return the share of the beam that the telescope sees, 1, at ranges in m.
+
+    Parameters
+    ----------
+    distance : ndarray, m
+    full_overlap_range : float, m
+        From which on the overlap is complete; for 0 it is 1 for all R > 0.
+
+    Notes
+    -----
+    :math:`O(R) = \sin^2(\pi R / 2 R_f)` up to the range of full overlap :math:`R_f`, exactly 1
+    beyond: smooth at both ends, and of second order at R = 0, where :math:`R^{-2}` diverges.
+    """
+    _checks.not_negative("full_overlap_range", full_overlap_range, "m")
+    if full_overlap_range == 0.0:
+        return np.where(distance > 0.0, 1.0, 0.0)
+    fraction = np.clip(distance / full_overlap_range, 0.0, 1.0)
+    return np.where(fraction < 1.0, np.sin(0.5 * np.pi * fraction) ** 2, 1.0)
 
 
 def optical_depth(distance: Array, extinction: Array) -> Array:
@@ -77,40 +97,6 @@ def relative_signal(distance: Array, extinction: Array, backscatter: Array) -> A
     return signal
 
 
-def transmission(distance: Array, extinction: Array) -> Array:
-    """Return the one-way transmission to each bin centre (Beer-Lambert law), 1.
-
-    References
-    ----------
-    `vasylkivskyi2009`, equation 13.
-    """
-    transmitted: Array = np.exp(-optical_depth(distance, extinction))
-    return transmitted
-
-
-def isotropic_backscatter(number_density: Array | float, cross_section: float) -> Array:
-    r"""Return the backscatter coefficient of isotropic scatterers of one kind, m-1 sr-1.
-
-    Parameters
-    ----------
-    number_density : ndarray or float, m-3
-    cross_section : float, m2
-        Total cross section of scattering.
-
-    Notes
-    -----
-    :math:`\beta = N \sigma^s / 4 \pi`.
-
-    References
-    ----------
-    `vasylkivskyi2009`, equation 16.
-    """
-    _checks.not_negative("cross_section", cross_section, "m2")
-    density = np.asarray(number_density, dtype=np.float64)
-    _checks.profile("number_density", np.atleast_1d(density), np.atleast_1d(density).shape, "m-3")
-    return density * (cross_section / (4.0 * np.pi))
-
-
 def backscatter_signal(
     distance: Array,
     *,
@@ -118,7 +104,6 @@ def backscatter_signal(
     backscatter: Array,
     system_constant: float,
     full_overlap_range: float = 0.0,
-    overlap: Overlap | None = None,
     returning_extinction: Array | None = None,
 ) -> Array:
     r"""Return the signal of backscatter at the bin centres, in the unit of the system constant.
@@ -132,10 +117,9 @@ def backscatter_signal(
     backscatter : ndarray, m-1 sr-1, shape (bins,)
         From the laser wavelength into the detected wavelength.
     system_constant : float, MHz m3 sr
-        Or W m3 sr for a power; see `lidarops.simulate.lidar.Lidar`.
+        Or W m3 sr for a power.
     full_overlap_range : float, m
-        Of `SineOverlap`; used where no overlap is given.
-    overlap : Overlap, optional
+        Of `sine_overlap`.
     returning_extinction : ndarray, m-1, shape (bins,), optional
         At the detected wavelength, where scattering changes it (Raman); by default that of the
         laser.
@@ -167,8 +151,7 @@ def backscatter_signal(
     two_way = extinction + (extinction if returning_extinction is None else returning_extinction)
     positive = distance > 0.0
     safe = np.where(positive, distance, 1.0)
-    overlap = overlap or SineOverlap(full_overlap_range)
-    gathered = overlap(distance) * backscatter / safe**2
+    gathered = sine_overlap(distance, full_overlap_range) * backscatter / safe**2
     transmitted = np.exp(-optical_depth(distance, two_way))
     return np.where(positive, system_constant * gathered * transmitted, 0.0)
 

@@ -43,12 +43,10 @@ def test_flows_say_what_they_need() -> None:
 
 
 def test_the_command_line_installs_no_matplotlib(repository: Path) -> None:
-    """It comes with miepython and takes a tenth of the room."""
+    """It comes with the documentation and takes a tenth of the room."""
     for lock in ("requirements.lock", "deploy/requirements.lock"):
         text = (repository / lock).read_text("utf-8")
         assert not [name for name in ("matplotlib", "miepython") if f"\n{name}==" in text]
-    code = WITHOUT_PREFECT.replace('"prefect"', '"miepython"') + "import lidarops.simulate.mie"
-    assert "pip install lidarops[mie]" in _run(code).stderr
 
 
 def test_only_the_extra_names_prefect_and_the_demo_installs_it(repository: Path) -> None:

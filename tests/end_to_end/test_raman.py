@@ -24,7 +24,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.run.archive import Options, reprocess
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.simulate.overlap import SineOverlap
+from lidarops.simulate.signal import sine_overlap
 
 STEP = 15.0
 SURFACE, SCALE_HEIGHT = 0.008, 2000.0
@@ -206,7 +206,7 @@ def test_the_overlap_of_the_pair_is_the_simulated_one(night):
     campaign, _, record = night
     product = product_of(campaign, record)
     near = (product["range"].values > 60.0) & (product["range"].values < 400.0)
-    true = SineOverlap(400.0)(product["range"].values)
+    true = sine_overlap(product["range"].values, 400.0)
     away = product["overlap"].values - true
     # Cells of 60 m average a curved function.
     error = np.hypot(product["overlap_standard_error"].values, 0.01)

@@ -12,7 +12,7 @@ from scipy.stats import gamma, poisson
 
 from lidarops.campaign.simulated_instrument import LEAST_NOISE, AnalogRecorder
 from lidarops.simulate.analog import digitise, digitise_fast, sample_moments
-from lidarops.simulate.photoelectrons import release
+from lidarops.simulate.counting import release
 
 BIN_WIDTH = 7.5
 BIN_TIME = 50e-9

@@ -12,7 +12,7 @@ from support.oracles.counter import registered
 
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.counting import count_fast, count_photons, counter_moments
-from lidarops.simulate.photoelectrons import BRIGHTEST, release
+from lidarops.simulate.counting import BRIGHTEST, release
 
 BIN_WIDTH = 7.5
 BIN_TIME = 50e-9

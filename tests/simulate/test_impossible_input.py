@@ -16,11 +16,10 @@ from lidarops.errors import CatalogError
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.analog import digitise_fast
-from lidarops.simulate.atmosphere import Air
+from lidarops.simulate.atmosphere import Air, solar_elevation
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.counting import count_fast, counter_moments
 from lidarops.simulate.signal import backscatter_signal, bin_centres
-from lidarops.simulate.sun import solar_elevation
 
 BIN_TIME = 50e-9
 RECORDER = AnalogRecorder(gain=0.1, noise=0.3, dark_offset=3.0)

@@ -14,7 +14,6 @@ from scipy.integrate import quad
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.errors import LidarOpsError
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.overlap import SineOverlap
 from lidarops.simulate.pulse import (
     ExponentialPulse,
     GaussianPulse,
@@ -280,7 +279,7 @@ def test_a_long_pulse_over_the_telescope_stays_finite():
         ({"extinction": np.zeros(49)}, "extinction"),
         ({"pulse": RectangularPulse(1e-4)}, "pulse"),
         ({"pulse": None}, "pulse"),
-        ({"full_overlap_range": 0.0}, "overlap"),
+        ({"full_overlap_range": 0.0}, "full_overlap_range"),
         ({"full_overlap_range": -3.0}, "full_overlap_range"),
         ({"bin_width": 0.0}, "bin_width"),
         ({"resolution": 1e-9}, "resolution"),
@@ -317,18 +316,3 @@ def test_impossible_input_is_refused(change, name):
 def test_impossible_pulses_are_refused(make):
     with pytest.raises(SimulationInputError):
         make()
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.floats(50, 800), st.floats(3, 30), st.booleans())
-def test_an_overlap_object_equals_the_built_in_formula(full, width, exponential):
-    # The same overlap by the built-in formula and evaluated from outside.
-    class Outside:
-        def __call__(self, distance):
-            return SineOverlap(full)(distance)
-
-    distance = bin_centres(150, width)
-    pulse = ExponentialPulse(5e-9) if exponential else GaussianPulse(12e-9)
-    inside = _homogeneous(distance, 3e-4, pulse, full_overlap_range=full, bin_width=width)
-    outside = _homogeneous(distance, 3e-4, pulse, overlap=Outside(), bin_width=width)
-    np.testing.assert_allclose(outside, inside, rtol=1e-12, atol=1e-300)

@@ -9,7 +9,7 @@ from support.lags import lag_of
 from lidarops.errors import RetrievalInputError
 from lidarops.raw import licel
 from lidarops.retrieve.signal import lag
-from lidarops.simulate.photoelectrons import delay_recorder, release
+from lidarops.simulate.counting import delay_recorder, release
 
 BINS = 1500
 

@@ -14,7 +14,7 @@ from lidarops.errors import LidarOpsError, RetrievalInputError
 from lidarops.retrieve.air import molecular
 from lidarops.simulate import analog, counting, pulse
 from lidarops.simulate import signal as short
-from lidarops.simulate.photoelectrons import release
+from lidarops.simulate.counting import release
 from support.stiff.cases import (
     Answer,
     Array,
