@@ -17,7 +17,7 @@ import os
 import secrets
 from typing import Final
 
-from lidarops.system.threads import use_one_thread
+from lidarops.system import use_one_thread
 
 if importlib.util.find_spec("prefect") is None:
     raise ImportError(

@@ -24,8 +24,7 @@ from lidarops.netcdf.read import opened_product
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import DetectionMode, Verdicts, is_glued
-from lidarops.system.files import sha256_of, within
-from lidarops.system.output_files import product_paths
+from lidarops.system.files import product_paths, sha256_of, within
 
 FOLDER: Final = "aggregates"
 """Folder of aggregates beside the products."""

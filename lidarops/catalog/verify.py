@@ -12,8 +12,7 @@ from lidarops.catalog import versions
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.records import Role
-from lidarops.system.files import sha256_of
-from lidarops.system.output_files import product_paths
+from lidarops.system.files import product_paths, sha256_of
 
 _UNLISTED: Final = (
     "is not in the ledger: a run makes it again if it is requested; else move it away"

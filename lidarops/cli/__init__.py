@@ -4,7 +4,7 @@ Exit codes: 0 success, 1 something was refused or failed, 2 wrong use.
 """
 
 # ruff: noqa: E402 - the number of threads is set before numpy is loaded
-from lidarops.system.threads import use_one_thread
+from lidarops.system import use_one_thread
 
 use_one_thread()
 

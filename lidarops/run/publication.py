@@ -10,8 +10,7 @@ from typing import Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.system.files import sha256_of
-from lidarops.system.output_files import COPIES, MANIFEST, SITE
+from lidarops.system.files import COPIES, MANIFEST, SITE, sha256_of
 from lidarops.system.stores import Published, RemoteStore
 
 _PUBLISHED: Final = ".."

@@ -31,8 +31,7 @@ from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, settings_digest
 from lidarops.scene import dependence
-from lidarops.system.files import sha256_of
-from lidarops.system.output_files import product_paths
+from lidarops.system.files import product_paths, sha256_of
 
 _BLOCK: Final = 1 << 24
 """Quality flags that are read at a time."""

@@ -40,8 +40,16 @@ from lidarops.site.paths import (
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.values import NO_VALUES, read_values
 from lidarops.system.code_version import pages_version
-from lidarops.system.files import copy_atomically, sha256_of, within, write_atomically
-from lidarops.system.output_files import COPIES, MANIFEST, SITE, product_paths
+from lidarops.system.files import (
+    COPIES,
+    MANIFEST,
+    SITE,
+    copy_atomically,
+    product_paths,
+    sha256_of,
+    within,
+    write_atomically,
+)
 from lidarops.system.processes import end_with_parent
 
 _FORMAT: Final = "lidarops site"

@@ -1,18 +1,23 @@
-"""Versions of code: of what makes a product, for every kind, and of what reads headers."""
+"""Versions of code: of what makes a product, for every kind, and of what reads headers.
+
+A version is a digest of modules with all that they import, which is found without running them.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import entry_points
-from importlib.util import find_spec
+from importlib.util import find_spec, resolve_name
 from pathlib import Path
 from typing import Final
 
+from lidarops.errors import LidarOpsError
 from lidarops.kinds import Kind, kind_of, kinds
 from lidarops.registry import RAW_FORMATS
-from lidarops.system.source_closure import Sources
 
 _EVERY_PRODUCT: Final = (
     "lidarops.scene.processing",
@@ -44,6 +49,17 @@ _WITH_DATA: Final = (
     "lidarops.site",
 )
 """Packages of lidarops whose tables, templates and other data count."""
+_NO_DATA: Final = (".py", ".pyc", ".pyi", ".nbc", ".nbi", "~")
+"""Endings of files beside modules that are no data of them."""
+_NO_STATEMENT: Final = re.compile(r"#[^\n]*|\\\n")
+_FOR_TYPES: Final = re.compile(
+    r"^([ \t]*)if (?:\w+\.)?TYPE_CHECKING:[^\n]*\n(?:\1[ \t]+[^\n]*\n|[ \t]*\n)*", re.MULTILINE
+)
+_IMPORT: Final = re.compile(
+    r"(?:^|[;:])[ \t]*"
+    r"(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n;]+)|import[ \t]+([^\n;]+))",
+    re.MULTILINE,
+)
 
 
 @cache
@@ -106,7 +122,7 @@ def version_of(kind: Kind, sources: Sources, *others: str) -> str:
         Further modules that count.
     """
     own = (f"{kind.package}.{name}" for name in _OF_KIND)
-    modules = (name for name in own if sources.has(name))
+    modules = (name for name in own if sources.path(name))
     return sources.digest((*_EVERY_PRODUCT, *_formats(), kind.package, *modules, *others))
 
 
@@ -150,7 +166,7 @@ def pages_version(sources: Sources | None = None) -> str:
     packages = [kind.package for kind in kinds().values()]
     of_kinds = (f"{package}.{name}" for package in packages for name in _ON_PAGES)
     starts = (_PAGES, *packages, *of_kinds)
-    return sources.digest(name for name in starts if sources.has(name))
+    return sources.digest(name for name in starts if sources.path(name))
 
 
 @cache
@@ -194,3 +210,157 @@ def source_roots() -> dict[str, tuple[Path, ...]]:
 def _formats() -> tuple[str, ...]:
     """Return the modules of raw formats. No import leads to them, and any file may need any."""
     return tuple(point.module for point in entry_points(group=RAW_FORMATS))
+
+
+def imported_modules(source: str) -> tuple[str, ...]:
+    """Return the modules that a source may import, also within functions, but not for types.
+
+    ``from a import b`` gives ``a`` and ``a.b``, because ``b`` may be a module; a relative import
+    begins with its dots. A text that reads like an import counts as one.
+    """
+    statements = _FOR_TYPES.sub("", _NO_STATEMENT.sub(" ", source))
+    found: set[str] = set()
+    for module, names, modules in _IMPORT.findall(statements):
+        dot = "" if module.endswith(".") else "."
+        found |= {module} if module else set()
+        found |= {f"{module}{dot}{name}" for name in _listed(names)}
+        found |= set(_listed(modules))
+    return tuple(sorted(found))
+
+
+def _listed(names: str) -> list[str]:
+    """Return the names in ``a as b, c``, with or without parentheses."""
+    return [words[0] for part in names.strip("() \t\n").split(",") if (words := part.split())]
+
+
+class Sources:
+    """Modules of some packages.
+
+    Parameters
+    ----------
+    roots : mapping of str to sequence of Path
+        Folders of each top-level package, or the file of a top-level module. Modules of others do
+        not count.
+    apart : collection of str
+        Modules and packages that do not count, whoever imports them.
+    with_data : collection of str
+        Packages whose other files, such as tables, count also, if one of their modules counts.
+    """
+
+    def __init__(
+        self,
+        roots: Mapping[str, Sequence[Path]],
+        *,
+        apart: Collection[str] = (),
+        with_data: Collection[str] = (),
+    ) -> None:
+        self._roots = roots
+        self._apart = apart
+        self._with_data = with_data
+        self.path = cache(self._find)
+        """Module -> its file; None where there is no such module."""
+        self._text = cache(_read)
+        self._imports = cache(self._imported)
+
+    def digest(self, starts: Iterable[str]) -> str:
+        """Return a digest of some modules and of all that they import.
+
+        Returns
+        -------
+        str
+            16 hexadecimal digits, which do not depend on where the sources are installed.
+
+        Raises
+        ------
+        LidarOpsError
+            If a source is missing or cannot be read.
+        """
+        files = self.closure(starts)
+        for name, path in list(files.items()):
+            if path.name == "__init__.py" and _within(name, self._with_data):
+                data = ((file.relative_to(path.parent), file) for file in _data(path.parent))
+                files |= {f"{name}:{place.as_posix()}": file for place, file in data}
+        digests = sorted(f"{name}={_digest(self._text(path))}" for name, path in files.items())
+        return hashlib.sha256("\n".join(digests).encode()).hexdigest()[:16]
+
+    def closure(self, starts: Iterable[str]) -> dict[str, Path]:
+        """Return the files of some modules and of all modules that these import.
+
+        A module runs the packages around it, so these count with their own imports.
+
+        Raises
+        ------
+        LidarOpsError
+            If a source is missing or cannot be read.
+        """
+        files: dict[str, Path] = {}
+        waiting: list[str] = []
+        for start in starts:
+            if self.path(start) is None:
+                raise LidarOpsError(
+                    f"the source of {start} is missing",
+                    remedy="install its package with its sources",
+                )
+            waiting += self._run_by(start)
+        while waiting:
+            name = waiting.pop()
+            path = self.path(name)
+            if path is not None and name not in files:
+                files[name] = path
+                waiting += self._imports(name, path)
+        return files
+
+    def _imported(self, module: str, path: Path) -> tuple[str, ...]:
+        """Return the modules that the import of a module runs, but for indirect ones."""
+        package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+        names: dict[str, None] = {}
+        for target in imported_modules(self._text(path)):
+            # A text that only reads like an import may have too many dots.
+            with suppress(ImportError):
+                names |= dict.fromkeys(self._run_by(resolve_name(target, package)))
+        return tuple(names)
+
+    def _run_by(self, target: str) -> Iterator[str]:
+        """Yield the packages around a target of an import and, unless it is a function, itself."""
+        if _within(target, self._roots) and not _within(target, self._apart):
+            parts = target.split(".")
+            names = (".".join(parts[:count]) for count in range(1, len(parts) + 1))
+            yield from (name for name in names if self.path(name) is not None)
+
+    def _find(self, module: str) -> Path | None:
+        root, *names = module.split(".")
+        places = [folder.joinpath(*names) for folder in self._roots.get(root, ())]
+        paths = ((place / "__init__.py", place.with_suffix(".py")) for place in places)
+        return next((path for both in paths for path in both if path.is_file()), None)
+
+
+def _within(name: str, packages: Collection[str]) -> bool:
+    """Return whether a module is one of some packages or modules, or lies in one."""
+    return name in packages or any(name.startswith(f"{package}.") for package in packages)
+
+
+def _data(folder: Path) -> Iterator[Path]:
+    """Yield the files of a package that are no modules, but not those of its subpackages."""
+    for path in folder.iterdir():
+        if path.name.startswith((".", "__pycache__")) or path.name.endswith(_NO_DATA):
+            continue
+        if not path.is_dir():
+            yield path
+        elif not (path / "__init__.py").exists():
+            yield from _data(path)
+
+
+def _read(path: Path) -> str:
+    """Return the bytes of a file as text; line ends depend on the checkout."""
+    try:
+        return path.read_bytes().decode("latin-1").replace("\r\n", "\n")
+    except OSError as error:
+        raise LidarOpsError(
+            f"cannot be read: {error.strerror}",
+            file=path,
+            remedy="mend it, or install its package again",
+        ) from error
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("latin-1")).hexdigest()

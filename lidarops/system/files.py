@@ -1,4 +1,4 @@
-"""Local files: their digest, paths within a folder, and writing that is complete or absent."""
+"""Local files: names in an output folder, digests, and writing that is complete or absent."""
 
 from __future__ import annotations
 
@@ -11,9 +11,16 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Final
 
 from lidarops.errors import ProductError
+
+SITE: Final = "site"
+"""Folder of the site beside the products, also where it is published."""
+MANIFEST: Final = "manifest.json"
+"""File that lists the products of a site. It also identifies a folder as a site."""
+COPIES: Final = "files"
+"""Folder of the site with copies of the products."""
 
 
 def sha256_of(path: Path) -> str:
@@ -54,6 +61,22 @@ def within(folder: Path, path: str) -> Path:
             "is a link that leads out of its folder", file=path, remedy="put the file in its place"
         )
     return file
+
+
+def product_paths(folder: Path) -> list[str]:
+    """List the NetCDF files below a folder, sorted, without hidden files and folders.
+
+    Links to folders are not followed, so that the search ends and stays inside.
+    """
+    paths = []
+    for parent, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        paths += [
+            (Path(parent) / name).relative_to(folder).as_posix()
+            for name in files
+            if name.endswith(".nc") and not name.startswith(".")
+        ]
+    return sorted(paths)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, Generic, Self, TypeVar
 
-from lidarops.system.threads import ONE_THREAD
+from lidarops.system import ONE_THREAD
 
 _BATCHES_AHEAD: Final = 8
 """Batches of items submitted per process."""
@@ -36,11 +36,12 @@ _MMAP_THRESHOLD: Final = (-3, 32 << 20)
 _TRIM_THRESHOLD: Final = (-1, 256 << 20)
 """M_TRIM_THRESHOLD of glibc, and its value in bytes: more than a scene leaves, which the next scene
 needs again."""
-_ENDS_WITH_PARENT: Final = "lidarops.system.ends_with_parent"
-PARENT: Final = "__LIDAROPS_PARENT_PID"
-"""Variable with the id of this process, for that module, which removes it."""
+_PARENT: Final = "__LIDAROPS_PARENT_PID"
+"""Variable with the id of this process, for its server, which loads this module and removes it."""
+_PR_SET_PDEATHSIG: Final = 1
+"""Of prctl on Linux: the signal that a process gets when its parent dies."""
 _LIBRARY_VARIABLES: Final = frozenset(
-    {*ONE_THREAD, PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
+    {*ONE_THREAD, _PARENT, "PYTHONHASHSEED", "__DASK_PARENT_PID", "HDF5_PLUGIN_PATH"}
 )
 """Variables that dask, when it starts workers, netCDF4 and `preload_modules` set here, too."""
 
@@ -62,10 +63,10 @@ def preload_modules(modules: Collection[str]) -> None:
         return
     # The kernel takes the thread that starts a process for its parent; only the main one stays.
     in_main = threading.current_thread() is threading.main_thread()
-    multiprocessing.set_forkserver_preload([*([_ENDS_WITH_PARENT] if in_main else []), *modules])
+    multiprocessing.set_forkserver_preload([*([__name__] if in_main else []), *modules])
     unset = {name: value for name, value in ONE_THREAD.items() if name not in os.environ}
     if in_main:
-        unset[PARENT] = str(os.getpid())
+        unset[_PARENT] = str(os.getpid())
     os.environ.update(unset)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:
@@ -329,3 +330,19 @@ def _run_task(task: Callable[[Any, Item], Result], item: Item) -> Result:
 
 def _run_batch(task: Callable[[Kept, Item], Result], kept: Kept, items: list[Item]) -> list[Result]:
     return [task(kept, item) for item in items]
+
+
+def _die_with(parent: int) -> None:
+    """Let the kernel kill this server of `preload_modules` when its parent is killed.
+
+    While it loads modules, for seconds, it does not see that its parent has gone.
+    """
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        # It was killed before, for which no signal comes.
+        os._exit(1)
+
+
+# Who else imports this module has no parent to end with.
+if _PARENT in os.environ:
+    _die_with(int(os.environ.pop(_PARENT)))

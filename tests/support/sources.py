@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 from lidarops.kinds import kinds
-from lidarops.system.code_version import source_roots, sources_in, version_of
-from lidarops.system.source_closure import Sources
+from lidarops.system.code_version import Sources, source_roots, sources_in, version_of
 
 
 class Copy:

@@ -13,6 +13,7 @@ from lidarops.settings import ChannelProduct
 from lidarops.system import code_version as versions
 from lidarops.system.code_version import (
     _APART,
+    Sources,
     code_version,
     joint_code_version,
     pages_version,
@@ -20,7 +21,6 @@ from lidarops.system.code_version import (
     sources_in,
     version_of,
 )
-from lidarops.system.source_closure import Sources
 
 ALL = set(kinds())
 OWN = sorted(kind.name for kind in kinds().values() if kind.package.startswith("lidarops."))

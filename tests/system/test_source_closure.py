@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lidarops.errors import LidarOpsError
-from lidarops.system.source_closure import Sources, imported_modules
+from lidarops.system.code_version import Sources, imported_modules
 
 PACKAGE: Mapping[str, str] = {
     "__init__.py": "",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarops.system.threads import ONE_THREAD
+from lidarops.system import ONE_THREAD
 
 THREADS = """
 import os, {package}, numpy
