@@ -19,8 +19,8 @@ from benchmarks.harness.timing import in_fresh_process, peak_memory
 from benchmarks.throughput.campaigns import campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
-from lidarops.raw import licel_write
-from lidarops.raw.licel_header import DatasetKind, Laser
+from lidarops.raw import licel
+from lidarops.raw.licel import DatasetKind, Laser
 from lidarops.run import archive
 
 BINS: Final = 16_000
@@ -181,14 +181,14 @@ def write_files(folder: Path, size: float) -> int:
         "shots": _SHOTS,
     }
     kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
-    datasets = [licel_write.new_dataset(kind=kind, **layout) for kind in kinds]
+    datasets = [licel.new_dataset(kind=kind, **layout) for kind in kinds]
     counts = _counts()
     number = round(size * 1e6 / (4 * BINS * len(kinds)))
     dark = max(1, round(_DARK_SHARE * number))
     for index in range(-dark, number):
         start = _DAY + index * _INTERVAL
         name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
-        header = licel_write.new_header(
+        header = licel.new_header(
             name=name,
             site="Here",
             start=start,
@@ -202,7 +202,7 @@ def write_files(folder: Path, size: float) -> int:
         )
         signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
         values = {dataset.name: signal for dataset in header.datasets}
-        (folder / name).write_bytes(licel_write.encode(header, values))
+        (folder / name).write_bytes(licel.encode(header, values))
     return number
 
 

@@ -20,7 +20,7 @@ from benchmarks.harness.study import Chapter, Results, Study
 from benchmarks.harness.timing import least_times
 from lidarops.errors import RawFormatError
 from lidarops.raw.archive import open_archive
-from lidarops.raw.licel import read_header, read_physical, select
+from lidarops.raw.licel import read_counts, read_header, select
 
 _Paths = Sequence[str | os.PathLike[str]]
 _REPEATS: Final = 7
@@ -59,7 +59,7 @@ def measure_readers(effort: Effort, paths: _Paths) -> Study:
     compared = {"header scan": read, "raw to float32": multiply, "archive to float32": multiply}
     calls = floors | {
         "header scan": lambda: [read_header(path) for path in paths],
-        "raw to float32": lambda: read_physical(paths),
+        "raw to float32": lambda: _scale(paths),
         "archive to float32": lambda: _archive(paths),
     }
     times = least_times(calls, effort.repeats or _REPEATS)
@@ -100,6 +100,17 @@ def _multiply(paths: _Paths, channels: list[tuple[int, int, np.float32]]) -> NDA
             counts = np.frombuffer(content, "<i4", bins, offset)
             np.multiply(counts, scale, out=row[start : start + bins], casting="unsafe")
             start += bins
+    return values
+
+
+def _scale(paths: _Paths) -> list[NDArray[np.float32]]:
+    values = []
+    for path in paths:
+        header, counts = read_counts(path)
+        values += [
+            (counts[dataset.name] * dataset.scale).astype(np.float32)
+            for dataset in select(header, counts)
+        ]
     return values
 
 

@@ -11,9 +11,7 @@ The modules in reading order. For every format:
 For Licel files:
 
 6. `licel_header`: bytes to `Header` and `Dataset`.
-7. `licel`: header to counts, counts to physical arrays (mV and MHz). The public functions of the
-   format.
-8. `licel_write`: numbers to header text, counts to bytes.
-9. `licel_format`: the format ``licel`` of the registry.
-10. `backend`: one file as a lazy Dataset, the xarray engine ``licel``.
+7. `licel`: header to counts, and both to bytes. The public functions of the format.
+8. `licel_format`: the format ``licel`` of the registry.
+9. `backend`: one file as a lazy Dataset, the xarray engine ``licel``.
 """

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import raw_format, read_raw_header
-from lidarops.raw.header import RawChannel, RawHeader, Stretches, channel_names, to_physical
-from lidarops.raw.model import Columns, Position, build_raw_dataset
+from lidarops.raw.header import RawChannel, RawHeader, Stretches, to_physical
+from lidarops.raw.model import Position, RawFiles, StatedFile, build_raw_dataset
 from lidarops.raw.recorders import Layout, named_layout, recorder_names
 from lidarops.records import Granule
 
@@ -103,65 +103,69 @@ def open_archive(
     RawFormatError
         If a file cannot be read or is of another format or layout; the error names the file.
     """
-    columns = Columns(channel_names(channels), header_position)
-    stamps = _read_headers(columns, _files(source, root))
-    columns.sort()
-    columns.keep(stretches or {})
-    chunks = _chunks(columns, profiles_per_chunk)
+    stated = _read_headers(_files(source, root), header_position)
+    files = RawFiles(stated, channels, header_position, stretches)
+    chunks = _chunks(files, profiles_per_chunk)
     # Hashing one text is faster than dask's walk over a list of numbers.
-    token = tokenize(repr(stamps), columns.kept)
+    stamps = [(file.path, file.size, file.mtime_ns) for file in stated]
+    token = tokenize(repr(stamps), files.kept)
 
     def signal(index: int, channel: RawChannel) -> da.Array:
-        places = columns.channel_places(index)
-        scales = columns.channel_values(index, "scale") if mask_and_scale else None
-        lengths = tuple(len(files.paths) for _, files in chunks)
-        kept = columns.kept.get(channel.name)
-        name = f"{columns.format}-{channel.name}-{tokenize(token, places, scales, lengths)}"
+        places = files.channel_places(index)
+        scales = files.channel_values(index, "scale") if mask_and_scale else None
+        lengths = tuple(len(chunk) for _, chunk in chunks)
+        kept = files.kept.get(channel.name)
+        name = f"{files.format}-{channel.name}-{tokenize(token, places, scales, lengths)}"
         graph = {}
-        for chunk, (rows, files) in enumerate(chunks):
+        for number, (rows, chunk) in enumerate(chunks):
             scale = None if scales is None else scales[rows]
-            graph[name, chunk, 0] = (_Chunk(files, places[rows], channel.bins, kept, scale),)
+            task = _Chunk(files.format, chunk, places[rows], channel.bins, kept, scale)
+            graph[name, number, 0] = (task,)
         shape = (lengths, (channel.bins,))
         dtype = np.int32 if scales is None else np.float32
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
 
-    return build_raw_dataset(columns, signal, scaled=mask_and_scale)
+    return build_raw_dataset(files, signal, scaled=mask_and_scale)
 
 
 def _read_headers(
-    columns: Columns, files: Mapping[str, Granule | None]
-) -> list[tuple[str, int, int]]:
-    """Fill `columns`; return path, size and modification time of each file.
+    files: Mapping[str, Granule | None], position_order: Position
+) -> list[StatedFile]:
+    """Return the files with their headers, in the same order.
 
     Of granules with equal header digests one header is read, unless the position of the header
     is requested: the catalog may hold another position.
     """
-    stamps = []
-    variants: dict[tuple[str, int, object], int] = {}
-    unnamed: list[RawHeader] = []
+    read: list[StatedFile] = []
+    alike: dict[tuple[object, ...], RawHeader] = {}
     for path, granule in files.items():
-        alike = None
-        if granule is not None and granule.header_digest and columns.position_order == "ignore":
-            alike = granule.header_digest, granule.size, granule.layout
-            if alike in variants:
-                columns.append_alike(granule, path, variants[alike])
-                stamps.append((path, granule.size, granule.mtime_ns))
-                continue
-        with RawFile(path) as file:
-            header = read_raw_header(file, "" if granule is None else granule.format)
-            stamps.append((path, file.size, file.mtime_ns))
-        if granule is None:
-            unnamed.append(header)
+        known = granule if granule and position_order == "ignore" and granule.start else None
+        key = (known.header_digest, known.size, known.layout) if known else ()
+        if known and key in alike:
+            read.append(StatedFile(path, known.size, known.mtime_ns, alike[key], known))
             continue
-        known = columns.position_order == "ignore" and granule.start
-        named = _renamed(header, granule.layout or header.layout)
-        columns.append(named, granule if known else None)
-        if alike == (header.header_digest, header.size, granule.layout):
-            variants[alike] = columns.variant[-1]
+        file = _read_header(path, granule)
+        read.append(replace(file, stated=known) if known else file)
+        digest = file.header.header_digest
+        if known and digest and key == (digest, file.size, known.layout):
+            alike[key] = file.header
+    unnamed = [file.header for file in read if files[file.path] is None]
     names = recorder_names((header.layout, 1, header.start) for header in unnamed)
-    for header in unnamed:
-        columns.append(_renamed(header, named_layout(header.layout, names)))
-    return stamps
+    return [
+        replace(file, header=_renamed(file.header, named_layout(file.header.layout, names)))
+        if files[file.path] is None
+        else file
+        for file in read
+    ]
+
+
+def _read_header(path: str, granule: Granule | None) -> StatedFile:
+    with RawFile(path) as file:
+        header = read_raw_header(file, "" if granule is None else granule.format)
+        stamp = file.size, file.mtime_ns
+    if granule is not None:
+        header = _renamed(header, granule.layout or header.layout)
+    return StatedFile(path, *stamp, header, header)
 
 
 def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
@@ -182,20 +186,13 @@ def _with_names(channels: tuple[RawChannel, ...], layout: Layout) -> tuple[RawCh
 
 
 @dataclass(frozen=True, slots=True)
-class _Files:
-    """The files of one chunk, shared by the tasks of all channels."""
-
-    format: str
-    """Name of their raw format."""
-    paths: tuple[str, ...]
-    sizes: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class _Chunk:
     """Task that reads one channel of the files of one chunk; small, and can be pickled."""
 
-    files: _Files
+    format: str
+    """Name of their raw format."""
+    files: tuple[tuple[str, int], ...]
+    """Path and size of each, shared by the tasks of all channels."""
     places: tuple[tuple[int, ...], ...]
     """Of the channel, for each file."""
     bins: int
@@ -208,9 +205,8 @@ class _Chunk:
         shape = len(self.places), self.bins
         counts = np.empty(shape if self.scales is None else shape[1:], np.dtype("<i4"))
         values = counts if self.scales is None else np.empty(shape, np.float32)
-        read_channel = raw_format(self.files.format).read_channel
-        files = zip(self.files.paths, self.files.sizes, self.places, strict=True)
-        for index, (path, size, places) in enumerate(files):
+        read_channel = raw_format(self.format).read_channel
+        for index, ((path, size), places) in enumerate(zip(self.files, self.places, strict=True)):
             row = counts if self.scales is not None else counts[index]
             with RawFile(path) as file:
                 file.expect(size)
@@ -223,9 +219,12 @@ class _Chunk:
         return values.astype(np.int32 if self.scales is None else np.float32, copy=False)
 
 
-def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]]:
+def _chunks(
+    files: RawFiles, profiles: int | None
+) -> list[tuple[slice, tuple[tuple[str, int], ...]]]:
+    """Return the rows of each chunk, with path and size of its files."""
     if profiles is None:
-        largest = max(channel.bins for channel in columns.selected)
+        largest = max(channel.bins for channel in files.selected)
         profiles = max(1, _CHUNK_BYTES // (4 * largest))
     if profiles < 1:
         raise RawFormatError(
@@ -233,11 +232,9 @@ def _chunks(columns: Columns, profiles: int | None) -> list[tuple[slice, _Files]
             field="profiles_per_chunk",
             remedy="give at least 1",
         )
-    slices = [slice(i, i + profiles) for i in range(0, len(columns.paths), profiles)]
-    return [
-        (rows, _Files(columns.format, tuple(columns.paths[rows]), tuple(columns.sizes[rows])))
-        for rows in slices
-    ]
+    stamps = tuple((file.path, file.size) for file in files.files)
+    slices = [slice(i, i + profiles) for i in range(0, len(stamps), profiles)]
+    return [(rows, stamps[rows]) for rows in slices]
 
 
 def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Granule | None]:

@@ -19,9 +19,9 @@ from xarray.core import indexing
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.file import RawFile
-from lidarops.raw.header import RawChannel, RawHeader, channel_names, to_physical
+from lidarops.raw.header import RawChannel, RawHeader, to_physical
 from lidarops.raw.licel_format import FORMAT
-from lidarops.raw.model import Columns, Position, build_raw_dataset
+from lidarops.raw.model import Position, RawFiles, StatedFile, build_raw_dataset
 
 
 class LicelBackendEntrypoint(BackendEntrypoint):
@@ -62,15 +62,15 @@ class LicelBackendEntrypoint(BackendEntrypoint):
             raise RawFormatError(
                 f"cannot open a {type(filename_or_obj).__name__}", remedy="give a local path"
             )
-        columns = Columns(channel_names(channels), header_position)
         header = licel.read_header(filename_or_obj)
-        columns.append(header)
+        file = StatedFile(header.path, header.size, 0, header, header)
+        files = RawFiles([file], channels, header_position)
 
         def signal(_: int, channel: RawChannel) -> Any:
             lazy = _LazyChannel(header, channel, scaled=mask_and_scale)
             return indexing.LazilyIndexedArray(lazy)
 
-        opened = build_raw_dataset(columns, signal, scaled=mask_and_scale)
+        opened = build_raw_dataset(files, signal, scaled=mask_and_scale)
         dropped = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
         opened = opened.drop_vars(list(dropped), errors="ignore")
         opened.encoding["engine"] = "licel"

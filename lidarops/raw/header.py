@@ -214,12 +214,6 @@ def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:
     return tuple(dict.fromkeys([channels] if isinstance(channels, str) else channels))
 
 
-def select_channels(header: RawHeader, names: tuple[str, ...] | None) -> tuple[RawChannel, ...]:
-    """Return the channels of these names; all in file order for None. Errors as `chosen`."""
-    stored = {channel.name: channel for channel in header.channels}
-    return chosen(stored, tuple(stored) if names is None else names, header.path)
-
-
 def chosen(stored: Mapping[str, _Channel], names: Sequence[str], file: str) -> tuple[_Channel, ...]:
     """Return the channels of these names, in their order.
 
@@ -237,32 +231,6 @@ def chosen(stored: Mapping[str, _Channel], names: Sequence[str], file: str) -> t
             remedy=f"stored: {', '.join(stored) or 'none'}",
         )
     return tuple(stored[name] for name in names)
-
-
-def check_layout(path: str, channels: Sequence[RawChannel], expected: Sequence[RawChannel]) -> None:
-    """Raise if channels of a file differ from the `expected` ones in range grid or ADC bits.
-
-    Raises
-    ------
-    RawFormatError
-        Naming file and channels.
-    """
-    if channels is expected:
-        return
-    grid, expected_grid = _grids(channels), _grids(expected)
-    if grid == expected_grid:
-        return
-    differing = sorted({name for name, *_ in grid ^ expected_grid})
-    raise RawFormatError(
-        "is of another layout (channels, bins, bin width or ADC bits) than the files before it",
-        file=path,
-        field=", ".join(differing),
-        remedy="open files of one layout, or choose channels that are equal in all files",
-    )
-
-
-def _grids(channels: Sequence[RawChannel]) -> set[tuple[str, int, float, int]]:
-    return {(c.name, c.bins, c.bin_width, c.adc_bits) for c in channels}
 
 
 def to_physical(counts: NDArray[np.int32], scale: float, out: NDArray[Any]) -> None:

@@ -1,37 +1,35 @@
-"""Licel raw files: bytes to header and arrays (numpy and the standard library only).
+"""Licel raw files: bytes to header and counts, and back (numpy and the standard library only).
 
 After the header (`lidarops.raw.licel_header`) a file holds, for each stored dataset, its bins as
 little-endian 32-bit counts followed by CRLF (`licel2023`). CRLF also occurs inside the data, so
 datasets are located by offset. The CRLF after a dataset is checked when the dataset is read.
 
 Reading
-    `read_header` (header only), `parse_header` (the same from bytes), `read_counts` (one file),
-    `read_physical` (many files of one layout, in mV and MHz).
+    `read_header` (header only), `parse_header` (the same from bytes), `read_counts` (one file).
+    Physical values of many files: `lidarops.open_archive`.
 Writing
     `new_dataset` and `new_header` build a `Dataset` and a `Header` from numbers,
     ``encode(header, counts)`` returns the bytes of a file, ``write(path, header, counts)`` writes
-    it (`lidarops.raw.licel_write`). A `Header` always agrees with its text: it is built or
-    parsed, never edited.
+    it. As from Licel instruments, every header line starts with a blank, has its values separated
+    by single blanks, is padded to 78 characters and ends in CRLF. A `Header` always agrees with its
+    text: it is built or parsed, never edited.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
-from typing import Any
+import secrets
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
-from lidarops.raw.header import (
-    HeaderOrder,
-    channel_names,
-    check_layout,
-    chosen,
-    to_physical,
-)
+from lidarops.raw.header import HeaderOrder, channel_names, chosen
 from lidarops.raw.licel_header import (
     CONVENTION,
     Dataset,
@@ -39,14 +37,8 @@ from lidarops.raw.licel_header import (
     Header,
     Laser,
     ScanGrid,
+    parse_dataset,
     parse_header,
-)
-from lidarops.raw.licel_write import (
-    encode,
-    format_header,
-    new_dataset,
-    new_header,
-    write,
 )
 
 __all__ = [
@@ -64,17 +56,20 @@ __all__ = [
     "parse_header",
     "read_counts",
     "read_header",
-    "read_physical",
     "select",
-    "select_signals",
     "write",
 ]
 
 Counts = NDArray[np.int32]
 PathLike = str | os.PathLike[str]
+Dialect = Literal["classic", "extended", "raymetrics"]
 
-_COUNTS = np.dtype("<i4")
-_MOST_ROWS = 256  # of one vectored read; systems allow 1024 buffers, two per row
+_COUNTS: Final = np.dtype("<i4")
+_MOST_ROWS: Final = 256
+"""Rows of one vectored read; systems allow 1024 buffers, two per row."""
+_LINE: Final = 78
+_INT32: Final = np.iinfo(np.int32)
+_ICE_POINT: Final = 273.15
 
 
 def _header(file: RawFile) -> Header:
@@ -156,26 +151,6 @@ def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Datas
     return chosen(stored, signals if names is None else names, header.path)
 
 
-def select_signals(header: Header, channels: Iterable[str] | None = None) -> tuple[Dataset, ...]:
-    """Return the signal channels of these names, as `select`.
-
-    Raises
-    ------
-    RawFormatError
-        As `select`, and if a dataset is not a signal.
-    """
-    datasets = select(header, channels)
-    for dataset in datasets:
-        if dataset.mode is None:
-            raise RawFormatError(
-                f"{dataset.name} is not a signal: it has no physical values",
-                file=header.path,
-                field="channels",
-                remedy="read it with licel.read_counts",
-            )
-    return datasets
-
-
 def read_counts(
     path: PathLike, channels: Iterable[str] | None = None, *, bins: int | None = None
 ) -> tuple[Header, dict[str, Counts]]:
@@ -222,71 +197,359 @@ def _read_rows(file: RawFile, datasets: Sequence[Dataset], rows: Sequence[Counts
     read_datasets(file, _offset(datasets[start]), rows[start:])
 
 
-def read_physical(
-    paths: Sequence[PathLike],
-    channels: Iterable[str] | None = None,
-    *,
-    dtype: DTypeLike = np.float32,
-) -> tuple[tuple[Header, ...], dict[str, NDArray[Any]]]:
-    """Read many files of one layout, and return physical values.
-
-    Parameters
-    ----------
-    paths : sequence of path or str
-    channels : iterable of str, optional
-        As in `select`.
-    dtype : dtype
-        Of the values; scaling is done in double precision.
-
-    Returns
-    -------
-    tuple of Header
-        In the order of `paths`.
-    dict of str to array (file, bin)
-        mV for analog channels, MHz for photon counting (`CONVENTION`). NaN without shots.
-
-    Raises
-    ------
-    RawFormatError
-        If a file cannot be read, or has another layout than the first; the error names it.
-    """
-    names = channel_names(channels)
-    headers: list[Header] = []
-    first: tuple[Dataset, ...] = ()
-    datasets: tuple[Dataset, ...] = ()
-    values: list[NDArray[Any]] = []
-    for index, path in enumerate(paths):
-        with RawFile(path) as file:
-            header = _header(file)
-            # Files with equal dataset lines share the parsed datasets, so the selection holds.
-            if not headers or header.datasets is not headers[-1].datasets:
-                datasets = select_signals(header, names)
-                scales = [dataset.scale for dataset in datasets]
-            if not headers:
-                first = datasets
-                values, rows = _allocate(first, len(paths), dtype)
-            check_layout(header.path, datasets, first)
-            _read_rows(file, datasets, rows)
-        for row, scale, block in zip(rows, scales, values, strict=True):
-            to_physical(row, scale, block[index])
-        headers.append(header)
-    return tuple(headers), {d.name: block for d, block in zip(first, values, strict=True)}
-
-
-def _allocate(
-    datasets: tuple[Dataset, ...], files: int, dtype: DTypeLike
-) -> tuple[list[NDArray[Any]], list[Counts]]:
-    # One large block, because the system maps it in huge pages.
-    total = np.empty(files * sum(dataset.bins for dataset in datasets), dtype)
-    values, start = [], 0
-    for dataset in datasets:
-        stop = start + files * dataset.bins
-        values.append(total[start:stop].reshape(files, dataset.bins))
-        start = stop
-    return values, [np.empty(dataset.bins, _COUNTS) for dataset in datasets]
-
-
 def _offset(dataset: Dataset) -> int:
     if dataset.offset is None:
         raise RawFormatError("is not stored", field=dataset.name)
     return dataset.offset
+
+
+def new_dataset(
+    *,
+    kind: DatasetKind = DatasetKind.ANALOG,
+    wavelength: float,
+    bins: int,
+    bin_width: float,
+    shots: int,
+    polarisation: str = "o",
+    laser: int = 1,
+    high_voltage: float = 0.0,
+    adc_bits: int = 12,
+    input_range: float = 0.5,
+    discriminator: float = 3.1746e-3,
+    device: str | None = None,
+    active: bool = True,
+    laser_polarisation: int = 1,
+    bin_shift: float = 0.0,
+    comment: str = "",
+) -> Dataset:
+    """Build a dataset line from numbers.
+
+    Parameters
+    ----------
+    kind : DatasetKind
+        ``DatasetKind.ANALOG`` or ``DatasetKind.PHOTON`` for a signal channel.
+    wavelength : float
+        m; written in whole nm (5.32e-5 gives the mistyped ``53200.o`` of some files).
+    bins : int
+    bin_width : float
+        m; must fit into four characters, such as 7.5 or 15.
+    shots : int
+    polarisation : str
+        o, p, s, r or l.
+    laser, laser_polarisation : int
+    high_voltage : float
+        V; written in whole volts.
+    adc_bits : int
+        Written as 0 for photon counting.
+    input_range : float
+        V, analog; in whole millivolts.
+    discriminator : float
+        V, photon counting; written in mV with four decimals.
+    device : str, optional
+        By default ``BT0`` (analog) or ``BC0`` (photon counting).
+    active : bool
+    bin_shift : float
+        Bins; written with three decimals.
+    comment : str
+
+    Returns
+    -------
+    Dataset
+        With `offset` 0; a header sets its offset and unique name.
+
+    Raises
+    ------
+    RawFormatError
+        If a number does not fit the format.
+    """
+    analog = kind in {DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED}
+    thousandths = round(bin_shift * 1000)
+    tokens = [
+        f"{active:d}",
+        f"{kind:d}",
+        f"{laser:d}",
+        f"{bins:05d}",
+        f"{laser_polarisation:d}",
+        f"{high_voltage:04.0f}",
+        _four_characters(bin_width, "bin width"),
+        f"{round(wavelength * 1e9):05d}.{polarisation}",
+        "0 0",
+        f"{thousandths // 1000:02d}",
+        f"{thousandths % 1000:03d}",
+        f"{adc_bits if analog else 0:02d}",
+        f"{shots:06d}",
+        f"{input_range:.3f}" if analog else f"{discriminator * 1e3:.4f}",
+        device or ("BT0" if analog else "BC0"),
+        comment,
+    ]
+    dataset = parse_dataset(_line(*tokens))
+    _compare("device", tokens[-2], dataset.device)
+    if analog:
+        _compare("input range", round(input_range, 9), dataset.input_range)
+    return dataset
+
+
+def new_header(
+    *,
+    name: str,
+    site: str,
+    start: datetime,
+    stop: datetime,
+    altitude: float,
+    longitude: float,
+    latitude: float,
+    datasets: Sequence[Dataset],
+    lasers: Sequence[Laser],
+    zenith_angle: float = 0.0,
+    azimuth: float | None = None,
+    temperature: float | None = None,
+    pressure: float | None = None,
+    custom: str | None = None,
+    timestamp: int | None = None,
+    scan: ScanGrid | None = None,
+    dialect: Dialect | None = None,
+) -> Header:
+    """Build a header from numbers.
+
+    Parameters
+    ----------
+    name : str
+        File name for line 1.
+    site : str
+    start, stop : datetime
+        Aware; written in UTC, in whole seconds.
+    altitude : float
+        m; written in whole metres.
+    longitude, latitude : float
+        degree; one decimal, four in a scan of Raymetrics, or six in the extended dialect.
+    datasets : sequence of Dataset
+        From `new_dataset` or a parsed header.
+    lasers : sequence of Laser
+        Two or three: shots and repetition rate in Hz.
+    zenith_angle : float
+        degree; whole degrees except in the extended dialect. Raymetrics writes -90 for vertical,
+        and in a scan the elevation, negative upwards, with one decimal.
+    azimuth : float, optional
+        degree; makes the dialect extended, unless a scan is given; both need it.
+    temperature, pressure : float, optional
+        K and Pa; make the dialect raymetrics, which needs both.
+    custom : str, optional
+        Quoted text; makes the dialect extended.
+    timestamp : int, optional
+        Timestamp of the controller; needs three lasers.
+    scan : ScanGrid, optional
+        Grid of a scan of Raymetrics; needs temperature and pressure.
+    dialect : {"classic", "extended", "raymetrics"}, optional
+        By default the one that the given values need.
+
+    Returns
+    -------
+    Header
+        As parsed from its text: rounded as written, with offsets, names and promised size.
+
+    Raises
+    ------
+    RawFormatError
+        If a number does not fit the dialect.
+    """
+    dialect = dialect or _dialect(azimuth, temperature, pressure, custom)
+    if scan is not None and dialect != "raymetrics":
+        raise RawFormatError("needs the raymetrics dialect", field="grid of the scan")
+    angles = (zenith_angle, azimuth)
+    place = [
+        f"{altitude:04.0f}",
+        *_coordinates(dialect, longitude, latitude, scan=scan is not None),
+        *(_angles(dialect, *angles) if scan is None else _scan_angles(*angles)),
+        *_weather(dialect, temperature, pressure),
+        *([] if custom is None else [f'"{custom}"']),
+    ]
+    text = b"".join(
+        [
+            _line(name),
+            _line(
+                site if dialect == "raymetrics" else f"{site:<8}",
+                _utc(start, "start"),
+                _utc(stop, "stop"),
+                *place,
+            ),
+            *([] if scan is None else [_scan_line(scan)]),
+            _line(*_laser_tokens(lasers, len(datasets), timestamp)),
+            *(dataset.line for dataset in datasets),
+            b"\r\n",
+        ]
+    )
+    size = len(text) + sum(4 * dataset.bins + 2 for dataset in datasets if dataset.active)
+    header = parse_header(text, file=name, size=size)
+    _compare("site", site.strip(), header.site)
+    _compare("custom text", custom, header.custom)
+    _compare("grid of the scan", scan, header.scan)
+    _compare("zenith angle", round(zenith_angle, 6), header.zenith_as_written)
+    _compare("datasets", len(datasets), len(header.datasets))
+    return header
+
+
+def format_header(header: Header) -> bytes:
+    """Return the header as bytes, as read or as built by `new_header`.
+
+    Raises
+    ------
+    RawFormatError
+        If a field was changed after the header was made and contradicts the text.
+    """
+    if parse_header(header.source, file=header.path, size=header.size) != header:
+        raise RawFormatError(
+            "the fields contradict the text of the header",
+            file=header.path,
+            remedy="build a changed header with new_header",
+        )
+    return header.source
+
+
+def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return the bytes of a file.
+
+    Parameters
+    ----------
+    header : Header
+    counts : mapping of str to integer array (bins,)
+        By name, for every stored dataset of `header`.
+
+    Raises
+    ------
+    RawFormatError
+        If counts are missing, surplus, of a wrong shape or type, or exceed 32 bits.
+    """
+    stored = [dataset for dataset in header.datasets if dataset.places]
+    surplus = set(counts) - {dataset.name for dataset in stored}
+    if surplus:
+        raise RawFormatError(f"not stored by the header: {', '.join(sorted(surplus))}")
+    parts = [format_header(header)]
+    for dataset in stored:
+        parts += [_counts(dataset, counts).tobytes(), b"\r\n"]
+    # The size of a header read from a file without its last CRLF excludes the CRLF.
+    return b"".join(parts)[: header.size]
+
+
+def write(path: str | os.PathLike[str], header: Header, counts: Mapping[str, NDArray[Any]]) -> None:
+    """Write a file as a whole, or not at all.
+
+    Raises
+    ------
+    RawFormatError
+        As `encode`.
+    """
+    target = Path(path)
+    content = encode(header, counts)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _counts(dataset: Dataset, counts: Mapping[str, NDArray[Any]]) -> NDArray[np.int32]:
+    if dataset.name not in counts:
+        raise RawFormatError("no counts are given", field=dataset.name)
+    values = np.asarray(counts[dataset.name])
+    if values.shape != (dataset.bins,) or values.dtype.kind not in "iu":
+        raise RawFormatError(
+            f"counts are {values.dtype} of shape {values.shape}, not integers of shape"
+            f" ({dataset.bins},)",
+            field=dataset.name,
+        )
+    if values.min() < _INT32.min or values.max() > _INT32.max:
+        raise RawFormatError("counts exceed 32 bits", field=dataset.name)
+    return values.astype("<i4")
+
+
+def _line(*tokens: str) -> bytes:
+    text = " " + " ".join(token for token in tokens if token)
+    if not text.isprintable():
+        raise RawFormatError(f"{text!r} holds a character that ends lines or does not print")
+    try:
+        return text.ljust(_LINE).encode("latin-1") + b"\r\n"
+    except UnicodeEncodeError:
+        raise RawFormatError(f"{text!r} is not Latin-1 text") from None
+
+
+def _four_characters(value: float, name: str) -> str:
+    text = f"{value:.2f}"[:4] if value < 100 else f"{value:04.0f}"
+    if not np.isclose(float(text), value, rtol=1e-12, atol=0):
+        raise RawFormatError(f"{value:g} cannot be written in four characters", field=name)
+    return text
+
+
+def _dialect(
+    azimuth: float | None, temperature: float | None, pressure: float | None, custom: str | None
+) -> Dialect:
+    if temperature is not None or pressure is not None:
+        return "raymetrics"
+    return "classic" if azimuth is None and custom is None else "extended"
+
+
+def _coordinates(dialect: Dialect, *degrees: float, scan: bool) -> list[str]:
+    if scan:
+        return [f"{value:.4f}" for value in degrees]
+    if dialect == "extended":
+        return [f"{value:011.6f}" for value in degrees]
+    return [f"{value:06.1f}" for value in degrees]
+
+
+def _angles(dialect: Dialect, zenith: float, azimuth: float | None) -> list[str]:
+    if dialect != "extended":
+        if azimuth is not None:
+            raise RawFormatError("needs the extended dialect", field="azimuth")
+        # Raymetrics writes a number without meaning behind the zenith angle.
+        return [f"{zenith:02.0f}", *(["00"] if dialect == "raymetrics" else [])]
+    if azimuth is None:
+        raise RawFormatError("the extended dialect needs one", field="azimuth")
+    return [f"{zenith:04.1f}", f"{azimuth:04.1f}"]
+
+
+def _scan_angles(elevation: float, azimuth: float | None) -> list[str]:
+    if azimuth is None:
+        raise RawFormatError("a scan needs one", field="azimuth")
+    return [f"{elevation:.1f}", f"{azimuth:.1f}"]
+
+
+def _scan_line(scan: ScanGrid) -> bytes:
+    azimuth = f"{scan.azimuth_start:04.1f} {scan.azimuth_stop:05.1f} {scan.azimuth_step:04.1f}"
+    first, last = f"{scan.elevation_start:04.1f}", f"{scan.elevation_stop:05.1f}"
+    elevation = f"{first} {last} {scan.elevation_step:04.1f}"
+    return _line(azimuth, f" {elevation}", f" {scan.azimuth_offset:04.1f}")
+
+
+def _weather(dialect: Dialect, temperature: float | None, pressure: float | None) -> list[str]:
+    if dialect != "raymetrics":
+        if temperature is not None or pressure is not None:
+            raise RawFormatError("needs the raymetrics dialect", field="temperature and pressure")
+        return []
+    if temperature is None or pressure is None:
+        raise RawFormatError("the raymetrics dialect needs both", field="temperature and pressure")
+    return [f"{temperature - _ICE_POINT:.1f}", f"{pressure / 100:.1f}"]
+
+
+def _laser_tokens(lasers: Sequence[Laser], datasets: int, timestamp: int | None) -> list[str]:
+    if len(lasers) not in {2, 3} or (timestamp is not None and len(lasers) == 2):
+        raise RawFormatError("two or three are needed, three with a timestamp", field="lasers")
+    pairs = [f"{laser.shots:07d} {laser.repetition_rate:04.0f}" for laser in lasers]
+    reserved = ["0000000 0000"] if len(lasers) == 3 else []
+    last = [] if timestamp is None else [f"{timestamp:d}"]
+    return [*pairs[:2], f"{datasets:02d}", *pairs[2:], *reserved, *last]
+
+
+def _utc(moment: datetime, name: str) -> str:
+    if moment.tzinfo is None or moment.microsecond:
+        raise RawFormatError("must be aware, in whole seconds", field=name)
+    return f"{moment.astimezone(UTC):%d/%m/%Y %H:%M:%S}"
+
+
+def _compare(name: str, requested: object, written: object) -> None:
+    if requested != written:
+        raise RawFormatError(
+            f"{requested!r} cannot be written: it reads as {written!r}", field=name
+        )

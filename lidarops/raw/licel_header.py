@@ -118,7 +118,7 @@ class Laser(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset(RawChannel):
-    """One dataset line of a header, from the parser or `licel_write.new_dataset`.
+    """One dataset line of a header, from the parser or `licel.new_dataset`.
 
     Its name is unique in its header: ``analog_532o``, ``photon_355p``, ``analog_532o_2``. Its
     places are the bytes at which counts start.
@@ -176,7 +176,7 @@ def _scale(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header(RawHeader):
-    """Header of a Licel file, from the parser or `licel_write.new_header`.
+    """Header of a Licel file, from the parser or `licel.new_header`.
 
     Times are by the clock of the instrument, taken as UTC; a stop that is not later than the start
     as written follows from shots and repetition rate.

@@ -16,11 +16,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from itertools import pairwise
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
@@ -28,13 +28,11 @@ from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import raw_format
-from lidarops.raw.header import RawChannel, RawHeader, Stretches, check_layout, select_channels
+from lidarops.raw.header import RawChannel, RawHeader, Stretches, channel_names, chosen
 from lidarops.raw.recorders import POLARISATIONS
-from lidarops.records import Granule, Header
+from lidarops.records import Header
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]
-
-POSITIONS: Final = ("longitude_first", "latitude_first", "ignore")
 
 _EPOCH = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
 _MICROSECOND = timedelta(microseconds=1)
@@ -60,186 +58,153 @@ _PROPERTIES: Mapping[str, _Property] = {
 }
 
 
-@dataclass(slots=True)
-class Columns:
-    """Header values of many files of one format and layout, one column per property."""
+@dataclass(frozen=True, slots=True)
+class StatedFile:
+    """A raw file, its header, and what is stated of it in place of the header."""
 
-    channels: tuple[str, ...] | None
-    """Names to open; None for all."""
-    position_order: Position
-    format: str = ""
-    """Name of the raw format; empty without files."""
-    paths: list[str] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
-    times: list[tuple[int, int]] = field(default_factory=list)
-    """Start and stop in ns since 1970."""
-    places: list[tuple[float, ...]] = field(default_factory=list)
-    """Latitude, longitude, altitude, zenith angle, azimuth; NaN if unknown."""
-    sites: set[str] = field(default_factory=set)
-    notes: set[str] = field(default_factory=set)
-    variants: dict[tuple[RawChannel, ...], tuple[int, tuple[RawChannel, ...]]] = field(
-        default_factory=dict
-    )
-    """All channels of a header -> number of the variant, selected channels."""
-    variant: list[int] = field(default_factory=list)
-    kept: dict[str, Stretches] = field(default_factory=dict)
-    """Stretches of the channels of which some bins are left out."""
+    path: str
+    size: int
+    mtime_ns: int
+    header: RawHeader
+    """Of this file, or of one with the same site and channels."""
+    stated: Header
+    """The header of this file, or a granule, which supplies times, altitude and pointing."""
 
-    def __post_init__(self) -> None:
-        if self.position_order not in POSITIONS:
-            raise RawFormatError(
-                f"{self.position_order!r} is unknown",
-                field="header_position",
-                remedy=f"choose one of {', '.join(POSITIONS)}",
-            )
 
-    def append(self, header: RawHeader, granule: Granule | None = None) -> None:
-        """Add a file.
+class RawFiles:
+    """Files of one format and layout, by start, then path, and the channels to open.
 
-        Parameters
-        ----------
-        header : RawHeader
-        granule : Granule, optional
-            Supplies times, altitude and pointing in place of the header.
+    Parameters
+    ----------
+    files : sequence of StatedFile
+        The first one gives the layout.
+    channels : iterable of str, optional
+        Names to open; by default all signal channels.
+    position_order : {"longitude_first", "latitude_first", "ignore"}
+    stretches : mapping of str to tuple of (int, int), optional
+        By channel, the stretches of bins to keep.
 
-        Raises
-        ------
-        RawFormatError
-            If the file is of another format than the first file, lacks a channel, has it on
-            another range grid than the first file, or has an impossible position.
-        """
-        if header.format != self.format:
-            self._start_format(header)
-        if header.channels not in self.variants:
-            selected = select_channels(header, self.channels)
-            check_layout(header.path, selected, self.selected if self.variants else selected)
-            ordered = sorted(selected, key=lambda channel: self._rank(channel.name))
-            self.variants[header.channels] = (len(self.variants), tuple(ordered))
-        variant = self.variants[header.channels][0]
-        position = None
-        if self.position_order != "ignore":
-            position = header.position(self.position_order)
-        self.sites.add(header.site)
-        if granule is not None:
-            self.append_alike(granule, header.path, variant)
-            return
-        self.notes.update((header.doubt,) if header.doubt else ())
-        self._add(header, header.path, header.size, variant, position)
+    Raises
+    ------
+    RawFormatError
+        If a file is of another format than the first file, lacks a channel, has it on another range
+        grid than the first file, or has an impossible position, or if stretches do not ascend.
+    """
 
-    def _start_format(self, header: RawHeader) -> None:
-        if self.format:
-            raise RawFormatError(
-                f"is of raw format {header.format}, the files before it of {self.format}",
-                file=header.path,
-                remedy="open files of one format",
-            )
-        self.format = header.format
-
-    def append_alike(self, granule: Granule, path: str, variant: int) -> None:
-        """Add a file whose header has the site and channels of another file.
-
-        Parameters
-        ----------
-        granule : Granule
-            The other values of the header; its position is ignored.
-        path : str
-            Path of the file.
-        variant : int
-            Number of the variant of the other file.
-        """
-        self._add(granule, path, granule.size, variant)
-
-    def _add(
+    def __init__(
         self,
-        header: Header,
-        path: str,
-        size: int,
-        variant: int,
-        position: tuple[float, float] | None = None,
+        files: Sequence[StatedFile],
+        channels: Iterable[str] | None,
+        position_order: Position,
+        stretches: Mapping[str, Stretches] | None = None,
     ) -> None:
-        if header.start is None or header.stop is None:
-            raise RawFormatError("has no start or stop in the catalog", file=path, field="start")
-        self.paths.append(path)
-        self.sizes.append(size)
-        start, stop = (
-            1000 * ((moment - _EPOCH) // _MICROSECOND) for moment in (header.start, header.stop)
-        )
-        self.times.append((start, stop))
-        stated = (header.altitude, header.zenith_angle, header.azimuth)
-        self.places.append(
-            (
-                *(position or (math.nan, math.nan)),
-                *(math.nan if value is None else value for value in stated),
+        if position_order not in get_args(Position):
+            raise RawFormatError(
+                f"{position_order!r} is unknown",
+                field="header_position",
+                remedy=f"choose one of {', '.join(get_args(Position))}",
             )
-        )
-        self.notes.update(header.notes)
-        self.variant.append(variant)
+        names = channel_names(channels)
+        self.format = files[0].header.format
+        """Name of the raw format."""
+        self.position_order = position_order
+        variants: dict[tuple[RawChannel, ...], int] = {}
+        self._variants: list[tuple[RawChannel, ...]] = []
+        """Selected channels of the files with the same ones; those of the first file first."""
+        variant_of = {}
+        for file in files:
+            header = file.header
+            if header.format != self.format:
+                raise RawFormatError(
+                    f"is of raw format {header.format}, the files before it of {self.format}",
+                    file=header.path,
+                    remedy="open files of one format",
+                )
+            variant = variants.setdefault(header.channels, len(variants))
+            if variant == len(self._variants):
+                self._variants.append(self._select(header, names))
+            variant_of[file.path] = variant
+        self.kept = _kept(stretches or {}, self.selected)
+        """Stretches of the channels of which some bins are left out."""
+        if self.kept:
+            self._variants = [
+                tuple(replace(c, bins=count_bins(self.stretches(c))) for c in selected)
+                for selected in self._variants
+            ]
+        times = {file.path: _interval(file) for file in files}
+        self.files = sorted(files, key=lambda file: (times[file.path][0], file.path))
+        self.times = np.array([times[file.path] for file in self.files], dtype=np.int64)
+        """Start and stop in ns since 1970, shape (files, 2)."""
+        self._variant = [variant_of[file.path] for file in self.files]
+
+    def _select(self, header: RawHeader, names: tuple[str, ...] | None) -> tuple[RawChannel, ...]:
+        """Return the requested channels of a header, in the order of the first file."""
+        stored = {channel.name: channel for channel in header.channels}
+        found = chosen(stored, tuple(stored) if names is None else names, header.path)
+        if not self._variants:
+            return found
+        differing = {name for name, *_ in _grids_of(found) ^ _grids_of(self.selected)}
+        if differing:
+            raise RawFormatError(
+                "is of another layout (channels, bins, bin width or ADC bits) than the files"
+                " before it",
+                file=header.path,
+                field=", ".join(sorted(differing)),
+                remedy="open files of one layout, or choose channels that are equal in all files",
+            )
+        return tuple(stored[channel.name] for channel in self.selected)
 
     @property
     def selected(self) -> tuple[RawChannel, ...]:
         """Selected channels of the first file."""
-        return next(iter(self.variants.values()))[1]
+        return self._variants[0]
 
     def channel_values(self, channel: int, name: str) -> NDArray[Any]:
         """Return a property of selected channel number `channel`, one value per file."""
-        by_variant = [getattr(selected[channel], name) for _, selected in self.variants.values()]
-        return np.array(by_variant)[self.variant]
+        return np.array([getattr(c[channel], name) for c in self._variants])[self._variant]
 
     def channel_places(self, channel: int) -> tuple[tuple[int, ...], ...]:
         """Return where each file holds the counts of selected channel number `channel`."""
-        by_variant = [selected[channel].places for _, selected in self.variants.values()]
-        return tuple(by_variant[variant] for variant in self.variant)
-
-    def sort(self) -> None:
-        """Order the files by start, then path."""
-        order = sorted(range(len(self.paths)), key=lambda i: (self.times[i][0], self.paths[i]))
-        for name in ("paths", "sizes", "times", "places", "variant"):
-            values = getattr(self, name)
-            setattr(self, name, [values[index] for index in order])
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the selected channels."""
-        return tuple(channel.name for channel in self.selected)
-
-    def keep(self, stretches: Mapping[str, Stretches]) -> None:
-        """Keep only some bins of these channels.
-
-        Raises
-        ------
-        RawFormatError
-            If a channel is not opened, or its stretches do not ascend.
-        """
-        stored = {channel.name: channel.bins for channel in self.selected}
-        for name, requested in stretches.items():
-            edges = [edge for stretch in requested for edge in stretch]
-            ascending = all(low < high for low, high in pairwise(edges))
-            if not (ascending and edges and 0 <= edges[0] < stored.get(name, 0)):
-                raise RawFormatError(
-                    f"bins {list(requested)} of {name} cannot be kept",
-                    field="stretches",
-                    remedy=f"give ascending stretches of bins (first, past) of {', '.join(stored)}",
-                )
-            clipped = [(first, min(past, stored[name])) for first, past in requested]
-            self.kept[name] = tuple(stretch for stretch in clipped if stretch[0] < stretch[1])
-            if self.kept[name] == ((0, stored[name]),):
-                del self.kept[name]
-        self.variants = {
-            channels: (
-                number,
-                tuple(replace(c, bins=count_bins(self.stretches(c))) for c in selected),
-            )
-            for channels, (number, selected) in self.variants.items()
-        }
+        return tuple(self._variants[variant][channel].places for variant in self._variant)
 
     def stretches(self, channel: RawChannel) -> Stretches:
         """Return the kept stretches of bins of a selected channel."""
         return self.kept.get(channel.name, ((0, channel.bins),))
 
-    def _rank(self, name: str) -> int:
-        if not self.variants:
-            return 0
-        return next(i for i, channel in enumerate(self.selected) if channel.name == name)
+
+def _grids_of(channels: Iterable[RawChannel]) -> set[tuple[str, int, float, int]]:
+    return {(c.name, c.bins, c.bin_width, c.adc_bits) for c in channels}
+
+
+def _interval(file: StatedFile) -> tuple[int, int]:
+    """Return start and stop in ns since 1970."""
+    start, stop = file.stated.start, file.stated.stop
+    if start is None or stop is None:
+        raise RawFormatError("has no start or stop in the catalog", file=file.path, field="start")
+    return (
+        1000 * ((start - _EPOCH) // _MICROSECOND),
+        1000 * ((stop - _EPOCH) // _MICROSECOND),
+    )
+
+
+def _kept(
+    stretches: Mapping[str, Stretches], selected: Sequence[RawChannel]
+) -> dict[str, Stretches]:
+    """Return the stretches within the channels, without those of whole channels."""
+    stored = {channel.name: channel.bins for channel in selected}
+    kept = {}
+    for name, requested in stretches.items():
+        edges = [edge for stretch in requested for edge in stretch]
+        ascending = all(low < high for low, high in pairwise(edges))
+        if not (ascending and edges and 0 <= edges[0] < stored.get(name, 0)):
+            raise RawFormatError(
+                f"bins {list(requested)} of {name} cannot be kept",
+                field="stretches",
+                remedy=f"give ascending stretches of bins (first, past) of {', '.join(stored)}",
+            )
+        clipped = [(first, min(past, stored[name])) for first, past in requested]
+        kept[name] = tuple(stretch for stretch in clipped if stretch[0] < stretch[1])
+    return {name: held for name, held in kept.items() if held != ((0, stored[name]),)}
 
 
 def count_bins(stretches: Stretches) -> int:
@@ -251,55 +216,58 @@ Signal = Callable[[int, RawChannel], Any]
 """Number of a channel, the channel in the first file -> array (time, range), lazy or not."""
 
 
-def build_raw_dataset(columns: Columns, signal: Signal, *, scaled: bool) -> xr.Dataset:
-    """Return the Dataset of the files in `columns`.
+def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Dataset:
+    """Return the Dataset of the files in `files`.
 
     Parameters
     ----------
-    columns : Columns
+    files : RawFiles
     signal : callable
         Returns the array of a channel.
     scaled : bool
         Whether `signal` returns physical values or counts.
     """
-    grids = _grids(columns)
+    grids = _grids(files)
+    stated = [file.stated for file in files.files]
+    notes = {note for header in stated for note in header.notes}
+    notes |= {header.doubt for header in stated if isinstance(header, RawHeader)} - {""}
     variables: dict[str, xr.Variable] = {}
-    for index, channel in enumerate(columns.selected):
-        dims = ("time", grids[columns.stretches(channel), channel.bin_width])
-        extra, attributes = _channel_properties(columns, index, scaled=scaled)
+    for index, channel in enumerate(files.selected):
+        dims = ("time", grids[files.stretches(channel), channel.bin_width])
+        extra, attributes = _channel_properties(files, index, scaled=scaled)
         variables[channel.name] = xr.Variable(dims, signal(index, channel), attributes)
         variables.update(extra)
     return xr.Dataset(
         variables,
-        {**_time(columns), **_ranges(grids), **_place(columns)},
+        {**_time(files), **_ranges(grids), **_place(files)},
         {
-            "source_format": raw_format(columns.format).title,
-            "site": ", ".join(sorted(columns.sites)),
-            **({"notes": "; ".join(sorted(columns.notes))} if columns.notes else {}),
+            "source_format": raw_format(files.format).title,
+            "site": ", ".join(sorted({file.header.site for file in files.files})),
+            **({"notes": "; ".join(sorted(notes))} if notes else {}),
         },
     )
 
 
-def _grids(columns: Columns) -> dict[tuple[Stretches, float], str]:
+def _grids(files: RawFiles) -> dict[tuple[Stretches, float], str]:
     # The most common grid is "range"; the others follow in file order.
-    uses = Counter((columns.stretches(c), c.bin_width) for c in columns.selected)
+    uses = Counter((files.stretches(c), c.bin_width) for c in files.selected)
     ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
     return {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
 
 
 def _channel_properties(
-    columns: Columns, index: int, *, scaled: bool
+    files: RawFiles, index: int, *, scaled: bool
 ) -> tuple[dict[str, xr.Variable], dict[str, Any]]:
-    channel = columns.selected[index]
+    channel = files.selected[index]
     attributes = {
         **_attributes(channel, scaled=scaled),
-        "conversion": raw_format(columns.format).conversion,
+        "conversion": raw_format(files.format).conversion,
         "device": channel.device,
-        **_full_scale(columns, index, scaled=scaled),
+        **_full_scale(files, index, scaled=scaled),
     }
     variables = {}
     for name, prop in _PROPERTIES.items():
-        values = columns.channel_values(index, name)
+        values = files.channel_values(index, name)
         # Of type object where a file lacks the property.
         if values.dtype == object or (name == "scale" and scaled):
             continue
@@ -317,16 +285,16 @@ def _channel_properties(
     return variables, attributes
 
 
-def _full_scale(columns: Columns, index: int, *, scaled: bool) -> dict[str, float]:
-    channel = columns.selected[index]
+def _full_scale(files: RawFiles, index: int, *, scaled: bool) -> dict[str, float]:
+    channel = files.selected[index]
     if channel.input_range is None:
         return {}
     if scaled:
         # In the precision of the signal, so saturated values compare equal.
-        nominal = columns.channel_values(index, "input_range") * 1e3 * (1 - 0.5**channel.adc_bits)
+        nominal = files.channel_values(index, "input_range") * 1e3 * (1 - 0.5**channel.adc_bits)
         values = nominal.astype(np.float32)
     else:
-        values = columns.channel_values(index, "full_scale")
+        values = files.channel_values(index, "full_scale")
     return {"full_scale": values[0].item()} if _is_constant(values) else {}
 
 
@@ -351,8 +319,8 @@ def _attributes(channel: RawChannel, *, scaled: bool) -> dict[str, Any]:
     }
 
 
-def _time(columns: Columns) -> dict[str, xr.Variable]:
-    bounds = np.array(columns.times, dtype=np.int64)
+def _time(files: RawFiles) -> dict[str, xr.Variable]:
+    bounds = files.times
     middle = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     return {
         "time": xr.Variable(
@@ -379,8 +347,11 @@ def _ranges(grids: Mapping[tuple[Stretches, float], str]) -> dict[str, xr.Variab
     }
 
 
-def _place(columns: Columns) -> dict[str, xr.Variable]:
-    latitude, longitude, altitude, zenith, azimuth = np.array(columns.places).T
+def _place(files: RawFiles) -> dict[str, xr.Variable]:
+    stated = [file.stated for file in files.files]
+    pointings = [(header.altitude, header.zenith_angle, header.azimuth) for header in stated]
+    # None becomes NaN.
+    altitude, zenith, azimuth = np.array(pointings, dtype=np.float64).T
     place = {
         "zenith_angle": xr.Variable(
             ("time",),
@@ -398,7 +369,10 @@ def _place(columns: Columns) -> dict[str, xr.Variable]:
             azimuth,
             {"units": "degree", "long_name": "azimuth of the beam, clockwise from north"},
         )
-    if columns.position_order != "ignore":
+    if files.position_order != "ignore":
+        order = files.position_order
+        positions = [file.header.position(order) or (math.nan, math.nan) for file in files.files]
+        latitude, longitude = np.array(positions).T
         place["latitude"] = _constant(
             latitude, {"units": "degrees_north", "standard_name": "latitude"}
         )

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
+from support.physical import read_physical
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
@@ -196,7 +197,7 @@ def test_only_the_needed_bins_are_read(data_root, reads):
 )
 def test_lazy_indexing_is_numpy_indexing(data_root, key):
     path = data_root / "pilar/20241002/h24A0217.301035"
-    _, values = licel.read_physical([path])
+    _, values = read_physical([path])
     lazy = xr.open_dataset(path, engine="licel", cache=False).analog_355s
     np.testing.assert_array_equal(lazy[key].values, values["analog_355s"][key])
 

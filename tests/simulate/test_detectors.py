@@ -13,8 +13,7 @@ from pydantic import ValidationError
 from lidarops.campaign.simulated_instrument import AnalogRecorder, LaserDrift
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.analog import digitise
-from lidarops.simulate.counting import count_photons
-from lidarops.simulate.counting import delay_recorder, release
+from lidarops.simulate.counting import count_photons, delay_recorder, release
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 BIN_WIDTH = 7.5

@@ -51,7 +51,10 @@ def test_raman_light_is_attenuated_at_both_wavelengths():
     np.testing.assert_allclose(raman / elastic, np.exp(1e-4 * distance), rtol=1e-12)
     np.testing.assert_allclose(
         elastic,
-        1e12 * sine_overlap(distance, 200.0) / distance**2 * np.exp(-2 * optical_depth(distance, out)),
+        1e12
+        * sine_overlap(distance, 200.0)
+        / distance**2
+        * np.exp(-2 * optical_depth(distance, out)),
         rtol=1e-12,
     )
 

@@ -6,9 +6,9 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
+from support.physical import read_physical
 
 from lidarops.errors import RetrievalInputError
-from lidarops.raw import licel
 from lidarops.retrieve.signal.dark import DarkSignals
 
 HOUR = 3600.0
@@ -139,7 +139,7 @@ def test_impossible_arguments_are_refused(change, field):
 
 
 def _channel(folder, name):
-    headers, values = licel.read_physical(sorted(folder.iterdir()), [name], dtype=np.float64)
+    headers, values = read_physical(sorted(folder.iterdir()), [name], dtype=np.float64)
     middles = [(h.start + timedelta(seconds=30)).timestamp() for h in headers]
     return values[name], np.array(middles)
 

@@ -7,9 +7,9 @@ import pytest
 from scipy import optimize
 from support.lags import lag_of
 from support.oracles import signal as oracle
+from support.physical import read_physical
 
 from lidarops.errors import RetrievalInputError
-from lidarops.raw import licel
 from lidarops.retrieve.signal import lag
 from lidarops.retrieve.signal.counts_to_signal import difference_variance
 from lidarops.retrieve.signal.gluing import glue
@@ -240,8 +240,8 @@ def test_a_real_station_is_glued_after_lag_correction(data_root, wavelength):
     folder = data_root / "saopaulo" / "20170928"
     names = [f"analog_{wavelength}o", f"photon_{wavelength}o"]
     files, darks = (sorted((folder / kind).iterdir()) for kind in ("signals", "dark"))
-    analog, photon = licel.read_physical(files, names, dtype=np.float64)[1].values()
-    dark = licel.read_physical(darks, names[:1], dtype=np.float64)[1][names[0]]
+    analog, photon = read_physical(files, names, dtype=np.float64)[1].values()
+    dark = read_physical(darks, names[:1], dtype=np.float64)[1][names[0]]
     range_ = (np.arange(4000) + 0.5) * 7.5
     clean = analog - dark.mean(axis=0)
     sky = photon[:, 3500:3950].mean(axis=1)

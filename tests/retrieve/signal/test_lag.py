@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.lags import lag_of
+from support.physical import read_physical
 
 from lidarops.errors import RetrievalInputError
-from lidarops.raw import licel
 from lidarops.retrieve.signal import lag
 from lidarops.simulate.counting import delay_recorder, release
 
@@ -125,7 +125,7 @@ def test_a_real_station(data_root):
     """Sao Paulo 532 nm: headers say 0."""
     files = sorted((data_root / "saopaulo" / "20170928" / "signals").iterdir())
     names = ["analog_532o", "photon_532o"]
-    headers, values = licel.read_physical(files, names, dtype=np.float64)
+    headers, values = read_physical(files, names, dtype=np.float64)
     assert {d.bin_shift for d in headers[0].channels if d.name in names} == {0.0}
     estimate = lag_of(*(values[name] for name in names))
     assert estimate.significant
