@@ -8,17 +8,7 @@ from lidarops.system import use_one_thread
 
 use_one_thread()
 
-from lidarops.cli import aggregate, archive, files, init, ledger, plan, preparation, site
+from lidarops.cli import archive, files, ledger, many, plan, preparation
 from lidarops.cli.app import app
 
-__all__ = [
-    "aggregate",
-    "app",
-    "archive",
-    "files",
-    "init",
-    "ledger",
-    "plan",
-    "preparation",
-    "site",
-]
+__all__ = ["app", "archive", "files", "ledger", "many", "plan", "preparation"]

@@ -1,4 +1,4 @@
-"""The typer application, the options that commands share, and their output."""
+"""The typer application; the options that commands share, what they mean, and their output."""
 
 from __future__ import annotations
 
@@ -7,18 +7,24 @@ import os
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, ParamSpec
 
 import typer
 
 from lidarops.errors import LidarOpsError
 from lidarops.figures.wording import visible
+from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from lidarops.campaign.model import Campaign
+    from lidarops.records import Findings
+    from lidarops.run.selection import Selection
 
 
 app = typer.Typer(
@@ -68,6 +74,18 @@ WaitOption = Annotated[
     float,
     typer.Option("--wait", min=0, help="Seconds to wait for another run on the same catalog."),
 ]
+
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, max=256, help="Number of processes.")
+]
+AllStepsOption = Annotated[
+    bool,
+    typer.Option(
+        "--all-steps", help="Run every step, even those without effect, and read files in full."
+    ),
+]
+
+NO_SCENE: Final = "nothing to do: the selection contains no scene of the archive"
 
 _P = ParamSpec("_P")
 
@@ -247,14 +265,12 @@ def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]])
     if not cells:
         return
     # As the title of the table it would fold at the width of the table.
-    for line in wrapped(title, ""):
-        say(line)
+    say_wrapped(title, "")
     widths = _column_widths(names, cells, terminal_width())
     if widths is None:
         for row in cells:
             for name, cell in zip(names, row, strict=True):
-                for line in wrapped(f"{name}: {cell}" if name else cell, "  "):
-                    say(line)
+                say_wrapped(f"{name}: {cell}" if name else cell, "  ")
             say("")
         return
     from rich.table import Table
@@ -290,6 +306,12 @@ def wrapped(text: str, indent: str) -> list[str]:
     )
 
 
+def say_wrapped(text: str, indent: str) -> None:
+    """Print a text whose lines fold between words only."""
+    for line in wrapped(text, indent):
+        say(line)
+
+
 def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list[int] | None:
     """Return widths of columns that break no word; None if these do not fit in a line."""
     columns = [list(column) for column in zip(names, *cells, strict=True)]
@@ -313,3 +335,87 @@ def bench() -> None:
         remedy="in a checkout, run: python -m benchmarks",
         wrong_use=True,
     )
+
+
+def loaded_campaign(
+    campaign: Path,
+    archive: str | None,
+    out: str | None,
+    catalog: str | None,
+    *,
+    all_steps: bool = False,
+) -> Campaign:
+    """Return the campaign of a file, with the places that options override."""
+    from lidarops.campaign.model import load_campaign
+    from lidarops.catalog.access import check_archive_and_catalog
+
+    settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
+    check_archive_and_catalog(settings, archive=archive)
+    return settings.model_copy(update={"all_steps": all_steps or settings.all_steps})
+
+
+def selection_of(
+    instruments: list[str] | None,
+    stations: list[str] | None,
+    products: list[str] | None,
+    since: datetime | None,
+    until: datetime | None,
+) -> Selection:
+    """Return the selection that options describe; refuse an unknown kind of product."""
+    from lidarops.run.selection import Selection
+
+    for name in products or ():
+        if name not in kinds():
+            raise typer.BadParameter(
+                f"{name!r} is not a kind of product; the kinds are {', '.join(kinds())}"
+            )
+    return Selection(
+        stations=tuple(stations or ()),
+        instruments=tuple(instruments or ()),
+        kinds=tuple(products or ()),
+        since=utc(since),
+        until=utc(until),
+    )
+
+
+def findings_document(findings: Findings) -> dict[str, Any]:
+    """Return the findings as plain JSON types."""
+    return {
+        "not_in_files": [
+            {**asdict(request), "nowhere": request.nowhere} for request in findings.unmet
+        ],
+        "patterns_without_file": [asdict(idle) for idle in findings.idle_patterns],
+        "file_notes": [asdict(note) for note in findings.file_notes],
+        "unusable_files": [asdict(unusable) for unusable in findings.unusable_files],
+        "incomplete_facts": [asdict(facts) for facts in findings.incomplete_facts],
+        "unused_facts": [asdict(idle) for idle in findings.idle_facts],
+        "lost_files": [asdict(lost) for lost in findings.lost_files],
+        "never_made": [asdict(unmade) for unmade in findings.unmade],
+    }
+
+
+def show_findings(findings: Findings) -> None:
+    """Print the findings as tables."""
+    from lidarops.reports.findings import finding_rows, lacking
+
+    columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
+    unmet = (
+        (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
+        for unmet in findings.unmet
+    )
+    show_rows("Requested, but not in the files", columns, unmet)
+    columns = ("instrument", "what", "finding")
+    for title, fails in (
+        ("The archive is not what the campaign states", True),
+        ("Notes on files and products", False),
+    ):
+        rows = [row for row in finding_rows(findings) if row.fails is fails]
+        show_rows(title, columns, ((row.instrument, row.subject, row.problem) for row in rows))
+
+
+def never_made(findings: Findings) -> str:
+    """Return the requested products that no scene gives, for the end of a line."""
+    from lidarops.reports.findings import unmade_words
+
+    names = ", ".join(unmade_words(findings))
+    return f"; requested, but made in no scene: {names}" if names else ""

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidarops.cli.app import (
+    NO_SCENE,
+    AllStepsOption,
     ArchiveOption,
     CampaignFile,
     CatalogOption,
@@ -22,21 +24,25 @@ from lidarops.cli.app import (
     StationOption,
     UntilOption,
     WaitOption,
+    WorkersOption,
     command,
     exit_with_status,
+    findings_document,
     from_here,
+    loaded_campaign,
+    never_made,
     progress_bar,
     say,
+    selection_of,
     show_error,
+    show_findings,
     show_rows,
 )
-from lidarops.cli.findings import findings_document, never_made, show_findings
 from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
-from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
 from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterator
     from contextlib import AbstractContextManager
 
     from distributed import Client
@@ -76,7 +82,7 @@ def catalog(
     archive: ArchiveOption = None,
     out: OutOption = None,
     catalog: CatalogOption = None,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
+    workers: WorkersOption = 1,
     wait: WaitOption = 0.0,
     rebuild: Annotated[
         bool,
@@ -312,8 +318,7 @@ def _show_refused(refused: list[Granule]) -> None:
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
-    record = result.record
-    scenes = () if record is None else record.scenes
+    record, scenes = result.record, _scenes(result)
     return {
         "run": None if record is None else record.id,
         "status": result.status.value,
@@ -389,21 +394,35 @@ def _refused(campaign: Campaign, result: Result) -> list[Granule]:
 
 
 def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removing: bool) -> None:
-    scenes = () if result.record is None else result.record.scenes
-    columns = ("scene", "kind", "channel", "values", "good", "care", "reject", "flags")
+    from lidarops.reports.findings import disagreement_rows, scene_note_rows
+
+    scenes = _scenes(result)
+    columns: tuple[str, ...] = (
+        "scene",
+        "kind",
+        "channel",
+        "values",
+        "good",
+        "care",
+        "reject",
+        "flags",
+    )
     show_rows("Products", columns, (row for scene in scenes for row in _product_rows(scene)))
     _show_changes(result)
     refused = _refused(campaign, result)
     _show_refused(refused)
     _show_unused(result, {granule.path for granule in refused})
     show_findings(result.findings)
-    _show_disagreements(scenes)
-    _show_scene_notes(scenes)
+    for title, where, found in (
+        ("Channels that disagree", "channels", disagreement_rows(scenes)),
+        ("Not found in the data", "in", scene_note_rows(scenes)),
+    ):
+        rows = ((row.instrument, row.subject, row.problem) for row in found)
+        show_rows(title, ("instrument", where, "finding"), rows)
     if not removing:
         _show_orphans(result, None)
     kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
-    title = "Requested products that could not be made again (kept)"
-    show_rows(title, ("file", "reason"), kept)
+    show_rows("Requested products that could not be made again (kept)", ("file", "reason"), kept)
     _show_scenes_with_problems(result)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
@@ -422,20 +441,6 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         say(f"nothing to do: {state}{never_made(result.findings)}")
 
 
-def _show_disagreements(scenes: Iterable[SceneOutcome]) -> None:
-    from lidarops.reports.findings import disagreement_rows
-
-    rows = ((row.instrument, row.subject, row.problem) for row in disagreement_rows(scenes))
-    show_rows("Channels that disagree", ("instrument", "channels", "finding"), rows)
-
-
-def _show_scene_notes(scenes: Iterable[SceneOutcome]) -> None:
-    from lidarops.reports.findings import scene_note_rows
-
-    rows = ((row.instrument, row.subject, row.problem) for row in scene_note_rows(scenes))
-    show_rows("Not found in the data", ("instrument", "in", "finding"), rows)
-
-
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
     for product in scene.products:
         flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
@@ -449,10 +454,9 @@ def _show_changes(result: Result) -> None:
     """Print how products differ from those that they replace, and frozen ones that would."""
     from lidarops.figures.wording import change_in_words
 
-    scenes = () if result.record is None else result.record.scenes
     rows = (
         (product.path, change.grade.value, change_in_words(change), "; ".join(change.causes))
-        for scene in scenes
+        for scene in _scenes(result)
         for product in scene.products
         for change in [product.change]
         if change is not None
@@ -492,5 +496,9 @@ def _show_scenes_with_problems(result: Result) -> None:
     )
 
 
+def _scenes(result: Result) -> tuple[SceneOutcome, ...]:
+    return () if result.record is None else result.record.scenes
+
+
 def _processed_scenes(result: Result) -> set[str]:
-    return {scene.scene for scene in (() if result.record is None else result.record.scenes)}
+    return {scene.scene for scene in _scenes(result)}

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from lidarops.cli.app import JsonOption, command, exit_with_status, say, show
+from lidarops.cli.app import JsonOption, WorkersOption, command, exit_with_status, say, show
 
 
 @command()
@@ -17,7 +17,7 @@ def report(
     run: Annotated[
         Path, typer.Argument(help="Report folder of a run, or its run.json.", metavar="RUN")
     ],
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
+    workers: WorkersOption = 1,
 ) -> None:
     """Build the HTML report of a run and its figures again.
 

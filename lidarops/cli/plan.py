@@ -1,15 +1,21 @@
-"""The command that shows scenes, their plans, and what is stale."""
+"""The command that shows scenes, their plans, and what is stale.
+
+By default a screen of text for each scene, whose words stay whole; with --all tables of all steps.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from lidarops.cli.app import (
+    NO_SCENE,
+    AllStepsOption,
     ArchiveOption,
     CampaignFile,
     CatalogOption,
@@ -23,13 +29,16 @@ from lidarops.cli.app import (
     WaitOption,
     command,
     exit_with_status,
+    findings_document,
+    loaded_campaign,
     say,
+    say_wrapped,
+    selection_of,
+    show_findings,
     show_rows,
-    wrapped,
 )
-from lidarops.cli.findings import findings_document, show_findings
-from lidarops.cli.plan_summary import grouped, scene_title, show_count, show_refused, show_scene
-from lidarops.cli.selection import NO_SCENE, AllStepsOption, loaded_campaign, selection_of
+from lidarops.figures.wording import counted
+from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
@@ -37,6 +46,10 @@ if TYPE_CHECKING:
     from lidarops.run.archive import EarlierProblems
     from lidarops.run.selection import Selection
     from lidarops.run.staleness import Judgement
+
+
+_REASONS: Final = 3
+"""Reasons of refused files that fit on the screen."""
 
 
 @command("plan")
@@ -121,7 +134,7 @@ def _plan(
         if everything:
             _show_all(judged, needs, plan=not stale)
         else:
-            show_scene(judged, needs, plan=not stale)
+            _show_scene(judged, needs, plan=not stale)
         _show_kept(judged)
     no_scene = not count and selects_no_scene(settings, selection)
     if as_json:
@@ -139,20 +152,19 @@ def _plan(
     else:
         if no_scene:
             say(NO_SCENE)
-        show_refused([granule.reason for granule in refused])
+        _show_refused([granule.reason for granule in refused])
         show_findings(findings)
         if settings.metadata.lacking:
             names = ", ".join(settings.metadata.lacking)
-            for line in wrapped(f"metadata of the campaign: products will lack {names}", ""):
-                say(line)
+            say_wrapped(f"metadata of the campaign: products will lack {names}", "")
         _show_earlier(earlier)
         # With --stale, fresh scenes are not judged.
-        show_count(to_be_made, None if stale else count)
+        _show_count(to_be_made, None if stale else count)
     exit_with_status(failed=failed or bool(refused) or any(earlier) or findings.failed)
 
 
 def _show_all(judged: Judgement, needs: str, *, plan: bool) -> None:
-    title = f"{scene_title(judged)}, {needs}"
+    title = f"{_scene_title(judged)}, {needs}"
     if plan:
         _show_plan(title, judged.requested)
     _show_stale(title, judged)
@@ -161,12 +173,12 @@ def _show_all(judged: Judgement, needs: str, *, plan: bool) -> None:
 def _show_plan(title: str, plan: Plan) -> None:
     """Print the steps of a plan, and what it leaves out; equal lines of channels are one."""
     columns = ("step", "channels", "what, and why")
-    steps = grouped(
+    steps = _grouped(
         (step.name, _words(_effect(step, plan), step, needs), step.channel)
         for step, needs in zip(plan.steps, _needs(plan), strict=True)
     )
     show_rows(f"{title}, plan {plan.hash[:12]}", columns, steps)
-    left_out = grouped((left.name, _words("", left, ""), left.channel) for left in plan.left_out)
+    left_out = _grouped((left.name, _words("", left, ""), left.channel) for left in plan.left_out)
     show_rows("Left out", columns, left_out)
 
 
@@ -231,7 +243,7 @@ def _show_earlier(earlier: EarlierProblems) -> None:
 
 def _show_stale(title: str, judged: Judgement) -> None:
     rows = list(
-        grouped((product.kind, product.reason, product.channel) for product in judged.stale)
+        _grouped((product.kind, product.reason, product.channel) for product in judged.stale)
     )
     if judged.failure:
         unchanged = "not tried again, because nothing has changed: " if judged.held else ""
@@ -275,3 +287,108 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         "failure": asdict(judged.failure) if judged.failure else None,
         "held": judged.held,
     }
+
+
+def _scene_title(judged: Judgement) -> str:
+    """Return the name of a scene with its numbers of files."""
+    scene = judged.scene
+    return f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+
+
+def _show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
+    """Print a scene: what is to be made and why, its steps, and what is left out.
+
+    Parameters
+    ----------
+    judged : Judgement
+    needs : str
+        Memory.
+    plan : bool
+        Whether steps are shown; a scene without anything to be made is left out otherwise.
+    """
+    stale = list(
+        _grouped((product.kind, product.reason, product.channel) for product in judged.stale)
+    )
+    if not plan and not stale and not judged.failure:
+        return
+    say_wrapped(f"{_scene_title(judged)}, plan {judged.requested.hash[:12]}", "")
+    say_wrapped(needs, "  ")
+    say_wrapped("to be made:" if stale else "to be made: nothing", "  ")
+    for kind, channels, reason in stale:
+        say_wrapped(f"{kind} {channels}: {reason}", "    ")
+    if judged.failure:
+        held = "; not tried again, because nothing has changed" if judged.held else ""
+        say_wrapped(f"failed before{held}: {judged.failure.error}", "  ")
+    if plan:
+        _say_steps(judged.requested)
+
+
+def _say_steps(plan: Plan) -> None:
+    from lidarops.scene.case import REQUEST
+    from lidarops.scene.channels import READ_STEP
+
+    names = dict.fromkeys(step.name for step in plan.steps)
+    if names:
+        say_wrapped(f"steps: {', '.join(names)}", "  ")
+    missed = [left for left in plan.left_out if left.name in kinds() and left.rule != REQUEST]
+    for name, channels, reason in _grouped(
+        (left.name, left.reason, left.channel) for left in missed
+    ):
+        say_wrapped(f"requested, but left out: {name} {channels}: {reason}", "  ")
+    for channels, reason in _unread(plan, {left.channel for left in missed}):
+        say_wrapped(f"without product: {channels}: {reason}", "  ")
+    warned = [step for step in plan.steps if step.warning]
+    for name, channels, warning in _grouped(
+        (step.name, step.warning, step.channel) for step in warned
+    ):
+        say_wrapped(f"warning: {name} {channels}: {warning}", "  ")
+    shown = {*kinds(), READ_STEP}
+    others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
+    if others:
+        say_wrapped(f"left out, of some channels: {', '.join(others)}", "  ")
+
+
+def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
+    """Yield channels that the campaign names and that are not read, with the reason.
+
+    Without those of which a product is shown as left out.
+    """
+    from lidarops.scene.case import REQUEST
+    from lidarops.scene.channels import READ_STEP
+
+    unread = (
+        left
+        for left in plan.left_out
+        if left.name == READ_STEP and left.rule != REQUEST and left.channel not in told
+    )
+    for _, channels, reason in _grouped((left.name, left.reason, left.channel) for left in unread):
+        yield channels, reason
+
+
+def _show_refused(reasons: Sequence[str]) -> None:
+    """Print the number of refused files, and of each reason."""
+    if not reasons:
+        return
+    say_wrapped(f"{counted(len(reasons), 'file')} refused (lidarops catalog names them):", "")
+    frequent = Counter(reasons).most_common(_REASONS)
+    for reason, count in frequent:
+        say_wrapped(f"{counted(count, 'file')}: {reason}", "  ")
+    rest = len(reasons) - sum(count for _, count in frequent)
+    if rest:
+        say_wrapped(f"{counted(rest, 'file')}: other reasons", "  ")
+
+
+def _show_count(stale: int, scenes: int | None) -> None:
+    """Print how many scenes are stale, of how many if all were judged, and how to see more."""
+    say_wrapped(f"{counted(stale, 'stale scene')}{'' if scenes is None else f' of {scenes}'}", "")
+    say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
+
+
+def _grouped(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    """Yield name, channels and text for lines of name, text and channel, _grouped by name."""
+    channels: dict[str, dict[str, dict[str, None]]] = {}
+    for name, text, channel in lines:
+        channels.setdefault(name, {}).setdefault(text, {})[channel] = None
+    for name, texts in channels.items():
+        for text, names in texts.items():
+            yield name, ", ".join(filter(None, names)), text

@@ -12,7 +12,6 @@ from support.archives.aggregate_archive import add_day
 from typer.testing import CliRunner
 
 from lidarops.aggregate import need
-from lidarops.cli import aggregate as _command  # noqa: F401  # registers the command
 from lidarops.cli import app
 from lidarops.errors import LidarOpsError
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.catalog.verify import verify_archive
-from lidarops.cli import aggregate, app, files, site  # noqa: F401  # registers the commands
+from lidarops.cli import app
 from lidarops.netcdf import read
 from lidarops.netcdf.comparison import compare_products
 from lidarops.records import Grade
