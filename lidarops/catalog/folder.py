@@ -22,8 +22,7 @@ from lidarops.catalog.sources import (
 )
 from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import parse_raw_header
-from lidarops.raw.header import HeaderPointing, RawHeader
-from lidarops.raw.recorders import named_layout, recorder_names
+from lidarops.raw.header import HeaderPointing, RawHeader, named_layout, recorder_names
 from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line

@@ -16,7 +16,7 @@ import sqlalchemy as sa
 from lidarops.catalog.database import Database
 from lidarops.catalog.rows import NO_NOTES, GranuleRow, day_of, naive
 from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
-from lidarops.raw.recorders import Names, recorder_names
+from lidarops.raw.header import Names, recorder_names
 from lidarops.records import ChannelLayout, DetectionMode, FileNote, Granule, Holding, Role, Status
 
 _C = GRANULE.c

@@ -19,7 +19,7 @@ from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import product_id, writing_time
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
-from lidarops.raw.recorders import POLARISATIONS, label_of
+from lidarops.raw.header import POLARISATIONS, label_of
 from lidarops.records import (
     GLUED,
     DetectionMode,

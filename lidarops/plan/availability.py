@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.raw.recorders import label_of
+from lidarops.raw.header import label_of
 from lidarops.records import ChannelLayout, FactsNote, Holding, LeftOut, Unmet, is_glued
 from lidarops.scene.channels import (
     ABSENT,

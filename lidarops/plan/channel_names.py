@@ -11,7 +11,7 @@ from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
 from lidarops.catalog.store import Store
 from lidarops.plan.availability import validity_edges
 from lidarops.plan.outlying_headers import joined_notes
-from lidarops.raw.recorders import Layout, named_layout, recorder_names
+from lidarops.raw.header import Layout, named_layout, recorder_names
 from lidarops.records import FileNote, Granule
 
 _ROUNDING_OF_WAVELENGTHS: Final = 1e-9

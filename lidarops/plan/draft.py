@@ -21,8 +21,7 @@ from lidarops.catalog.folder import (
 )
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
-from lidarops.raw.header import POINTING_NOTE, HeaderOrder
-from lidarops.raw.recorders import label_of
+from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
 from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.scene.channels import file_channels

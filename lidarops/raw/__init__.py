@@ -11,7 +11,7 @@ The modules in reading order. For every format:
 For Licel files:
 
 6. `licel_header`: bytes to `Header` and `Dataset`.
-7. `licel`: header to counts, and both to bytes. The public functions of the format.
-8. `licel_format`: the format ``licel`` of the registry.
+7. `licel_format`: header to counts, the format ``licel`` of the registry.
+8. `licel`: header and counts of a file, and both to bytes. The public functions of the format.
 9. `backend`: one file as a lazy Dataset, the xarray engine ``licel``.
 """

@@ -28,9 +28,16 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import raw_format, read_raw_header
-from lidarops.raw.header import RawChannel, RawHeader, Stretches, to_physical
+from lidarops.raw.header import (
+    Layout,
+    RawChannel,
+    RawHeader,
+    Stretches,
+    named_layout,
+    recorder_names,
+    to_physical,
+)
 from lidarops.raw.model import Position, RawFiles, StatedFile, build_raw_dataset
-from lidarops.raw.recorders import Layout, named_layout, recorder_names
 from lidarops.records import Granule
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]

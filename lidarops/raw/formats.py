@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
+from lidarops.kinds import RAW_FORMATS, by_name, registered
 from lidarops.raw.file import RawFile
 from lidarops.raw.header import RawHeader, Stretches, holds_text
 from lidarops.records import UNKNOWN_FORMAT
-from lidarops.registry import RAW_FORMATS, by_name, registered
 
 _INT32: Final = np.iinfo(np.int32)
 

@@ -1,9 +1,5 @@
 """Licel raw files: bytes to header and counts, and back (numpy and the standard library only).
 
-After the header (`lidarops.raw.licel_header`) a file holds, for each stored dataset, its bins as
-little-endian 32-bit counts followed by CRLF (`licel2023`). CRLF also occurs inside the data, so
-datasets are located by offset. The CRLF after a dataset is checked when the dataset is read.
-
 Reading
     `read_header` (header only), `parse_header` (the same from bytes), `read_counts` (one file).
     Physical values of many files: `lidarops.open_archive`.
@@ -30,6 +26,7 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.file import RawFile
 from lidarops.raw.header import HeaderOrder, channel_names, chosen
+from lidarops.raw.licel_format import COUNTS, Counts, read_datasets
 from lidarops.raw.licel_header import (
     CONVENTION,
     Dataset,
@@ -60,11 +57,9 @@ __all__ = [
     "write",
 ]
 
-Counts = NDArray[np.int32]
 PathLike = str | os.PathLike[str]
 Dialect = Literal["classic", "extended", "raymetrics"]
 
-_COUNTS: Final = np.dtype("<i4")
 _MOST_ROWS: Final = 256
 """Rows of one vectored read; systems allow 1024 buffers, two per row."""
 _LINE: Final = 78
@@ -74,48 +69,6 @@ _ICE_POINT: Final = 273.15
 
 def _header(file: RawFile) -> Header:
     return file.read_header(lambda head: parse_header(head, file=file.path, size=file.size))
-
-
-def read_datasets(file: RawFile, offset: int, rows: Sequence[Counts]) -> None:
-    """Fill `rows` with the counts of consecutive datasets from byte `offset` on.
-
-    Raises
-    ------
-    RawFormatError
-        If counts are missing, or a dataset is not followed by CRLF.
-    """
-    tails = [bytearray(2) for _ in rows]
-    buffers: list[Any] = [buffer for pair in zip(rows, tails, strict=True) for buffer in pair]
-    length = file.read_into(offset, buffers)
-    expected = sum([row.nbytes for row in rows]) + 2 * len(rows)
-    if length == file.size - offset and expected - 2 <= length < expected:
-        # Only the last CRLF of the file is missing.
-        tails[-1][length - expected :] = b"\r\n"[length - expected :]
-        length = expected
-    if length != expected or b"".join(tails) != b"\r\n" * len(rows):
-        raise RawFormatError(
-            f"no CRLF follows the counts from byte {offset}: the data are not where the"
-            " header says",
-            file=file.path,
-            field="data",
-            remedy="copy the file again from the instrument, or leave it out",
-        )
-
-
-def read_part(file: RawFile, offset: int, number: int) -> Counts:
-    """Return `number` counts from byte `offset` on.
-
-    Raises
-    ------
-    RawFormatError
-        If the file ends before.
-    """
-    content = file.read(offset, 4 * number)
-    if len(content) < 4 * number:
-        raise RawFormatError(
-            f"ends within the {number} counts at byte {offset}", file=file.path, field="data"
-        )
-    return np.frombuffer(content, _COUNTS)
 
 
 def read_header(path: PathLike) -> Header:
@@ -179,7 +132,7 @@ def read_counts(
         datasets = select(header, channels)
         if bins is not None and bins < 1:
             raise RawFormatError(f"{bins} bins cannot be read", file=file.path, field="bins")
-        rows = [np.empty(dataset.bins, _COUNTS) for dataset in datasets]
+        rows = [np.empty(dataset.bins, COUNTS) for dataset in datasets]
         _read_rows(file, datasets, rows)
     return header, {
         dataset.name: row[:bins].astype(np.int32, copy=False)

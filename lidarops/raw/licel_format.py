@@ -1,19 +1,28 @@
-"""The raw format ``licel``: Licel files as `lidarops.raw.formats` knows them."""
+"""The raw format ``licel``: Licel files as `lidarops.raw.formats` knows them.
+
+After the header a file holds, for each stored dataset, its bins as little-endian 32-bit counts
+followed by CRLF (`licel2023`). CRLF also occurs inside the data, so datasets are located by offset.
+The CRLF after a dataset is checked when the dataset is read.
+"""
 
 from __future__ import annotations
 
 import re
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw import licel, licel_header
+from lidarops.raw import licel_header
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import RawFormat
 from lidarops.raw.header import RawChannel, RawHeader, Stretches
 
+Counts = NDArray[np.int32]
+
+COUNTS: Final = np.dtype("<i4")
 _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
 
 
@@ -31,7 +40,7 @@ def _recognises(head: bytes) -> bool:
 
 
 def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
-    header = licel.parse_header(head, file=file, size=size)
+    header = licel_header.parse_header(head, file=file, size=size)
     if len(head) == size:
         for channel in header.channels:
             first, *further = (np.frombuffer(head, "<i4", channel.bins, p) for p in channel.places)
@@ -89,23 +98,65 @@ def _check_blocks(counts: NDArray[np.int32], channel: RawChannel, path: str) -> 
             )
 
 
+def read_datasets(file: RawFile, offset: int, rows: Sequence[Counts]) -> None:
+    """Fill `rows` with the counts of consecutive datasets from byte `offset` on.
+
+    Raises
+    ------
+    RawFormatError
+        If counts are missing, or a dataset is not followed by CRLF.
+    """
+    tails = [bytearray(2) for _ in rows]
+    buffers: list[Any] = [buffer for pair in zip(rows, tails, strict=True) for buffer in pair]
+    length = file.read_into(offset, buffers)
+    expected = sum([row.nbytes for row in rows]) + 2 * len(rows)
+    if length == file.size - offset and expected - 2 <= length < expected:
+        # Only the last CRLF of the file is missing.
+        tails[-1][length - expected :] = b"\r\n"[length - expected :]
+        length = expected
+    if length != expected or b"".join(tails) != b"\r\n" * len(rows):
+        raise RawFormatError(
+            f"no CRLF follows the counts from byte {offset}: the data are not where the"
+            " header says",
+            file=file.path,
+            field="data",
+            remedy="copy the file again from the instrument, or leave it out",
+        )
+
+
+def read_part(file: RawFile, offset: int, number: int) -> Counts:
+    """Return `number` counts from byte `offset` on.
+
+    Raises
+    ------
+    RawFormatError
+        If the file ends before.
+    """
+    content = file.read(offset, 4 * number)
+    if len(content) < 4 * number:
+        raise RawFormatError(
+            f"ends within the {number} counts at byte {offset}", file=file.path, field="data"
+        )
+    return np.frombuffer(content, COUNTS)
+
+
 def _read_counts(
     file: RawFile, place: int, stretches: Stretches | None, row: NDArray[np.int32]
 ) -> None:
     if stretches is None:
-        licel.read_datasets(file, place, [row])
+        read_datasets(file, place, [row])
         return
     start = 0
     for first, past in stretches:
         bins = past - first
-        row[start : start + bins] = licel.read_part(file, place + row.itemsize * first, bins)
+        row[start : start + bins] = read_part(file, place + row.itemsize * first, bins)
         start += bins
 
 
 FORMAT: Final = RawFormat(
     name=licel_header.FORMAT,
     title="Licel",
-    conversion=licel.CONVENTION,
+    conversion=licel_header.CONVENTION,
     recognises=_recognises,
     parse_header=_parse_header,
     read_counts=_read_counts,

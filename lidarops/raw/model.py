@@ -28,8 +28,14 @@ from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import raw_format
-from lidarops.raw.header import RawChannel, RawHeader, Stretches, channel_names, chosen
-from lidarops.raw.recorders import POLARISATIONS
+from lidarops.raw.header import (
+    POLARISATIONS,
+    RawChannel,
+    RawHeader,
+    Stretches,
+    channel_names,
+    chosen,
+)
 from lidarops.records import Header
 
 Position = Literal["longitude_first", "latitude_first", "ignore"]

@@ -16,7 +16,7 @@ from lidarops.errors import ProductError
 from lidarops.netcdf.read import read_origin
 from lidarops.raw.file import RawFile
 from lidarops.raw.formats import read_raw_header
-from lidarops.raw.recorders import named_layout, recorder_names
+from lidarops.raw.header import named_layout, recorder_names
 from lidarops.records import (
     Granule,
     InputRecord,

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.campaign.model import ChannelFacts, Instrument, InstrumentFacts, channel_facts
-from lidarops.raw.recorders import label_of
+from lidarops.raw.header import label_of
 from lidarops.records import GLUED, ChannelLayout, DetectionMode, LeftOut, PlannedStep, is_glued
 
 READ_STEP: Final = "read"

@@ -7,7 +7,7 @@ import re
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -31,6 +31,12 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 Progress = Callable[[int], None]
+_Work = Sequence[tuple[PlannedFile, int | None]]
+"""Files of one instrument that are written together, and their rows in the truth, None for dark
+files."""
+_Batch = tuple[SimulatedInstrument, _Work]
+_Truths = list[tuple[int | None, FileTruth]]
+"""Of the files of a batch."""
 
 _BATCH: Final = 64
 """Files that one worker writes at a time."""
@@ -51,8 +57,6 @@ class SimulatedCampaign:
     archive: Path
     paths: tuple[str, ...]
     """Files in the archive, dark ones included, by instrument and time."""
-    size: int
-    """Bytes of the files."""
     truth: xr.Dataset
     """True values of every signal file; see `simulate_campaign`."""
 
@@ -67,25 +71,6 @@ class SimulationPlan:
     """Files of each site: dark files first, then signal files in time."""
     paths: tuple[str, ...]
     """Paths in the archive, in the same order."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Batch:
-    """Files of one instrument that are written together, and their rows in the truth."""
-
-    site: SimulatedInstrument
-    files: tuple[PlannedFile, ...]
-    rows: tuple[int | None, ...]
-    """None for dark files."""
-
-
-@dataclass(frozen=True, slots=True)
-class _BatchResult:
-    """Result of one batch."""
-
-    files: int
-    size: int
-    truths: tuple[tuple[int, FileTruth], ...]
 
 
 def simulate_campaign(
@@ -174,17 +159,19 @@ def write_simulation(
         _make_folder(archive / folder)
     rows = sum(planned.role is Role.SIGNAL for files in plan.files for planned in files)
     table = TruthTable(rows, {site.key: Simulator(site).grid for site in plan.sites})
-    size = 0
     work = _batches(plan)
-    results = _serial(work, archive) if client is None else _distributed(work, archive, client)
-    for result in results:
-        size += result.size
-        for row, file_truth in result.truths:
-            table.add(row, file_truth)
+    results = (
+        (_write_batch(batch, archive) for batch in work)
+        if client is None
+        else _distributed(work, archive, client)
+    )
+    for truths in results:
+        for row, file_truth in truths:
+            if row is not None:
+                table.add(row, file_truth)
         if progress:
-            progress(result.files)
-    truth = table.dataset(plan.campaign.name)
-    return SimulatedCampaign(archive, plan.paths, size, truth)
+            progress(len(truths))
+    return SimulatedCampaign(archive, plan.paths, table.dataset(plan.campaign.name))
 
 
 def _make_folder(folder: Path) -> None:
@@ -200,64 +187,41 @@ def _make_folder(folder: Path) -> None:
 
 
 def _batches(plan: SimulationPlan) -> Iterator[_Batch]:
-    row = 0
+    rows = count()
     for site, files in zip(plan.sites, plan.files, strict=True):
-        for first in range(0, len(files), _BATCH):
-            batch = files[first : first + _BATCH]
-            rows: list[int | None] = []
-            for planned in batch:
-                rows.append(row if planned.role is Role.SIGNAL else None)
-                row += planned.role is Role.SIGNAL
-            yield _Batch(site, batch, tuple(rows))
+        work = [(file, next(rows) if file.role is Role.SIGNAL else None) for file in files]
+        for first in range(0, len(work), _BATCH):
+            yield site, work[first : first + _BATCH]
 
 
-def _serial(work: Iterable[_Batch], archive: Path) -> Iterator[_BatchResult]:
-    simulator: Simulator | None = None
-    for batch in work:
-        if simulator is None or simulator.site is not batch.site:
-            simulator = Simulator(batch.site)
-        for planned, row in zip(batch.files, batch.rows, strict=True):
-            yield _write(simulator, [(planned, row)], archive)
-
-
-def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_BatchResult]:
+def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_Truths]:
     from distributed import as_completed  # noqa: PLC0415 - takes a second to import
+
+    def submit(batch: _Batch) -> Future[_Truths]:
+        return client.submit(_write_batch, batch, archive, pure=False)
 
     workers = max(1, len(client.scheduler_info()["workers"]))
     waiting = iter(work)
-    futures = [_submit(client, batch, archive) for batch in islice(waiting, _QUEUE * workers)]
-    stream = as_completed(futures)
+    stream = as_completed([submit(batch) for batch in islice(waiting, _QUEUE * workers)])
     try:
         for future in stream:
             yield future.result()
             future.release()
             for batch in islice(waiting, 1):
-                stream.add(_submit(client, batch, archive))
+                stream.add(submit(batch))
     finally:
         client.cancel(list(stream.futures))
 
 
-def _submit(client: Client, batch: _Batch, archive: Path) -> Future[_BatchResult]:
-    return client.submit(_write_batch, batch, archive, pure=False)
-
-
-def _write_batch(batch: _Batch, archive: Path) -> _BatchResult:
-    work = list(zip(batch.files, batch.rows, strict=True))
-    return _write(Simulator(batch.site), work, archive)
-
-
-def _write(
-    simulator: Simulator, work: Sequence[tuple[PlannedFile, int | None]], archive: Path
-) -> _BatchResult:
-    size = 0
-    truths = []
+def _write_batch(batch: _Batch, archive: Path) -> _Truths:
+    site, work = batch
+    simulator = Simulator(site)
+    truths: _Truths = []
     for planned, row in work:
         content, truth = simulator.simulate(planned)
         _write_whole(archive / truth.path, content)
-        size += len(content)
-        if row is not None:
-            truths.append((row, truth))
-    return _BatchResult(len(work), size, tuple(truths))
+        truths.append((row, truth))
+    return truths
 
 
 def _sites(campaign: Campaign) -> list[SimulatedInstrument]:

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import Kind, kind_of, kinds
-from lidarops.registry import RAW_FORMATS
+from lidarops.kinds import RAW_FORMATS, Kind, kind_of, kinds
 
 _EVERY_PRODUCT: Final = (
     "lidarops.scene.processing",
