@@ -18,6 +18,9 @@ from lidarops.cli.app import (
     CatalogOption,
     InstrumentOption,
     JsonOption,
+    LogFileOption,
+    LogJsonOption,
+    LogLevelOption,
     OutOption,
     ProductOption,
     SinceOption,
@@ -34,11 +37,11 @@ from lidarops.cli.app import (
     progress_bar,
     say,
     selection_of,
+    set_up_log,
     show_error,
     show_findings,
     show_rows,
 )
-from lidarops.cli.logs import LogFileOption, LogJsonOption, LogLevelOption, set_up
 from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
@@ -218,7 +221,7 @@ def reprocess(
     """
     from lidarops.catalog.access import refuse_held_catalog
 
-    set_up(log_level, as_json=log_json, file=log_file)
+    set_up_log(log_level, as_json=log_json, file=log_file)
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     if not wait:
         # Before what follows loads modules for seconds.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, NamedTuple, TypedDict, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,13 @@ _CACHED: Final = 64
 
 _AIR_STEP: Final = timedelta(minutes=10)
 """Interval at which the air changes in a fast simulation."""
+
+
+class _Blind(TypedDict):
+    """When a photon counter is blind."""
+
+    dead_time: float
+    paralyzable: bool
 
 
 class _BinGrid(NamedTuple):
@@ -268,18 +275,33 @@ class Simulator:
         self, conditions: _Conditions, detector: Detector, random: np.random.Generator
     ) -> dict[str, tuple[AnyCounts, ChannelTruth]]:
         lights = self._lights(conditions, detector, random)
-        channels = {}
+        shots = conditions.acquisition.shots
+        channels: dict[str, tuple[AnyCounts, ChannelTruth]] = {}
         for mode in modes(detector):
             name = channel_name(mode, detector)
             light = lights[_offset(conditions, name)]
             if mode is DetectionMode.ANALOG and detector.analog is not None:
                 recorder = _drifted(detector.analog, conditions.hours)
-                counts = self._digitised(light, recorder, conditions, random)
+                counts: AnyCounts = (
+                    digitise(light.electrons, recorder, random=random)
+                    if light.electrons
+                    else digitise_fast(
+                        light.rate, recorder, shots=shots, bin_time=light.bin_time, random=random
+                    )
+                )
                 unit, dark_offset = recorder.gain, recorder.dark_offset
             else:
-                seconds = photon_dead_time(self.site, conditions.start, name)
-                counter = detector.photon or PhotonCounter()
-                counts = self._counted(light, counter, seconds, conditions, random)
+                blind: _Blind = {
+                    "dead_time": photon_dead_time(self.site, conditions.start, name),
+                    "paralyzable": (detector.photon or PhotonCounter()).paralyzable,
+                }
+                counts = (
+                    count_photons(light.electrons, random=random, **blind)
+                    if light.electrons
+                    else count_fast(
+                        light.rate, shots=shots, bin_time=light.bin_time, random=random, **blind
+                    )
+                )
                 unit, dark_offset = 1.0, math.nan
             channels[name] = (
                 counts,
@@ -319,44 +341,6 @@ class Simulator:
             )
             lights[offset] = replace(common, rate=electrons.rate, electrons=electrons)
         return lights
-
-    def _digitised(
-        self,
-        light: _Light,
-        recorder: AnalogRecorder,
-        conditions: _Conditions,
-        random: np.random.Generator,
-    ) -> AnyCounts:
-        if light.electrons is not None:
-            return digitise(light.electrons, recorder, random=random)
-        return digitise_fast(
-            light.rate,
-            recorder,
-            shots=conditions.acquisition.shots,
-            bin_time=light.bin_time,
-            random=random,
-        )
-
-    def _counted(
-        self,
-        light: _Light,
-        counter: PhotonCounter,
-        dead_time: float,
-        conditions: _Conditions,
-        random: np.random.Generator,
-    ) -> AnyCounts:
-        if light.electrons is not None:
-            return count_photons(
-                light.electrons, dead_time=dead_time, random=random, paralyzable=counter.paralyzable
-            )
-        return count_fast(
-            light.rate,
-            shots=conditions.acquisition.shots,
-            bin_time=light.bin_time,
-            dead_time=dead_time,
-            random=random,
-            paralyzable=counter.paralyzable,
-        )
 
     def _light(
         self,

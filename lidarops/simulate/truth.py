@@ -197,8 +197,8 @@ class TruthTable:
         handled = [handling[str(kind)] for kind in self._damage]
         truth = xr.Dataset(
             {
-                "path": _row(self._text(self._paths), "path of the raw file in the archive"),
-                "instrument": _row(self._text(self._instruments), "instrument"),
+                "path": _row(self._paths.astype(str), "path of the raw file in the archive"),
+                "instrument": _row(self._instruments.astype(str), "instrument"),
                 "time": _row(self._times, "middle of the file, UTC"),
                 **{
                     name: _row(self._facts[name], *about)
@@ -209,11 +209,11 @@ class TruthTable:
                     np.isfinite(extinction).astype(np.int8), "1 if the path is homogeneous", "1"
                 ),
                 "damage": _row(
-                    self._text(self._damage),
+                    self._damage.astype(str),
                     "kind of damage of the raw file; empty for good files",
                 ),
                 "handling": _row(
-                    self._text(np.array(handled, dtype=object)),
+                    np.array(handled, dtype=str),
                     "correct handling of the damaged raw file: "
                     + ", ".join(handling.value for handling in Handling),
                 ),
@@ -238,10 +238,6 @@ class TruthTable:
             if profiles:
                 truth = truth.merge(_profiles(self._grids[key], profiles))
         return truth
-
-    @staticmethod
-    def _text(values: NDArray[np.object_]) -> NDArray[np.str_]:
-        return values.astype(str)
 
 
 _FACTS = {

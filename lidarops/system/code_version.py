@@ -41,13 +41,6 @@ _APART: Final = (
     "lidarops.campaign.yaml_errors",
 )
 """Modules and packages that the others import, and that cannot change a product."""
-_WITH_DATA: Final = (
-    "lidarops.figures",
-    "lidarops.products",
-    "lidarops.retrieve",
-    "lidarops.site",
-)
-"""Packages of lidarops whose tables, templates and other data count."""
 _NO_DATA: Final = (".py", ".pyc", ".pyi", ".nbc", ".nbi", "~")
 """Endings of files beside modules that are no data of them."""
 _NO_STATEMENT: Final = re.compile(r"#[^\n]*|\\\n")
@@ -133,8 +126,7 @@ def sources_in(roots: Mapping[str, Sequence[Path]]) -> Sources:
     roots : mapping of str to sequence of Path
         Folders of each top-level package.
     """
-    with_data = (*_WITH_DATA, *(root for root in roots if root != "lidarops"))
-    return Sources(roots, apart=_APART, with_data=with_data)
+    return Sources(roots, apart=_APART)
 
 
 def reading_version() -> str:
@@ -242,8 +234,6 @@ class Sources:
         not count.
     apart : collection of str
         Modules and packages that do not count, whoever imports them.
-    with_data : collection of str
-        Packages whose other files, such as tables, count also, if one of their modules counts.
     """
 
     def __init__(
@@ -251,18 +241,16 @@ class Sources:
         roots: Mapping[str, Sequence[Path]],
         *,
         apart: Collection[str] = (),
-        with_data: Collection[str] = (),
     ) -> None:
         self._roots = roots
         self._apart = apart
-        self._with_data = with_data
         self.path = cache(self._find)
         """Module -> its file; None where there is no such module."""
         self._text = cache(_read)
         self._imports = cache(self._imported)
 
     def digest(self, starts: Iterable[str]) -> str:
-        """Return a digest of some modules and of all that they import.
+        """Return a digest of some modules, of all that they import, and of the data of packages.
 
         Returns
         -------
@@ -276,7 +264,7 @@ class Sources:
         """
         files = self.closure(starts)
         for name, path in list(files.items()):
-            if path.name == "__init__.py" and _within(name, self._with_data):
+            if path.name == "__init__.py":
                 data = ((file.relative_to(path.parent), file) for file in _data(path.parent))
                 files |= {f"{name}:{place.as_posix()}": file for place, file in data}
         digests = sorted(f"{name}={_digest(self._text(path))}" for name, path in files.items())
