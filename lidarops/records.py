@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, Self
@@ -238,15 +238,7 @@ class PlannedStep:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step as plain JSON types."""
-        return {
-            "name": self.name,
-            "channel": self.channel,
-            "settings": dict(self.settings),
-            "reason": self.reason,
-            **({"warning": self.warning} if self.warning else {}),
-            **_origin_fields(self),
-            **({"needs": list(self.needs)} if self.needs else {}),
-        }
+        return _plain_entry(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,23 +259,20 @@ class LeftOut:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the omission as plain JSON types."""
-        return {
-            "name": self.name,
-            "channel": self.channel,
-            "reason": self.reason,
-            **_origin_fields(self),
-        }
+        return _plain_entry(self)
 
 
-def _origin_fields(entry: PlannedStep | LeftOut) -> dict[str, Any]:
-    """Return what a plan states of the origin of an entry; empty fields are left out."""
-    fields = {
-        "instrument": entry.instrument,
-        "product": entry.product,
-        "rule": entry.rule,
-        "number": entry.number,
+_ALWAYS: Final = frozenset({"name", "channel", "settings", "reason"})
+"""Fields that entries state even where they are empty."""
+
+
+def _plain_entry(entry: PlannedStep | LeftOut) -> dict[str, Any]:
+    values = {item.name: getattr(entry, item.name) for item in fields(entry)}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in values.items()
+        if name in _ALWAYS or value not in ("", None, ())
     }
-    return {name: value for name, value in fields.items() if value not in ("", None)}
 
 
 @dataclass(frozen=True, slots=True)

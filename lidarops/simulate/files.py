@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import Any, Final, NamedTuple, TypedDict, TypeVar, cast
+from functools import partial
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,13 +69,6 @@ _CACHED: Final = 64
 
 _AIR_STEP: Final = timedelta(minutes=10)
 """Interval at which the air changes in a fast simulation."""
-
-
-class _Blind(TypedDict):
-    """When a photon counter is blind."""
-
-    dead_time: float
-    paralyzable: bool
 
 
 class _BinGrid(NamedTuple):
@@ -291,16 +285,15 @@ class Simulator:
                 )
                 unit, dark_offset = recorder.gain, recorder.dark_offset
             else:
-                blind: _Blind = {
-                    "dead_time": photon_dead_time(self.site, conditions.start, name),
-                    "paralyzable": (detector.photon or PhotonCounter()).paralyzable,
-                }
-                counts = (
-                    count_photons(light.electrons, random=random, **blind)
+                counter: Callable[..., AnyCounts] = (
+                    partial(count_photons, light.electrons)
                     if light.electrons
-                    else count_fast(
-                        light.rate, shots=shots, bin_time=light.bin_time, random=random, **blind
-                    )
+                    else partial(count_fast, light.rate, shots=shots, bin_time=light.bin_time)
+                )
+                counts = counter(
+                    dead_time=photon_dead_time(self.site, conditions.start, name),
+                    paralyzable=(detector.photon or PhotonCounter()).paralyzable,
+                    random=random,
                 )
                 unit, dark_offset = 1.0, math.nan
             channels[name] = (
