@@ -52,19 +52,19 @@ class FlagBit(IntFlag):
     severity: Severity
     description: str
     """As a phrase without a full stop."""
+    word: str
+    """Name of a single bit in ``flag_meanings``."""
 
-    def __new__(cls, place: int, severity: Severity, description: str) -> Self:
+    def __new__(cls, place: int, *_: object) -> Self:
         """Return the bit at a place."""
         bit = int.__new__(cls, 1 << place)
         bit._value_ = 1 << place
-        bit.severity = severity
-        bit.description = description
         return bit
 
-    @property
-    def word(self) -> str:
-        """Name of a single bit in ``flag_meanings``."""
-        return str(self.name).lower()
+    def __init__(self, _: int, severity: Severity, description: str) -> None:
+        self.severity = severity
+        self.description = description
+        self.word = str(self.name).lower()
 
 
 class Quality(FlagBit):
