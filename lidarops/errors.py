@@ -6,6 +6,7 @@ to the user.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -57,19 +58,8 @@ class LidarOpsError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # The default loses keyword-only arguments, and errors are pickled between processes.
-        arguments = (self.problem, self.file, self.field, self.remedy, self.wrong_use)
-        return _rebuild, (type(self), *arguments)
-
-
-def _rebuild(
-    kind: type[LidarOpsError],
-    problem: str,
-    file: str | None,
-    field: str | None,
-    remedy: str | None,
-    wrong_use: bool,  # noqa: FBT001 - pickle passes arguments by position
-) -> LidarOpsError:
-    return kind(problem, file=file, field=field, remedy=remedy, wrong_use=wrong_use)
+        named = {"file": self.file, "field": self.field, "remedy": self.remedy}
+        return partial(type(self), self.problem, **named, wrong_use=self.wrong_use), ()
 
 
 class RawFormatError(LidarOpsError, ValueError):

@@ -109,24 +109,13 @@ def version_of(kind: Kind, sources: Sources, *others: str) -> str:
     ----------
     kind : Kind
     sources : Sources
-        From `sources_in`; of all packages that `source_roots` gives.
+        Of all packages that `source_roots` gives.
     *others : str
         Further modules that count.
     """
     own = (f"{kind.package}.{name}" for name in _OF_KIND)
     modules = (name for name in own if sources.path(name))
     return sources.digest((*_EVERY_PRODUCT, *_formats(), kind.package, *modules, *others))
-
-
-def sources_in(roots: Mapping[str, Sequence[Path]]) -> Sources:
-    """Return the sources of lidarops and of packages with kinds of product or raw formats.
-
-    Parameters
-    ----------
-    roots : mapping of str to sequence of Path
-        Folders of each top-level package.
-    """
-    return Sources(roots, apart=_APART)
 
 
 def reading_version() -> str:
@@ -146,7 +135,7 @@ def pages_version(sources: Sources | None = None) -> str:
     Parameters
     ----------
     sources : Sources, optional
-        From `sources_in`; by default the installed ones.
+        By default the installed ones.
 
     Returns
     -------
@@ -181,7 +170,7 @@ def source_version() -> str:
 
 @cache
 def _installed() -> Sources:
-    return sources_in(source_roots())
+    return Sources(source_roots())
 
 
 def source_roots() -> dict[str, tuple[Path, ...]]:
@@ -225,14 +214,14 @@ def _listed(names: str) -> list[str]:
 
 
 class Sources:
-    """Modules of some packages.
+    """Modules of lidarops, and of packages with kinds of product or raw formats.
 
     Parameters
     ----------
     roots : mapping of str to sequence of Path
         Folders of each top-level package, or the file of a top-level module. Modules of others do
         not count.
-    apart : collection of str
+    apart : collection of str, optional
         Modules and packages that do not count, whoever imports them.
     """
 
@@ -240,7 +229,7 @@ class Sources:
         self,
         roots: Mapping[str, Sequence[Path]],
         *,
-        apart: Collection[str] = (),
+        apart: Collection[str] = _APART,
     ) -> None:
         self._roots = roots
         self._apart = apart

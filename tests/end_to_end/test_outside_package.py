@@ -30,7 +30,7 @@ from lidarops.raw import licel
 from lidarops.run.archive import assess, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.system import code_version as versions
-from lidarops.system.code_version import sources_in
+from lidarops.system.code_version import Sources
 
 KIND = "integrated"
 WINDOWS = [[1500, 3000], [3900, 6000], [9000, 9500]]
@@ -286,7 +286,7 @@ def changed_sources(
     package = tmp_path / "lidar_extras"
     shutil.copytree(repository / "tests/plugin/lidar_extras", package)
     roots = {"lidarops": (repository / "lidarops",), "lidar_extras": (package,)}
-    monkeypatch.setattr(versions, "_installed", lambda: sources_in(roots))
+    monkeypatch.setattr(versions, "_installed", lambda: Sources(roots))
     versions.code_version.cache_clear()
     yield package
     versions.code_version.cache_clear()

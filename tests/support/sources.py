@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from lidarops.kinds import kinds
-from lidarops.system.code_version import Sources, source_roots, sources_in, version_of
+from lidarops.system.code_version import Sources, source_roots, version_of
 
 
 class Copy:
@@ -27,7 +27,7 @@ class Copy:
 
     def sources(self) -> Sources:
         """Return the sources as they are now."""
-        return sources_in({**source_roots(), "lidarops": (self.root,)})
+        return Sources({**source_roots(), "lidarops": (self.root,)})
 
     def versions(self) -> dict[str, str]:
         """Return the code version of every kind."""

@@ -18,7 +18,6 @@ from lidarops.system.code_version import (
     joint_code_version,
     pages_version,
     source_roots,
-    sources_in,
     version_of,
 )
 
@@ -190,7 +189,7 @@ def test_a_kind_of_another_package_counts_its_own_modules(copy: Copy, tmp_path: 
     kind = Kind("clouds", "Clouds", "other.clouds", ChannelProduct, 50)
 
     def versions() -> tuple[str, str]:
-        sources = sources_in({**source_roots(), "lidarops": (copy.root,), "other": (package,)})
+        sources = Sources({**source_roots(), "lidarops": (copy.root,), "other": (package,)})
         return version_of(kind, sources), version_of(kind_of("signal"), sources)
 
     first = versions()
@@ -216,7 +215,7 @@ def test_a_raw_format_of_another_package_counts_for_every_kind(
     monkeypatch.setattr(versions, "_formats", lambda: ("raymetrics",))
 
     def now() -> dict[str, str]:
-        sources = sources_in({**source_roots(), "lidarops": (copy.root,), "raymetrics": (reader,)})
+        sources = Sources({**source_roots(), "lidarops": (copy.root,), "raymetrics": (reader,)})
         return {kind.name: version_of(kind, sources) for kind in kinds().values()}
 
     before = now()
@@ -226,7 +225,7 @@ def test_a_raw_format_of_another_package_counts_for_every_kind(
 
 def test_modules_that_are_kept_apart_are_imported(copy: Copy):
     """Otherwise they need not be named."""
-    sources = Sources({"lidarops": (copy.root,)})
+    sources = Sources({"lidarops": (copy.root,)}, apart=())
     closure = sources.closure(["lidarops.scene.processing"])
     assert set(_APART) <= set(closure)
 
