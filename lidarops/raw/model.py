@@ -130,13 +130,18 @@ class RawFiles:
             if variant == len(self._variants):
                 self._variants.append(self._select(header, names))
             variant_of[file.path] = variant
-        self.kept = _kept(stretches or {}, self.selected)
+        self.kept = _kept(stretches or {}, self._variants[0])
         """Stretches of the channels of which some bins are left out."""
         if self.kept:
             self._variants = [
-                tuple(replace(c, bins=count_bins(self.stretches(c))) for c in selected)
+                tuple(
+                    replace(c, bins=sum(past - first for first, past in self.stretches(c)))
+                    for c in selected
+                )
                 for selected in self._variants
             ]
+        self.selected = self._variants[0]
+        """Selected channels of the first file."""
         times = {file.path: _interval(file) for file in files}
         self.files = sorted(files, key=lambda file: (times[file.path][0], file.path))
         self.times = np.array([times[file.path] for file in self.files], dtype=np.int64)
@@ -149,7 +154,8 @@ class RawFiles:
         found = chosen(stored, tuple(stored) if names is None else names, header.path)
         if not self._variants:
             return found
-        differing = {name for name, *_ in _grids_of(found) ^ _grids_of(self.selected)}
+        first = self._variants[0]
+        differing = {name for name, *_ in _grids_of(found) ^ _grids_of(first)}
         if differing:
             raise RawFormatError(
                 "is of another layout (channels, bins, bin width or ADC bits) than the files"
@@ -158,12 +164,7 @@ class RawFiles:
                 field=", ".join(sorted(differing)),
                 remedy="open files of one layout, or choose channels that are equal in all files",
             )
-        return tuple(stored[channel.name] for channel in self.selected)
-
-    @property
-    def selected(self) -> tuple[RawChannel, ...]:
-        """Selected channels of the first file."""
-        return self._variants[0]
+        return tuple(stored[channel.name] for channel in first)
 
     def channel_values(self, channel: int, name: str) -> NDArray[Any]:
         """Return a property of selected channel number `channel`, one value per file."""
@@ -211,11 +212,6 @@ def _kept(
         clipped = [(first, min(past, stored[name])) for first, past in requested]
         kept[name] = tuple(stretch for stretch in clipped if stretch[0] < stretch[1])
     return {name: held for name, held in kept.items() if held != ((0, stored[name]),)}
-
-
-def count_bins(stretches: Stretches) -> int:
-    """Return the number of bins in stretches."""
-    return sum(past - first for first, past in stretches)
 
 
 Signal = Callable[[int, RawChannel], Any]
