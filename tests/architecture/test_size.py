@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 77_110,
-    "lines of code alone": 50_280,
-    "modules": 371,
-    "dataclasses": 338,
-    "lines of dataclasses": 8_510,
+    "lines": 76_130,
+    "lines of code alone": 49_700,
+    "modules": 351,
+    "dataclasses": 330,
+    "lines of dataclasses": 8_050,
     "tuning numbers": 254,
     "tuning numbers that are assumed": 87,
     "copied thresholds": 1,
@@ -28,8 +28,8 @@ MOST = {
     "lines of the largest package": 6_440,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 86, "functions": 747, "changes": 398},
-    "elastic": {"modules": 97, "functions": 885, "changes": 425},
+    "homogeneous": {"modules": 82, "functions": 758, "changes": 381},
+    "elastic": {"modules": 93, "functions": 892, "changes": 401},
 }
 
 
