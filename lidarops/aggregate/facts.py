@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -108,6 +108,11 @@ class Group(NamedTuple):
     def grid_words(self) -> str:
         """The grid, with the recorder where it is known."""
         return self.grid[:8] + (f" of recorder {self.recorder}" if self.recorder else "")
+
+    @property
+    def words(self) -> str:
+        """The group in words, to select it by."""
+        return f"{' '.join(self[:4])} grid {self.grid_words}"
 
     @property
     def name(self) -> str:
@@ -352,6 +357,19 @@ def groups(products: Iterable[Facts]) -> dict[Group, list[Facts]]:
     for product in sorted(products, key=lambda facts: (facts.start, facts.path)):
         by_group.setdefault(product.group, []).append(product)
     return dict(sorted(by_group.items()))
+
+
+def refuse_several(names: Sequence[str], file: str | Path | None, remedy: str) -> None:
+    """Refuse products of several groups, with these names, to be joined.
+
+    Raises
+    ------
+    ProductError
+        If there is more than one group.
+    """
+    if len(names) > 1:
+        problem = f"products of {len(names)} groups cannot be joined: {'; '.join(names)}"
+        raise ProductError(problem, file=file, remedy=remedy)
 
 
 def grid_notes(all_groups: Iterable[Group]) -> list[str]:

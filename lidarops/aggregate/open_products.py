@@ -13,13 +13,13 @@ import xarray as xr
 from lidarops.aggregate._join import join, open_piece, shared_attributes
 from lidarops.aggregate.facts import (
     Facts,
-    Group,
     Refused,
     groups,
     list_products,
     read_facts,
     read_product_facts,
     refuse_duplicates,
+    refuse_several,
 )
 from lidarops.aggregate.index import INDEX, find_in_index
 from lidarops.aggregate.selection import ProductSelection, parse_selection
@@ -99,12 +99,8 @@ def open_products(
     if not all_products:
         raise ProductError("no product found", file=store, remedy=_remedy(store))
     by_group = groups(all_products)
-    if len(by_group) > 1:
-        raise ProductError(
-            f"products of {len(by_group)} groups cannot be joined: {_choices(by_group)}",
-            file=_path_of(source),
-            remedy="select by kind, channel, station or instrument, or give the files of one grid",
-        )
+    remedy = "select by kind, channel, station or instrument, or give the files of one grid"
+    refuse_several([group.words for group in by_group], store, remedy)
     (products,) = by_group.values()
     return _masked(_opened(root, products), usable)
 
@@ -119,13 +115,6 @@ def _remedy(folder: str | None) -> str:
 
 def _path_of(source: Paths) -> str | None:
     return os.fspath(source) if isinstance(source, str | os.PathLike) else None
-
-
-def _choices(all_groups: Iterable[Group]) -> str:
-    return "; ".join(
-        f"{group.station} {group.instrument} {group.kind} {group.channel} grid {group.grid_words}"
-        for group in all_groups
-    )
 
 
 def _find(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]]:

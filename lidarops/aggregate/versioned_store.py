@@ -29,6 +29,7 @@ from lidarops.aggregate.facts import (
     plain,
     refuse_changed,
     refuse_duplicates,
+    refuse_several,
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.aggregate.selection import ProductSelection
@@ -464,8 +465,10 @@ def open_store(path: Path, selection: ProductSelection, version: str | None) -> 
         which = {"branch": _BRANCH} if version is None else {"snapshot_id": version}
         store = repository.readonly_session(**which).store
         names = [name for name, _ in _stored_groups(store, selection)]
-        if len(names) != 1:
-            raise _not_one(path, names)
+        if not names:
+            raise _nothing(path)
+        remedy = "select by channel, station or instrument, or open a group with xarray.open_zarr"
+        refuse_several(names, path, remedy)
         data = xr.open_zarr(store, group=names[0], consolidated=False, chunks={})
     ids = data[PRODUCT.name]
     ids = xr.Variable(ids.dims, np.array(ids.values.tolist(), str), ids.attrs)
@@ -473,14 +476,8 @@ def open_store(path: Path, selection: ProductSelection, version: str | None) -> 
     return join([_within_times(data.set_coords(PRODUCT_INDEX.name), selection, path)])
 
 
-def _not_one(path: Path, names: Sequence[str]) -> ProductError:
-    if not names:
-        return ProductError("no product found", file=path, remedy="select less strictly")
-    return ProductError(
-        f"products of {len(names)} groups cannot be joined: {'; '.join(names)}",
-        file=path,
-        remedy="select by channel, station or instrument, or open a group with xarray.open_zarr",
-    )
+def _nothing(path: Path) -> ProductError:
+    return ProductError("no product found", file=path, remedy="select less strictly")
 
 
 def _within_times(data: xr.Dataset, selection: ProductSelection, path: Path) -> xr.Dataset:
@@ -496,7 +493,7 @@ def _within_times(data: xr.Dataset, selection: ProductSelection, path: Path) -> 
     if selection.until is not None:
         admitted &= np.minimum.reduceat(begins, first) < _datetime64(selection.until)
     if not admitted.any():
-        raise _not_one(path, ())
+        raise _nothing(path)
     chosen = data.isel(time=admitted[index], product=admitted)
     number = (np.cumsum(admitted, dtype=np.int32) - np.int32(1))[index[admitted[index]]]
     return chosen.assign_coords({PRODUCT_INDEX.name: chosen[PRODUCT_INDEX.name].copy(data=number)})

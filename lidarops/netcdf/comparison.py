@@ -292,11 +292,14 @@ def _making(file: Path) -> dict[str, dict[str, str]]:
     """Return what a product was made from and with, by its provenance."""
     document = read_provenance(file)
     try:
+        entities, software = document["entity"], document["agent"]["lidarops:software"]
+        settings = json.loads(entities["lidarops:product"]["lidarops:settings"])
+        packages = dict(package.split(" ", 1) for package in software["lidarops:versions"])
         return {
-            "input": _inputs(document),
-            "setting": _settings(document),
-            "step": _steps(document),
-            "software": _software(document),
+            "input": dict(_inputs(entities)),
+            "setting": dict(_flat("", settings)),
+            "step": _steps(json.loads(entities["lidarops:plan"]["lidarops:json"])),
+            "software": {**packages, "code": str(software["lidarops:code_version"])},
         }
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ProductError(
@@ -326,7 +329,7 @@ def planned_changes(file: Path, settings: Mapping[str, Any], plan: Plan) -> tupl
     """
     making = _making(file)
     changes = [*_changes("setting", making["setting"], dict(_flat("", settings)))]
-    changes = changes or [*_changes("step", making["step"], _steps_of(plan.as_dict()))]
+    changes = changes or [*_changes("step", making["step"], _steps(plan.as_dict()))]
     return tuple(_first(changes, _MOST_REASONS))
 
 
@@ -369,20 +372,12 @@ def _short(text: str, first: int) -> str:
     return f"{'...' * (first > 0)}{part}{'...' * (first + _LONGEST < len(text))}"
 
 
-def _inputs(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return path -> digest of the inputs."""
-    inputs = {}
-    for entity in document["entity"].values():
+def _inputs(entities: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield path and digest of the inputs."""
+    for entity in entities.values():
         paths = entity.get("lidarops:path", ())
         for path in [paths] if isinstance(paths, str) else paths:
-            inputs[str(path)] = str(entity["lidarops:sha256"])[:12]
-    return inputs
-
-
-def _settings(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return setting -> value, of facts, settings and texts of the campaign."""
-    settings = json.loads(document["entity"]["lidarops:product"]["lidarops:settings"])
-    return dict(_flat("", settings))
+            yield str(path), str(entity["lidarops:sha256"])[:12]
 
 
 def _flat(key: str, value: Any) -> Iterator[tuple[str, str]]:
@@ -393,22 +388,11 @@ def _flat(key: str, value: Any) -> Iterator[tuple[str, str]]:
         yield key, json.dumps(value)
 
 
-def _steps(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return step, channel and setting -> value, of the plan."""
-    return _steps_of(json.loads(document["entity"]["lidarops:plan"]["lidarops:json"]))
-
-
-def _steps_of(plan: Mapping[str, Any]) -> dict[str, str]:
+def _steps(plan: Mapping[str, Any]) -> dict[str, str]:
+    """Return step, channel and setting -> value, of a plan."""
     stated = {}
     for step in plan["steps"]:
         name = " ".join(part for part in (step["name"], step.get("channel", "")) if part)
         stated[name] = "runs"
         stated |= {f"{name} {key}": value for key, value in _flat("", step.get("settings") or {})}
     return stated
-
-
-def _software(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the version of each package, and of the code."""
-    software = document["agent"]["lidarops:software"]
-    packages = dict(package.split(" ", 1) for package in software["lidarops:versions"])
-    return {**packages, "code": str(software["lidarops:code_version"])}
