@@ -275,14 +275,14 @@ def _write_group(
         lacking = list(range(len(ids)))
     # What all have in common is known of those that stay, unless others go.
     read = range(len(ids)) if gone else lacking
-    about = {at: _about(root, products[at]) for at in read}
+    stated = {at: _stated(root, products[at]) for at in read}
     times = [
-        about[at].times if at in about else held.times[slice(*rows)]
+        stated[at].times if at in stated else held.times[slice(*rows)]
         for at, rows in enumerate(pairwise(starts))
     ]
     refuse_duplicates(zip((product.path for product in products), times, strict=True))
     known = [] if gone or 0 in lacking else [held.attributes]
-    shared = shared_attributes([*known, *(stated.attributes for stated in about.values())])
+    shared = shared_attributes([*known, *(file.attributes for file in stated.values())])
     if 0 in lacking:
         with _piece(root, products[0]) as piece:
             _create(store, name, piece)
@@ -290,7 +290,7 @@ def _write_group(
     group.attrs.put({key: plain(value) for key, value in shared.items()})
     _write_rows(group, root, products, lacking, starts)
     new = [at for at in lacking if ids[at] not in held.places]
-    changes.added += [(products[at].path, about[at].attributes["product_version"]) for at in new]
+    changes.added += [(products[at].path, stated[at].attributes["product_version"]) for at in new]
     changes.dropped += len(gone)
 
 
@@ -315,17 +315,17 @@ def _held(store: Any, name: str) -> _Held:
     return _Held(group.attrs.asdict(), group["time"][:], places)
 
 
-class _About(NamedTuple):
+class _Stated(NamedTuple):
     """What the file of a product states."""
 
     attributes: Mapping[str, Any]
     times: NDArray[np.float64]
 
 
-def _about(root: Path, facts: Facts) -> _About:
+def _stated(root: Path, facts: Facts) -> _Stated:
     with _readable(facts), opened(within(root, facts.path)) as product:
         refuse_changed(product, facts)
-        return _About(dict(product.attrs), product["time"].values)
+        return _Stated(dict(product.attrs), product["time"].values)
 
 
 @contextmanager
@@ -466,7 +466,7 @@ def open_store(path: Path, selection: ProductSelection, version: str | None) -> 
         store = repository.readonly_session(**which).store
         names = [name for name, _ in _stored_groups(store, selection)]
         if not names:
-            raise _nothing(path)
+            raise _no_product(path)
         remedy = "select by channel, station or instrument, or open a group with xarray.open_zarr"
         refuse_several(names, path, remedy)
         data = xr.open_zarr(store, group=names[0], consolidated=False, chunks={})
@@ -476,7 +476,7 @@ def open_store(path: Path, selection: ProductSelection, version: str | None) -> 
     return join([_within_times(data.set_coords(PRODUCT_INDEX.name), selection, path)])
 
 
-def _nothing(path: Path) -> ProductError:
+def _no_product(path: Path) -> ProductError:
     return ProductError("no product found", file=path, remedy="select less strictly")
 
 
@@ -493,7 +493,7 @@ def _within_times(data: xr.Dataset, selection: ProductSelection, path: Path) -> 
     if selection.until is not None:
         admitted &= np.minimum.reduceat(begins, first) < _datetime64(selection.until)
     if not admitted.any():
-        raise _nothing(path)
+        raise _no_product(path)
     chosen = data.isel(time=admitted[index], product=admitted)
     number = (np.cumsum(admitted, dtype=np.int32) - np.int32(1))[index[admitted[index]]]
     return chosen.assign_coords({PRODUCT_INDEX.name: chosen[PRODUCT_INDEX.name].copy(data=number)})
