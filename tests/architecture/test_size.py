@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 76_130,
-    "lines of code alone": 49_700,
+    "lines": 76_120,
+    "lines of code alone": 49_690,
     "modules": 351,
     "dataclasses": 330,
     "lines of dataclasses": 8_050,
