@@ -22,7 +22,7 @@ from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
 from lidarops.retrieve.air import MolecularProfile, reference_window
-from lidarops.retrieve.background import cubic_and_tail, known_shape, photon_counts
+from lidarops.retrieve.background import cubic_and_tail, known_shape
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
 from lidarops.retrieve.background.known_shape import KnownShapeResult
 from lidarops.retrieve.clouds import layers
@@ -218,7 +218,7 @@ def _known_shape(
 
 def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
-    variance = photon_counts.mean_profile_variance(counts[:, far], SHOTS)
+    variance = 1.0 / count_weight(counts[:, far])
     fit = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
     return _estimates(fit)
 
@@ -229,7 +229,7 @@ def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
         cubic_and_tail.cubic(
             counts[:, far],
             sky.range[far],
-            variance=photon_counts.mean_profile_variance(counts[:, far], SHOTS),
+            variance=1.0 / count_weight(counts[:, far]),
         )
     )
 

@@ -15,7 +15,7 @@ from lidarops.flags import Quality
 from lidarops.netcdf.variables import ErrorKind
 from lidarops.products.elastic.variables import sources
 from lidarops.retrieve.air import MolecularProfile, reference_window
-from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
+from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.background import known_shape
 from lidarops.retrieve.clouds import layers, outlying_bins
 from lidarops.retrieve.elastic import inversion

@@ -13,11 +13,15 @@ from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.products.raman.settings import RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman.cells import Cells, make_cells
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal
+from lidarops.retrieve.raman.signals import (
+    AirColumn,
+    Cells,
+    ChannelSignal,
+    RamanSettings,
+    make_cells,
+)
 
 Random = np.random.Generator
 

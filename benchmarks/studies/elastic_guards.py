@@ -25,7 +25,7 @@ from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.clouds import layers, outlying_bins
 from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.elastic.inversion import THRESHOLDS
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/elastic.md"
 CLUSTERS: Final = 60

@@ -17,11 +17,16 @@ from benchmarks.harness.timing import READ
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import RamanSettings
+from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import condition
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage, joined
-from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
-from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.labeled_averaging import (
+    ClockAverage,
+    Record,
+    ScreenedAverage,
+    Screening,
+    joined,
+)
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 PROFILES: Final = 720

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.retrieve.common.azimuths import widest_azimuth_gap
+from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.scene.case import ChannelCase
 
 STEEPEST: Final = 80.0

@@ -12,8 +12,12 @@ import xarray as xr
 
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage
-from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
+from lidarops.retrieve.signal.labeled_averaging import (
+    ClockAverage,
+    Record,
+    ScreenedAverage,
+    Screening,
+)
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Indices = npt.NDArray[np.int64]
@@ -224,7 +228,7 @@ class ScreenedAverages:
     """Means of the profiles of channels over clock intervals, without outlying parts.
 
     A part that is outlying in any channel is left out of all. The means of a channel have the
-    variables of `lidarops.retrieve.signal.labeled_screening.ScreenedAverage.completed`.
+    variables of `lidarops.retrieve.signal.labeled_averaging.ScreenedAverage.completed`.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic.labeled import invert_elastic
 from lidarops.retrieve.raman.labeled import Assumptions, retrieve
-from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import RamanSettings
 from lidarops.retrieve.signal.counts_to_signal import photon_signal
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 from lidarops.settings import ReferenceSettings

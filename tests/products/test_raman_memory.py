@@ -10,7 +10,7 @@ from benchmarks.throughput.raman_night import night, night_signals, screened_ave
 from lidarops.products.raman.retrieval import bytes_held
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import RamanSettings
 
 SETTINGS = RamanSettings(355e-9, 387e-9, 1.0, 0.5, 3000.0, 6500.0, 2000.0, 1.0, 0.02, 0.01)
 NAMES = ("355", "387")

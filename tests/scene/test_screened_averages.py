@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from lidarops.records import DetectionMode
-from lidarops.retrieve.signal.labeled_screening import Screening
+from lidarops.retrieve.signal.labeled_averaging import Screening
 from lidarops.scene.profiles import Chunk, FileProfiles, ScreenedAverages
 
 STEP, BINS, PROFILES = 7.5, 400, 12

@@ -9,9 +9,13 @@ import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman.cells import Cells, make_cells
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal
+from lidarops.retrieve.raman.signals import (
+    AirColumn,
+    Cells,
+    ChannelSignal,
+    RamanSettings,
+    make_cells,
+)
 
 Array = npt.NDArray[np.float64]
 

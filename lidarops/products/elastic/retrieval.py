@@ -16,9 +16,8 @@ from lidarops.products.elastic.settings import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
-from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
-from lidarops.retrieve.signal.labeled_screening import Screening
-from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.averaging import cloud_contrast
+from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import REQUESTED, Entries, Entry, NoSettings, ProductCase
 from lidarops.scene.channels import range_channel, range_offset
 from lidarops.scene.choices import AverageSettings, average, with_low_signal_to_noise, with_methods

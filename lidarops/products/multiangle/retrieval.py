@@ -30,7 +30,7 @@ from lidarops.products.multiangle.baseline import (
 from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
 from lidarops.records import Granule
-from lidarops.retrieve.common.azimuths import widest_azimuth_gap
+from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles

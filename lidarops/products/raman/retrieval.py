@@ -20,11 +20,10 @@ from lidarops.retrieve.raman.scattering import (
     is_raman_line,
     raman_wavelength,
 )
-from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import RamanSettings
+from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
-from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER
-from lidarops.retrieve.signal.labeled_screening import Screening
-from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import REQUESTED, Entries, ProductCase
 from lidarops.scene.channels import file_channels, member_channel, range_channel, wavelength
 from lidarops.scene.choices import AverageSettings, average, with_low_signal_to_noise, with_methods

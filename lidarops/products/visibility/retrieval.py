@@ -29,7 +29,7 @@ from lidarops.products.visibility.settings import (
 from lidarops.products.visibility.variables import LAYOUT
 from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, is_glued
 from lidarops.retrieve.air.labeled import VisibilityDefinition
-from lidarops.retrieve.background.left_signal import window_before
+from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BeamAverages
 from lidarops.retrieve.network.thresholds import THRESHOLDS

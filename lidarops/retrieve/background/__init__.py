@@ -4,8 +4,8 @@
 `left_signal` how much signal may have been subtracted with the background. The methods alone:
 `tail_mean` averages the far bins, `cubic` solves the cubic of a homogeneous path in closed form,
 `fit_known_shape` fits background and amplitude of clear air (`molecular_shape`). Beside them,
-`photon_counts` gives the variance of counts, and `detectable_light` tests on a few profiles
-whether a stretch of range holds any backscatter. Kernels are in the modules with an underscore.
+`detectable_light` tests on a few profiles whether a stretch of range holds any backscatter. Kernels
+are in the modules with an underscore.
 """
 
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, cubic, tail_mean
@@ -14,14 +14,12 @@ from lidarops.retrieve.background.known_shape import (
     fit_known_shape,
     molecular_shape,
 )
-from lidarops.retrieve.background.photon_counts import mean_profile_variance
 
 __all__ = [
     "BackgroundResult",
     "KnownShapeResult",
     "cubic",
     "fit_known_shape",
-    "mean_profile_variance",
     "molecular_shape",
     "tail_mean",
 ]

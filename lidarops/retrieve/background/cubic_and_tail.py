@@ -97,7 +97,7 @@ def cubic(
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    noise = inputs.variance_rows(variance, grid, leading)
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     known = variance is not None
     result, _ = solve_cubic(rows, grid.values, lag, noise, known_variance=known)
     return BackgroundResult(
@@ -200,7 +200,7 @@ def tail_mean(
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    noise = inputs.variance_rows(variance, grid, leading)
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     first = first_of_tail(grid.values, start)
     values = np.ascontiguousarray(rows[:, first:], dtype=np.float64)
     noise = np.broadcast_to(noise[:, first:], values.shape)

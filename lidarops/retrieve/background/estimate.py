@@ -11,6 +11,7 @@ The result of a profile does not depend on the other profiles, to the last bit.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -18,8 +19,6 @@ from scipy import special
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, known_shape
-from lidarops.retrieve.background._section_fit import fit_section, groups
-from lidarops.retrieve.background.left_signal import LeftSignal, left_in_tail, shifts
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
@@ -251,7 +250,7 @@ def from_cubic(
     section = _bins(range, span)
     grid = inputs.range_grid(range[section])
     rows, leading = inputs.profiles(power[..., section], grid)
-    noise = inputs.variance_rows(variance[..., section], grid, leading)
+    noise = inputs.noise_rows(variance[..., section], "variance", grid, leading, negative=False)
     root, _ = cubic_and_tail.solve_cubic(rows, grid.values, None, noise, known_variance=True)
     error = root.background_standard_error
     usable = np.isfinite(error)
@@ -303,3 +302,187 @@ def _bins(range_: Array, span: tuple[float, float] | None) -> slice:
             remedy=f"ranges end at {range_[-1]:g} m",
         )
     return slice(int(first), int(past))
+
+
+_STEPS: Final = 4
+_STEEPEST: Final = 100.0
+"""Largest optical depth, there and back, of a section; the signal vanishes within a few bins."""
+_LARGEST_STEP: Final = 3.0
+"""Largest change of that optical depth in one step."""
+
+
+class SectionFit(NamedTuple):
+    """Result of each profile, (profile,)."""
+
+    background: Array
+    variance: Array
+    """Of the background."""
+    waves: Array
+    """Chi-square of the mean residuals of `groups` of bins; the fit uses 3 degrees of freedom."""
+
+
+def groups(bins: int) -> int:
+    """Return the number of groups of neighbouring bins whose mean residuals are tested."""
+    return min(bins, 16)
+
+
+def fit_section(power: Array, range_: Array, variance: Array, background: Array) -> SectionFit:
+    """Fit background, amplitude and extinction.
+
+    Parameters
+    ----------
+    power, variance : (profile, bin) float
+    range_ : (bin,) float
+        m, ascending and uniform.
+    background : (profile,) float
+        From which the steps begin.
+    """
+    fall = (range_[0] / range_) ** 2
+    with np.errstate(all="ignore"):
+        along = (range_ - range_[0]) / (range_[-1] - range_[0])
+        depth = _first_depth(power - background[:, np.newaxis], fall)
+        root = 1.0 / np.sqrt(variance)
+        for step in range(_STEPS):
+            shape = fall * np.exp(-depth[:, np.newaxis] * along)
+            solved = _least_squares(root * power, (root, root * shape, root * shape * along))
+            change = np.clip(-solved.tilt / solved.amplitude, -_LARGEST_STEP, _LARGEST_STEP)
+            usable = (solved.amplitude > 0.0) & np.isfinite(change) & (step < _STEPS - 1)
+            depth = np.clip(depth + np.where(usable, change, 0.0), -_STEEPEST, _STEEPEST)
+        count = groups(range_.size)
+        edges = np.arange(count) * range_.size // count
+        total = np.add.reduceat(solved.residuals * root, edges, axis=-1)
+        weight = np.add.reduceat(root**2, edges, axis=-1)
+        waves = (total**2 / weight).sum(axis=-1)
+    return SectionFit(solved.background, solved.variance, waves)
+
+
+def _first_depth(net: Array, fall: Array) -> Array:
+    """Return the optical depth there and back from the signals of the first two quarters."""
+    quarter = max(fall.size // 4, 1)
+    level = net / fall
+    near, next_ = level[:, :quarter].sum(axis=-1), level[:, quarter : 2 * quarter].sum(axis=-1)
+    depth = np.log(near / next_) * (fall.size - 1) / quarter
+    return np.where(np.isfinite(depth), np.clip(depth, -_STEEPEST, _STEEPEST), 0.0)
+
+
+class _Solution(NamedTuple):
+    background: Array
+    variance: Array
+    amplitude: Array
+    tilt: Array
+    residuals: Array
+
+
+def _least_squares(values: Array, columns: tuple[Array, Array, Array]) -> _Solution:
+    """Solve for three coefficients by orthogonalization, the background last."""
+    constant, shape, tilted = columns
+    residuals = np.broadcast_to(values, shape.shape).copy()
+    first, first_norm = _unit(shape)
+    on_tilted, on_constant = _along(first, tilted), _along(first, constant)
+    second, second_norm = _unit(tilted - on_tilted[:, np.newaxis] * first)
+    rest = constant - on_constant[:, np.newaxis] * first
+    second_on_constant = _along(second, rest)
+    third, third_norm = _unit(rest - second_on_constant[:, np.newaxis] * second)
+    products = []
+    for direction in (first, second, third):
+        product = _along(direction, residuals)
+        residuals -= product[:, np.newaxis] * direction
+        products.append(product)
+    background = products[2] / third_norm
+    tilt = (products[1] - second_on_constant * background) / second_norm
+    amplitude = (products[0] - on_tilted * tilt - on_constant * background) / first_norm
+    return _Solution(background, third_norm**-2.0, amplitude, tilt, residuals)
+
+
+def _unit(column: Array) -> tuple[Array, Array]:
+    norm = np.sqrt((column**2).sum(axis=-1))
+    return column / norm[:, np.newaxis], norm
+
+
+def _along(direction: Array, column: Array) -> Array:
+    return np.asarray((direction * column).sum(axis=-1))
+
+
+@dataclass(frozen=True, slots=True)
+class LeftSignal:
+    """Signal that may have been subtracted with the background, one value a profile."""
+
+    most: Array
+    """In the unit of the power; NaN where no bin before the tail is known."""
+    standard_error: Array
+
+    @property
+    def detected(self) -> Array:
+        """`most` where the signal before the tail exceeds its noise, else 0."""
+        with np.errstate(invalid="ignore"):
+            beyond_noise = self.most > THRESHOLDS.detected * self.standard_error
+        return np.where(beyond_noise, self.most, 0.0)
+
+
+def window_before(start: float) -> tuple[float, float]:
+    """Return the ranges, near and far, of the window that is compared with a tail.
+
+    Parameters
+    ----------
+    start : float
+        m, start of the tail.
+    """
+    return THRESHOLDS.nearest * start, THRESHOLDS.farthest * start
+
+
+def shifts(shift: Array, standard_error: Array) -> Booleans:
+    """Return where a shift of a value by signal left in the tail is too large for no flag.
+
+    Parameters
+    ----------
+    shift, standard_error : (...) float
+        Of the value, in one unit; NaN raises no flag.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.abs(shift) > THRESHOLDS.share_of_error * standard_error)
+
+
+def left_in_tail(
+    power: Array,
+    range: Array,  # noqa: A002 - the field's word
+    variance: Array,
+    tail: slice,
+    background: Array,
+    background_standard_error: Array,
+    shape: Array | None = None,
+) -> LeftSignal:
+    """Return the most signal that the mean of a tail may contain.
+
+    Parameters
+    ----------
+    power, variance : (..., range) float
+        Bins are skipped where either is not finite.
+    range : (range,) float
+        m, ascending.
+    tail : slice
+        Bins whose mean is the background.
+    background, background_standard_error : (...) float
+        From these bins.
+    shape : (..., range) float, optional
+        Signal that falls no faster than the actual one from the window before to the tail. By
+        default that of air of constant scattering, without attenuation.
+
+    Returns
+    -------
+    LeftSignal
+        With the leading axes of `power`.
+    """
+    before = slice(*np.searchsorted(range, window_before(float(range[tail][0]))))
+    if before.start == before.stop:
+        unknown = np.full(power.shape[:-1], np.nan)
+        return LeftSignal(unknown, unknown)
+    slowest = range**-2.0 if shape is None else shape
+    fall = slowest[..., tail].mean(axis=-1) / slowest[..., before].mean(axis=-1)
+    net, noise = power[..., before] - background[..., np.newaxis], variance[..., before]
+    known = np.isfinite(net) & np.isfinite(noise)
+    count = known.sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(known, net, 0.0).sum(axis=-1) / count
+        error = np.sqrt(np.where(known, noise, 0.0).sum(axis=-1)) / count
+        spread = np.hypot(error, background_standard_error)
+    return LeftSignal(mean * fall / (1.0 - fall), spread * fall / (1.0 - fall))

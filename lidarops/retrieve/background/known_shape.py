@@ -205,7 +205,7 @@ def _noise(
             "is not positive", field="exposure", remedy="mask profiles without shots"
         )
     return _shape_fit.ShapeNoise(
-        frozen(inputs.variance_rows(variance, grid, leading)),
+        frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
         frozen(np.full(1, np.nan) if counts is None else counts),
     )
 

@@ -58,11 +58,5 @@ class Thresholds(NamedTuple):
     """Relative error of the signal in the tail as computed from the shape of clean air, caused by
     aerosol in the far range; simulations with haze of 12 percent of the air there."""
 
-    enough_counts: float = 1000.0
-    """Counts over which a mean profile is averaged: their variance is known to 3 percent, by
-    Poisson statistics."""
-    widest: int = 7
-    """Most bins to either side over which a mean profile is averaged; assumed."""
-
 
 THRESHOLDS: Final = Thresholds()

@@ -16,7 +16,7 @@ import xarray as xr
 from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air import reference_window as _reference
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
+from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.background import cubic_and_tail, estimate
 from lidarops.retrieve.background import known_shape as _known_shape
 from lidarops.retrieve.clouds import layers as _layers
@@ -123,7 +123,7 @@ class MeanProfiles:
     overlap : (range,) float, optional
         NaN where it is not known.
     contrast : float
-        Least contrast of a cloud (`lidarops.retrieve.signal.screening.cloud_contrast`).
+        Least contrast of a cloud (`lidarops.retrieve.signal.averaging.cloud_contrast`).
     """
 
     def __init__(

@@ -15,8 +15,8 @@ from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Integers, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
-from lidarops.retrieve.signal.screening import skewness_margin
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
 _ROUNDING: Final = 1e-9
@@ -233,7 +233,7 @@ def _tests(
     """Return the validated arguments of `find_layers` and the limits of its tests."""
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    noise = inputs.variance_rows(variance, grid, leading)
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     shape = inputs.noise_rows(molecular_attenuated, "molecular_attenuated", grid, leading)
     if not np.all(shape >= 0.0) or np.any(np.isinf(shape)):
         raise RetrievalInputError(

@@ -84,7 +84,7 @@ def bridge_outliers(
     rows = profiles.astype(np.float64, copy=False)
     given = inputs.profile_values(background, "background", leading)
     level = np.zeros(1) if given is None else given
-    noise = inputs.variance_rows(variance, grid, leading)
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     signal = rows - level[:, np.newaxis]
     outlying = np.zeros(rows.shape, dtype=np.bool_)
     work = np.empty((5, grid.size))

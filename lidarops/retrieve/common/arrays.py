@@ -40,3 +40,17 @@ def frozen(values: _Array) -> _Array:
 def usable(power: float, variance: float) -> bool:
     """Return whether a power and its variance are finite, and the variance not negative."""
     return abs(power) < HUGE and 0.0 <= variance < HUGE
+
+
+def widest_azimuth_gap(azimuth: Array) -> float:
+    """Return the widest range of azimuths without a beam, radian.
+
+    Parameters
+    ----------
+    azimuth : (angle,) float
+        radian; only of beams that are not vertical.
+    """
+    if azimuth.size == 0:
+        return 2.0 * np.pi
+    ordered = np.sort(np.mod(azimuth, 2.0 * np.pi))
+    return float(np.max(np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))))

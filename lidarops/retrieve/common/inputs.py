@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from lidarops.retrieve.common.arrays import Array, Block, Floats
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
 _Array = TypeVar("_Array", bound=Block)
+_Result = TypeVar("_Result", bound=Any)
 
 SHORTEST_REACH = 100.0
 """m. No lidar section ends nearer, but every section in km does: detects wrong units."""
@@ -106,35 +107,49 @@ def range_grid(values: npt.ArrayLike) -> RangeGrid:
     return RangeGrid(grid, descending)
 
 
-def profiles(power: npt.ArrayLike, grid: RangeGrid) -> tuple[Floats, tuple[int, ...]]:
-    """Return `power` as contiguous (profile, bin), and the shape of its leading axes.
+def profiles(
+    power: npt.ArrayLike, grid: RangeGrid, name: str = "power"
+) -> tuple[Floats, tuple[int, ...]]:
+    """Return powers as contiguous (profile, bin), and the shape of their leading axes.
 
     Raises
     ------
     RetrievalInputError
         Where the last axis does not match the range.
     """
-    array = real_array(power, "power")
+    array = real_array(power, name)
     if array.ndim == 0 or array.shape[-1] != grid.size:
         raise RetrievalInputError(
             f"has the shape {array.shape}, but range has {grid.size} bins",
-            field="power",
-            remedy="the last axis of power is range",
+            field=name,
+            remedy="the last axis is range",
         )
     leading = array.shape[:-1]
-    flat = grid.turn(array).reshape(_count(leading), grid.size)
-    return np.ascontiguousarray(flat), leading
+    rows = int(np.prod(leading, dtype=np.int64))
+    return np.ascontiguousarray(grid.turn(array).reshape(rows, grid.size)), leading
+
+
+def with_leading_axes(result: _Result, leading: tuple[int, ...]) -> _Result:
+    """Return a dataclass of (profile, ...) arrays with the leading axes of the profiles."""
+    arrays = {field.name: getattr(result, field.name) for field in fields(result)}
+    shaped = {name: array.reshape((*leading, *array.shape[1:])) for name, array in arrays.items()}
+    return replace(result, **shaped)
 
 
 def noise_rows(
-    noise: npt.ArrayLike | None, name: str, grid: RangeGrid, leading: tuple[int, ...]
+    noise: npt.ArrayLike | None,
+    name: str,
+    grid: RangeGrid,
+    leading: tuple[int, ...],
+    *,
+    negative: bool = True,
 ) -> Array:
-    """Return variances or weights as contiguous (profile or 1, bin); ones for None.
+    """Return values of bins, such as variances, as contiguous (profile or 1, bin); ones for None.
 
     Raises
     ------
     RetrievalInputError
-        Where they do not broadcast to the power.
+        Where they do not broadcast to the power, or are negative although they must not be.
     """
     if noise is None:
         return np.ones((1, grid.size))
@@ -144,43 +159,28 @@ def noise_rows(
     shared = array.size == 1 or all(length == 1 for length in array.shape[:-1])
     target = (*((1,) * len(leading) if shared else leading), grid.size)
     rows = broadcast(array.reshape(array.shape[-1:]) if shared else array, target, name)
-    return np.ascontiguousarray(rows.reshape(1 if shared else _count(leading), grid.size))
-
-
-def variance_rows(
-    variance: npt.ArrayLike | None, grid: RangeGrid, leading: tuple[int, ...]
-) -> Array:
-    """Return `noise_rows` of a variance.
-
-    Raises
-    ------
-    RetrievalInputError
-        Where it does not broadcast to the power, or is negative.
-    """
-    rows = noise_rows(variance, "variance", grid, leading)
-    if np.any(rows < 0):
-        raise RetrievalInputError(
-            "is negative", field="variance", remedy="give squares of the power's unit"
-        )
-    return rows
+    if not negative and np.any(rows < 0):
+        raise RetrievalInputError("is negative", field=name)
+    count = 1 if shared else int(np.prod(leading, dtype=np.int64))
+    return np.ascontiguousarray(rows.reshape(count, grid.size))
 
 
 def profile_values(
-    values: npt.ArrayLike | None, name: str, leading: tuple[int, ...]
+    values: npt.ArrayLike | None, name: str, leading: tuple[int, ...], *, finite: bool = True
 ) -> Array | None:
     """Return one value per profile as (profile or 1,); None for None.
 
     Raises
     ------
     RetrievalInputError
-        Where they do not broadcast to the profiles, or are not finite.
+        Where they do not broadcast to the profiles, or are not finite although they must be.
     """
     if values is None:
         return None
     array = real_array(values, name).astype(np.float64, copy=False)
     spread = array if array.size == 1 else broadcast(array, leading, name)
     flat = np.ascontiguousarray(spread.reshape(-1))
-    if not np.all(np.isfinite(flat)):
+    if finite and not np.all(np.isfinite(flat)):
         raise RetrievalInputError("is not finite", field=name)
     return flat
 
@@ -199,7 +199,3 @@ def choice(name: str, kind: type[_Choice], field: str) -> _Choice:
         raise RetrievalInputError(
             f"is {name!r}", field=field, remedy=f"choose one of {', '.join(kind)}"
         ) from None
-
-
-def _count(leading: tuple[int, ...]) -> int:
-    return int(np.prod(leading, dtype=np.int64))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,6 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, frozen
 from lidarops.retrieve.elastic import _fernald
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
 
 Reference = tuple[npt.ArrayLike, npt.ArrayLike]
 
@@ -236,7 +235,7 @@ def invert_elastic(
     )
     noise = np.zeros((1, grid.size))
     if variance is not None:
-        noise = inputs.variance_rows(variance, grid, leading)
+        noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     ratio_error = _errors(lidar_ratio_standard_error, "lidar_ratio_standard_error", grid, leading)
     air_error = _errors(molecular_relative_error, "molecular_relative_error", grid, leading)
     window = _window(reference, grid, leading)
@@ -430,3 +429,30 @@ def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ..
             field="reference",
         )
     return np.asarray(inside)
+
+
+class Thresholds(NamedTuple):
+    """Limits of the inversion."""
+
+    longest_gap: float = 150.0
+    """m; a longer gap without data ends the integration. Assumed."""
+    least_denominator: float = 0.05
+    """Share of the denominator at the reference. Beyond, errors grow as its inverse. Assumed."""
+    least_certainty: float = 5.0
+    """Standard errors by which the denominator must exceed zero for first-order errors to hold.
+    Simulations, with `skewed`."""
+    skewed: float = 5.5
+    """Ratio s of the denominator to its noise error at which noise errors are twice those of first
+    order. A reference that is too high by noise makes both values and errors too low, so noise
+    errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1. Simulations: less than 0.1 %
+    of the values are then off by more than 4 errors, without it 1 to 3 % where s is 5 to 8."""
+    negative: float = 4.0
+    """Standard errors below zero at which backscatter contradicts the signal. Manaus, 355 nm, with
+    an overlap that is not full where it was stated to be: 57 standard errors."""
+    negative_bins: int = 4
+    """Bins in a row that must be that low, so that noise alone is none. Assumed."""
+    largest_backscatter: float = 5e-4
+    """m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
+
+
+THRESHOLDS: Final = Thresholds()

@@ -28,9 +28,9 @@ from lidarops.retrieve.clouds.labeled import (
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.elastic.inversion import THRESHOLDS
+from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import systematic_changes, without_analog_background
-from lidarops.retrieve.signal.screening import cloud_contrast
 
 RatioAt = Callable[[Array], tuple[Array, Array]]
 """Altitudes in m -> lidar ratio and its standard error, sr."""
@@ -66,7 +66,7 @@ def invert_elastic(
         ``power``, ``variance``, ``quality`` over (time, range) and ``shots``, ``profiles`` over
         time, with the scalar coordinate ``zenith_angle`` (degree), from
         `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. With the signals of
-        their parts, from `lidarops.retrieve.signal.labeled_screening.ScreenedAverage`, clouds are
+        their parts, from `lidarops.retrieve.signal.labeled_averaging.ScreenedAverage`, clouds are
         sought in these too, else in the mean only. For the errors of
         dead time and baseline, see `lidarops.retrieve.signal.labeled.systematic_changes`.
     molecules : MolecularProfile

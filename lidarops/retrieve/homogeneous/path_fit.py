@@ -77,8 +77,7 @@ def fit_homogeneous_path(
     variance : (..., range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`; a scalar
         holds for every bin. Bins whose variance is zero or not finite are excluded. For counts,
-        give that of a mean profile (`lidarops.retrieve.background.mean_profile_variance`):
-        variances from the counts of the profile itself bias the fit.
+        give that of a mean profile: variances from the counts of the profile itself bias the fit.
     weights : (..., range) float, optional
         Inverse variances up to a common factor, in place of `variance`. Bins whose weight is
         not positive and finite are excluded.
@@ -231,7 +230,7 @@ def _noise(
         raise RetrievalInputError(
             "is given together with variance", field="weights", remedy="give one of the two"
         )
-    return inputs.variance_rows(variance, grid, leading), True
+    return inputs.noise_rows(variance, "variance", grid, leading, negative=False), True
 
 
 def _prior(

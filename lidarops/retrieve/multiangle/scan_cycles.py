@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.common.arrays import Array, Booleans, Integers
-from lidarops.retrieve.common.azimuths import widest_azimuth_gap
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers, widest_azimuth_gap
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 

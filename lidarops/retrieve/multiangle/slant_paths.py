@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from lidarops.constants import EFFECTIVE_RADIUS
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.common.arrays import Array, Booleans, Integers
-from lidarops.retrieve.common.azimuths import widest_azimuth_gap
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers, widest_azimuth_gap
 from lidarops.retrieve.common.inputs import real_array
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 

@@ -14,8 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air import labeled
 from lidarops.retrieve.air.labeled import VisibilityDefinition
-from lidarops.retrieve.background.estimate import from_tail
-from lidarops.retrieve.background.left_signal import shifts
+from lidarops.retrieve.background.estimate import from_tail, shifts
 from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult

@@ -19,7 +19,7 @@ from typing import Final, Self
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
-from lidarops.retrieve.raman._smooth_solution import least_sum, restricted_scores, solve
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 _LEAST_WEIGHT: Final = 1e-2
@@ -192,3 +192,251 @@ def _weights(cells: int) -> Array:
     """Return the weights of smoothness that are compared, up to one that leaves a straight line."""
     decades = np.log10(10.0 * (cells / np.pi) ** 4 / _LEAST_WEIGHT)
     return np.asarray(_LEAST_WEIGHT * 10.0 ** np.arange(0.0, decades, 1.0 / _PER_DECADE))
+
+
+@compiled
+def _triangle(rows: Array) -> None:
+    """Rotate rows in place until those below the diagonal are 0 in all columns but the last."""
+    count, columns = rows.shape
+    for j in range(columns - 1):
+        for i in range(j + 1, count):
+            if rows[i, j] == 0.0:
+                continue
+            length = np.hypot(rows[j, j], rows[i, j])
+            cosine, sine = rows[j, j] / length, rows[i, j] / length
+            for k in range(j, columns):
+                upper, lower = rows[j, k], rows[i, k]
+                rows[j, k] = cosine * upper + sine * lower
+                rows[i, k] = cosine * lower - sine * upper
+            rows[i, j] = 0.0
+
+
+@compiled
+def factor(
+    information: Array, weight: float, response: Array
+) -> tuple[Array, Array, Array, Array, float]:
+    """Return d and both diagonals of L, the right-hand side of its transpose, and the misfit.
+
+    Parameters
+    ----------
+    information, response : (cell,) float
+        At least 4 cells.
+    weight : float
+        Of the sum of squared second differences.
+
+    Returns
+    -------
+    (cell,) float64, (cell,) float64, (cell,) float64
+        NaN where the matrix is singular.
+    (cell,) float64
+        Right-hand side: the solution of the transposed L is that of the least sum.
+    float
+        The least sum of squares: of responses by their information, and of smoothness.
+    """
+    cells = information.size
+    pivot, near, far, target = np.empty(cells), np.zeros(cells), np.zeros(cells), np.zeros(cells)
+    misfit, bend = 0.0, np.sqrt(weight)
+    # Columns: this cell and the next two, and the right-hand side. Rows: two that the cells before
+    # leave, the information of this cell, and its second difference.
+    rows = np.zeros((4, 4))
+    for i in range(cells):
+        root = np.sqrt(information[i])
+        rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = root, 0.0, 0.0, root * response[i]
+        inside = bend if i < cells - 2 else 0.0
+        rows[3, 0], rows[3, 1], rows[3, 2], rows[3, 3] = inside, -2.0 * inside, inside, 0.0
+        _triangle(rows)
+        misfit += rows[3, 3] ** 2
+        first = rows[0, 0] if rows[0, 0] != 0.0 else np.nan
+        pivot[i], target[i] = first * first, rows[0, 3] / first
+        near[i], far[i] = rows[0, 1] / first, rows[0, 2] / first
+        for row in range(2):
+            rows[row, 0], rows[row, 1] = rows[row + 1, 1], rows[row + 1, 2]
+            rows[row, 2], rows[row, 3] = 0.0, rows[row + 1, 3]
+    return pivot, near, far, target, misfit
+
+
+@compiled
+def least_sum(information: Array, weight: float, response: Array) -> Array:
+    """Return the solution of the least sum of squares, (cell,)."""
+    _, near, far, solved, _ = factor(information, weight, response)
+    for i in range(information.size - 2, -1, -1):
+        solved[i] -= near[i] * solved[i + 1]
+        if i < information.size - 2:
+            solved[i] -= far[i] * solved[i + 2]
+    return solved
+
+
+@compiled
+def _forward(near: Array, far: Array, right: Array) -> None:
+    """Replace right-hand sides (cell, side) by the solutions of L."""
+    cells, sides = right.shape
+    for i in range(1, cells):
+        for k in range(sides):
+            right[i, k] -= near[i - 1] * right[i - 1, k]
+        if i > 1:
+            for k in range(sides):
+                right[i, k] -= far[i - 2] * right[i - 2, k]
+
+
+@compiled
+def _backward(pivot: Array, near: Array, far: Array, right: Array) -> None:
+    """Replace right-hand sides (cell, side) by the solutions of d and the transposed L."""
+    cells, sides = right.shape
+    for i in range(cells - 1, -1, -1):
+        for k in range(sides):
+            right[i, k] /= pivot[i]
+        if i < cells - 1:
+            for k in range(sides):
+                right[i, k] -= near[i] * right[i + 1, k]
+        if i < cells - 2:
+            for k in range(sides):
+                right[i, k] -= far[i] * right[i + 2, k]
+
+
+@compiled
+def _substitute(pivot: Array, near: Array, far: Array, right: Array) -> None:
+    """Replace right-hand sides (cell, side) by their solutions."""
+    _forward(near, far, right)
+    _backward(pivot, near, far, right)
+
+
+@compiled
+def solve(information: Array, weight: float, right: Array) -> Array:
+    """Return the solutions of right-hand sides (cell, side), refined once.
+
+    The refinement restores the digits that the squares of the roots lose.
+    """
+    pivot, near, far, _, _ = factor(information, weight, np.zeros(information.size))
+    solved = right.copy()
+    _substitute(pivot, near, far, solved)
+    cells, sides = right.shape
+    left = np.empty((cells, sides))
+    for i in range(cells):
+        for k in range(sides):
+            left[i, k] = right[i, k] - information[i] * solved[i, k]
+    for i in range(cells - 2):
+        for k in range(sides):
+            bend = weight * (solved[i, k] - 2.0 * solved[i + 1, k] + solved[i + 2, k])
+            left[i, k] -= bend
+            left[i + 1, k] += 2.0 * bend
+            left[i + 2, k] -= bend
+    _substitute(pivot, near, far, left)
+    return np.asarray(solved + left)
+
+
+@compiled
+def restricted_scores(information: Array, response: Array, weights: Array) -> Array:
+    """Return minus twice the logarithm of the restricted likelihood of weights, up to a constant.
+
+    Parameters
+    ----------
+    information, response : (cell,) float
+    weights : (weight,) float
+        Of the sum of squared second differences.
+    """
+    scores = np.empty(weights.size)
+    for number in range(weights.size):
+        pivot, _, _, _, misfit = factor(information, weights[number], response)
+        logarithm = np.log(pivot).sum()
+        scores[number] = misfit + logarithm - (response.size - 2) * np.log(weights[number])
+    return scores
+
+
+@dataclass(frozen=True, slots=True)
+class Extinction:
+    """Particle extinction at the laser wavelength, (cell,) unless stated."""
+
+    value: Array
+    """m-1."""
+    kernel: Array
+    """(cell, cell): weights of the true extinction of each cell in the value, 1 in total."""
+    vertical_resolution: Array
+    """m along the beam: length over which a mean has the sum of squared weights of the kernel."""
+    noise: Array
+    """(cell, noise of a cell): response in m-1 to independent unit noise."""
+    resolution_error: Array
+    """m-1: of the value as the mean over `vertical_resolution`."""
+    smoothing_error: Array
+    """m-1: of the value as the extinction of the cell itself."""
+
+    @property
+    def noise_error(self) -> Array:
+        """Standard error by noise, m-1."""
+        return root_of_squares(self.noise)
+
+
+def slope(depth: Array, step: float) -> Array:
+    """Return the derivative along the first axis: central differences, one-sided at the ends."""
+    change = np.empty(depth.shape)
+    change[1:-1] = depth[2:] - depth[:-2]
+    change[1:-1] *= 0.5 / step
+    change[0] = (depth[1] - depth[0]) / step
+    change[-1] = (depth[-1] - depth[-2]) / step
+    return change
+
+
+def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
+    r"""Return the extinction of a fit, with resolution and errors.
+
+    .. math:: \alpha = \frac{1}{1 + \kappa} \frac{\mathrm{d}\theta}{\mathrm{d}R}
+
+    The smoothness is also a model of extinction: a random walk, from which the errors by
+    resolution follow.
+
+    Parameters
+    ----------
+    fit : DepthFit
+    step : float
+        m, length of a cell.
+    ratio : float
+        :math:`\kappa`, particle extinction at the Raman wavelength over that at the laser's.
+
+    References
+    ----------
+    `ansmann1990`; `iarlori2015` (resolution).
+    """
+    both = 1.0 + ratio
+    response = slope(fit.inverse, step)
+    weights = response * fit.information
+    beyond = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
+    kernel = step * (beyond - 0.5 * weights)
+    resolution = step / root_of_squares(kernel) ** 2
+    walk = np.sqrt(1.0 / fit.walk) / (step * both)
+    away = kernel - mean_weights(resolution, step)
+    return Extinction(
+        value=slope(fit.depth, step) / both,
+        kernel=kernel,
+        vertical_resolution=resolution,
+        noise=response * np.sqrt(fit.information) / both,
+        resolution_error=walk * _summed(away),
+        smoothing_error=walk * _summed(kernel - np.eye(kernel.shape[0])),
+    )
+
+
+def _summed(weights: Array) -> Array:
+    """Return the response of weighted sums to a random walk with unit steps."""
+    return root_of_squares(np.cumsum(weights[:, :0:-1], axis=1))
+
+
+def mean_weights(length: Array, step: float) -> Array:
+    """Return the weights of cells in means over a length around each cell, within the profile.
+
+    Parameters
+    ----------
+    length : (cell,) float
+        m.
+    step : float
+        m, length of a cell.
+
+    Returns
+    -------
+    (cell, cell) float64
+        Rows have the sum 1.
+    """
+    edges = np.arange(length.size + 1) * step
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    low, high = middle - 0.5 * length, middle + 0.5 * length
+    inside = np.minimum(high[:, np.newaxis], edges[1:])
+    inside -= np.maximum(low[:, np.newaxis], edges[:-1])
+    np.maximum(inside, 0.0, out=inside)
+    return np.asarray(inside / inside.sum(axis=1, keepdims=True))

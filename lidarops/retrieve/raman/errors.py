@@ -10,10 +10,8 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter
-from lidarops.retrieve.raman.depth_fit import DepthFit
-from lidarops.retrieve.raman.extinction import Extinction, slope
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, CellSignal
+from lidarops.retrieve.raman.depth_fit import DepthFit, Extinction, slope
+from lidarops.retrieve.raman.signals import AirColumn, CellSignal, RamanSettings
 
 EXTINCTION_CAUSES: Final = (
     "noise", "resolution", "background", "dead_time", "baseline", "angstrom", "molecular",

@@ -19,20 +19,23 @@ from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.background import estimate
 from lidarops.retrieve.clouds import labeled as _clouds
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
-from lidarops.retrieve.raman.cells import (
+from lidarops.retrieve.raman.backscatter import overlap_of
+from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
+from lidarops.retrieve.raman.scattering import nitrogen_line_share
+from lidarops.retrieve.raman.signals import (
+    AirColumn,
     Cells,
+    ChannelSignal,
+    RamanSettings,
+    cell_signals,
     largest_of_cells,
     make_cells,
     state_of_cells,
     touched,
 )
-from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.overlap import overlap_of
-from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
-from lidarops.retrieve.raman.scattering import nitrogen_line_share
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal, cell_signals
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
+from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import (
     CORRELATION_LENGTH,
     actual_noise,
@@ -41,7 +44,6 @@ from lidarops.retrieve.signal.labeled import (
     systematic_changes,
     without_analog_background,
 )
-from lidarops.retrieve.signal.screening import cloud_contrast
 
 _WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
 _DOUBTED: Final = _WITHHELD | int(Quality.PILE_UP)

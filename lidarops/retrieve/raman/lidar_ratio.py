@@ -9,9 +9,8 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter, inverse_of_weak
-from lidarops.retrieve.raman.depth_fit import root_of_squares
+from lidarops.retrieve.raman.depth_fit import Extinction, root_of_squares
 from lidarops.retrieve.raman.errors import RANDOM, Cause, Quotient
-from lidarops.retrieve.raman.extinction import Extinction
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 _MOST_UNKNOWN: Final = 0.05

@@ -20,12 +20,16 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
-from lidarops.retrieve.air.thresholds import THRESHOLDS as WINDOW_THRESHOLDS
+from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.common.arrays import Array
-from lidarops.retrieve.raman.cells import Cells
 from lidarops.retrieve.raman.depth_fit import DepthFit
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, CellSignal, ChannelSignal
+from lidarops.retrieve.raman.signals import (
+    AirColumn,
+    Cells,
+    CellSignal,
+    ChannelSignal,
+    RamanSettings,
+)
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 

@@ -13,8 +13,13 @@ from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Integers
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.raman import backscatter as _backscatter
-from lidarops.retrieve.raman.cells import Cells
-from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise, fit_depth, root_of_squares
+from lidarops.retrieve.raman.depth_fit import (
+    DepthFit,
+    SignalNoise,
+    extinction_of,
+    fit_depth,
+    root_of_squares,
+)
 from lidarops.retrieve.raman.errors import (
     BACKSCATTER_CAUSES,
     EXTINCTION_CAUSES,
@@ -23,12 +28,17 @@ from lidarops.retrieve.raman.errors import (
     Quotient,
     summed,
 )
-from lidarops.retrieve.raman.extinction import extinction_of
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.lidar_ratio import lidar_ratio_of
 from lidarops.retrieve.raman.reference import choose_window
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, CellSignal, ChannelSignal, cell_signals
+from lidarops.retrieve.raman.signals import (
+    AirColumn,
+    Cells,
+    CellSignal,
+    ChannelSignal,
+    RamanSettings,
+    cell_signals,
+)
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 

@@ -11,8 +11,7 @@ from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import inverse_mean
 from lidarops.retrieve.raman.errors import Quotient
 from lidarops.retrieve.raman.scattering import particle_ratio
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import CellSignal
+from lidarops.retrieve.raman.signals import CellSignal, RamanSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,13 +22,12 @@ from lidarops.retrieve.signal.counts_to_signal import (
     photon_signal,
     range_corrected,
 )
-from lidarops.retrieve.signal.dark import DarkProfile, DarkSignals
+from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.gluing import GluedSignal, glue
 from lidarops.retrieve.signal.lag import LagEstimate, estimate_lag, shift_signal
 
 __all__ = [
     "Averages",
-    "DarkProfile",
     "DarkSignals",
     "GluedSignal",
     "LagEstimate",

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,3 +196,188 @@ def join_bits(
         row, of_group = quality[t], bits[groups[t]]
         for i in range(row.size):
             of_group[i] |= row[i] & passed
+
+
+_SIGNS: Final = (1.0, -1.0)
+
+_CONTRAST_WAVELENGTH: Final = 532e-9
+"""m; wavelength of `Thresholds.cloud_contrast`."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartCells:
+    """Means of consecutive bins, (..., cell)."""
+
+    power: Array
+    """NaN where less than half of the bins have data."""
+    variance: Array
+    quantum: Array
+    """(...): the power of a cell with a single count; 0 where nothing is counted."""
+
+
+def cloud_contrast(wavelength: float) -> float:
+    """Return the least contrast of a cloud, that of the same aerosol at each wavelength.
+
+    Over air, aerosol of an Angstrom exponent of 1 scales with lambda^3.
+
+    Parameters
+    ----------
+    wavelength : float
+        m.
+    """
+    scaled = (wavelength / _CONTRAST_WAVELENGTH) ** 3
+    return 1.0 + (THRESHOLDS.cloud_contrast - 1.0) * scaled
+
+
+def skewness_margin(quantile: Array | float) -> Array:
+    r"""Return the counts by which those of few counts exceed a quantile of the normal distribution.
+
+    The Cornish-Fisher expansion of a Poisson distribution, of skewness :math:`N^{-1/2}`, gives
+    :math:`(t^2 - 1) / 6` counts more than :math:`t \sqrt N`.
+    """
+    return np.asarray((np.square(quantile) - 1.0) / 6.0)
+
+
+def cells_of_parts(
+    sums: Array, usable: Booleans, first: int, past: int, bins: int
+) -> tuple[Array, Array]:
+    """Return power and variance of means over cells of a number of bins, (part, cell).
+
+    The power is NaN where less than half of the bins have data.
+
+    Parameters
+    ----------
+    sums : (4, part, range) float
+        Of `lidarops.retrieve.signal.averaging.RunningMean`.
+    usable : (part, range) bool
+    first, past : int
+        Bins from and before which cells lie; bins that are left over at the end are left out.
+    bins : int
+    """
+    shape = sums.shape[1], (past - first) // bins
+    power, variance = np.empty(shape), np.empty(shape)
+    _fill_cells(frozen(sums), frozen(usable), first, bins, power, variance)
+    return power, variance
+
+
+def tail_of_cells(power: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the mean of the last tenth of the cells and its error, (part, 1): the background."""
+    tail = slice(-max(power.shape[1] // 10, 1), None)
+    known = np.isfinite(power[:, tail])
+    count = np.maximum(known.sum(axis=1, keepdims=True), 1)
+    mean = np.where(known, power[:, tail], 0.0).sum(axis=1, keepdims=True) / count
+    noise = np.where(known, variance[:, tail], 0.0).sum(axis=1, keepdims=True)
+    return mean, np.sqrt(noise) / count
+
+
+@compiled
+def _fill_cells(
+    sums: Array, usable: Booleans, first: int, bins: int, power: Array, variance: Array
+) -> None:
+    for part in range(power.shape[0]):
+        for cell in range(power.shape[1]):
+            signal = noise = 0.0
+            count = 0
+            begin = first + cell * bins
+            for i in range(max(begin, 0), min(begin + bins, sums.shape[2])):
+                total = sums[0, part, i]
+                if total > 0.0 and usable[part, i]:
+                    share = 1.0 / total
+                    shared = sums[3, part, i] * share
+                    signal += sums[1, part, i] * share
+                    noise += sums[2, part, i] * share * share + shared * shared
+                    count += 1
+            known = 2 * count >= bins and count > 0
+            power[part, cell] = signal / count if known else np.nan
+            variance[part, cell] = noise / (count * count) if known else np.nan
+
+
+def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Booleans:
+    r"""Return the parts in which a cell exceeds that cell in all other parts by more than a factor.
+
+    Let :math:`x_1 \ge x_2 \ge \dots` be the signals of one cell in the :math:`n` parts. The first
+    :math:`k \le n / 5` are outlying where
+
+    .. math:: \frac{x_k - c \max(x_{k+1}, 0)}{\sqrt{\sigma_k^2 + c^2 \sigma_{k+1}^2}} > t.
+
+    This tests the hypothesis that the light of the cell differs by no more than the factor
+    :math:`c` from part to part, whatever the aerosol and its drift. If that holds everywhere, a
+    part is outlying with a probability below `Thresholds.screening_false_alarm` for each mean:
+    :math:`t` is the quantile of the normal distribution for that rate over the number of cells and
+    parts (Bonferroni bound), with a margin for few counts (`skewness_margin`). The same test of
+    :math:`-x` finds signals below zero. Noise that exceeds the stated one in the far half of a
+    part raises its :math:`\sigma` (`lidarops.retrieve.signal.noise_correlation`).
+
+    Where more than a fifth of the parts are outlying in one cell or another, or there are fewer
+    than 5, none is: what is rare is then not told from what is common.
+
+    Parameters
+    ----------
+    cells : PartCells
+        (part, cell), background subtracted.
+    compared : slice
+        The cells that are compared; the noise is that of the far half of all.
+    contrast : float
+        The factor :math:`c`, at least 1.
+
+    Returns
+    -------
+    (part,) bool
+    """
+    count, size = cells.power[:, compared].shape
+    outlying = np.zeros(count, dtype=np.bool_)
+    most = count // THRESHOLDS.fewest_parts
+    if not most:
+        return outlying
+    excess = estimate_noise_correlation(cells.power, cells.variance).excess
+    least = -float(ndtri(THRESHOLDS.screening_false_alarm / (len(_SIGNS) * count * size)))
+    margin = float(skewness_margin(least)) * cells.quantum
+    power, variance = (frozen(array[:, compared]) for array in (cells.power, cells.variance))
+    _mark_parts(power, variance, frozen(excess), frozen(margin), contrast, least, outlying)
+    return outlying if outlying.sum() <= most else np.zeros_like(outlying)
+
+
+@compiled
+def _mark_parts(
+    power: Array,
+    variance: Array,
+    excess: Array,
+    margin: Array,
+    contrast: float,
+    least: float,
+    outlying: Booleans,
+) -> None:
+    """Mark the parts that exceed all others in a cell, by the test of either sign."""
+    largest = np.empty(power.shape[0] // THRESHOLDS.fewest_parts + 1, dtype=np.intp)
+    for cell in range(power.shape[1]):
+        for sign in _SIGNS:
+            if not _find_largest(power, variance, cell, sign, largest):
+                continue
+            for k in range(largest.size - 1, 0, -1):
+                high, low = largest[k - 1], largest[k]
+                next_power = max(sign * power[low, cell], 0.0)
+                above = sign * power[high, cell] - margin[high] - contrast * next_power
+                noise = excess[high] * variance[high, cell]
+                noise += contrast * contrast * excess[low] * variance[low, cell]
+                if above > least * math.sqrt(noise):
+                    outlying[largest[:k]] = True
+                    break
+
+
+@compiled
+def _find_largest(power: Array, variance: Array, cell: int, sign: float, largest: Indices) -> bool:
+    """Find the parts with the largest power in a cell, descending; False where one is missing."""
+    filled = 0
+    for part in range(power.shape[0]):
+        value = sign * power[part, cell]
+        if not math.isfinite(value + variance[part, cell]):
+            return False
+        at = filled
+        while at > 0 and value > sign * power[largest[at - 1], cell]:
+            at -= 1
+        filled = min(filled + 1, largest.size)
+        for k in range(filled - 1, at, -1):
+            largest[k] = largest[k - 1]
+        if at < largest.size:
+            largest[at] = part
+    return True

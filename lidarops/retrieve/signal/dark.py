@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -32,17 +31,6 @@ class _DarkMethod(StrEnum):
     session, that session."""
 
 
-@dataclass(frozen=True, slots=True)
-class DarkProfile:
-    """Dark signals, one for each requested time."""
-
-    dark: Array
-    """(..., time, range), in the unit of the dark signals; NaN where no file is finite."""
-    variance: Array
-    """(..., time, range), noise variance, independent from bin to bin. Profiles with the same dark
-    files share that noise: it does not average down over them."""
-
-
 class DarkSignals:
     r"""Dark signals of an analog channel at any time, from its dark files.
 
@@ -56,9 +44,9 @@ class DarkSignals:
 
     Parameters
     ----------
-    dark_signals : (..., dark, range) float
+    dark_signals : (dark, range) float
         mV; NaN is skipped.
-    dark_times : (dark,) float in s, or datetime64
+    dark_times : (dark,) datetime64
         Middle of each dark file, in any order.
     method : {"nearest", "interpolated"}
 
@@ -73,88 +61,68 @@ class DarkSignals:
     ) -> None:
         self._method = inputs.choice(method, _DarkMethod, "method")
         signals = _signals(dark_signals)
-        self._times = np.atleast_1d(np.asarray(dark_times))
-        dark_seconds, _ = _seconds(self._times, self._times)
-        if signals.shape[-2] != dark_seconds.size:
+        self._times = np.asarray(dark_times)
+        dark_seconds = self._seconds(self._times, "dark_times")
+        if len(signals) != dark_seconds.size:
             raise RetrievalInputError(
                 f"have the shape {signals.shape} for {dark_seconds.size} times",
                 field="dark_signals",
-                remedy="the axis before the last is that of dark_times",
+                remedy="the first axis is that of dark_times",
             )
         self._sessions = _sessions(dark_seconds)
         self._means, self._variances = _means(signals, self._sessions)
         self.drift = _drift(signals)
         """Standard deviation of the shape of dark files, in their unit: that of means over 16ths of
-        the range, without the level of the file. NaN for one file, or of several channels."""
+        the range, without the level of the file. NaN for one file."""
 
-    def at(self, times: npt.ArrayLike) -> DarkProfile:
-        """Return the dark signal of each profile.
+    def _seconds(self, times: npt.ArrayLike, name: str) -> Array:
+        """Return times as s since the first dark file."""
+        # Division makes NaT a NaN; a cast to float would make it a number.
+        since = np.asarray(times).astype("M8[ns]") - self._times[:1].astype("M8[ns]")
+        seconds = np.asarray(since / np.timedelta64(1, "s"))
+        if not np.all(np.isfinite(seconds)):
+            raise RetrievalInputError(
+                "are not all known", field=name, remedy="leave those profiles out"
+            )
+        return seconds
+
+    def at(self, times: npt.ArrayLike) -> tuple[Array, Array]:
+        """Return the dark signal of each profile and the variance of its noise, (time, range).
+
+        In the unit of the dark signals and its square; NaN where no file is finite. The variance is
+        the scatter of the files of a session about their mean, after removing the level of each
+        file, averaged over 65 neighbouring bins. A session of one file gets the scatter of files in
+        other sessions; without any, that between neighbouring bins in the far half of the range.
+        It is independent from bin to bin; profiles with the same dark files share that noise, which
+        does not average down over them.
 
         Parameters
         ----------
-        times : (time,) float in s, or datetime64
+        times : (time,) datetime64
             Middle of each profile.
-
-        Returns
-        -------
-        DarkProfile
-            The variance is the scatter of the files of a session about their mean, after removing
-            the level of each file, averaged over 65 neighbouring bins. A session of one file gets
-            the scatter of files in other sessions; without any, that between neighbouring bins in
-            the far half of the range.
         """
-        dark_seconds, seconds = _seconds(self._times, times)
-        shares = _shares(dark_seconds, self._sessions, seconds, self._method)
-        return DarkProfile(
-            _weighted_sum(shares, self._means), _weighted_sum(shares**2, self._variances)
+        seconds, dark_seconds = (
+            self._seconds(part, name)
+            for part, name in ((times, "times"), (self._times, "dark_times"))
         )
+        shares = _shares(dark_seconds, self._sessions, seconds, self._method)
+        return _weighted_sum(shares, self._means), _weighted_sum(shares**2, self._variances)
 
     def variance(self, times: npt.ArrayLike) -> Array:
-        """Return the variance of the dark signal at times, (..., time, range)."""
-        return self.at(times).variance
+        """Return the variance of the dark signal at times, (time, range)."""
+        return self.at(times)[1]
 
 
 def _signals(values: npt.ArrayLike) -> Array:
     signals = inputs.real_array(values, "dark_signals").astype(np.float64)
-    if signals.ndim < 2 or signals.shape[-2] == 0 or signals.shape[-1] == 0:
+    if signals.ndim != 2 or signals.size == 0:
         raise RetrievalInputError(
             f"have the shape {signals.shape}",
             field="dark_signals",
-            remedy="give (..., dark, range) with at least one dark file, or leave the dark out",
+            remedy="give (dark, range) with at least one dark file, or leave the dark out",
         )
     signals[~np.isfinite(signals)] = np.nan
     return signals
-
-
-def _seconds(dark_times: npt.ArrayLike, times: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return both as s since the first dark file."""
-    arrays = []
-    for name, values in (("dark_times", dark_times), ("times", times)):
-        array = np.atleast_1d(np.asarray(values))
-        if array.ndim != 1 or array.dtype.kind not in "iufM":
-            raise RetrievalInputError(
-                f"hold {array.dtype} of the shape {array.shape}",
-                field=name,
-                remedy="give one time for each profile, in s or as datetime64",
-            )
-        arrays.append(array)
-    if (arrays[0].dtype.kind == "M") != (arrays[1].dtype.kind == "M"):
-        raise RetrievalInputError(
-            f"hold {arrays[0].dtype}, the times {arrays[1].dtype}",
-            field="dark_times",
-            remedy="give both as datetime64, or both in s",
-        )
-    if arrays[0].dtype.kind == "M":
-        # Division makes NaT a NaN; a cast to float would make it a number.
-        origin = arrays[0][:1].astype("M8[ns]")
-        arrays = [(array.astype("M8[ns]") - origin) / np.timedelta64(1, "s") for array in arrays]
-    dark_seconds, seconds = (array.astype(np.float64) for array in arrays)
-    for name, array in (("dark_times", dark_seconds), ("times", seconds)):
-        if not np.all(np.isfinite(array)):
-            raise RetrievalInputError(
-                "are not all known", field=name, remedy="leave those profiles out"
-            )
-    return dark_seconds, seconds
 
 
 def _sessions(dark_seconds: Array) -> list[Indices]:
@@ -165,16 +133,16 @@ def _sessions(dark_seconds: Array) -> list[Indices]:
 
 
 def _means(signals: Array, sessions: list[Indices]) -> tuple[Array, Array]:
-    """Return mean and variance of the mean of each session, (..., session, range)."""
+    """Return mean and variance of the mean of each session, (session, range)."""
     means, counts, squares, freedoms = [], [], [], []
     for files in sessions:
         # A copy, changed in place: there may be many files.
-        residual = signals[..., files, :]
+        residual = signals[files]
         finite = np.isfinite(residual)
         residual[~finite] = 0.0
         count = finite.sum(axis=-2)
         mean = _ratio(residual.sum(axis=-2), count)
-        residual -= mean[..., np.newaxis, :]
+        residual -= mean
         residual[~finite] = 0.0
         # The level drifts from file to file, which is no noise of the single bin.
         residual -= _ratio(residual.sum(axis=-1, keepdims=True), finite.sum(axis=-1, keepdims=True))
@@ -186,7 +154,7 @@ def _means(signals: Array, sessions: list[Indices]) -> tuple[Array, Array]:
     all_squares = np.stack([*squares, sum(squares)], axis=-2)
     all_freedoms = np.stack([*freedoms, sum(freedoms)], axis=-2).astype(np.float64)
     scatter = _ratio(_window_sum(all_squares), _window_sum(all_freedoms))
-    session_scatter, pooled = scatter[..., :-1, :], scatter[..., -1:, :]
+    session_scatter, pooled = scatter[:-1], scatter[-1:]
     file_variance = np.where(np.isfinite(session_scatter), session_scatter, pooled)
     file_variance = np.where(np.isfinite(file_variance), file_variance, _far_variance(signals))
     variance = _ratio(file_variance, np.stack(counts, axis=-2))
@@ -196,7 +164,7 @@ def _means(signals: Array, sessions: list[Indices]) -> tuple[Array, Array]:
 
 def _drift(signals: Array) -> float:
     """Return the standard deviation over files of means over parts of the range."""
-    if signals.ndim != 2 or len(signals) < 2 or signals.shape[-1] < _DRIFT_PARTS:
+    if len(signals) < 2 or signals.shape[-1] < _DRIFT_PARTS:
         return float("nan")
     edges = np.linspace(0, signals.shape[-1], _DRIFT_PARTS, endpoint=False).astype(np.intp)
     finite = np.isfinite(signals)
@@ -208,8 +176,8 @@ def _drift(signals: Array) -> float:
 
 
 def _far_variance(signals: Array) -> Array:
-    """Return the noise variance from second differences of the far bins, (..., 1, 1)."""
-    far = signals[..., int(signals.shape[-1] * (1.0 - THRESHOLDS.far_share)) :]
+    """Return the noise variance from second differences of the far bins, (1, 1)."""
+    far = signals[:, int(signals.shape[-1] * (1.0 - THRESHOLDS.far_share)) :]
     second = np.diff(far, n=2, axis=-1) ** 2 / _SECOND_DIFFERENCE_VARIANCE
     finite = np.isfinite(second)
     total = np.where(finite, second, 0.0).sum(axis=(-2, -1), keepdims=True)
@@ -257,10 +225,10 @@ def _shares(
 
 
 def _weighted_sum(shares: Array, values: Array) -> Array:
-    """Return the weighted sums of the sessions, (..., time, range)."""
-    total = np.zeros((*values.shape[:-2], len(shares), values.shape[-1]))
+    """Return the weighted sums of the sessions, (time, range)."""
+    total = np.zeros((len(shares), values.shape[1]))
     for session in range(shares.shape[1]):
         share = shares[:, session]
         used = share > 0
-        total[..., used, :] += share[used, np.newaxis] * values[..., session, np.newaxis, :]
+        total[used] += share[used, np.newaxis] * values[session]
     return total

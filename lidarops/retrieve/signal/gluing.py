@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,11 +12,19 @@ from scipy import special
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers, frozen
-from lidarops.retrieve.signal import _line_fit
+from lidarops.retrieve.common.arrays import Array, Block, Booleans, Indices, Integers, frozen
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
-_VARIANCES: Final = [_line_fit.SLOPE_VARIANCE, _line_fit.CENTRE_VARIANCE]
+_HUGE: Final = 1e150
+_PASSES: Final = 4
+"""Iterations; each multiplies the error of the slope by about the share of noise in the spread of
+x."""
+
+_LINE: Final = ("slope", "intercept", "slope_variance", "centre_variance", "centre")
+LINE: Final = np.dtype([(name, np.float64) for name in (*_LINE, "chi2", "points")])
+"""Line of a profile: NaN where there are fewer than 3 points. Slope and value at the centre have
+independent errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +42,6 @@ class GluedSignal:
     slope: Array
     """(...), MHz mV-1."""
     slope_standard_error: Array
-    intercept: Array
-    """(...), MHz: 0 within its error if both backgrounds are right."""
-    intercept_standard_error: Array
-    chi2: Array
-    """(...), of the line."""
-    degrees_of_freedom: Integers
     start: Array
     """(...), m: first bin of the window; NaN where there is none."""
     stop: Array
@@ -130,55 +133,70 @@ def glue(
         raise RetrievalInputError(
             f"has the leading shape {photon_leading}, analog {leading}", field="photon_counting"
         )
-    xv = _variance(analog_variance, "analog_variance", grid, leading)
-    yv = _variance(photon_variance, "photon_variance", grid, leading)
+    xv, yv = (
+        frozen(np.broadcast_to(inputs.noise_rows(v, name, grid, leading, negative=False), x.shape))
+        for v, name in ((analog_variance, "analog_variance"), (photon_variance, "photon_variance"))
+    )
     sky = inputs.profile_values(photon_background, "photon_background", leading)
     highest = THRESHOLDS.count_rates[1] - (np.zeros(1) if sky is None else sky)
     first, past = _search(x, y, xv, np.broadcast_to(highest, len(x)))
     near = np.arange(grid.size) < ((first + past) // 2)[:, np.newaxis]
-
-    def fitted(photons: Array) -> Array:
-        lines = np.full((len(x), _line_fit.COLUMNS), np.nan)
-        _line_fit.fit_lines(x, photons, xv, yv, first, past, lines)
-        return lines
-
-    lines = fitted(y)
+    line = fit_lines(x, y, xv, yv, first, past)
     length = inputs.profile_values(analog_correlation_length, "analog_correlation_length", leading)
-    lines[:, _VARIANCES] *= _correlated_share(xv, yv, lines, first, past, length)
-    joined = _joined(x, y, xv, yv, lines, near)
-    change, changed = np.broadcast_to(0.0, y.shape), lines
+    share = _correlated_share(xv, yv, line["slope"], first, past, length)
+    line["slope_variance"] *= share
+    line["centre_variance"] *= share
+    power, variance, systematic = _joined(x, y, xv, yv, line, near)
+    change, misfit = np.broadcast_to(0.0, y.shape), _misfits(line)
+    common = misfit
     if np.any(photon_change):
         moved = frozen(y + inputs.noise_rows(photon_change, "photon_change", grid, leading))
-        changed = fitted(moved)
-        change = _joined(x, moved, xv, yv, changed, near)[0] - joined[0]
-    return _result((lines, changed), (first, past), (*joined, change), leading, grid)
+        changed = fit_lines(x, moved, xv, yv, first, past)
+        change = _joined(x, moved, xv, yv, changed, near)[0] - power
+        common = misfit & _misfits(changed)
+    empty, error = past == 0, np.sqrt(line["slope_variance"])
+    with np.errstate(invalid="ignore"):
+        poor_fit = misfit | ~(line["slope"] >= THRESHOLDS.least_slope * error)
+    result = GluedSignal(
+        power=grid.turn(power),
+        variance=grid.turn(variance),
+        systematic_variance=grid.turn(systematic),
+        change=grid.turn(change),
+        slope=line["slope"],
+        slope_standard_error=error,
+        start=np.where(empty, np.nan, grid.values[first]),
+        stop=np.where(empty, np.nan, grid.values[np.maximum(past - 1, 0)]),
+        no_window=empty,
+        poor_fit=poor_fit & ~empty,
+        misfit=common,
+    )
+    return inputs.with_leading_axes(result, leading)
 
 
 def _correlated_share(
-    xv: Array, yv: Array, lines: Array, first: Indices, past: Indices, length: Array | None
+    xv: Array, yv: Array, slope: Array, first: Indices, past: Indices, length: Array | None
 ) -> Array:
-    """Return the noise of means of both channels over that of independent bins, (profile, 1)."""
+    """Return the noise of means of both channels over that of independent bins, (profile,)."""
     index = np.arange(xv.shape[1])
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
-    analog = lines[:, _line_fit.SLOPE] ** 2 * np.where(inside, xv, 0.0).sum(axis=-1)
+    analog = slope**2 * np.where(inside, xv, 0.0).sum(axis=-1)
     photons = np.where(inside, yv, 0.0).sum(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         share = (analog * (1.0 if length is None else length) + photons) / (analog + photons)
-    return np.where(np.isfinite(share), share, 1.0)[:, np.newaxis]
+    return np.where(np.isfinite(share), share, 1.0)
 
 
 def _joined(
-    x: Array, y: Array, xv: Array, yv: Array, lines: Array, near: Booleans
+    x: Array, y: Array, xv: Array, yv: Array, line: Block, near: Booleans
 ) -> tuple[Array, Array, Array]:
     """Return signal, noise variance and variance by the line: scaled x where `near`, else y."""
-    column = np.where(lines[:, _line_fit.SLOPE, np.newaxis] > 0.0, lines, np.nan).T[..., np.newaxis]
-    slope = column[_line_fit.SLOPE]
+    slope, intercept, by_slope, by_centre, centre = (line[name][:, np.newaxis] for name in _LINE)
     with np.errstate(invalid="ignore", over="ignore"):
-        power = np.where(near, slope * x + column[_line_fit.INTERCEPT], y)
-        valid = (np.abs(power) < _line_fit.HUGE) & (slope > 0.0)
-        lever = x - column[_line_fit.CENTRE]
-        of_line = column[_line_fit.SLOPE_VARIANCE] * lever * lever
-        of_line = of_line + column[_line_fit.CENTRE_VARIANCE]
+        power = np.where(near, slope * x + intercept, y)
+        valid = (np.abs(power) < _HUGE) & (slope > 0.0)
+        lever = x - centre
+        of_line = by_slope * lever * lever
+        of_line = of_line + by_centre
         variance, systematic = np.where(near, slope * slope * xv, yv), np.where(near, of_line, 0.0)
     power[~valid] = variance[~valid] = systematic[~valid] = np.nan
     return power, variance, systematic
@@ -187,25 +205,8 @@ def _joined(
 def _rows(
     values: npt.ArrayLike, name: str, grid: inputs.RangeGrid
 ) -> tuple[Array, tuple[int, ...]]:
-    array = inputs.real_array(values, name)
-    if array.ndim == 0 or array.shape[-1] != grid.size:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, but range has {grid.size} bins",
-            field=name,
-            remedy="the last axis is range",
-        )
-    rows = grid.turn(array).reshape(-1, grid.size).astype(np.float64, copy=False)
-    return frozen(rows), array.shape[:-1]
-
-
-def _variance(
-    values: npt.ArrayLike, name: str, grid: inputs.RangeGrid, leading: tuple[int, ...]
-) -> Array:
-    rows = inputs.noise_rows(values, name, grid, leading)
-    if np.any(rows < 0):
-        raise RetrievalInputError("is negative", field=name)
-    count = int(np.prod(leading, dtype=np.int64))
-    return frozen(np.broadcast_to(rows, (count, grid.size)))
+    rows, leading = inputs.profiles(values, grid, name)
+    return frozen(rows.astype(np.float64, copy=False)), leading
 
 
 def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Indices]:
@@ -215,7 +216,7 @@ def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Ind
         usable = (rate >= THRESHOLDS.count_rates[0]) & (rate <= highest[:, np.newaxis])
     usable &= _is_lit(x, xv)
     first, past = np.zeros((2, len(x)), dtype=np.intp)
-    _line_fit.longest_runs(usable, first, past)
+    longest_runs(usable, first, past)
     index = np.arange(rate.shape[1])
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
     highest_rate = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
@@ -235,59 +236,150 @@ def _is_lit(x: Array, variance: Array) -> Booleans:
 def _smooth(values: Array) -> Array:
     """Return averages over `Thresholds.smoothing` bins, fewer at the ends, skipping NaN."""
     smooth = np.empty(values.shape)
-    _line_fit.running_means(frozen(values), THRESHOLDS.smoothing // 2, smooth)
+    running_means(frozen(values), THRESHOLDS.smoothing // 2, smooth)
     return smooth
 
 
-def _misfits(lines: Array) -> Booleans:
+def _misfits(line: Block) -> Booleans:
     """Return which lines have a chi-square that noise does not explain."""
-    freedom = _degrees_of_freedom(lines)
+    freedom = np.maximum(np.nan_to_num(line["points"]).astype(np.int64) - 2, 0)
     noise = special.chdtri(freedom, THRESHOLDS.misfit_false_alarm)
-    largest = np.maximum(THRESHOLDS.largest_misfit * freedom, noise)
     with np.errstate(invalid="ignore"):
-        return np.asarray(lines[:, _line_fit.CHI2] > largest)
+        return np.asarray(line["chi2"] > np.maximum(THRESHOLDS.largest_misfit * freedom, noise))
 
 
-def _degrees_of_freedom(lines: Array) -> Integers:
-    return np.maximum(np.nan_to_num(lines[:, _line_fit.POINTS]).astype(np.int64) - 2, 0)
+def fit_lines(
+    x: Array, y: Array, x_variance: Array, y_variance: Array, first: Indices, past: Indices
+) -> Block:
+    """Return the line of each profile, within its window, (profile,) `LINE`.
+
+    Parameters
+    ----------
+    x, y, x_variance, y_variance : (profile, bin) float64
+        Points with a non-finite value or a variance that is not positive are skipped.
+    first, past : (profile,) int
+        Window of each profile.
+    """
+    out = np.full(len(x), np.nan, LINE)
+    _fit_lines(x, y, x_variance, y_variance, first, past, out)
+    return out
 
 
-def _result(
-    fits: tuple[Array, Array],
-    window: tuple[Indices, Indices],
-    joined: tuple[Array, Array, Array, Array],
-    leading: tuple[int, ...],
-    grid: inputs.RangeGrid,
-) -> GluedSignal:
-    lines, misfit = fits[0], [_misfits(fit) for fit in fits]
-    first, past = window
-    empty = past == 0
-    start = np.where(empty, np.nan, grid.values[first])
-    stop = np.where(empty, np.nan, grid.values[np.maximum(past - 1, 0)])
-    slope = lines[:, _line_fit.SLOPE]
-    slope_error = np.sqrt(lines[:, _line_fit.SLOPE_VARIANCE])
-    intercept_error = np.sqrt(
-        lines[:, _line_fit.CENTRE_VARIANCE] + (lines[:, _line_fit.CENTRE] * slope_error) ** 2
-    )
-    with np.errstate(invalid="ignore"):
-        poor_fit = misfit[0] | ~(slope >= THRESHOLDS.least_slope * slope_error)
-    power, variance, systematic, change = (
-        grid.turn(values.reshape(*leading, grid.size)) for values in joined
-    )
-    return GluedSignal(
-        power=power,
-        variance=variance,
-        systematic_variance=systematic,
-        change=change,
-        slope=slope.reshape(leading),
-        slope_standard_error=slope_error.reshape(leading),
-        intercept=lines[:, _line_fit.INTERCEPT].reshape(leading),
-        intercept_standard_error=intercept_error.reshape(leading),
-        chi2=lines[:, _line_fit.CHI2].reshape(leading),
-        degrees_of_freedom=_degrees_of_freedom(lines).reshape(leading),
-        start=start.reshape(leading),
-        stop=stop.reshape(leading),
-        no_window=empty.reshape(leading),
-        poor_fit=(poor_fit & ~empty).reshape(leading),
-        misfit=(misfit[0] & misfit[1]).reshape(leading),
-    )
+@compiled
+def running_means(values: Array, half: int, out: Array) -> None:
+    """Average over windows of 2 half + 1 bins, shorter at the ends, skipping non-finite values.
+
+    Parameters
+    ----------
+    values, out : (row, bin) float64
+    half : int
+    """
+    bins = values.shape[1]
+    for k in range(values.shape[0]):
+        total, count = 0.0, 0
+        for i in range(-half, bins):
+            new, old = i + half, i - half - 1
+            if new < bins and abs(values[k, new]) < _HUGE:
+                total += values[k, new]
+                count += 1
+            if old >= 0 and abs(values[k, old]) < _HUGE:
+                total -= values[k, old]
+                count -= 1
+            if i >= 0:
+                out[k, i] = total / count if count > 0 else math.nan
+
+
+@compiled
+def longest_runs(valid: Booleans, first: Indices, past: Indices) -> None:
+    """Write the longest run of true bins of each row, the first of equals; (0, 0) for none."""
+    for k in range(valid.shape[0]):
+        start = best = 0
+        first[k] = past[k] = 0
+        for i in range(valid.shape[1]):
+            if not valid[k, i]:
+                start = i + 1
+            elif i + 1 - start > best:
+                best = i + 1 - start
+                first[k], past[k] = start, i + 1
+
+
+@compiled
+def _usable(x: float, y: float, x_variance: float, y_variance: float) -> bool:
+    finite = abs(x) < _HUGE and abs(y) < _HUGE
+    return finite and 0.0 < x_variance < _HUGE and 0.0 < y_variance < _HUGE
+
+
+@compiled
+def _centroid(x: Array, y: Array, xv: Array, yv: Array, slope: float) -> Any:
+    """Return the sum of the weights, the weighted means, and the number of points."""
+    total = x_mean = y_mean = 0.0
+    points = 0
+    for i in range(x.size):
+        if _usable(x[i], y[i], xv[i], yv[i]):
+            weight = 1.0 / (yv[i] + slope * (slope * xv[i]))
+            total += weight
+            x_mean += weight * x[i]
+            y_mean += weight * y[i]
+            points += 1
+    return total, x_mean / total, y_mean / total, points
+
+
+@compiled
+def _moments(
+    x: Array, y: Array, xv: Array, yv: Array, slope: float, x_mean: float, y_mean: float
+) -> Any:
+    """Return the sums of York's equations: for y, x, the adjusted x, its square, and chi-square."""
+    y_sum = x_sum = shift = square = chi2 = 0.0
+    for i in range(x.size):
+        if not _usable(x[i], y[i], xv[i], yv[i]):
+            continue
+        weight = 1.0 / (yv[i] + slope * (slope * xv[i]))
+        u, v = x[i] - x_mean, y[i] - y_mean
+        beta = weight * (u * yv[i] + slope * v * xv[i])
+        y_sum += weight * beta * v
+        x_sum += weight * beta * u
+        shift += weight * beta
+        square += weight * beta * beta
+        chi2 += weight * (v - slope * u) ** 2
+    return y_sum, x_sum, shift, square, chi2
+
+
+@compiled
+def _first_slope(x: Array, y: Array, xv: Array, yv: Array) -> float:
+    """Return the ratio of the spreads of y and x, which depends little on noise in either."""
+    points, x_mean, y_mean = 0, 0.0, 0.0
+    for i in range(x.size):
+        if _usable(x[i], y[i], xv[i], yv[i]):
+            points += 1
+            x_mean += (x[i] - x_mean) / points
+            y_mean += (y[i] - y_mean) / points
+    spread = rise = 0.0
+    for i in range(x.size):
+        if _usable(x[i], y[i], xv[i], yv[i]):
+            spread += (x[i] - x_mean) ** 2
+            rise += (y[i] - y_mean) ** 2
+    return math.sqrt(rise / spread)
+
+
+@compiled
+def _fit_lines(
+    x: Array, y: Array, xv: Array, yv: Array, first: Indices, past: Indices, out: Any
+) -> None:
+    for k in range(x.shape[0]):
+        near, far, row = first[k], past[k], out[k]
+        values = (x[k, near:far], y[k, near:far], xv[k, near:far], yv[k, near:far])
+        slope = _first_slope(*values)
+        total, x_mean, y_mean, points = _centroid(*values, slope)
+        row.points = points
+        if points < 3:
+            continue
+        for _ in range(_PASSES):
+            y_sum, x_sum, _, _, _ = _moments(*values, slope, x_mean, y_mean)
+            slope = y_sum / x_sum
+            total, x_mean, y_mean, points = _centroid(*values, slope)
+        _, _, shift, square, chi2 = _moments(*values, slope, x_mean, y_mean)
+        row.slope, row.intercept = slope, y_mean - slope * x_mean
+        row.slope_variance = 1.0 / (square - shift * shift / total)
+        row.centre_variance = 1.0 / total
+        row.centre = x_mean + shift / total
+        row.chi2 = chi2

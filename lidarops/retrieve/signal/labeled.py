@@ -503,7 +503,7 @@ def _analog(
 ) -> tuple[Block, ...]:
     if dark is not None and times is not None:
         at_times = dark.at(times.astype("datetime64[ns]"))
-        settings |= {"dark": at_times.dark, "dark_variance": at_times.variance}
+        settings |= dict(zip(("dark", "dark_variance"), at_times, strict=True))
     return _parts(
         counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
     )

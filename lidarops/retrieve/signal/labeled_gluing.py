@@ -88,7 +88,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]], *, known: float) -> Chan
     )
     if not estimate.significant:
         return ChannelLag(known)
-    return ChannelLag(float(estimate.lag), float(estimate.standard_error))
+    return ChannelLag(estimate.lag, estimate.standard_error)
 
 
 def glue(
@@ -182,7 +182,7 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     Parameters
     ----------
     analog, photon : xr.Dataset
-        From `lidarops.retrieve.signal.labeled_screening.ScreenedAverage`, the lag corrected.
+        From `lidarops.retrieve.signal.labeled_averaging.ScreenedAverage`, the lag corrected.
     glued : xr.Dataset
         From `glue`.
     """

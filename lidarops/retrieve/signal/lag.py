@@ -31,21 +31,17 @@ profile keeps 1 - 1/n of its noise."""
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """Lag of the analog signal behind photon counting in bins, for each channel."""
+    """Lag of the analog signal behind photon counting in bins."""
 
-    lag: Array
-    """(...), bins; positive where analog shows a cloud farther than photon counting. NaN without
-    any correlation."""
-    standard_error: Array
-    """(...), bins: scatter of parts of the range, and the systematic error by the peak's width."""
-    confidence: Array
-    """(...): probability that noise without a common cause has no peak as high as this one."""
-    significant: Booleans
-    """(...): the confidence is at least 99.9 %, and the peak is not at the largest lag."""
-    correlation: Array
-    """(..., lag): correlation of the noise of both at each of `lags`."""
-    lags: Integers
-    """(lag,), bins."""
+    lag: float
+    """Bins; positive where analog shows a cloud farther than photon counting. NaN without any
+    correlation."""
+    standard_error: float
+    """Bins: scatter of parts of the range, and the systematic error by the peak's width."""
+    confidence: float
+    """Probability that noise without a common cause has no peak as high as this one."""
+    significant: bool
+    """The confidence is at least 99.9 %, and the peak is not at the largest lag."""
 
 
 def profile_groups(profiles: int) -> list[slice]:
@@ -71,7 +67,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
     Parameters
     ----------
     groups : iterable of (analog, photon_counting)
-        At least one, (..., time, range) each, of the profiles of one of `profile_groups`:
+        At least one, (time, range) each, of the profiles of one of `profile_groups`:
         simultaneous, on bins of the same width, in any unit, with or without background; NaN is
         skipped. One profile is enough if its noise is large enough.
 
@@ -86,43 +82,43 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
     RetrievalInputError
         For fewer than 200 bins between the largest lags.
     """
-    sums, first_energy, second_energy = (np.zeros(()) for _ in range(3))
-    for first, second in groups:
-        if not enough_bins(first.shape[-1]):
+    sums, energies = np.zeros((_PARTS, _LAGS.size)), np.zeros(2)
+    for pair in groups:
+        bins = pair[0].shape[-1]
+        if not enough_bins(bins):
             raise RetrievalInputError(
-                f"have {first.shape[-1]} bins for lags up to {THRESHOLDS.largest_lag}",
+                f"have {bins} bins for lags up to {THRESHOLDS.largest_lag}",
                 field="analog",
                 remedy="give all bins of the profiles",
             )
-        noise = _noise(first), _noise(second)
-        inner = (..., slice(_REACH, first.shape[-1] - _REACH))
-        sums = sums + _correlate(*noise)
-        first_energy = first_energy + (noise[0][inner] ** 2).sum(axis=(-2, -1))
-        second_energy = second_energy + (noise[1][inner] ** 2).sum(axis=(-2, -1))
-    scale = np.sqrt(first_energy * second_energy)[..., np.newaxis, np.newaxis]
-    return _estimate(sums / np.where(scale > 0, scale, np.inf))
+        first, second = (_noise(profiles) for profiles in pair)
+        edges = np.linspace(_REACH, bins - _REACH, _PARTS + 1).astype(np.intp)
+        of_group = np.zeros(sums.shape)
+        _add_products(frozen(first), frozen(second), _REACH, edges, of_group)
+        sums += of_group
+        inner = (..., slice(_REACH, bins - _REACH))
+        energies += [(noise[inner] ** 2).sum(axis=(-2, -1)) for noise in (first, second)]
+    scale = np.sqrt(energies[0] * energies[1])
+    by_part = sums / (scale if scale > 0 else np.inf)
+    total = by_part.sum(axis=-2)
+    lag, systematic, at_end = _peak(total)
+    without = by_part.sum(axis=-2, keepdims=True) - by_part
+    estimates = _peak(without)[0]
+    # The jackknife over the parts of the range.
+    deviation = estimates - estimates.mean()
+    scatter = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
+    confidence, defined = _confidence(total, lag), bool(np.isfinite(lag))
+    return LagEstimate(
+        lag=float(lag),
+        standard_error=float(np.hypot(scatter, systematic)) if defined else math.nan,
+        confidence=confidence,
+        significant=defined and confidence >= THRESHOLDS.confidence and not at_end,
+    )
 
 
 def enough_bins(bins: int) -> bool:
     """Return whether profiles of as many bins allow an estimate of the lag."""
     return bins >= THRESHOLDS.fewest_lag_bins + 2 * _REACH
-
-
-def _estimate(by_part: Array) -> LagEstimate:
-    """Return the lag from the contributions of each part of the range, (..., part, lag)."""
-    total = by_part.sum(axis=-2)
-    lag, systematic, at_end = _peak(total, _LAGS)
-    scatter = _jackknife(by_part, _LAGS)
-    confidence = _confidence(total, _LAGS, lag)
-    undefined = ~np.isfinite(lag)
-    return LagEstimate(
-        lag=lag,
-        standard_error=np.where(undefined, np.nan, np.hypot(scatter, systematic)),
-        confidence=confidence,
-        significant=(confidence >= THRESHOLDS.confidence) & ~undefined & ~at_end,
-        correlation=total[..., _MARGIN:-_MARGIN],
-        lags=_LAGS[_MARGIN:-_MARGIN],
-    )
 
 
 def _noise(profiles: Array) -> Array:
@@ -156,17 +152,6 @@ def _box(values: Array, window: int) -> Array:
     return total
 
 
-def _correlate(first: Array, second: Array) -> Array:
-    """Return the sum of products at each lag in each part of the range, (..., part, lag)."""
-    *leading, times, bins = first.shape
-    flat = (math.prod(leading), times, bins)
-    edges = np.linspace(_REACH, bins - _REACH, _PARTS + 1).astype(np.intp)
-    sums = np.zeros((flat[0], _PARTS, _LAGS.size))
-    _add_products(frozen(first.reshape(flat)), frozen(second.reshape(flat)), _REACH, edges, sums)
-    by_part: Array = sums.reshape(*leading, *sums.shape[1:])
-    return by_part
-
-
 @summing
 def _product(first: Any, second: Any) -> float:
     total = 0.0
@@ -187,25 +172,24 @@ def _add_products(
 
     Parameters
     ----------
-    first, second : (channel, time, bin) float64
+    first, second : (time, bin) float64
     reach : int
         Largest lag to either side, in bins.
     edges : (part + 1,) int
         Bins of `second` where the parts begin and end, at least `reach` from both ends.
-    sums : (channel, part, lag) float64
+    sums : (part, lag) float64
         The sums to which the products are added.
     """
-    for c in range(first.shape[0]):
-        for t in range(first.shape[1]):
-            x, y = first[c, t], second[c, t]
-            for p in range(edges.size - 1):
-                segment = y[edges[p] : edges[p + 1]]
-                for j in range(2 * reach + 1):
-                    start = edges[p] + j - reach
-                    sums[c, p, j] += _product(x[start : start + segment.size], segment)
+    for t in range(first.shape[0]):
+        x, y = first[t], second[t]
+        for p in range(edges.size - 1):
+            segment = y[edges[p] : edges[p + 1]]
+            for j in range(2 * reach + 1):
+                start = edges[p] + j - reach
+                sums[p, j] += _product(x[start : start + segment.size], segment)
 
 
-def _peak(total: Array, lags: Integers) -> tuple[Array, Array, Booleans]:
+def _peak(total: Array) -> tuple[Array, Array, Booleans]:
     """Return the lag, its distance to the centroid of four bins, and whether it is the largest."""
     index = np.argmax(total[..., _MARGIN:-_MARGIN], axis=-1) + _MARGIN
 
@@ -222,8 +206,8 @@ def _peak(total: Array, lags: Integers) -> tuple[Array, Array, Booleans]:
         fraction = np.clip(beside / sum_of_two, 0.0, 1.0)
         moment = beside - (outside[0] + base) + 2.0 * (outside[1] + base)
         systematic = np.minimum(np.abs(moment / sum_of_four - fraction), 1.0)
-        lag = np.where(sum_of_two > 0, lags[index] + side * fraction, np.nan)
-    ends = (index == _MARGIN) | (index == lags.size - 1 - _MARGIN)
+        lag = np.where(sum_of_two > 0, _LAGS[index] + side * fraction, np.nan)
+    ends = (index == _MARGIN) | (index == _LAGS.size - 1 - _MARGIN)
     return lag, systematic, ends
 
 
@@ -240,27 +224,18 @@ def _correct_for_high_pass(peak: Array, beside: Array) -> tuple[Array, Array]:
     )
 
 
-def _jackknife(sums: Array, lags: Integers) -> Array:
-    """Return the jackknife standard error of the lag over the parts of the range."""
-    without = sums.sum(axis=-2, keepdims=True) - sums
-    estimates = _peak(without, lags)[0]
-    deviation = estimates - estimates.mean(axis=-1, keepdims=True)
-    scatter: Array = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
-    return scatter
-
-
-def _confidence(total: Array, lags: Integers, lag: Array) -> Array:
+def _confidence(total: Array, lag: Array) -> float:
     """Return the probability that the highest of as many random correlations is lower."""
-    far = np.abs(lags - lag[..., np.newaxis]) > THRESHOLDS.peak_width
-    tried = lags.size - 2 * _MARGIN
+    far = np.abs(_LAGS - lag) > THRESHOLDS.peak_width
+    tried = _LAGS.size - 2 * _MARGIN
     # The spread of the others is smaller because the highest of all is not among them.
-    count = np.maximum(far.sum(axis=-1) + 1.0 - special.ndtri(0.5 / tried) ** 2, 1.0)
+    count = np.maximum(far.sum() + 1.0 - special.ndtri(0.5 / tried) ** 2, 1.0)
     # The spread of the others includes noise correlated along range, and interference.
     noise = np.sqrt(np.where(far, total**2, 0.0).sum(axis=-1) / count)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        height = total[..., _MARGIN:-_MARGIN].max(axis=-1) / noise
-        probability = np.exp(tried * special.log_ndtr(height))
-    return np.where(np.isfinite(lag) & (noise > 0), probability, 0.0)
+    if not (np.isfinite(lag) and noise > 0):
+        return 0.0
+    height = total[_MARGIN:-_MARGIN].max() / noise
+    return float(np.exp(tried * special.log_ndtr(height)))
 
 
 def shift_signal(

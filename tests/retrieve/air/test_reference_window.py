@@ -9,11 +9,11 @@ from scipy import stats
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.air.reference_window import (
+    THRESHOLDS,
     Rejection,
     candidate_windows,
     choose_reference,
 )
-from lidarops.retrieve.air.thresholds import THRESHOLDS
 from lidarops.retrieve.elastic.inversion import invert_elastic
 
 AIR = MolecularProfile.us_standard()

@@ -16,8 +16,9 @@ from lidarops.retrieve.background.estimate import (
     from_far_range,
     from_known_shape,
     from_tail,
+    shifts,
+    window_before,
 )
-from lidarops.retrieve.background.left_signal import shifts, window_before
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 
 RANGE = 7.5 * (np.arange(2000) + 0.5)

@@ -17,7 +17,7 @@ from lidarops.retrieve.air.reference_window import (
 from lidarops.retrieve.clouds.labeled import with_margin
 from lidarops.retrieve.clouds.layers import find_layers, find_visible_air
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.averaging import cloud_contrast
 
 AIR = MolecularProfile.us_standard()
 RANGE = 15.0 * (np.arange(900) + 0.5)[20:]

@@ -11,8 +11,7 @@ from scipy.integrate import solve_ivp
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.clouds.outlying_bins import bridge_outliers
-from lidarops.retrieve.elastic.inversion import invert_elastic
-from lidarops.retrieve.elastic.thresholds import THRESHOLDS
+from lidarops.retrieve.elastic.inversion import THRESHOLDS, invert_elastic
 
 GREEN = 532e-9
 AIR = MolecularProfile.us_standard()

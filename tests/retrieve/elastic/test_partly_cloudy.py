@@ -16,9 +16,13 @@ from lidarops.retrieve.elastic.labeled import (
     constant_ratio,
     invert_elastic,
 )
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage
-from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
-from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.signal.averaging import cloud_contrast
+from lidarops.retrieve.signal.labeled_averaging import (
+    ClockAverage,
+    Record,
+    ScreenedAverage,
+    Screening,
+)
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 GREEN = 532e-9

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support.mean_counts import mean_profile_variance
 from support.oracles.homogeneous import (
     GEOMETRIES,
-    TABLE_BIAS,
     amplitude,
     linear_step,
     lowest_errors,
@@ -20,7 +20,6 @@ from support.oracles.homogeneous import (
 from lidarops.errors import RetrievalInputError
 from lidarops.kinds import flags_of
 from lidarops.retrieve.background import cubic_and_tail
-from lidarops.retrieve.background.photon_counts import mean_profile_variance
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -271,38 +270,6 @@ def test_counts_reach_the_least_possible_scatter():
             assert 0.935 < coverage(fit, name, true) < 0.965, name
 
 
-def test_variance_of_a_mean_profile():
-    rng = np.random.default_rng(13)
-    expected = 20.0 + signal(LONG, 1e5, 1.0 * KM)
-    one = mean_profile_variance(rng.poisson(expected, (400, 225)))
-    assert one.shape == (225,)
-    np.testing.assert_allclose(one, expected, rtol=0.05)
-    # Weak bins of few profiles are averaged with their neighbours; strong bins are not.
-    few = mean_profile_variance(rng.poisson(expected, (3, 225)))
-    assert np.std(few[-100:] / expected[-100:]) < 0.06
-    np.testing.assert_allclose(few[0], expected[0], rtol=0.01)
-    assert np.all(mean_profile_variance(np.zeros((4, 20))) > 0)
-    shots = np.array([1.0, 4.0])
-    power = rng.poisson(expected * shots[:, np.newaxis]) / shots[:, np.newaxis]
-    power[0, 7] = np.nan
-    own = mean_profile_variance(power, shots)
-    assert own.shape == (2, 225)
-    np.testing.assert_allclose(own[0], 4.0 * own[1], rtol=1e-13)
-    assert np.isnan(mean_profile_variance(np.full((2, 30), np.nan))).all()
-    for bad in (-1.0, 0.0, np.nan):
-        with pytest.raises(RetrievalInputError) as caught:
-            mean_profile_variance(np.ones((2, 20)), bad)
-        assert caught.value.field == "shots"
-    with pytest.raises(RetrievalInputError, match="negative counts"):
-        mean_profile_variance(-np.ones((2, 20)))
-    with pytest.raises(RetrievalInputError, match="single number"):
-        mean_profile_variance(1.0)
-
-
-# Bias of the published tables ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("length", "expected"), TABLE_BIAS)
 def test_published_bias_is_that_of_the_noise_and_the_fit_has_none(length, expected):
     r, power = table_profiles(2500.0, length, 2000, seed=15)
     published = cubic_and_tail.cubic(power, r, lag=1, variance=0.0).background

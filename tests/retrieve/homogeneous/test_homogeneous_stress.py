@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import mpmath as mp
 import numpy as np
 import pytest
+from support.mean_counts import mean_profile_variance
 from support.oracles.homogeneous import (
     GEOMETRIES,
     amplitude,
@@ -26,7 +27,6 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.retrieve.background import cubic_and_tail
-from lidarops.retrieve.background.photon_counts import mean_profile_variance
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult, fit_homogeneous_path
 

@@ -21,8 +21,7 @@ from lidarops.retrieve.raman.scattering import (
     nitrogen_line_share,
     raman_wavelength,
 )
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import CellSignal
+from lidarops.retrieve.raman.signals import CellSignal, RamanSettings
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 
 STEP = 15.0

@@ -8,12 +8,16 @@ import xarray as xr
 from support.raman_signals import LASER, make_sky, mean_over
 
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman.cells import largest_of_cells, make_cells, state_of_cells, touched
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.labeled import Assumptions, retrieve
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage
-from lidarops.retrieve.signal.labeled_screening import Record, ScreenedAverage, Screening
-from lidarops.retrieve.signal.screening import cloud_contrast
+from lidarops.retrieve.raman.signals import largest_of_cells, make_cells, state_of_cells, touched
+from lidarops.retrieve.signal.averaging import cloud_contrast
+from lidarops.retrieve.signal.labeled_averaging import (
+    ClockAverage,
+    Record,
+    ScreenedAverage,
+    Screening,
+)
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 STEP = 15.0

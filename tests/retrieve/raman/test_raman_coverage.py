@@ -15,8 +15,7 @@ from lidarops.retrieve.raman.backscatter import (
     inverse_mean,
     inverse_of_weak,
 )
-from lidarops.retrieve.raman.depth_fit import SignalNoise
-from lidarops.retrieve.raman.extinction import Extinction
+from lidarops.retrieve.raman.depth_fit import Extinction, SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.lidar_ratio import lidar_ratio_of
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.raman_signals import make_sky, sliding_line
 
-from lidarops.retrieve.raman.depth_fit import SignalNoise, fit_depth
-from lidarops.retrieve.raman.extinction import extinction_of, mean_weights
+from lidarops.retrieve.raman.depth_fit import SignalNoise, extinction_of, fit_depth, mean_weights
 from lidarops.retrieve.raman.signals import cell_signals
 
 STEP = 30.0

@@ -20,9 +20,13 @@ from lidarops.flags import Quality
 from lidarops.products.raman.settings import RamanProductSettings, RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
-from lidarops.retrieve.raman.cells import make_cells
-from lidarops.retrieve.raman.settings import RamanSettings
-from lidarops.retrieve.raman.signals import AirColumn, ChannelSignal, cell_signals
+from lidarops.retrieve.raman.signals import (
+    AirColumn,
+    ChannelSignal,
+    RamanSettings,
+    cell_signals,
+    make_cells,
+)
 
 STEP = 15.0
 RAMAN = {"355": ("387", 386.7e-9), "532": ("608", 607.4e-9)}

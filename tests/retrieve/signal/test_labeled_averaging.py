@@ -268,7 +268,7 @@ class TestSharedVariance:
             dark = DarkSignals(files, MIDNIGHT - np.arange(1, darks + 1) * 60 * SECOND)
             conditioned, shots = made(minutes, seed=draw)
             noise = sigma * rng.standard_normal((profiles, BINS))
-            conditioned["power"][:] = noise - dark.at(conditioned["time"].to_numpy()).dark
+            conditioned["power"][:] = noise - dark.at(conditioned["time"].to_numpy())[0]
             conditioned["variance"][:] = sigma**2 + sigma**2 / darks
             result = clock_average(
                 conditioned,

@@ -37,7 +37,6 @@ def test_a_known_lag_is_estimated(true_lag):
     assert estimate.confidence > 0.9999
     assert abs(estimate.lag - true_lag) < 3.0 * estimate.standard_error
     assert estimate.standard_error < 0.1
-    assert estimate.lags[np.argmax(estimate.correlation)] in (np.floor(true_lag), np.ceil(true_lag))
 
 
 def test_the_standard_error_covers_the_scatter():
@@ -63,11 +62,12 @@ def test_one_profile_is_enough():
 def test_noise_without_a_common_cause_has_no_lag():
     rng = np.random.default_rng(4)
     analog, photon = rng.normal(size=(2, 1500, 3, 500))
-    estimate = lag_of(analog, photon)
-    assert estimate.significant.sum() <= 6
+    estimates = [lag_of(*pair) for pair in zip(analog, photon, strict=True)]
+    assert sum(estimate.significant for estimate in estimates) <= 6
     # The confidence is uniform without a common cause.
-    assert estimate.confidence.mean() == pytest.approx(0.5, abs=0.05)
-    assert (estimate.confidence > 0.9).mean() == pytest.approx(0.1, abs=0.035)
+    confidence = np.array([estimate.confidence for estimate in estimates])
+    assert confidence.mean() == pytest.approx(0.5, abs=0.05)
+    assert (confidence > 0.9).mean() == pytest.approx(0.1, abs=0.035)
 
 
 def test_profiles_of_different_times_have_no_lag():
@@ -99,25 +99,13 @@ def test_gaps_dead_channels_and_spikes_do_not_mislead():
         assert not without_signal.significant
 
 
-def test_channels_are_independent_of_each_other():
-    rng = np.random.default_rng(8)
-    pairs = [recorded(rng, shift, profiles=4) for shift in (2.5, 7.0)]
-    both = lag_of(*(np.stack(signals) for signals in zip(*pairs, strict=True)))
-    for k, pair in enumerate(pairs):
-        alone = lag_of(*(signal for signal in pair))
-        assert both.lag[k] == alone.lag
-        assert both.standard_error[k] == alone.standard_error
-        np.testing.assert_array_equal(both.correlation[k], alone.correlation)
-
-
 def test_groups_one_after_another_give_the_bits_of_all_profiles():
     analog, photon = recorded(np.random.default_rng(8), 5.3, profiles=70)
     groups = lag.profile_groups(70)
     assert [group.stop - group.start for group in groups] == [23, 23, 24]
     whole = lag_of(analog, photon)
     parts = lag.estimate_lag((analog[rows], photon[rows]) for rows in groups)
-    np.testing.assert_array_equal(parts.correlation, whole.correlation)
-    assert parts.lag == whole.lag
+    assert parts == whole
     assert abs(whole.lag - 5.3) < 3.0 * whole.standard_error
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from benchmarks.accuracy.homogeneous_cases import Scenario, least_errors
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.background import cubic_and_tail, photon_counts
+from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from support.mean_counts import mean_profile_variance
 from support.stiff.cases import (
     Accepted,
     Answer,
@@ -195,7 +196,7 @@ def _counted(shots: int, base: float, signal: float, profiles: int) -> dict[str,
     path = Path(signal=signal, background=base)
     rng = np.random.default_rng(2)
     power = rng.poisson(shots * path.power, (profiles, path.bins)) / shots
-    noise = photon_counts.mean_profile_variance(power, shots)
+    noise = mean_profile_variance(power, shots)
     return {
         "power": power,
         "range": path.range,
