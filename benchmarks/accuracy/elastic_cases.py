@@ -273,8 +273,8 @@ def subtract_background(counts: Array, sky: SimulatedSky, estimates: BackgroundE
     return np.where(sky.inverted, counts - estimates.background[:, np.newaxis], np.nan)
 
 
-def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> layers.Layers:
-    """Return the detected clouds; the sky has none."""
+def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> Mask:
+    """Return the bins in detected clouds; the sky has none."""
     return layers.find_layers(power, sky.range, noise, molecular_attenuated=sky.shape)
 
 
@@ -361,7 +361,7 @@ def invert(
     edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
     hidden: npt.ArrayLike = 0.0
     if chain.choose:
-        clouds = find_clouds(power, noise, sky).mask
+        clouds = find_clouds(power, noise, sky)
         window = choose_window(power, noise, sky, clouds, background_error=estimates.standard_error)
         edges = window.edges
         hidden = window.undetected_particles if chain.carried else 0.0

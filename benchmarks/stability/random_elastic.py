@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.accuracy import elastic_cases
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, Mask
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import ErrorKind
@@ -17,7 +17,7 @@ from lidarops.products.elastic.variables import sources
 from lidarops.retrieve.air import MolecularProfile, reference_window
 from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.background import known_shape
-from lidarops.retrieve.clouds import layers, outlying_bins
+from lidarops.retrieve.clouds import outlying_bins
 from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.settings import ReferenceSettings
@@ -179,7 +179,7 @@ class _Processed:
     """Results of all steps for the profiles of one sky."""
 
     background: known_shape.KnownShapeResult
-    clouds: layers.Layers
+    clouds: Mask
     window: reference_window.ReferenceWindow
     solved: inversion.ElasticResult
 
@@ -194,7 +194,7 @@ def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _
     power = np.where(base.inverted, counts - fit.background[:, np.newaxis], np.nan)
     clouds = elastic_cases.find_clouds(power, noise, base)
     window = elastic_cases.choose_window(
-        power, noise, base, clouds.mask, background_error=fit.background_standard_error,
+        power, noise, base, clouds, background_error=fit.background_standard_error,
         candidates=_WINDOWS,
     )  # fmt: skip
     solved = _solve(power, noise, base, window.edges, _input_errors(fit, window))
@@ -351,13 +351,14 @@ def _scored(
     bits |= np.where(window.chosen, np.int32(0), np.int32(ElasticQuality.NO_REFERENCE))[
         :, np.newaxis
     ]
-    bits |= np.where(clouds.mask, np.int32(ElasticQuality.CLOUD), np.int32(0))
+    bits |= np.where(clouds, np.int32(ElasticQuality.CLOUD), np.int32(0))
     # Values with an uncertain background are rejected.
     uncertain = np.asarray(processed.background.quality) & int(Quality.NOT_HOMOGENEOUS)
     bits |= uncertain[:, np.newaxis]
     # As in the product: bins below a cloud were inverted through it.
     with np.errstate(invalid="ignore"):
-        behind_cloud = (window.top > clouds.cloud_base_range)[:, np.newaxis]
+        base_of_cloud = np.where(clouds.any(axis=-1), r[np.argmax(clouds, axis=-1)], np.nan)
+        behind_cloud = (window.top > base_of_cloud)[:, np.newaxis]
     bits |= np.where(behind_cloud, np.int32(ElasticQuality.CLOUD), np.int32(0))
     # As products average them: what is independent between profiles is random.
     random = _error(solved.budget, sources(ErrorKind.RANDOM))

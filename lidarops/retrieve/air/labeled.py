@@ -110,7 +110,7 @@ def _at_550_nm(
     spread: float,
     definition: VisibilityDefinition,
 ) -> visibility.VisibilityResult:
-    reference = visibility.at_reference_wavelength(
+    at_reference = visibility.at_reference_wavelength(
         extinction,
         error,
         wavelength=definition.wavelength,
@@ -118,6 +118,4 @@ def _at_550_nm(
         exponent=definition.angstrom_exponent,
         exponent_standard_error=spread,
     )
-    return visibility.visibility_from_extinction(
-        reference.extinction, reference.extinction_standard_error, contrast=definition.contrast
-    )
+    return visibility.visibility_from_extinction(*at_reference, contrast=definition.contrast)

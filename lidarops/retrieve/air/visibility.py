@@ -51,16 +51,6 @@ class WavelengthLaw(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class ReferenceExtinction:
-    """Extinction at 550 nm, with the shape of the input."""
-
-    extinction: Array
-    """m-1."""
-    extinction_standard_error: Array
-    """m-1."""
-
-
-@dataclass(frozen=True, slots=True)
 class VisibilityResult:
     """Visibility, with the shape of the extinction."""
 
@@ -152,8 +142,8 @@ def at_reference_wavelength(
     law: str,
     exponent: npt.ArrayLike | None = None,
     exponent_standard_error: float = 0.0,
-) -> ReferenceExtinction:
-    r"""Convert extinction at the wavelength of a lidar to 550 nm.
+) -> tuple[Array, Array]:
+    r"""Return extinction at 550 nm and its standard error, from that at another wavelength.
 
     .. math:: \sigma_{550} = \sigma_\lambda (\lambda / 550\,\mathrm{nm})^{q}
 
@@ -176,7 +166,8 @@ def at_reference_wavelength(
 
     Returns
     -------
-    ReferenceExtinction
+    extinction, standard_error : (...) float
+        m-1.
 
     Raises
     ------
@@ -206,14 +197,15 @@ def at_reference_wavelength(
     if chosen is WavelengthLaw.NONE:
         power, logarithm = np.zeros(value.shape), 0.0
     elif chosen is WavelengthLaw.ANGSTROM:
-        power = _exponents(exponent, value.shape)
+        given = inputs.real_array(np.nan if exponent is None else exponent, "exponent")
+        power = inputs.broadcast(given, value.shape, "exponent").astype(np.float64)
     else:
         power, gain = _kruse(value, logarithm)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         factor = np.exp(power * logarithm)
         spread = value * factor * logarithm * exponent_standard_error
         total = np.hypot(factor * gain * error, gain * spread)
-    return ReferenceExtinction(value * factor, total)
+    return value * factor, total
 
 
 def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array]:
@@ -258,16 +250,6 @@ def _kruse(extinction: Array, logarithm: float) -> tuple[Array, Array]:
 
 def _near_exponent(visibility: Array) -> Array:
     return _KRUSE_SLOPE * np.cbrt(np.minimum(visibility, _KRUSE_NEAR) / 1000.0)
-
-
-def _exponents(exponent: npt.ArrayLike | None, shape: tuple[int, ...]) -> Array:
-    values = inputs.real_array(np.nan if exponent is None else exponent, "exponent")
-    try:
-        return np.broadcast_to(values, shape).astype(np.float64)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {values.shape}, but extinction {shape}", field="exponent"
-        ) from None
 
 
 def _checked(extinction: npt.ArrayLike, error: npt.ArrayLike | None) -> tuple[Array, Array]:

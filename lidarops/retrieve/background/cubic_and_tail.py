@@ -14,7 +14,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import _cubic_kernel
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Flags, Floats, Indices, frozen
+from lidarops.retrieve.common.arrays import Array, Flags, Floats, frozen
 
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid, over the last range: rounding of float32 ranges."""
@@ -100,11 +100,7 @@ def cubic(
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     known = variance is not None
     result, _ = solve_cubic(rows, grid.values, lag, noise, known_variance=known)
-    return BackgroundResult(
-        result.background.reshape(leading),
-        result.background_standard_error.reshape(leading),
-        result.quality.reshape(leading),
-    )
+    return inputs.with_leading_axes(result, leading)
 
 
 def solve_cubic(
@@ -216,11 +212,12 @@ def tail_mean(
         else:
             error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / bins
     few = bins < THRESHOLDS.least_known * values.shape[-1]
-    quality = _tail_quality(bins)
-    quality[few & (bins > 0)] |= np.int32(Quality.TOO_FEW_BINS)
+    scarce = few | (bins < THRESHOLDS.fewest_bins)
+    quality = np.where(scarce, np.int32(Quality.TOO_FEW_BINS), np.int32(0))
+    quality[bins == 0] = np.int32(Quality.INPUT_MISSING)
     mean[few] = np.nan
     error[few | (bins < 2 if variance is None else bins < 1)] = np.nan
-    return BackgroundResult(mean.reshape(leading), error.reshape(leading), quality.reshape(leading))
+    return inputs.with_leading_axes(BackgroundResult(mean, error, quality), leading)
 
 
 def selection_bias(share: npt.ArrayLike) -> Array:
@@ -248,13 +245,6 @@ def selection_bias(share: npt.ArrayLike) -> Array:
     density = np.exp(-0.5 * special.ndtri(left) ** 2) / np.sqrt(2.0 * np.pi)
     with np.errstate(invalid="ignore"):
         return np.asarray(density / left)
-
-
-def _tail_quality(bins: Indices) -> Flags:
-    quality = np.zeros(bins.shape, dtype=np.int32)
-    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
-    quality[(bins > 0) & (bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
-    return quality
 
 
 def first_of_tail(range_: Array, start: float | None = None) -> int:

@@ -8,7 +8,7 @@
 means and of their parts; import it from its module, so that the numerics stay free of xarray.
 """
 
-from lidarops.retrieve.clouds.layers import Layers, find_layers, find_visible_air
+from lidarops.retrieve.clouds.layers import find_layers, find_visible_air
 from lidarops.retrieve.clouds.outlying_bins import BridgedProfiles, bridge_outliers
 
-__all__ = ["BridgedProfiles", "Layers", "bridge_outliers", "find_layers", "find_visible_air"]
+__all__ = ["BridgedProfiles", "bridge_outliers", "find_layers", "find_visible_air"]

@@ -7,7 +7,7 @@ rise may be that of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -191,27 +191,23 @@ class MeanProfiles:
         air[air <= 0.0] = np.nan
         return summed(power) / air, np.sqrt(summed(self.variance)) / air
 
-    def find_clouds(self, power: Array) -> _layers.Layers:
-        """Return the clouds of a signal without background."""
-        return _layers.find_layers(
-            power,
-            self.distance,
-            self.variance,
-            molecular_attenuated=self.air.shape,
-            contrast=self.contrast,
-            quantum=self.quantum,
-        )
+    @property
+    def _cloud(self) -> dict[str, Any]:
+        """What a cloud differs from, and by how much."""
+        return {
+            "molecular_attenuated": self.air.shape,
+            "contrast": self.contrast,
+            "quantum": self.quantum,
+        }
+
+    def find_clouds(self, power: Array) -> Booleans:
+        """Return the bins in clouds of a signal without background."""
+        return _layers.find_layers(power, self.distance, self.variance, **self._cloud)
 
     def visible_air(self, power: Array, cloudy: Booleans) -> Booleans:
         """Return where noise would not hide a cloud in a signal without background."""
         return _layers.find_visible_air(
-            power,
-            self.distance,
-            self.variance,
-            cloudy=cloudy,
-            molecular_attenuated=self.air.shape,
-            contrast=self.contrast,
-            quantum=self.quantum,
+            power, self.distance, self.variance, cloudy=cloudy, **self._cloud
         )
 
 
@@ -234,10 +230,10 @@ def signal_and_clouds(
         means, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
     )
     fraction = np.where(doubtful, np.nan, _cloud_fraction(averages, means))
-    means.partly = (fraction > 0.0) & ~layers.mask
+    means.partly = (fraction > 0.0) & ~layers
     if means.partly.any():
         signal, layers = _signal_beyond_clouds(means, known_shape=known_shape)
-    mask = (layers.mask | (fraction == 1.0)) & ~doubtful
+    mask = (layers | (fraction == 1.0)) & ~doubtful
     unknown = (doubtful | ~np.isfinite(signal.power)) & ~mask & np.isnan(fraction)
     clouds = Clouds(mask, fraction, unknown)
     hidden = np.isfinite(signal.power) & ~means.visible_air(signal.power, clouds.any)
@@ -280,7 +276,7 @@ def _cloud_fraction(averages: xr.Dataset, means: MeanProfiles) -> Array:
         quantum=averages["part_quantum"].to_numpy()[there],
     )
     cloudy = np.zeros((*profiles.shape, cells), dtype=np.bool_)
-    cloudy[there] = found.mask
+    cloudy[there] = found
     # A cloud may span cells without data.
     examined = np.isfinite(power) | cloudy
     with_cloud, of_all = (
@@ -320,20 +316,20 @@ def cloud_heights(
 
 def _signal_beyond_overlap(
     means: MeanProfiles, reference: Reference, *, known_shape: bool, overlap_is_stated: bool
-) -> tuple[MeanSignal, _layers.Layers, Booleans]:
+) -> tuple[MeanSignal, Booleans, Booleans]:
     """Return signals without background, their layers, and those that may be the overlap's."""
     signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
-    near = clouds.mask & _begin_before(clouds.mask, means.distance < reference.lowest)
+    near = clouds & _begin_before(clouds, means.distance < reference.lowest)
     nowhere = np.zeros_like(near)
     if not near.any():
         return signal, clouds, nowhere
-    window = reference_window(signal, means, reference, clouds.mask & ~near)
+    window = reference_window(signal, means, reference, clouds & ~near)
     ratio, error = means.ratio_to_air(signal.power)
     partial = _less_than_air(ratio, error, near, window, means.distance)
     if partial.any():
         means.reject_overlap(partial)
         clouds = _signal_beyond_clouds(means, known_shape=known_shape)[1]
-        nearer, farther = _overlap_bins(ratio, partial, clouds.mask, window, means)
+        nearer, farther = _overlap_bins(ratio, partial, clouds, window, means)
         means.reject_overlap(nearer)
         means.unknown_overlap |= farther
         signal, clouds = _signal_beyond_clouds(means, known_shape=known_shape)
@@ -342,16 +338,14 @@ def _signal_beyond_overlap(
     # Without clean air to compare with, a rise may as well be that of the overlap.
     doubtful = near & ~window.chosen[:, np.newaxis]
     means.unknown_overlap |= doubtful
-    return signal, _layers.Layers.of(clouds.mask & ~doubtful, means.distance), doubtful
+    return signal, clouds & ~doubtful, doubtful
 
 
-def _signal_beyond_clouds(
-    means: MeanProfiles, *, known_shape: bool
-) -> tuple[MeanSignal, _layers.Layers]:
+def _signal_beyond_clouds(means: MeanProfiles, *, known_shape: bool) -> tuple[MeanSignal, Booleans]:
     """Return signals without background, and their clouds."""
     signal = _subtract_background(means, np.ones_like(means.raw, bool), known_shape=known_shape)
     clouds = means.find_clouds(signal.power)
-    cloudy = clouds.mask | means.partly
+    cloudy = clouds | means.partly
     if not known_shape or not cloudy.any():
         return signal, clouds
     # Only beyond the cloud does the signal have the shape of air: fit the background there.

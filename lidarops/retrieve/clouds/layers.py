@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -26,25 +26,6 @@ _ROUNDING: Final = 1e-9
 POWER, SHAPE, VARIANCE, COUNT = 0, 1, 2, 3
 
 
-@dataclass(frozen=True, slots=True)
-class Layers:
-    """Layers of each profile, with the leading axes of the power."""
-
-    cloud_base_range: Array
-    """m, of the first bin of the lowest layer; NaN where there is none."""
-    mask: Booleans
-    """(..., range): bins of all layers, from base to apparent top, the last bin before the signal
-    is back at its level below the base and falls no more. Below the true top where a layer hides
-    its upper part in noise."""
-    cloudy: Booleans
-
-    @classmethod
-    def of(cls, mask: Booleans, distance: Array) -> Layers:
-        """Return the layers that a mask marks, (..., range), along an ascending distance in m."""
-        cloudy = np.asarray(mask.any(axis=-1))
-        return cls(np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan), mask, cloudy)
-
-
 def find_layers(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
@@ -54,8 +35,12 @@ def find_layers(
     contrast: float = SIGNAL_THRESHOLDS.cloud_contrast,
     false_alarm: float = THRESHOLDS.cloud_false_alarm,
     quantum: npt.ArrayLike = 0.0,
-) -> Layers:
-    r"""Return layers at whose base the scattering ratio rises by more than a factor.
+) -> Booleans:
+    r"""Return the bins in layers at whose base the scattering ratio rises by more than a factor.
+
+    Layers are marked from base to apparent top, the last bin before the signal is back at its level
+    below the base and falls no more: below the true top where a layer hides its upper part in
+    noise.
 
     Let :math:`\rho = \sum P / \sum \phi` be the ratio of the power to the molecular shape in two
     adjoining windows, below and above a bin. The bin is a base where
@@ -105,7 +90,7 @@ def find_layers(
 
     Returns
     -------
-    Layers
+    (..., range) bool
 
     Raises
     ------
@@ -129,8 +114,7 @@ def find_layers(
         frozen(tests.margins),
         mask,
     )
-    layers = Layers.of(mask.reshape(*tests.leading, tests.grid.size), tests.grid.values)
-    return replace(layers, mask=tests.grid.turn(layers.mask))
+    return tests.grid.turn(mask.reshape(*tests.leading, tests.grid.size))
 
 
 def find_visible_air(
@@ -232,22 +216,14 @@ def _tests(
 ) -> _Tests:
     """Return the validated arguments of `find_layers` and the limits of its tests."""
     grid = inputs.range_grid(range)
-    rows, leading = inputs.profiles(power, grid)
+    values, leading, shape = inputs.profiles_and_air(power, molecular_attenuated, grid)
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
-    shape = inputs.noise_rows(molecular_attenuated, "molecular_attenuated", grid, leading)
-    if not np.all(shape >= 0.0) or np.any(np.isinf(shape)):
-        raise RetrievalInputError(
-            "is negative or not finite",
-            field="molecular_attenuated",
-            remedy="give a value for each bin",
-        )
     if not 1.0 <= contrast < np.inf:
         raise RetrievalInputError(f"is {contrast}", field="contrast", remedy="give 1 or more")
     step = float(np.median(np.diff(grid.values))) if grid.size > 1 else 1.0
     # A window has at least two bins.
     lengths = np.unique(np.maximum(np.rint(np.array(THRESHOLDS.window_lengths) / step), 2.0))
     anywhere, at_an_edge = -ndtri(false_alarm / lengths.size / np.array([grid.size, 2.0]))
-    values = rows.astype(np.float64, copy=False)
     limits = anywhere * _excess_noise(values, noise, lengths)
     margins = skewness_margin(limits) * np.reshape(quantum, (-1, 1))
     return _Tests(

@@ -129,6 +129,26 @@ def profiles(
     return np.ascontiguousarray(grid.turn(array).reshape(rows, grid.size)), leading
 
 
+def profiles_and_air(
+    power: npt.ArrayLike, molecular_attenuated: npt.ArrayLike, grid: RangeGrid
+) -> tuple[Array, tuple[int, ...], Array]:
+    """Return `profiles` as float64, and the shape of the signal of air, (profile or 1, bin).
+
+    Raises
+    ------
+    RetrievalInputError
+        Where the last axis does not match the range, or the air is negative or not known.
+    """
+    rows, leading = profiles(power, grid)
+    name = "molecular_attenuated"
+    shape = noise_rows(molecular_attenuated, name, grid, leading)
+    if not np.all(shape >= 0.0) or np.any(np.isinf(shape)):
+        raise RetrievalInputError(
+            "is negative or not finite", field=name, remedy="give a value for each bin"
+        )
+    return rows.astype(np.float64, copy=False), leading, shape
+
+
 def with_leading_axes(result: _Result, leading: tuple[int, ...]) -> _Result:
     """Return a dataclass of (profile, ...) arrays with the leading axes of the profiles."""
     arrays = {field.name: getattr(result, field.name) for field in fields(result)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,42 @@ from lidarops.retrieve.common.arrays import Array, Booleans, frozen
 from lidarops.retrieve.elastic import _fernald
 
 Reference = tuple[npt.ArrayLike, npt.ArrayLike]
+
+
+class Thresholds(NamedTuple):
+    """Limits of the inversion."""
+
+    longest_gap: float = 150.0
+    """m; a longer gap without data ends the integration. Assumed."""
+    least_denominator: float = 0.05
+    """Share of the denominator at the reference. Beyond, errors grow as its inverse. Assumed."""
+    least_certainty: float = 5.0
+    """Standard errors by which the denominator must exceed zero for first-order errors to hold.
+    Simulations, with `skewed`."""
+    skewed: float = 5.5
+    """Ratio s of the denominator to its noise error at which noise errors are twice those of first
+    order. A reference that is too high by noise makes both values and errors too low, so noise
+    errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1. Simulations: less than 0.1 %
+    of the values are then off by more than 4 errors, without it 1 to 3 % where s is 5 to 8."""
+    negative: float = 4.0
+    """Standard errors below zero at which backscatter contradicts the signal. Manaus, 355 nm, with
+    an overlap that is not full where it was stated to be: 57 standard errors."""
+    negative_bins: int = 4
+    """Bins in a row that must be that low, so that noise alone is none. Assumed."""
+    largest_backscatter: float = 5e-4
+    """m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
+
+
+THRESHOLDS: Final = Thresholds()
+_LIMITS: Final = np.array(
+    [
+        THRESHOLDS.longest_gap,
+        THRESHOLDS.least_denominator,
+        THRESHOLDS.least_certainty**2,
+        THRESHOLDS.skewed**2,
+    ]
+)
+"""Limits of the kernel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +276,12 @@ def invert_elastic(
     air_error = _errors(molecular_relative_error, "molecular_relative_error", grid, leading)
     window = _window(reference, grid, leading)
     causes = _causes(
-        (background_standard_error, reference_relative_error, noise_correlation_length), leading
+        {
+            "background_standard_error": background_standard_error,
+            "reference_relative_error": reference_relative_error,
+            "noise_correlation_length": noise_correlation_length,
+        },
+        leading,
     )
 
     def solved(power_rows: Array) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
@@ -256,7 +297,7 @@ def invert_elastic(
             frozen(ratio),
             (frozen(ratio_error), frozen(air_error)),
             frozen(causes),
-            _limits(),
+            _LIMITS,
             out,
             scalars,
             state,
@@ -328,18 +369,6 @@ def invert_elastic(
     )
 
 
-def _limits() -> Array:
-    """Return the limits of the kernel."""
-    return np.array(
-        [
-            THRESHOLDS.longest_gap,
-            THRESHOLDS.least_denominator,
-            THRESHOLDS.least_certainty**2,
-            THRESHOLDS.skewed**2,
-        ]
-    )
-
-
 def _air(
     molecular_backscatter: npt.ArrayLike,
     molecular_extinction: npt.ArrayLike,
@@ -352,25 +381,25 @@ def _air(
     extinction = inputs.noise_rows(molecular_extinction, "molecular_extinction", grid, leading)
     ratio = inputs.noise_rows(lidar_ratio, "lidar_ratio", grid, leading)
     largest = THRESHOLDS.largest_backscatter
-    _require_molecular(backscatter, "molecular_backscatter", largest)
     # The lidar ratio of air is below 10 sr.
-    _require_molecular(extinction, "molecular_extinction", 10.0 * largest)
+    for rows, name, most in (
+        (backscatter, "molecular_backscatter", largest),
+        (extinction, "molecular_extinction", 10.0 * largest),
+    ):
+        _require(rows >= 0.0, rows, name, "give a molecular value of 0 or more for every bin")
+        _require(rows < most, rows, name, "give m-1, not km-1")
     _require(ratio > 0.0, ratio, "lidar_ratio", "give positive sr")
     return backscatter, extinction, ratio
 
 
-def _causes(causes: tuple[npt.ArrayLike, ...], leading: tuple[int, ...]) -> Array:
-    names = (
-        "background_standard_error",
-        "reference_relative_error",
-        "noise_correlation_length",
-    )
+def _causes(causes: dict[str, npt.ArrayLike], leading: tuple[int, ...]) -> Array:
     columns = []
-    for values, name in zip(causes, names, strict=True):
+    for name, values in causes.items():
         column = _profile_values(values, name, leading)
-        least = 1.0 if name == names[-1] else 0.0
-        remedy = "give 1 bin or more" if least else "give a standard error"
-        _require((column >= least) | np.isnan(column), column, name, remedy)
+        least = 1.0 if name == "noise_correlation_length" else 0.0
+        _require(
+            (column >= least) | np.isnan(column), column, name, f"give a value of {least:g} or more"
+        )
         columns.append(column)
     return np.ascontiguousarray(np.stack(np.broadcast_arrays(*columns), axis=-1))
 
@@ -383,11 +412,6 @@ def _errors(
     return rows
 
 
-def _require_molecular(rows: Array, name: str, largest: float) -> None:
-    _require(rows >= 0.0, rows, name, "give a molecular value of 0 or more for every bin")
-    _require(rows < largest, rows, name, "give m-1, not km-1")
-
-
 def _require(acceptable: Booleans, values: Array, name: str, remedy: str) -> None:
     # Comparisons are False for NaN; infinities are refused as well.
     invalid = ~acceptable | np.isinf(values)
@@ -397,17 +421,7 @@ def _require(acceptable: Booleans, values: Array, name: str, remedy: str) -> Non
 
 def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
     """Return one value per profile as (profile or 1,), with NaN kept."""
-    array = inputs.real_array(values, name).astype(np.float64, copy=False)
-    if array.size == 1:
-        return array.reshape(1)
-    try:
-        return np.ascontiguousarray(np.broadcast_to(array, leading)).reshape(-1)
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, which does not broadcast to the shape {leading} of"
-            " the profiles",
-            field=name,
-        ) from None
+    return cast("Array", inputs.profile_values(values, name, leading, finite=False))
 
 
 def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ...]) -> Booleans:
@@ -429,30 +443,3 @@ def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ..
             field="reference",
         )
     return np.asarray(inside)
-
-
-class Thresholds(NamedTuple):
-    """Limits of the inversion."""
-
-    longest_gap: float = 150.0
-    """m; a longer gap without data ends the integration. Assumed."""
-    least_denominator: float = 0.05
-    """Share of the denominator at the reference. Beyond, errors grow as its inverse. Assumed."""
-    least_certainty: float = 5.0
-    """Standard errors by which the denominator must exceed zero for first-order errors to hold.
-    Simulations, with `skewed`."""
-    skewed: float = 5.5
-    """Ratio s of the denominator to its noise error at which noise errors are twice those of first
-    order. A reference that is too high by noise makes both values and errors too low, so noise
-    errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1. Simulations: less than 0.1 %
-    of the values are then off by more than 4 errors, without it 1 to 3 % where s is 5 to 8."""
-    negative: float = 4.0
-    """Standard errors below zero at which backscatter contradicts the signal. Manaus, 355 nm, with
-    an overlap that is not full where it was stated to be: 57 standard errors."""
-    negative_bins: int = 4
-    """Bins in a row that must be that low, so that noise alone is none. Assumed."""
-    largest_backscatter: float = 5e-4
-    """m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
-
-
-THRESHOLDS: Final = Thresholds()

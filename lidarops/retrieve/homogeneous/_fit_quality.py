@@ -7,8 +7,8 @@ hardly affects; the tests allow for the scatter of that estimate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -51,8 +51,7 @@ class Verdict:
     quality: Flags
 
 
-@dataclass(frozen=True, slots=True)
-class _Limits:
+class _Limits(NamedTuple):
     """Limits beyond which the tests fail."""
 
     misfit: Array
@@ -204,15 +203,10 @@ def _limits_of_counts(limits: _Limits, bins: Array, counts: CountMoments, unknow
     variance = (2.0 + counts.inverse) * dof
     shape = 4.0 * variance**3 / ((8.0 + 22.0 * counts.inverse + counts.inverse_square) * dof) ** 2
     above = (special.gammaincinv(shape, 1.0 - rate) - shape) / np.sqrt(shape)
-    return replace(
-        limits,
+    return limits._replace(
         outlier=np.fmax(limits.outlier, (highest - mean) / np.sqrt(mean)),
         misfit=np.fmax(limits.misfit, 1.0 + above * np.sqrt(variance) / dof),
     )
-
-
-def _outlier_limit(quantile: Array) -> Array:
-    return np.maximum(THRESHOLDS.outlier, quantile)
 
 
 def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:
@@ -220,18 +214,13 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
     return (
         special.chdtri(dof, 0.5 * THRESHOLDS.false_alarm) / dof,
         np.where(shapes > 0, special.chdtri(shapes, THRESHOLDS.false_alarm), np.inf),
-        _outlier_limit(-special.ndtri(0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0))),
+        np.maximum(
+            THRESHOLDS.outlier,
+            -special.ndtri(0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0)),
+        ),
         np.ones_like(bins),
         np.zeros_like(bins),
     )
-
-
-def _widening(dof: Array) -> Array:
-    """Return the factor on standard errors of which the noise is estimated.
-
-    An error over its estimate follows Student's distribution; 1.96 of them hold 95 percent.
-    """
-    return np.asarray(special.stdtrit(dof, _OUTSIDE) / special.ndtri(_OUTSIDE))
 
 
 def _estimated_limits(
@@ -241,13 +230,17 @@ def _estimated_limits(
     dof = np.where(independent, _DIFFERENCE_DOF * differences, _residual_dof(bins, unknowns))
     neighbours = differences + 2.0
     ratio = np.exp(_RATIO / np.sqrt(neighbours) + _RATIO_SHORT / neighbours)
-    widening = _widening(dof)
+    # An error over its estimate follows Student's distribution; 1.96 of them hold 95 percent.
+    widening = np.asarray(special.stdtrit(dof, _OUTSIDE) / special.ndtri(_OUTSIDE))
     return (
         np.where(independent, ratio, np.inf),
         np.where(
             shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - THRESHOLDS.false_alarm), np.inf
         ),
-        _outlier_limit(-special.stdtrit(dof, 0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0))),
+        np.maximum(
+            THRESHOLDS.outlier,
+            -special.stdtrit(dof, 0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0)),
+        ),
         widening,
         2.0 * special.stdtr(dof, -_FAR * widening),
     )

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final, cast
 
 import numpy as np
@@ -37,15 +37,6 @@ _NOTHING: Final = np.zeros(1, dtype=np.int32)
 _FITTED_BACKGROUND: Final = np.full(1, np.nan)
 
 
-@dataclass(frozen=True, slots=True)
-class _AddedVariances:
-    """Variances from sources other than the noise of the fit, in absolute terms."""
-
-    background: Array
-    amplitude_relative: Array
-    extinction: Array
-
-
 def solve_by_direct_fit(problem: PathProblem) -> HomogeneousResult:
     """Solve by least squares for all three unknowns."""
     return _solution(_estimate(problem, _direct.solve_direct, _FITTED_BACKGROUND), problem)
@@ -57,7 +48,7 @@ def solve_by_linearization(problem: PathProblem) -> HomogeneousResult:
     fit = _estimate(problem, _direct.solve_from, prior, is_prior=True)
     shifts = _neglected_shifts(problem, prior, fit.extinction, fit.amplitude)
     with np.errstate(over="ignore", invalid="ignore"):
-        added = _AddedVariances(*(shift**2 for shift in shifts))
+        added = tuple(shift**2 for shift in shifts)
     return _solution(fit, problem, added=added)
 
 
@@ -76,11 +67,8 @@ def solve_with_known_background(problem: PathProblem) -> HomogeneousResult:
     fit = _estimate(problem, _direct.solve_direct, background)
     spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
-        added = _AddedVariances(
-            variance,
-            variance * spread["amplitude_slope"] ** 2,
-            variance * spread["extinction_slope"] ** 2,
-        )
+        by_slopes = (spread[f"{name}_slope"] for name in ("amplitude", "extinction"))
+        added = (variance, *(variance * slope**2 for slope in by_slopes))
     return _solution(fit, problem, unknowns=2, added=added)
 
 
@@ -178,11 +166,14 @@ def _solution(
     *,
     unknowns: int = 3,
     quality: Flags = _NOTHING,
-    added: _AddedVariances | None = None,
+    added: tuple[Array, ...] = (np.zeros(1),) * 3,
 ) -> HomogeneousResult:
-    """Judge an estimate and return the solution."""
-    if added is None:
-        added = _AddedVariances(np.zeros(1), np.zeros(1), np.zeros(1))
+    """Judge an estimate and return the solution.
+
+    `added` are variances from sources other than the noise of the fit: of the background, of the
+    logarithm of the amplitude, and of the extinction.
+    """
+    of_background, of_amplitude, of_extinction = added
     length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
     verdict = judge_fit(
         fit,
@@ -191,7 +182,7 @@ def _solution(
         counts=_count_moments(problem),
         unknowns=unknowns,
         correlation_length=length,
-        added_variance=added.extinction,
+        added_variance=of_extinction,
     )
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -200,9 +191,9 @@ def _solution(
             curved_widening(verdict.relative_error) ** 2 - 1.0
         )
         background_variance = fit.background_variance + np.where(fitted, curved, 0.0)
-        background_error = np.sqrt(background_variance * level + added.background)
-        relative_error = np.sqrt(fit.amplitude_relative_variance * level + added.amplitude_relative)
-        extinction_error = np.sqrt(fit.extinction_variance * level + added.extinction)
+        background_error = np.sqrt(background_variance * level + of_background)
+        relative_error = np.sqrt(fit.amplitude_relative_variance * level + of_amplitude)
+        extinction_error = np.sqrt(fit.extinction_variance * level + of_extinction)
         signal_to_noise = np.copysign(
             np.sqrt(fit.signal_energy / verdict.noise / length), fit.amplitude
         )

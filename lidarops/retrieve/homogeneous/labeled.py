@@ -1,4 +1,4 @@
-"""Homogeneous path over xarray: checks units, cuts sections, merges quality."""
+"""Homogeneous path over xarray: checks units, cuts sections, merges quality; in memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMP
 CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
 """Bits that a section takes over from its bins."""
 _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
-_VALUES: Final = {
+_UNITS: Final = {
     "background": "{}",
     "background_standard_error": "{}",
     "background_model_error": "{}",
@@ -33,7 +33,16 @@ _VALUES: Final = {
     "reduced_chi2": "1",
 }
 """Variables and their units, in terms of the unit of the power."""
-_COUNTS: Final = ("valid_bins", "quality_flag")
+_VARIABLES: Final = (*_UNITS, "valid_bins", "quality_flag")
+_BACKGROUND: Final = ("background", "background_error", "background_bits")
+_OF_PROFILES: Final = {
+    "correlation_length": "noise_correlation_length",
+    "background": "background",
+    "background_error": "background_standard_error",
+    "extinction": "extinction",
+    "exposure": "exposure",
+}
+"""Values of whole profiles, and the arguments of the fit that they are."""
 
 
 def fit_homogeneous_path(
@@ -56,41 +65,26 @@ def fit_homogeneous_path(
     Parameters
     ----------
     power : xr.DataArray, (..., range)
-        Any unit; the coordinate of ``range`` in m. May be dask-backed, chunked in any way.
+        Any unit; the coordinate of ``range`` ascending, in m.
     sections : sequence of (float, float)
         m; a section holds the bins with near <= range < far.
-    variance : xr.DataArray or float, optional
-        Noise variance in the square of the power's unit. Its dimensions are among those of
-        `power`.
+    variance, noise_correlation_length, extinction, exposure : xr.DataArray or float, optional
+        As for `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`, as are `method` and
+        `lag`; their dimensions are among those of `power`.
     quality : xr.DataArray, optional
         Bits of `lidarops.flags.Quality` of each bin. Missing, saturated and incompletely
         overlapping bins are excluded; a section takes over SATURATED, PILE_UP and
         INCOMPLETE_OVERLAP from its bins.
-    method : str
-        A method of `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`;
-        "known_background" needs `background_range` or `background`, "linearized" and
-        "known_extinction" need `extinction`.
     relative_variance : bool
         Whether `variance` is known up to a factor only, which each section estimates: for a
         variance estimated from the same data.
-    noise_correlation_length : xr.DataArray, optional
-        Bins, over the dimensions of `power` but range; see
-        `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`.
     background_range : (float, float), optional
         m; far range whose mean is the background of "known_background", which needs `variance`. Its
         error holds the signal that may be left there. Where that cannot be estimated,
         BACKGROUND_UNCERTAIN is raised.
-    extinction : xr.DataArray or float, optional
-        m-1, of molecules and particles, over the dimensions of `power` but range: the prior of
-        "linearized", which must be known to some percent, and exact for "known_extinction".
-    exposure : xr.DataArray, optional
-        Of Poisson counts: counts per unit of power, over the dimensions of `power` but range; not
-        with `relative_variance`.
     background : (float, float), optional
         Of "known_background", in place of `background_range`: the background and its standard
         error, in the unit of the power.
-    lag : int, optional
-        Bins, of "cubic"; see `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`.
 
     Returns
     -------
@@ -98,8 +92,7 @@ def fit_homogeneous_path(
         ``background``, ``amplitude``, ``total_extinction``, each with ``_standard_error``,
         ``background_model_error``, ``total_extinction_model_error``, ``reduced_chi2``,
         ``valid_bins`` and ``quality_flag``, with the coordinates ``section``, ``section_range``
-        (its middle) and ``section_bounds``. As lazy as the input, with the same bits for any
-        chunking.
+        (its middle) and ``section_bounds``; in memory.
 
     Raises
     ------
@@ -107,48 +100,56 @@ def fit_homogeneous_path(
         Where units, dimensions or sections are invalid.
     """
     distance, edges = _distance(power), _edges(sections)
-    bins = [_bins(distance, near, far) for near, far in edges]
-    used = slice(min(section.start for section in bins), max(section.stop for section in bins))
-    checked = _checked_inputs(power, variance, quality, noise_correlation_length)
+    power = power.transpose(..., "range")
     inputs = {
-        name: array.isel(range=used, missing_dims="ignore") for name, array in checked.items()
+        "power": power,
+        "variance": variance,
+        "quality": quality,
+        "correlation_length": noise_correlation_length,
+        "extinction": extinction,
+        "exposure": exposure,
     }
-    if extinction is not None:
-        given = xr.DataArray(extinction)
-        _check_dimensions(given, power, "extinction")
-        inputs["extinction"] = given
-    if exposure is not None:
-        _check_dimensions(exposure, power, "exposure")
-        inputs["exposure"] = exposure
+    arrays = {
+        name: _along(xr.DataArray(values), power, name)
+        for name, values in inputs.items()
+        if values is not None
+    }
     if background is not None:
-        inputs |= _given_background(background, background_range)
+        arrays |= _given_background(background, background_range)
     elif background_range is not None:
-        inputs |= _far_background(checked, distance, background_range)
-    outputs = xr.apply_ufunc(
-        _solve,
-        *inputs.values(),
-        input_core_dims=[["range"] if "range" in a.dims else [] for a in inputs.values()],
-        output_core_dims=[["section"]] * (len(_VALUES) + len(_COUNTS)),
-        kwargs={
-            "ranged": {name: "range" in array.dims for name, array in inputs.items()},
-            "range": distance[used],
-            "sections": [slice(b.start - used.start, b.stop - used.start) for b in bins],
-            "method": method,
-            "relative": relative_variance,
-            "lag": lag,
-        },
-        dask="parallelized",
-        output_dtypes=[np.float64] * len(_VALUES) + [np.int32] * len(_COUNTS),
-        dask_gufunc_kwargs={"output_sizes": {"section": len(bins)}},
-        keep_attrs=False,
-    )
-    result = xr.Dataset(dict(zip((*_VALUES, *_COUNTS), outputs, strict=True)))
+        arrays |= _far_background(arrays, distance, background_range)
+    solutions = [
+        _solve(arrays, distance, _bins(distance, *edge), method, lag, relative=relative_variance)
+        for edge in edges
+    ]
+    dims = (*power.dims[:-1], "section")
+    stacked = (np.stack(values, axis=-1) for values in zip(*solutions, strict=True))
+    result = xr.Dataset(
+        {name: (dims, values) for name, values in zip(_VARIABLES, stacked, strict=True)},
+        coords=power.coords,
+    ).drop_dims("range")
     return _described(result, edges, power.attrs.get("units", "1"))
+
+
+def _along(values: xr.DataArray, power: xr.DataArray, name: str) -> Block:
+    """Return values over the dimensions of the power, of length 1 where they lack one."""
+    extra = set(values.dims) - set(power.dims)
+    if extra:
+        raise RetrievalInputError(
+            f"has the dimensions {values.dims}, power has {power.dims}", field=name
+        )
+    try:
+        xr.align(power, values, join="exact", copy=False)
+    except ValueError as error:
+        raise RetrievalInputError(f"does not fit power: {error}", field=name) from error
+    own = [dim for dim in power.dims if dim in values.dims]
+    sizes = [values.sizes.get(dim, 1) for dim in power.dims]
+    return np.asarray(values.transpose(*own).to_numpy()).reshape(sizes)
 
 
 def _described(result: xr.Dataset, edges: Array, power_unit: str) -> xr.Dataset:
     """Return values of sections with their units and coordinates."""
-    for name, pattern in _VALUES.items():
+    for name, pattern in _UNITS.items():
         result[name].attrs["units"] = pattern.format(power_unit).removeprefix("1 ")
     return result.assign_coords(
         section=("section", np.arange(len(edges), dtype=np.int32)),
@@ -183,79 +184,39 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
     return bits.drop_vars(bits.coords)
 
 
-def _checked_inputs(
-    power: xr.DataArray,
-    variance: xr.DataArray | float | None,
-    quality: xr.DataArray | None,
-    correlation_length: xr.DataArray | None,
-) -> dict[str, xr.DataArray]:
-    """Return the arrays that are given, each with its range in one chunk."""
-    inputs = {"power": power}
-    if variance is not None:
-        inputs["variance"] = xr.DataArray(variance)
-    if correlation_length is not None:
-        inputs["correlation_length"] = correlation_length
-    if quality is not None:
-        inputs["quality"] = quality
-        if quality.dtype.kind not in "iu":
-            raise RetrievalInputError(
-                f"holds {quality.dtype}", field="quality", remedy="give bits as integers"
-            )
-    for name, array in inputs.items():
-        _check_dimensions(array, power, name)
-    return {
-        name: array.chunk({"range": -1}) if array.chunks and "range" in array.dims else array
-        for name, array in inputs.items()
-    }
-
-
 def _given_background(
     background: tuple[float, float], background_range: tuple[float, float] | None
-) -> dict[str, xr.DataArray]:
+) -> dict[str, Block]:
     """Return a background that is given for all profiles, and its standard error."""
     if background_range is not None:
         raise RetrievalInputError(
             "is given together with background_range", field="background", remedy="give one of them"
         )
-    value, error = background
-    return {"background": xr.DataArray(value), "background_error": xr.DataArray(error)}
+    return dict(zip(_BACKGROUND, (np.full(1, value) for value in background), strict=False))
 
 
 def _far_background(
-    inputs: Mapping[str, xr.DataArray],
-    distance: Array,
-    background_range: tuple[float, float],
-) -> dict[str, xr.DataArray]:
+    arrays: Mapping[str, Block], distance: Array, background_range: tuple[float, float]
+) -> dict[str, Block]:
     """Return the mean of the far range, its standard error, and whether that is uncertain."""
-    if "variance" not in inputs:
+    if "variance" not in arrays:
         raise RetrievalInputError("is needed for a background of the far range", field="variance")
-    front = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
+    power, front = arrays["power"], slice(int(np.searchsorted(distance, 0.0, side="right")), None)
+    used = _usable(arrays)[..., front]
+    noise = arrays["variance"] * arrays.get("correlation_length", 1.0)
+    noise = np.broadcast_to(noise, power.shape)[..., front]
+    sky = from_bounded_tail(used, distance[front], noise, None, background_range)
+    bits = sky.quality & np.int32(Quality.BACKGROUND_UNCERTAIN)
+    error = np.hypot(sky.standard_error, sky.left.most)
+    found = (sky.background, error, bits)
+    return {name: part[..., np.newaxis] for name, part in zip(_BACKGROUND, found, strict=True)}
 
-    def mean(
-        power: Block, variance: Block, quality: Block, length: Block
-    ) -> tuple[Block, Block, Block]:
-        values = np.where((quality & EXCLUDED) != 0, np.nan, power)[..., front]
-        noise = np.broadcast_to(variance * length, power.shape)[..., front]
-        sky = from_bounded_tail(values, distance[front], noise, None, background_range)
-        bits = sky.quality & np.int32(Quality.BACKGROUND_UNCERTAIN)
-        return sky.background, np.hypot(sky.standard_error, sky.left.most), bits
 
-    power = inputs["power"]
-    arrays = [
-        power,
-        inputs["variance"].broadcast_like(power),
-        inputs.get("quality", xr.zeros_like(power, dtype=np.int32)),
-        inputs.get("correlation_length", xr.DataArray(1.0)).broadcast_like(power),
-    ]
-    outputs = xr.apply_ufunc(
-        mean,
-        *(array.transpose(..., "range") for array in arrays),
-        input_core_dims=[["range"]] * len(arrays),
-        output_core_dims=[[], [], []],
-        dask="parallelized",
-        output_dtypes=[np.float64, np.float64, np.int32],
-    )
-    return dict(zip(("background", "background_error", "background_bits"), outputs, strict=True))
+def _usable(arrays: Mapping[str, Block]) -> Block:
+    """Return the power, NaN in bins that are excluded from a fit."""
+    if "quality" not in arrays:
+        return arrays["power"]
+    return np.where((arrays["quality"] & EXCLUDED) != 0, np.nan, arrays["power"])
 
 
 def _bins(distance: Array, near: float, far: float) -> slice:
@@ -272,84 +233,38 @@ def _bins(distance: Array, near: float, far: float) -> slice:
 
 
 def _solve(
-    *blocks: Block,
-    ranged: Mapping[str, bool],
-    range: Block,  # noqa: A002 - the field's word
-    sections: Sequence[slice],
+    arrays: Mapping[str, Block],
+    distance: Array,
+    bins: slice,
     method: str,
-    relative: bool,
     lag: int | None,
-) -> tuple[Block, ...]:
-    """Return the values of all sections, stacked along a last axis."""
-    # Values of whole profiles broadcast along range.
-    arrays = {
-        name: block if along else np.asarray(block)[..., np.newaxis]
-        for (name, along), block in zip(ranged.items(), blocks, strict=True)
-    }
-    solutions = [
-        _solve_section(
-            **{n: a[..., bins] if a.shape[-1] > 1 else a for n, a in arrays.items()},
-            range=range[bins],
-            method=method,
-            relative=relative,
-            lag=lag,
-        )
-        for bins in sections
-    ]
-    return tuple(np.stack(values, axis=-1) for values in zip(*solutions, strict=True))
-
-
-def _solve_section(
-    power: Block,
-    variance: Block | None = None,
-    quality: Block | None = None,
-    correlation_length: Block | None = None,
-    background: Block | None = None,
-    background_error: Block | None = None,
-    background_bits: Block | None = None,
-    extinction: Block | None = None,
-    exposure: Block | None = None,
     *,
-    range: Block,  # noqa: A002 - the field's word
-    method: str,
     relative: bool,
-    lag: int | None,
 ) -> tuple[Block, ...]:
-    carried = np.int32(0)
-    if quality is not None:
-        power = np.where((quality & EXCLUDED) != 0, np.nan, power)
-        carried = np.bitwise_or.reduce(quality & CARRIED, axis=-1).astype(np.int32)
-    weights = None
-    if relative and variance is not None:
+    """Return `_VARIABLES` of a section, over the leading dimensions of the power."""
+    inside = {n: a[..., bins] if a.shape[-1] > 1 else a for n, a in arrays.items()}
+    noise = {"variance": inside.get("variance")}
+    if relative and "variance" in inside:
         with np.errstate(divide="ignore"):
-            weights = 1.0 / variance
-        variance = None
-    whole = (
-        correlation_length, background, background_error, background_bits, extinction, exposure,
-    )  # fmt: skip
-    length, level, error, doubt, prior, counted = (
-        None if values is None else values[..., 0] for values in whole
-    )
+            noise = {"weights": 1.0 / inside["variance"]}
+    of_profile = {name: array[..., 0] for name, array in inside.items() if name in _OF_PROFILES}
     fit = _homogeneous.fit_homogeneous_path(
-        power,
-        range,
-        variance=variance,
-        weights=weights,
+        _usable(inside),
+        distance[bins],
         method=method,
-        noise_correlation_length=length,
-        background=level,
-        background_standard_error=error,
-        extinction=prior,
-        exposure=counted,
         lag=lag,
+        **noise,
+        **{_OF_PROFILES[name]: values for name, values in of_profile.items()},
     )
-    values = tuple(getattr(fit, name.removeprefix("total_")) for name in _VALUES)
-    bits = fit.quality | carried
-    return (*values, fit.valid_bins, bits if doubt is None else bits | doubt)
+    bits = fit.quality | inside.get("background_bits", np.zeros(1, np.int32))[..., 0]
+    if "quality" in inside:
+        bits = bits | np.bitwise_or.reduce(inside["quality"] & CARRIED, axis=-1).astype(np.int32)
+    values = (getattr(fit, name.removeprefix("total_")) for name in _UNITS)
+    return (*values, fit.valid_bins, bits)
 
 
 def _distance(power: xr.DataArray) -> Array:
-    """Return the range coordinate, in m and monotonic."""
+    """Return the range coordinate, in m and ascending."""
     if "range" not in power.dims or "range" not in power.coords:
         raise RetrievalInputError(
             f"has the dimensions {power.dims} and coordinates {tuple(power.coords)}",
@@ -364,9 +279,8 @@ def _distance(power: xr.DataArray) -> Array:
             remedy="convert the coordinate to m and set its attribute units to 'm'",
         )
     distance = power["range"].to_numpy().astype(np.float64)
-    steps = np.diff(distance)
-    if not (np.all(steps > 0) or np.all(steps < 0)):
-        raise RetrievalInputError("is not finite and strictly monotonic", field="range")
+    if not np.all(np.diff(distance) > 0):
+        raise RetrievalInputError("is not finite, or does not ascend", field="range")
     return distance
 
 
@@ -380,15 +294,3 @@ def _edges(sections: Sequence[tuple[float, float]]) -> Array:
             f"is {sections!r}", field="sections", remedy="give pairs (near, far) in m, near first"
         )
     return edges
-
-
-def _check_dimensions(array: xr.DataArray, power: xr.DataArray, name: str) -> None:
-    extra = set(array.dims) - set(power.dims)
-    try:
-        xr.align(power, array, join="exact", copy=False)
-    except ValueError as error:
-        raise RetrievalInputError(f"does not fit power: {error}", field=name) from error
-    if extra:
-        raise RetrievalInputError(
-            f"has the dimensions {array.dims}, power has {power.dims}", field=name
-        )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 from enum import StrEnum
 from typing import Final
 
@@ -213,9 +212,7 @@ def fit_homogeneous_path(
         exposure=counted,
         lag=lag,
     )
-    solved = _SOLVERS[chosen_method](problem)
-    values = {field.name: getattr(solved, field.name) for field in fields(HomogeneousResult)}
-    return HomogeneousResult(**{name: array.reshape(leading) for name, array in values.items()})
+    return inputs.with_leading_axes(_SOLVERS[chosen_method](problem), leading)
 
 
 def _noise(

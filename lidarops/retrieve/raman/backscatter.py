@@ -221,15 +221,6 @@ _ABOVE: Final = 1000.0
 """m above full overlap, in which the lidar ratio is averaged. Assumed."""
 
 
-@dataclass(frozen=True, slots=True)
-class OverlapProfile:
-    """Overlap function, (cell,): 1 beyond full overlap, NaN where it is not known."""
-
-    value: Array
-    standard_error: Array
-    """By noise of the Raman signal, and by the lidar ratio."""
-
-
 def overlap_of(
     raman: Array,
     variance: Array,
@@ -239,8 +230,11 @@ def overlap_of(
     partial: Booleans,
     step: float,
     ratio: float,
-) -> OverlapProfile:
-    r"""Return the overlap below the range of full overlap.
+) -> tuple[Array, Array]:
+    r"""Return the overlap below the range of full overlap, and its standard error, (cell,).
+
+    It is 1 beyond full overlap, and NaN where it is not known. The error is that by noise of the
+    Raman signal, and by the lidar ratio.
 
     Overlap cancels in backscatter. With the lidar ratio :math:`S` that is measured above the range
     :math:`R_f` of full overlap, it is linear in the Raman signal, and no iteration is needed:
@@ -274,7 +268,7 @@ def overlap_of(
     above = slice(first, first + max(1, round(_ABOVE / step)))
     known = np.isfinite(lidar_ratio[0][above])
     if not partial[0] or not known.any():
-        return OverlapProfile(missing, missing - 1.0)
+        return missing, missing - 1.0
     ratio_above, error = (float(part[above][known].mean()) for part in lidar_ratio)
     near = np.where(partial, np.nan_to_num(backscatter), 0.0)
     beyond = (1.0 + ratio) * step * (np.cumsum(near[::-1])[::-1] - 0.5 * near)
@@ -283,4 +277,4 @@ def overlap_of(
     transmission = np.exp(depth[first] - ratio_above * beyond)
     value = np.where(partial, raman * transmission, 1.0)
     noise = np.sqrt(variance) * transmission
-    return OverlapProfile(value, np.where(partial, np.hypot(noise, value * error * beyond), 0.0))
+    return value, np.where(partial, np.hypot(noise, value * error * beyond), 0.0)

@@ -80,27 +80,24 @@ class Assumptions:
     """m, full width at half maximum of the filter of nitrogen; None where all lines pass."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Bins:
-    """Bins of a channel for the ranges that all channels have in common."""
-
-    inside: slice
-    share: float
-    """Weight of the bin beyond in the value at a common range; 0 where ranges agree."""
+_Bins = tuple[slice, float]
+"""Bins of a channel for the ranges that all channels have in common, and the weight of the bin
+beyond in the value at a common range; 0 where ranges agree."""
 
 
 class _Channel:
     """Means of one channel, whose values are given at the ranges that all channels have."""
 
     def __init__(self, averages: xr.Dataset, bins: _Bins, distance: Array) -> None:
-        averages = averages.isel(range=bins.inside)
-        self._share, self._distance = bins.share, distance
-        if not bins.share:
+        inside, share = bins
+        averages = averages.isel(range=inside)
+        self._share, self._distance = share, distance
+        if not share:
             averages = averages.assign_coords(range=("range", distance))
         self.averages = averages
         quality = averages["quality"].to_numpy().astype(np.int32)
         hidden = (quality & np.int32(_WITHHELD)) != 0
-        self.quality = quality[:, :-1] | quality[:, 1:] if bins.share else quality
+        self.quality = quality[:, :-1] | quality[:, 1:] if share else quality
         self._power = np.where(hidden, np.nan, averages["power"].to_numpy())
         noise = actual_noise(averages)
         self._variance = noise.variance * noise.correlation_length[:, np.newaxis]
@@ -216,7 +213,7 @@ def retrieve(
         _Channel(averages, part, distance)
         for averages, part in zip((elastic, *others), bins, strict=True)
     ]
-    seen = np.ones(distance.size) if overlap is None else overlap[bins[0].inside]
+    seen = np.ones(distance.size) if overlap is None else overlap[bins[0][0]]
     settings = assumptions.settings
     heights = station_altitude + climb * distance
     air = _air(molecules, heights, distance, settings, assumptions.filter_width, seen)
@@ -244,8 +241,9 @@ def retrieve(
         "shots": elastic["shots"],
     }
     if water is not None:
-        pair = _Pair((of_raman, air), channels[2], water)
-        of_water, doubtful = _water(pair, cells, result, sky, assumptions)
+        of_water, doubtful = _water(
+            water, channels[2], of_raman, air, cells, result, sky, assumptions
+        )
         dims, bits = variables["quality_flag"]
         doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
         variables |= {**of_water, "quality_flag": (dims, bits | doubt)}
@@ -336,9 +334,9 @@ def _common_bins(
     inside = (distance > 0) & (altitude + climb * distance < HIGHEST)
     first = max(first, int(np.argmax(inside)))
     stop = min(stop, distance.size - int(np.argmax(inside[::-1])))
-    bins = [_Bins(slice(first, stop), 0.0)]
+    bins = [(slice(first, stop), 0.0)]
     for shift, last, share in zip(shifts, needed, shares, strict=True):
-        bins.append(_Bins(slice(first + shift, stop + last), share))
+        bins.append((slice(first + shift, stop + last), share))
     return distance[first:stop], bins
 
 
@@ -520,7 +518,7 @@ def _overlap(
     signals = cell_signals(raman, unity.raman_shape, cells)
     for row, (signal, bits) in enumerate(zip(signals, result.quality, strict=True)):
         partial = (bits & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
-        found = overlap_of(
+        measured, spread = overlap_of(
             signal.value,
             signal.variance,
             result.raman_depth[row],
@@ -530,35 +528,28 @@ def _overlap(
             cells.step,
             settings.ratio,
         )
-        value[row] = np.where(partial, found.value, stated)
-        error[row] = np.where(partial, found.standard_error, stated_error)
+        value[row] = np.where(partial, measured, stated)
+        error[row] = np.where(partial, spread, stated_error)
     return {"overlap": value, "overlap_standard_error": error}
 
 
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """Channels of nitrogen and water vapour."""
-
-    nitrogen: tuple[ChannelSignal, AirColumn]
-    channel: _Channel
-    water: WaterVapour
-
-
 def _water(
-    pair: _Pair,
+    water: WaterVapour,
+    channel: _Channel,
+    nitrogen: ChannelSignal,
+    air: AirColumn,
     cells: Cells,
     result: RamanResult,
     sky: _Sky,
     assumptions: Assumptions,
 ) -> tuple[dict[str, Any], Booleans]:
     """Return the mixing ratio of water vapour with its errors, and the cells that are doubtful."""
-    (nitrogen, air), water = pair.nitrogen, pair.water
     settings, heights = assumptions.settings, sky.altitude(air.range)
     density = sky.molecules.number_density(heights)
     depth = _depth(sky.molecules, heights, air.range, water.wavelength)
     # The share of the lines of nitrogen that the filter passes is not that of water vapour.
     shape = replace(air, raman_depth=depth, density=density)
-    vapour, uncertain = pair.channel.signal(shape.raman_shape, known_shape=assumptions.known_shape)
+    vapour, uncertain = channel.signal(shape.raman_shape, known_shape=assumptions.known_shape)
     share = air.density / density
     errors = (
         water.constant_standard_error / water.constant,
@@ -586,7 +577,7 @@ def _water(
         value[row], random[row], systematic[row] = found.value, found.random, found.systematic
     names = ("", "_standard_error", "_error_random", "_error_systematic")
     arrays = (value, np.hypot(random, systematic), random, systematic)
-    doubted = cells.split((pair.channel.quality & np.int32(_DOUBTED)) != 0).any(axis=-1)
+    doubted = cells.split((channel.quality & np.int32(_DOUBTED)) != 0).any(axis=-1)
     doubtful = np.isnan(value) | doubted | uncertain[:, np.newaxis]
     return {
         f"water_vapour_mixing_ratio{name}": (("time", "range"), array)

@@ -13,15 +13,13 @@ What is left is that of the counts of both signals, independent from cell to cel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
-from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.depth_fit import DepthFit
 from lidarops.retrieve.raman.signals import (
     AirColumn,
@@ -72,16 +70,26 @@ def choose_window(
             continue
         of_raman, fit = signal
         power[number, fit.expected_error > THRESHOLDS.most_uncertain] = np.nan
-        pair = _Pair.of(power[number], variance[number], of_raman, fit, of_air, settings.ratio)
-        level = pair.level(inside)
-        away = level * pair.per_raman * (of_raman.value - pair.mean)
-        shape[number] = pair.per_raman * pair.mean
+        # Of the fit, only the small difference of both transmissions is used.
+        mean = np.exp(-fit.depth)
+        per_raman = of_air * np.exp((1.0 - 2.0 / (1.0 + settings.ratio)) * fit.depth)
+        # For the smooth signal: by the observed one, low counts would weigh more.
+        noise = of_raman.noise.of(mean)
+        level = _level(
+            inside,
+            power[number],
+            variance[number],
+            per_raman * of_raman.value,
+            per_raman**2 * noise,
+        )
+        away = level * per_raman * (of_raman.value - mean)
+        shape[number] = per_raman * mean
         power[number] -= away
-        variance[number] += (level * pair.per_raman) ** 2 * pair.raman_variance
+        variance[number] += (level * per_raman) ** 2 * noise
         # Over air, both signals have nearly the same shape, so that backgrounds are alike too.
-        shift = level * (pair.per_raman * of_raman.background)[inside.any(axis=0)].mean()
+        shift = level * (per_raman * of_raman.background)[inside.any(axis=0)].mean()
         background[number] = np.hypot(background[number], shift)
-        shift = np.nan_to_num(level * pair.per_raman * of_raman.baseline)
+        shift = np.nan_to_num(level * per_raman * of_raman.baseline)
         baseline[number] = np.hypot(baseline[number], shift)
     return reference_window.choose_reference(
         power,
@@ -108,58 +116,32 @@ def _candidates(cells: Cells, settings: RamanSettings) -> Array:
     return reference_window.candidate_windows(settings.lowest, highest, width, step)
 
 
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """Both signals of one profile, (cell,)."""
+def _level(
+    windows: Booleans,
+    power: Array,
+    variance: Array,
+    expected: Array,
+    expected_variance: Array,
+) -> float:
+    """Return the ratio of the elastic signal over that of air, of the window with the lowest bound.
 
-    power: Array
-    variance: Array
-    raman: Array
-    mean: Array
-    """Smooth Raman signal."""
-    raman_variance: Array
-    """For the smooth signal: by the observed one, low counts would weigh more."""
-    per_raman: Array
-    """Elastic signal of air over the Raman one."""
+    The bound is the upper one, as in the choice of the window. 0 where there is no signal.
 
-    @classmethod
-    def of(
-        cls,
-        power: Array,
-        variance: Array,
-        raman: CellSignal,
-        fit: DepthFit,
-        of_air: Array,
-        ratio: float,
-    ) -> _Pair:
-        """Return the pair; of the fit, only the small difference of both transmissions is used."""
-        mean = np.exp(-fit.depth)
-        per_raman = of_air * np.exp((1.0 - 2.0 / (1.0 + ratio)) * fit.depth)
-        return cls(power, variance, raman.value, mean, raman.noise.of(mean), per_raman)
-
-    def level(self, windows: npt.NDArray[np.bool_]) -> float:
-        """Return the ratio of the signals over that of air, of the window with the lowest bound.
-
-        The bound is the upper one, as in the choice of the window. 0 where there is no signal.
-
-        Parameters
-        ----------
-        windows : (window, cell) bool
-        """
-        known = np.isfinite(self.power) & np.isfinite(self.raman)
-        sums = [
-            windows[:, known] @ values[known]
-            for values in (
-                self.power,
-                self.per_raman * self.raman,
-                self.variance,
-                self.per_raman**2 * self.raman_variance,
-            )
-        ]
-        seen = sums[1] > 0.0
-        if not seen.any():
-            return 0.0
-        power, expected, variance, raman_variance = (values[seen] for values in sums)
-        ratio = power / expected
-        error = np.sqrt(variance + ratio**2 * raman_variance) / expected
-        return float(ratio[np.argmin(ratio + WINDOW_THRESHOLDS.most_deviation * error)])
+    Parameters
+    ----------
+    windows : (window, cell) bool
+    power, variance, expected, expected_variance : (cell,) float
+        Of the elastic signal, and of that of air by the Raman signal of the cell.
+    """
+    known = np.isfinite(power) & np.isfinite(expected)
+    sums = [
+        windows[:, known] @ values[known]
+        for values in (power, expected, variance, expected_variance)
+    ]
+    lit = sums[1] > 0.0
+    if not lit.any():
+        return 0.0
+    of_power, of_air, noise, noise_of_air = (values[lit] for values in sums)
+    ratio = of_power / of_air
+    error = np.sqrt(noise + ratio**2 * noise_of_air) / of_air
+    return float(ratio[np.argmin(ratio + WINDOW_THRESHOLDS.most_deviation * error)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,18 +13,18 @@ from lidarops.retrieve.raman.scattering import particle_ratio
 from lidarops.retrieve.raman.signals import CellSignal, RamanSettings
 
 
-@dataclass(frozen=True, slots=True)
-class ParticleTransmission:
-    r"""Transmission of particles at the nitrogen line over that at the line of water vapour."""
+def particle_transmission(settings: RamanSettings, wavelength: float) -> tuple[float, float]:
+    r"""Return the transmission of particles at the nitrogen line over that of water vapour.
 
-    exponent: float
-    r"""Of its logarithm per fitted optical depth, :math:`(\kappa_W - \kappa) / (1 + \kappa)`."""
-    standard_error: float
-    """By the Ångström exponent."""
+    That is the exponent of its logarithm per fitted optical depth,
+    :math:`(\kappa_W - \kappa) / (1 + \kappa)`, and its standard error by the Ångström exponent.
 
-
-def particle_transmission(settings: RamanSettings, wavelength: float) -> ParticleTransmission:
-    """Return the transmission ratio of particles for a water vapour channel at a wavelength, m."""
+    Parameters
+    ----------
+    settings : RamanSettings
+    wavelength : float
+        m, of the channel of water vapour.
+    """
     laser = settings.wavelength
     nitrogen = settings.ratio
     water = particle_ratio(settings.angstrom_exponent, laser, wavelength)
@@ -33,7 +32,7 @@ def particle_transmission(settings: RamanSettings, wavelength: float) -> Particl
     of_nitrogen = nitrogen * np.log(laser / settings.raman_wavelength)
     of_water = water * np.log(laser / wavelength)
     slope = (of_water - of_nitrogen - exponent * of_nitrogen) / (1.0 + nitrogen)
-    return ParticleTransmission(exponent, float(abs(slope)) * settings.angstrom_standard_error)
+    return exponent, float(abs(slope)) * settings.angstrom_standard_error
 
 
 def mixing_ratio(
@@ -43,7 +42,7 @@ def mixing_ratio(
     partial: Booleans,
     *,
     constant: float,
-    particles: ParticleTransmission,
+    particles: tuple[float, float],
     relative_errors: Sequence[Array | float],
 ) -> Quotient:
     r"""Return the mixing ratio, with the calibration constant of both channels.
@@ -64,7 +63,8 @@ def mixing_ratio(
         Cells without full overlap.
     constant : float
         Calibration constant, kg kg-1 per ratio of the signals.
-    particles : ParticleTransmission
+    particles : (float, float)
+        From `particle_transmission`.
     relative_errors : sequence of float or (cell,) float
         Relative standard errors of the constant and of what else all profiles share.
 
@@ -80,7 +80,8 @@ def mixing_ratio(
     level = np.where(partial, nitrogen.value, np.exp(-depth))
     square = np.where(partial, own, error**2)
     factor = constant * inverse_mean(level, square)
-    factor *= np.exp(particles.exponent * beyond)
+    exponent, spread = particles
+    factor *= np.exp(exponent * beyond)
     value = factor * water.value
     background, dead_time, baseline = (
         nitrogen.relative(change, level)
@@ -88,7 +89,7 @@ def mixing_ratio(
     )
     noise = factor**2 * (water.variance + water.background**2)
     noise += value**2 * (square + background**2)
-    shared = dead_time**2 + baseline**2 + (particles.standard_error * beyond) ** 2
+    shared = dead_time**2 + baseline**2 + (spread * beyond) ** 2
     shared += sum(np.square(relative) for relative in relative_errors)
     systematic = np.sqrt(value**2 * shared + factor**2 * (water.dead_time**2 + water.baseline**2))
     return Quotient(value, np.sqrt(noise), systematic)

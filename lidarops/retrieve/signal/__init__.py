@@ -8,7 +8,7 @@ In this order:
 3. `estimate_lag` and `shift_signal` align analog with photon counting.
 4. `glue` joins analog (near) and photon counting (far).
 5. `RunningMean` averages profiles.
-6. `range_corrected` subtracts the background and multiplies with the square of range.
+6. `labeled.correct_for_range` subtracts the background and multiplies with the square of range.
 
 `labeled`, `labeled_gluing` and `labeled_averaging` do the same on `xarray` data; import them as
 modules, so that the numerics stay free of xarray.
@@ -20,7 +20,6 @@ from lidarops.retrieve.signal.counts_to_signal import (
     analog_signal,
     difference_variance,
     photon_signal,
-    range_corrected,
 )
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.gluing import GluedSignal, glue
@@ -38,6 +37,5 @@ __all__ = [
     "estimate_lag",
     "glue",
     "photon_signal",
-    "range_corrected",
     "shift_signal",
 ]

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.flags import Quality
-from lidarops.retrieve.common.arrays import Array, Flags, Integers, Singles
+from lidarops.retrieve.common.arrays import Array, Flags, Integers
 from lidarops.retrieve.common.compiled_code import compiled
 
 Indices = npt.NDArray[np.uint32]
@@ -372,31 +372,3 @@ def photon_profiles(
         _photon_variance(exposure[k], counter, s.local, bins, s.mean, variance[k])
         if not missing:
             _reject_overloaded(counts[k], exposure[k], counter, s.local, bins, power[k], quality[k])
-
-
-@compiled
-def range_corrected_profiles(
-    power: Array,
-    variance: Array,
-    background: Array,
-    background_variance: Array,
-    square: Array,
-    out_power: Singles,
-    out_variance: Singles,
-) -> None:
-    """Subtract the background and multiply with the square of range.
-
-    Parameters
-    ----------
-    power, variance : (profile, bin) float64
-    background, background_variance : (profile,) float64
-    square : (bin,) float64
-        m^2.
-    out_power, out_variance : (profile, bin) float32
-        Output.
-    """
-    for k in range(power.shape[0]):
-        level, spread = background[k], background_variance[k]
-        for i in range(square.size):
-            out_power[k, i] = (power[k, i] - level) * square[i]
-            out_variance[k, i] = (variance[k, i] + spread) * (square[i] * square[i])

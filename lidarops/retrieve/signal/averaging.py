@@ -28,8 +28,6 @@ class Averages:
     """Variance of the mean by noise that is independent from profile to profile."""
     shared_variance: Array
     """Variance of the mean by errors that all averaged profiles have in common."""
-    count: Integers
-    """Number of finite values in each mean."""
 
 
 class RunningMean:
@@ -124,7 +122,7 @@ def _averages(sums: Array, count: Integers) -> Averages:
         systematic **= 2
     for means in (value, noise, systematic):
         means[count == 0] = np.nan
-    return Averages(value, noise, systematic, count)
+    return Averages(value, noise, systematic)
 
 
 def _term(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:

@@ -1,8 +1,7 @@
 """Raw counts to signals with known noise.
 
 `analog_signal` converts ADC counts to mV and subtracts the dark signal. `photon_signal` converts
-photon counts to MHz and corrects for dead time, which is done nowhere else. `range_corrected`
-subtracts the background and multiplies with the square of range.
+photon counts to MHz and corrects for dead time, which is done nowhere else.
 
 The last axis is range, the one before it time. Quantities other than the signals are in SI units.
 Arrays may have any memory layout, byte order and integer or float type; masked entries are
@@ -25,7 +24,7 @@ from lidarops.constants import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Singles, frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, frozen
 from lidarops.retrieve.signal import _noise_kernels as noise_kernels
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
@@ -520,58 +519,3 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
         frozen(_rows(profiles)), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)
     )
     return variance
-
-
-def range_corrected(
-    power: Array,
-    variance: Array,
-    range: Array,  # noqa: A002 - the field's word
-    *,
-    background: npt.ArrayLike,
-    background_standard_error: npt.ArrayLike,
-) -> tuple[Singles, Singles]:
-    r"""Return the signal minus the background, multiplied by the square of range, and its error.
-
-    .. math:: X = (P - P^*) R^2, \qquad \mathrm{var}(X) = (v_P + v_{P^*}) R^4
-
-    Parameters
-    ----------
-    power, variance : (..., range) float
-        mV or MHz, and its square.
-    range : (range,) float
-        m.
-    background, background_standard_error : (...) float
-        In the unit of the signal.
-
-    Returns
-    -------
-    signal, standard_error : (..., range) float32
-        In mV m2 or MHz m2, computed in float64; noise is far above the precision of float32.
-        Negative values are kept: clipping would bias every mean.
-
-    Raises
-    ------
-    RetrievalInputError
-        For shapes that do not match, a range that is not finite or repeats a bin.
-    """
-    grid = _grid(range)
-    powers = _profiles(power, "power", grid.size)
-    variances = _profiles(variance, "variance", grid.size)
-    if variances.shape != powers.shape:
-        raise RetrievalInputError(
-            f"has the shape {variances.shape}, the power {powers.shape}", field="variance"
-        )
-    leading = powers.shape[:-1]
-    level = _per_profile(background, "background", leading)
-    level_error = _per_profile(background_standard_error, "background_standard_error", leading)
-    signal, square = np.empty((2, *powers.shape), np.float32)
-    kernels.range_corrected_profiles(
-        frozen(_rows(powers)),
-        frozen(_rows(variances)),
-        frozen(level),
-        frozen(level_error**2),
-        frozen(grid**2),
-        _rows(signal),
-        _rows(square),
-    )
-    return signal, np.sqrt(square, out=square)

@@ -277,7 +277,9 @@ def correct_for_range(
     background_range: tuple[float, float],
     background_method: str = "tail_mean",
 ) -> xr.Dataset:
-    """Return signals minus their background, multiplied by the square of range.
+    r"""Return signals minus their background, multiplied by the square of range.
+
+    .. math:: X = (P - P^*) R^2, \qquad \mathrm{var}(X) = (v_P + v_{P^*}) R^4
 
     Parameters
     ----------
@@ -523,13 +525,11 @@ def _corrected(
     noise = _actual_noise(power, variance, glued_until, stated_length, range)
     length = noise.correlation_length
     sky = estimate(power, range, noise.variance * length[..., np.newaxis], background_range)
-    signal, error = counts_to_signal.range_corrected(
-        power,
-        noise.variance,
-        range,
-        background=sky.background,
-        background_standard_error=sky.standard_error,
-    )
+    level, level_error = sky.background[..., np.newaxis], sky.standard_error[..., np.newaxis]
+    square = range**2
+    # Negative values are kept: clipping would bias every mean.
+    signal = ((power - level) * square).astype(np.float32)
+    error = np.sqrt(((noise.variance + level_error**2) * (square * square)).astype(np.float32))
     bits = quality | sky.quality[..., np.newaxis]
     published = np.where(noise.known | (length > 1.0), length, np.nan)
     return signal, error, bits, sky.background, sky.standard_error, published

@@ -32,6 +32,7 @@ MEANS_TOGETHER: Final = 16
 """Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
+_AVERAGES: Final = ("values", "variance", "shared_variance")
 Shared = Callable[[npt.NDArray[np.datetime64]], Array]
 Units = dict[str, dict[str, Any]]
 
@@ -294,22 +295,6 @@ class Screening:
     night files have some, would cost a part of the mean and change nothing that is retrieved."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Mean:
-    """One mean of one record, and its parts."""
-
-    values: Averages
-    quality: npt.NDArray[np.int32]
-    length: Array
-    profiles: npt.NDArray[np.int32]
-    shots: npt.NDArray[np.int32]
-    left_out: int
-    cells: PartCells
-    """(part, cell), NaN in parts that are left out or do not exist."""
-    of_parts: npt.NDArray[np.int32]
-    """(part,): number of profiles, 0 in those."""
-
-
 class ScreenedAverage:
     """Means of profiles over intervals of the clock, without outlying parts.
 
@@ -332,7 +317,7 @@ class ScreenedAverage:
         self._first = int(np.searchsorted(records[-1].range, 0.0, side="right"))
         self._first_range = float(records[-1].range[0]) + self._first * self._step
         self._past = min(record.range.size for record in records)
-        self._open: list[tuple[_Mean, ...]] = []
+        self._open: list[tuple[dict[str, Any], ...]] = []
         self._units: tuple[dict[str, Any], ...] = ()
         self._number, self._total = 0, self.times.sizes["time"]
         self._completed: list[tuple[xr.Dataset, ...]] = []
@@ -413,50 +398,48 @@ class ScreenedAverage:
         return LICEL_RANGE_PER_MICROSECOND / (np.maximum(sums.shots, 1) * self._step)
 
     def _labeled(
-        self, record: Record, numbers: slice, means: Sequence[_Mean], units: dict[str, Any]
+        self,
+        record: Record,
+        numbers: slice,
+        means: Sequence[dict[str, Any]],
+        units: dict[str, Any],
     ) -> xr.Dataset:
-        values = (mean.values for mean in means)
-        rows = zip(
-            *((v.values, v.variance, v.shared_variance, v.count) for v in values), strict=True
+        of = {name: np.stack([mean[name] for mean in means]) for name in means[0]}
+        averages = Averages(*(of[name][:, 0] for name in _AVERAGES))
+        labeled = record.means.labeled(
+            numbers, averages, of["quality"], of["length"], of["profiles"], of["shots"], units
         )
-        averages = Averages(*(np.concatenate(row) for row in rows))
-        quality = np.stack([mean.quality for mean in means])
-        length = np.array([float(mean.length) for mean in means])
-        profiles, shots, left_out = (
-            np.array([getattr(mean, name) for mean in means], dtype=np.int32)
-            for name in ("profiles", "shots", "left_out")
-        )
-        labeled = record.means.labeled(numbers, averages, quality, length, profiles, shots, units)
         along = ("time", "part", "cell")
-        power, variance = (
-            np.stack([getattr(mean.cells, name) for mean in means])
-            for name in ("power", "variance")
-        )
+        cells = {"bins": self._bins, "first_range": self._first_range}
         return labeled.assign(
-            part_power=(along, power, {"bins": self._bins, "first_range": self._first_range}),
-            part_variance=(along, variance),
-            part_quantum=(along[:2], np.stack([mean.cells.quantum for mean in means])),
-            part_profiles=(("time", "part"), np.stack([mean.of_parts for mean in means])),
-            profiles_left_out=("time", left_out),
+            part_power=(along, of["part_power"], cells),
+            part_variance=(along, of["part_variance"]),
+            part_quantum=(along[:2], of["part_quantum"]),
+            part_profiles=(along[:2], of["part_profiles"]),
+            profiles_left_out=("time", of["left_out"]),
         )
 
 
-def _mean(sums: PartSums, cells: PartCells, kept: Booleans) -> _Mean:
-    """Return the mean of the parts that are kept."""
+def _mean(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
+    """Return the mean of the parts that are kept, and their cells: NaN in those that are not."""
     parts = THRESHOLDS.most_parts
     shape = parts, cells.power.shape[1]
     power, variance = np.full(shape, np.nan), np.full(shape, np.nan)
     quantum, of_parts = np.zeros(parts), np.zeros(parts, dtype=np.int32)
-    shown = np.flatnonzero(kept)
-    power[shown], variance[shown] = cells.power[shown], cells.variance[shown]
-    quantum[shown], of_parts[shown] = cells.quantum[shown], sums.profiles[shown]
-    return _Mean(
-        values=sums.sums.joined(kept),
-        quality=np.bitwise_or.reduce(sums.quality if kept.all() else sums.quality[kept], axis=0),
-        length=sums.lengths.joined(kept).values[0, 0],
-        profiles=sums.profiles[kept].sum(),
-        shots=sums.shots[kept].sum(),
-        left_out=int(sums.profiles[~kept].sum()),
-        cells=PartCells(power, variance, quantum),
-        of_parts=of_parts,
-    )
+    places = np.flatnonzero(kept)
+    power[places], variance[places] = cells.power[places], cells.variance[places]
+    quantum[places], of_parts[places] = cells.quantum[places], sums.profiles[places]
+    averages = sums.sums.joined(kept)
+    quality = sums.quality if kept.all() else sums.quality[kept]
+    return {
+        **{name: getattr(averages, name) for name in _AVERAGES},
+        "quality": np.bitwise_or.reduce(quality, axis=0),
+        "length": float(sums.lengths.joined(kept).values[0, 0]),
+        "profiles": np.int32(sums.profiles[kept].sum()),
+        "shots": np.int32(sums.shots[kept].sum()),
+        "left_out": np.int32(sums.profiles[~kept].sum()),
+        "part_power": power,
+        "part_variance": variance,
+        "part_quantum": quantum,
+        "part_profiles": of_parts,
+    }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import signal, stats
@@ -57,8 +59,18 @@ def counted(expected, background, rng):
     return counts - background, np.broadcast_to(expected + background, counts.shape)
 
 
+def detected(*arguments, **settings):
+    """Return the layers of each profile: their bins, the first one, and whether there are any."""
+    mask = find_layers(*arguments, **settings)
+    cloudy = mask.any(axis=-1)
+    base = np.where(mask, arguments[1], np.inf).min(axis=-1)
+    return SimpleNamespace(
+        mask=mask, cloudy=cloudy, cloud_base_range=np.where(cloudy, base, np.nan)
+    )
+
+
 def detect(power, variance, **settings):
-    return find_layers(power, RANGE, variance, molecular_attenuated=SHAPE, **settings)
+    return detected(power, RANGE, variance, molecular_attenuated=SHAPE, **settings)
 
 
 CLOUDS = {
@@ -158,7 +170,7 @@ def test_noise_of_analog_channels_makes_no_layers(data_root):
         far = power[:, r > 24e3]
         variance = 0.5 * np.mean(np.diff(far, axis=1) ** 2, axis=1, keepdims=True)
         extinction = AIR.extinction(330.0 + r, wavelength)
-        found = find_layers(
+        found = detected(
             power - far.mean(axis=1, keepdims=True),
             r,
             np.broadcast_to(variance, power.shape),
@@ -218,7 +230,7 @@ def test_aerosol_is_no_cloud_at_short_wavelengths_either():
     _, power, shape = of_wavelength(BLUE, 532.0 / 355.0 * aerosol(3000, rng))
     for scale, background in ((1e17, 1.0), (1e18, 1.0), (1e20, 1e3)):
         counts, variance = counted(scale * power, background, rng)
-        layers = find_layers(
+        layers = detected(
             counts, RANGE, variance, molecular_attenuated=shape, contrast=cloud_contrast(BLUE)
         )
         assert np.mean(layers.cloudy) <= 0.01
@@ -232,7 +244,7 @@ def test_a_cirrus_stands_out_at_each_wavelength(wavelength):
     air, power, shape = of_wavelength(wavelength, cirrus, 25.0)
     inside = between(8550.0, 9450.0)
     spread = np.sum(cirrus[inside]) / np.sqrt(np.sum(inside)) / 26.0 / air * shape
-    found = find_layers(
+    found = detected(
         power + spread * rng.standard_normal((500, RANGE.size)), RANGE, spread**2,
         molecular_attenuated=shape, contrast=cloud_contrast(wavelength),
     )  # fmt: skip
@@ -263,7 +275,7 @@ def found_tops(wavelength, name, ratio):
     rng = np.random.default_rng(22)
     air, power, shape = of_wavelength(wavelength, TOPS[name], 20.0)
     spread = np.hypot(np.interp(9000.0, RANGE, shape) / ratio, 0.003 * power)
-    masks = find_layers(
+    masks = detected(
         power + spread * rng.standard_normal((100, RANGE.size)), RANGE, spread**2,
         molecular_attenuated=shape, contrast=cloud_contrast(wavelength),
     ).mask  # fmt: skip
@@ -338,7 +350,7 @@ def test_air_between_two_layers_is_outside_of_them(ratio):
     _, power, shape = of_wavelength(532e-9, layers, 20.0)
     spread = np.interp(9000.0, RANGE, shape) / ratio
     noisy = power + spread * rng.standard_normal((100, RANGE.size))
-    mask = find_layers(noisy, RANGE, spread**2 + 0.0 * noisy, molecular_attenuated=shape).mask
+    mask = detected(noisy, RANGE, spread**2 + 0.0 * noisy, molecular_attenuated=shape).mask
     assert mask[:, between(8560.0, 8940.0)].mean() < 0.02
 
 
@@ -367,7 +379,7 @@ def test_a_grey_cirrus_has_to_be_brighter_to_be_a_cloud_at_355_nm(wavelength, ra
     inside = between(9000.0, 9000.0 + depth)
     _, power, shape = of_wavelength(wavelength, excess * BACKSCATTER * inside, 25.0)
     spread = np.full(RANGE.size, np.interp(9000.0, RANGE, shape) / 30.0)
-    mask = find_layers(
+    mask = detected(
         power + spread * rng.standard_normal(power.shape), RANGE, spread**2,
         molecular_attenuated=shape, contrast=cloud_contrast(wavelength),
     ).mask  # fmt: skip
@@ -393,7 +405,7 @@ def test_a_layer_is_found_where_noise_would_not_hide_it(wavelength):
 
     def searched(expected):
         counts, variance = counted(expected, 100.0, rng)
-        return counts, RANGE, variance, find_layers(counts, RANGE, variance, **settings).mask
+        return counts, RANGE, variance, detected(counts, RANGE, variance, **settings).mask
 
     *air, cloudy = searched(of_air)
     visible = find_visible_air(*air, cloudy=cloudy, **settings).mean(axis=0)
@@ -442,7 +454,7 @@ def test_air_without_noise_has_no_layers_however_sensitive_the_test():
     r = 7.5 * (np.arange(10_000) + 0.5)[20:]
     extinction = AIR.extinction(r, 532e-9)
     shape = AIR.backscatter(r, 532e-9) * np.exp(-15.0 * np.cumsum(extinction)) / r**2
-    layers = find_layers(1e9 * shape, r, 0.0, molecular_attenuated=shape, contrast=1.0)
+    layers = detected(1e9 * shape, r, 0.0, molecular_attenuated=shape, contrast=1.0)
     assert not layers.cloudy
 
 
@@ -494,7 +506,7 @@ def test_profiles_are_tested_independently_in_any_layout():
     power, variance = counted(1e17 * true, 5.0, rng)
     whole = detect(power, variance)
     cube = detect(power.reshape(3, 4, -1).astype(np.float32), variance.reshape(3, 4, -1))
-    turned = find_layers(
+    turned = detected(
         power[:, ::-1], RANGE[::-1], variance[:, ::-1], molecular_attenuated=SHAPE[::-1]
     )
     assert cube.mask.shape == (3, 4, RANGE.size)
@@ -517,5 +529,5 @@ def test_profiles_are_tested_independently_in_any_layout():
 )
 def test_impossible_arguments_are_refused_by_name(change, field):
     with pytest.raises(RetrievalInputError) as caught:
-        find_layers(SHAPE, RANGE, SHAPE**2, **{"molecular_attenuated": SHAPE, **change})
+        detected(SHAPE, RANGE, SHAPE**2, **{"molecular_attenuated": SHAPE, **change})
     assert caught.value.field == field

@@ -444,21 +444,6 @@ def test_every_missing_value_has_a_flag() -> None:
     assert (_photon(masked, np.full(2, 600)).quality[:, 0] == Quality.INPUT_MISSING).all()
 
 
-def test_range_correction_carries_both_variances() -> None:
-    counts = np.random.default_rng(1).poisson(900, (3, 400)).astype(np.int32)
-    raw = _photon(counts, np.full(3, 600), dead_time=0.0)
-    level = np.array([40.0, 2.0, np.nan])
-    signal, error = counts_to_signal.range_corrected(
-        raw.power, raw.variance, RANGE, background=level, background_standard_error=0.5
-    )
-    assert signal.dtype == error.dtype == np.float32
-    # 30 MHz minus 40 MHz: negative, and not clipped.
-    expected = (raw.power - level[:, np.newaxis]) * RANGE**2
-    assert (expected[0] < 0.0).all()
-    np.testing.assert_array_equal(signal, expected.astype(np.float32))
-    np.testing.assert_allclose(error, np.sqrt(raw.variance + 0.25) * RANGE**2, rtol=1e-6)
-
-
 _COUNTS = np.ones((1, 400), np.int32)
 
 
@@ -480,16 +465,6 @@ _COUNTS = np.ones((1, 400), np.int32)
         ("dead_time", lambda: _photon(_COUNTS, SHOTS, dead_time=-4e-9)),
         ("noise_variance", lambda: _analog(_COUNTS, SHOTS, noise_variance=np.nan)),
         ("full_overlap_range", lambda: _photon(_COUNTS, SHOTS, full_overlap_range=np.nan)),
-        (
-            "background",
-            lambda: counts_to_signal.range_corrected(
-                np.ones((1, 400)),
-                np.ones((1, 400)),
-                RANGE,
-                background=[1.0, 2.0],
-                background_standard_error=0.0,
-            ),
-        ),
         (
             "input_range",
             lambda: counts_to_signal.analog_signal(

@@ -254,7 +254,7 @@ def _choose_window(power: Array, variance: Array, air: elastic_cases.SimulatedSk
     clouds = layers.find_layers(power, air.range, variance, molecular_attenuated=air.shape)
     window = reference_window.choose_reference(
         power, air.range, variance, molecular_attenuated=air.shape,
-        candidates=elastic_cases.CANDIDATES, exclude=clouds.mask,
+        candidates=elastic_cases.CANDIDATES, exclude=clouds,
     )  # fmt: skip
     bits = np.where(window.chosen, np.int32(0), np.int32(ElasticQuality.NO_REFERENCE))
     return Answer({"bottom": window.bottom, "top": window.top}, bits)

@@ -101,7 +101,7 @@ def _labeled(array: Any, chunk: int) -> Mapping[str, Any]:
     sections = [(2500.0, 6000.0), (6000.0, 10000.0)]
     if chunk:
         power = power.chunk({"time": chunk, "range": 50})
-    result = labeled.fit_homogeneous_path(power, sections=sections, variance=1.0).compute()
+    result = labeled.fit_homogeneous_path(power, sections=sections, variance=1.0)
     return {str(name): result[name].to_numpy() for name in result.data_vars}
 
 
