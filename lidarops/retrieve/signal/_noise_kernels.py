@@ -204,7 +204,7 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
 
 
 @compiled
-def _estimate(power: Array, noise: NoiseModel, s: kernels.SignalScratch, out: Array) -> None:
+def _measure(power: Array, noise: NoiseModel, s: kernels.SignalScratch, out: Array) -> None:
     complete = kernels.load_values(power, s.sums)
     kernels.write_averages(s.sums, noise.narrow, complete, s.mean)
     far = power.size // 2
@@ -237,4 +237,4 @@ def noise_profiles(power: Array, noise: NoiseModel, s: kernels.SignalScratch, ou
         Output: the variance.
     """
     for k in range(power.shape[0]):
-        _estimate(power[k], noise, s, out[k])
+        _measure(power[k], noise, s, out[k])

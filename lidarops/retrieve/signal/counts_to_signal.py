@@ -24,7 +24,7 @@ from lidarops.constants import (
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, frozen
+from lidarops.retrieve.common.arrays import Array, Flags, Indices, frozen
 from lidarops.retrieve.signal import _noise_kernels as noise_kernels
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
@@ -404,17 +404,6 @@ def _per_bin(values: npt.ArrayLike | None, name: str, shape: tuple[int, ...]) ->
     return _rows(array)
 
 
-def _profiles(values: npt.ArrayLike, name: str, bins: int) -> Array:
-    array = inputs.real_array(values, name)
-    if array.shape[-1:] != (bins,):
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, but range has {bins} bins",
-            field=name,
-            remedy="the last axis is range",
-        )
-    return np.require(array, np.float64, "A")
-
-
 def _rows(array: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
     """Return an array as (profile, bin)."""
     return array.reshape(int(np.prod(array.shape[:-1], dtype=np.int64)), array.shape[-1])
@@ -435,7 +424,10 @@ def _windows(grid: Array, window: float) -> kernels.Windows:
     with np.errstate(over="ignore", invalid="ignore"):
         reach = np.nan_to_num(np.abs(grid) * (window / spacing))
     half = np.clip(reach, MIN_NOISE_BINS, max(size, MIN_NOISE_BINS)).astype(np.intp)
-    begin, end = _gap_free_stretch(steps > MIN_NOISE_BINS * spacing)
+    # A gap is where bins were not read. No window may extend across it.
+    gaps = np.flatnonzero(steps > MIN_NOISE_BINS * spacing) + 1
+    edges = np.concatenate([[0], gaps, [size]])
+    begin, end = (np.repeat(part, np.diff(edges)) for part in (edges[:-1], edges[1:]))
     # Windows stay symmetric near the ends; a one-sided one would bias a steep signal.
     half = np.minimum(half, np.maximum(np.minimum(index - begin, end - 1 - index), MIN_NOISE_BINS))
     first, past = np.maximum(index - half, begin), np.minimum(index + half + 1, end)
@@ -446,18 +438,6 @@ def _windows(grid: Array, window: float) -> kernels.Windows:
         frozen(past.astype(np.uint32)),
         frozen(bins),
     )
-
-
-def _gap_free_stretch(
-    gaps: Booleans,
-) -> tuple[Indices, Indices]:
-    """Return the first and past-the-last bin of the stretch without a gap that holds each bin.
-
-    A gap is where bins were not read. No window may extend across it.
-    """
-    edges = np.concatenate([[0], np.flatnonzero(gaps) + 1, [gaps.size + 1]])
-    lengths = np.diff(edges)
-    return np.repeat(edges[:-1], lengths), np.repeat(edges[1:], lengths)
 
 
 def _noise_model(grid: Array) -> noise_kernels.NoiseModel:
@@ -513,7 +493,13 @@ def difference_variance(power: Array, range: Array) -> Array:  # noqa: A002 - th
         For shapes that do not match, a range that is not finite or repeats a bin.
     """
     grid = _grid(range)
-    profiles = _profiles(power, "power", grid.size)
+    profiles = np.require(inputs.real_array(power, "power"), np.float64, "A")
+    if profiles.shape[-1:] != grid.shape:
+        raise RetrievalInputError(
+            f"has the shape {profiles.shape}, but range has {grid.size} bins",
+            field="power",
+            remedy="the last axis is range",
+        )
     variance = np.empty(profiles.shape)
     noise_kernels.noise_profiles(
         frozen(_rows(profiles)), _noise_model(grid), kernels.scratch(grid.size), _rows(variance)

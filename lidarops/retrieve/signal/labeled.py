@@ -31,16 +31,6 @@ BASELINE_ERROR: Final = "baseline_standard_error"
 
 CORRELATION_LENGTH: Final = "noise_correlation_length"
 """Name of the integral correlation length of noise along range, bins."""
-_SIGNAL_NAMES = ("power", "variance", "quality", CORRELATION_LENGTH)
-_CORRECTED: Final = {
-    "signal": np.float32,
-    "signal_standard_error": np.float32,
-    "quality_flag": np.int32,
-    "background": np.float64,
-    "background_standard_error": np.float64,
-    CORRELATION_LENGTH: np.float64,
-}
-"""Variables of `correct_for_range` and their types; the last three have no range."""
 
 
 class BackgroundMethod(StrEnum):
@@ -74,7 +64,7 @@ def condition(
     Parameters
     ----------
     archive : xr.Dataset
-        From `lidarops.open_archive(..., mask_and_scale=False)`; may be dask-backed.
+        From `lidarops.open_archive(..., mask_and_scale=False)`.
     channel : str
         Name of the channel.
     dead_time : float, optional
@@ -97,52 +87,56 @@ def condition(
     -------
     xr.Dataset
         ``power`` (mV or MHz), ``variance`` and ``quality`` over (time, range), and
-        ``noise_correlation_length`` (bins) over time, as lazy as the input. The attribute
+        ``noise_correlation_length`` (bins) over time, in memory. The attribute
         ``dead_time_standard_error`` (s) of the power of photon counting, and
         ``baseline_standard_error`` of analog, are the inputs of `systematic_changes`.
     """
-    counts = _with_range(archive[channel], range_offset)
+    counts, shots = archive[channel], archive[f"{channel}_shots"].to_numpy()
+    grid = str(counts.dims[-1])
+    distance = counts[grid].to_numpy()
+    if range_offset:
+        distance = distance + range_offset
+    along = distance.astype(np.float64)
     unit = channel_unit(archive, channel)
-    settings: dict[str, Any] = {
-        "range": counts["range"].to_numpy().astype(np.float64),
-        "full_overlap_range": full_overlap_range,
-    }
-    arguments = [counts, archive[f"{channel}_shots"]]
     if unit == "MHz":
-        settings |= {
-            "bin_width": counts.attrs["bin_width"],
-            "dead_time": dead_time,
-            "dead_time_uncertainty": dead_time_uncertainty,
-        }
-    else:
-        settings |= {"adc_bits": counts.attrs["adc_bits"], "noise_variance": noise_variance}
-        arguments.append(archive[f"{channel}_input_range"])
-        if dark is not None:
-            arguments.append(archive["time"].astype(np.int64).drop_vars(archive["time"].coords))
-            settings["dark"] = dark
-    arrays = xr.apply_ufunc(
-        _photons if unit == "MHz" else _analog,
-        *arguments,
-        input_core_dims=[["range"]] + [[]] * (len(arguments) - 1),
-        output_core_dims=[["range"]] * 3 + [[]],
-        kwargs=settings,
-        dask="parallelized",
-        output_dtypes=[np.float64, np.float64, np.int32, np.float64],
-    )
-    # All parts have the same coordinates; passing them avoids a comparison.
-    variables = {name: array.variable for name, array in zip(_SIGNAL_NAMES, arrays, strict=True)}
-    result = xr.Dataset(variables, coords=arrays[0].coords)
-    result["power"].attrs = {"units": unit}
-    if unit == "MHz":
-        result["power"].attrs[DEAD_TIME_ERROR] = counts_to_signal.dead_time_standard_error(
-            dead_time, dead_time_uncertainty
+        signal = counts_to_signal.photon_signal(
+            counts.to_numpy(),
+            shots,
+            along,
+            bin_width=counts.attrs["bin_width"],
+            dead_time=dead_time,
+            dead_time_uncertainty=dead_time_uncertainty,
+            full_overlap_range=full_overlap_range,
         )
+        error = counts_to_signal.dead_time_standard_error(dead_time, dead_time_uncertainty)
+        attributes: dict[str, Any] = {DEAD_TIME_ERROR: error}
     else:
-        result["power"].attrs[BASELINE_ERROR] = _baseline(baseline_uncertainty, dark)
-    result["variance"].attrs = {"units": f"{unit}2"}
-    result[CORRELATION_LENGTH].attrs = {"units": "1"}
-    result["range"].attrs = counts["range"].attrs
-    return result
+        given = (None, None) if dark is None else dark.at(archive["time"].to_numpy())
+        signal = counts_to_signal.analog_signal(
+            counts.to_numpy(),
+            shots,
+            along,
+            adc_bits=counts.attrs["adc_bits"],
+            input_range=archive[f"{channel}_input_range"].to_numpy(),
+            dark=given[0],
+            dark_variance=given[1],
+            noise_variance=noise_variance,
+            full_overlap_range=full_overlap_range,
+        )
+        attributes = {BASELINE_ERROR: _baseline(baseline_uncertainty, dark)}
+    dims = (*counts.dims[:-1], "range")
+    return xr.Dataset(
+        {
+            "power": (dims, signal.power, {"units": unit, **attributes}),
+            "variance": (dims, signal.variance, {"units": f"{unit}2"}),
+            "quality": (dims, signal.quality),
+            CORRELATION_LENGTH: (dims[:-1], signal.correlation_length, {"units": "1"}),
+        },
+        coords={
+            **{name: array for name, array in counts.coords.items() if name != grid},
+            "range": ("range", distance, counts[grid].attrs),
+        },
+    )
 
 
 def _baseline(given: float | None, dark: DarkSignals | None) -> tuple[float, float]:
@@ -261,17 +255,6 @@ def dead_time_change(profiles: xr.Dataset) -> tuple[Block, float] | None:
     return profiles["power"].to_numpy() ** 2 * per_square, per_square
 
 
-def _with_range(counts: xr.DataArray, offset: float) -> xr.DataArray:
-    """Return counts over ``range``, shifted by an offset in m."""
-    grid = str(counts.dims[-1])
-    if grid != "range":
-        counts = counts.rename({grid: "range"})
-    if not offset:
-        return counts
-    shifted = counts["range"].copy(data=counts["range"].to_numpy() + offset)
-    return counts.assign_coords(range=shifted)
-
-
 def correct_for_range(
     conditioned: xr.Dataset,
     background_range: tuple[float, float],
@@ -313,26 +296,38 @@ def correct_for_range(
         If no bin lies in the range of the background, or the method is another.
     """
     method = inputs.choice(background_method, BackgroundMethod, "background_method")
-    arrays = xr.apply_ufunc(
-        _corrected,
-        *(conditioned[name] for name in ("power", "variance", "quality")),
-        _glued_until(conditioned),
-        _stated_length(conditioned),
-        input_core_dims=[["range"]] * 3 + [[]] * 2,
-        output_core_dims=[["range"]] * 3 + [[]] * 3,
-        kwargs={
-            "range": conditioned["range"].to_numpy().astype(np.float64),
-            "background_range": background_range,
-            "estimate": _BACKGROUNDS[method][0],
+    noise = actual_noise(conditioned)
+    power, length = conditioned["power"].to_numpy(), noise.correlation_length
+    distance = conditioned["range"].to_numpy().astype(np.float64)
+    of_means = noise.variance * length[..., np.newaxis]
+    sky = _BACKGROUNDS[method][0](power, distance, of_means, background_range)
+    level, level_error = sky.background[..., np.newaxis], sky.standard_error[..., np.newaxis]
+    square = distance**2
+    # Negative values are kept: clipping would bias every mean.
+    signal = ((power - level) * square).astype(np.float32)
+    error = np.sqrt(((noise.variance + level_error**2) * (square * square)).astype(np.float32))
+    plane = conditioned["power"].dims
+    result = xr.Dataset(
+        {
+            "signal": (plane, signal),
+            "signal_standard_error": (plane, error),
+            "quality_flag": (
+                plane,
+                conditioned["quality"].to_numpy() | sky.quality[..., np.newaxis],
+            ),
+            "background": (plane[:-1], sky.background),
+            "background_standard_error": (plane[:-1], sky.standard_error),
+            CORRELATION_LENGTH: (
+                plane[:-1],
+                np.where(noise.known | (length > 1.0), length, np.nan),
+            ),
         },
-        dask="parallelized",
-        output_dtypes=list(_CORRECTED.values()),
+        coords=conditioned.coords,
+        attrs={"steps": background_words(method, background_range)},
     )
-    words = background_words(method, background_range)
-    result = xr.Dataset(dict(zip(_CORRECTED, arrays, strict=True)), attrs={"steps": words})
-    square = conditioned["range"].astype(np.float64) ** 2
+    along = conditioned["range"].astype(np.float64) ** 2
     changes = systematic_changes(conditioned, result["background"])
-    errors = {f"signal_{cause}_error": change * square for cause, change in changes.items()}
+    errors = {f"signal_{cause}_error": change * along for cause, change in changes.items()}
     result = result.assign({name: error.astype(np.float32) for name, error in errors.items()})
     return without_analog_background(result, conditioned)
 
@@ -355,7 +350,7 @@ class ActualNoise(NamedTuple):
 
 
 def actual_noise(profiles: xr.Dataset) -> ActualNoise:
-    """Return the noise of profiles.
+    """Return the noise of profiles, in memory.
 
     Parameters
     ----------
@@ -365,7 +360,14 @@ def actual_noise(profiles: xr.Dataset) -> ActualNoise:
     power, variance = profiles["power"].to_numpy(), profiles["variance"].to_numpy()
     distance = profiles["range"].to_numpy().astype(np.float64)
     glued_until, stated = (part(profiles).to_numpy() for part in (_glued_until, _stated_length))
-    return _actual_noise(power, variance, glued_until, stated, distance)
+    rows = (-1, distance.size)
+    noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
+    leading = power.shape[:-1]
+    excess = noise.excess.reshape(leading)
+    beyond = distance > glued_until[..., np.newaxis]
+    raised = variance * np.where(beyond, excess[..., np.newaxis], 1.0)
+    length = np.maximum(noise.length.reshape(leading), stated)
+    return ActualNoise(raised, excess, length, noise.known.reshape(leading))
 
 
 def counts_per_power(
@@ -426,23 +428,6 @@ def _stated_length(profiles: xr.Dataset) -> xr.DataArray:
     return xr.ones_like(profiles["power"].isel(range=0, drop=True))
 
 
-def _actual_noise(
-    power: Block,
-    variance: Block,
-    glued_until: Block,
-    stated_length: Block,
-    distance: Block,
-) -> ActualNoise:
-    rows = (-1, distance.size)
-    noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
-    leading = power.shape[:-1]
-    excess = noise.excess.reshape(leading)
-    beyond = distance > glued_until[..., np.newaxis]
-    raised = variance * np.where(beyond, excess[..., np.newaxis], 1.0)
-    length = np.maximum(noise.length.reshape(leading), stated_length)
-    return ActualNoise(raised, excess, length, noise.known.reshape(leading))
-
-
 def channel_unit(archive: xr.Dataset, channel: str) -> str:
     """Return the unit of the power of a channel: MHz for photon counting, mV for analog."""
     return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
@@ -484,52 +469,3 @@ def read_dark(archive: xr.Dataset, channel: str, *, method: str) -> DarkSignals:
 
 _DARK_TOGETHER: Final = 32
 """Dark files that are converted together, which bounds the memory of the conversion."""
-
-
-def _photons(counts: Block, shots: Block, **settings: Any) -> tuple[Block, ...]:
-    return _parts(counts_to_signal.photon_signal(counts, shots, **settings))
-
-
-def _parts(signal: counts_to_signal.Signal) -> tuple[Block, ...]:
-    return signal.power, signal.variance, signal.quality, signal.correlation_length
-
-
-def _analog(
-    counts: Block,
-    shots: Block,
-    input_range: Block,
-    times: Block | None = None,
-    *,
-    dark: DarkSignals | None = None,
-    **settings: Any,
-) -> tuple[Block, ...]:
-    if dark is not None and times is not None:
-        at_times = dark.at(times.astype("datetime64[ns]"))
-        settings |= dict(zip(("dark", "dark_variance"), at_times, strict=True))
-    return _parts(
-        counts_to_signal.analog_signal(counts, shots, input_range=input_range, **settings)
-    )
-
-
-def _corrected(
-    power: Block,
-    variance: Block,
-    quality: Block,
-    glued_until: Block,
-    stated_length: Block,
-    *,
-    range: Block,  # noqa: A002
-    background_range: tuple[float, float],
-    estimate: Callable[..., Background],
-) -> tuple[Block, ...]:
-    noise = _actual_noise(power, variance, glued_until, stated_length, range)
-    length = noise.correlation_length
-    sky = estimate(power, range, noise.variance * length[..., np.newaxis], background_range)
-    level, level_error = sky.background[..., np.newaxis], sky.standard_error[..., np.newaxis]
-    square = range**2
-    # Negative values are kept: clipping would bias every mean.
-    signal = ((power - level) * square).astype(np.float32)
-    error = np.sqrt(((noise.variance + level_error**2) * (square * square)).astype(np.float32))
-    bits = quality | sky.quality[..., np.newaxis]
-    published = np.where(noise.known | (length > 1.0), length, np.nan)
-    return signal, error, bits, sky.background, sky.standard_error, published

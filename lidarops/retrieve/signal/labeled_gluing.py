@@ -63,7 +63,7 @@ def scene_slope(parts: Iterable[tuple[xr.Dataset, xr.Dataset]], lag: ChannelLag)
 
     The standard error holds the scatter of the slopes, as by a drift of the gain. NaN without any.
     """
-    glued = [glue(*part, lag, UNKNOWN_SLOPE)[[*_LINE]].compute() for part in parts]
+    glued = [glue(*part, lag, UNKNOWN_SLOPE)[[*_LINE]] for part in parts]
     slope, error = (np.concatenate([part[name].to_numpy() for part in glued]) for name in _LINE)
     slope, error = slope[lines := np.isfinite(slope)], error[lines]
     if not slope.size:
@@ -108,7 +108,7 @@ def glue(
     ----------
     analog, photon : xr.Dataset
         ``power``, ``variance``, ``quality`` over (time, range), of the same profiles and bins of
-        the same width; may be dask-backed.
+        the same width.
     lag : ChannelLag
         Lag of analog behind photon counting (`range_lag`, `estimate_lag`).
     slope : (float, float), optional
@@ -129,28 +129,22 @@ def glue(
     """
     bins = min(analog.sizes["range"], photon.sizes["range"])
     analog, photon = analog.isel(range=slice(bins)), photon.isel(range=slice(bins))
-    inputs = [channel[name] for channel in (analog, photon) for name in _PARTS]
-    inputs.append(analog[CORRELATION_LENGTH])
     dead_time_error = photon["power"].attrs.get(DEAD_TIME_ERROR)
-    settings = {
-        "lag": lag.bins,
-        "distance": photon["range"].to_numpy().astype(np.float64),
-        "dead_time_error": (dead_time_error or 0.0) * 1e6,
-        "slope": slope,
-    }
-    outputs = xr.apply_ufunc(
-        _glue,
-        *(_whole_profiles(array) for array in inputs),
-        input_core_dims=[["range"]] * 6 + [[]],
-        output_core_dims=[["range"]] * 4 + [[]] * 4,
-        kwargs=settings,
-        dask="parallelized",
-        output_dtypes=[np.float64, np.float64, np.int32, *[np.float64] * 5],
+    records = [tuple(channel[name].to_numpy() for name in _PARTS) for channel in (analog, photon)]
+    outputs = _glue(
+        records[0],
+        records[1],
+        analog[CORRELATION_LENGTH].to_numpy(),
+        lag=lag.bins,
+        distance=photon["range"].to_numpy().astype(np.float64),
+        dead_time_error=(dead_time_error or 0.0) * 1e6,
+        slope=slope,
     )
     units = {"power": "MHz", "variance": "MHz2", "quality": None, "dead_time_error": "MHz"}
     units |= _LINE | _WINDOW
-    result = xr.Dataset(dict(zip(units, outputs, strict=True)))
-    result = result.assign_coords(range=photon["range"])
+    plane = photon["power"].dims
+    variables = {n: (plane[: v.ndim], v) for n, v in zip(units, outputs, strict=True)}
+    result = xr.Dataset(variables, coords=photon["power"].coords)
     for name, value in zip(_LAG, (lag.bins, lag.standard_error), strict=True):
         result[name] = xr.full_like(result["glue_slope"], value)
     # That of photon counting is less, so that errors of its part become too large.
@@ -209,19 +203,9 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     }
 
 
-def _whole_profiles(array: xr.DataArray) -> xr.DataArray:
-    if "range" not in array.dims:
-        return array
-    return array.drop_vars("range").chunk(range=-1) if array.chunks else array.drop_vars("range")
-
-
 def _glue(
-    analog: Block,
-    analog_variance: Block,
-    analog_quality: Block,
-    photon: Block,
-    photon_variance: Block,
-    photon_quality: Block,
+    of_analog: tuple[Block, ...],
+    of_photon: tuple[Block, ...],
     correlation_length: Block,
     *,
     lag: float,
@@ -229,6 +213,8 @@ def _glue(
     dead_time_error: float,
     slope: Slope | None,
 ) -> tuple[Block, ...]:
+    analog, analog_variance, analog_quality = of_analog
+    photon, photon_variance, photon_quality = of_photon
     # Bins at negative ranges hold no light and are not glued.
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
     r = distance[ahead]

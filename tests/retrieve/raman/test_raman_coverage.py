@@ -17,7 +17,7 @@ from lidarops.retrieve.raman.backscatter import (
 )
 from lidarops.retrieve.raman.depth_fit import Extinction, SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.lidar_ratio import lidar_ratio_of
+from lidarops.retrieve.raman.retrieval import lidar_ratio_of
 
 STEP = 30.0
 R = STEP * (np.arange(400) + 0.5)
