@@ -1,7 +1,7 @@
 """Background of a profile: the power that a recorder shows without backscatter.
 
-`estimate` gives background, standard error and flags by one of three methods, and judges with
-`left_signal` how much signal may have been subtracted with the background. The methods alone:
+`estimate` gives background, standard error and flags by one of three methods, and judges how much
+signal may have been subtracted with the background. The methods alone:
 `tail_mean` averages the far bins, `cubic` solves the cubic of a homogeneous path in closed form,
 `fit_known_shape` fits background and amplitude of clear air (`molecular_shape`). Beside them,
 `detectable_light` tests on a few profiles whether a stretch of range holds any backscatter. Kernels

@@ -2,10 +2,14 @@
 
 `from_tail` averages the far bins, `from_bounded_tail` subtracts half of the signal that they may
 hold, `from_known_shape` fits background and amplitude of clear air, `from_far_range` takes the
-better known of these two, and `from_cubic` solves the cubic of a homogeneous section. All return a
-`Background`: value, standard
-error, the most signal that may have been subtracted with it (`left_signal`), and quality bits.
-The result of a profile does not depend on the other profiles, to the last bit.
+better known of these two, and `from_cubic` solves the cubic of a homogeneous section, which
+`fit_section` judges. All return a `Background`: value, standard error, the most signal that may
+have been subtracted with it (`LeftSignal`), and quality bits. The result of a profile does not
+depend on the other profiles, to the last bit.
+
+In front of the tail, the far range whose mean is the background, the signal without background is
+S - L, where L is the mean signal in the tail, which was subtracted with the background. Unless the
+air becomes more turbid, S falls at least with the square of range; this bounds L (`left_in_tail`).
 """
 
 from __future__ import annotations

@@ -3,5 +3,5 @@
 `inputs` turns arguments into contiguous (profile, bin) arrays or raises `RetrievalInputError`.
 `arrays.frozen` gives compiled functions arrays of one type. `compiled_code.keep_apart`
 gives every state of the sources its own cache of compiled code; importing `lidarops.retrieve`
-calls it once. `azimuths` are those of several beams.
+calls it once.
 """

@@ -1,4 +1,4 @@
-"""Types of arrays that retrievals take and return, and tests of single values."""
+"""Types of arrays that retrievals take and return, tests of single values, and azimuths of beams."""
 
 from __future__ import annotations
 

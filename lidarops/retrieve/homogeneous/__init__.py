@@ -4,7 +4,7 @@
 solver of the chosen `HomogeneousMethod` in `_methods`:
 
 1. `_direct`: least squares by Newton steps over the bins (`_projection`).
-2. `_given`, `_propagation`: with a given background, extinction or prior.
+2. `_methods`: with a given background, extinction or prior.
 
 `_misfit` sums the residuals, `_fit_quality` estimates the noise and sets the quality bits.
 

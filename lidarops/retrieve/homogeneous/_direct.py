@@ -3,7 +3,7 @@
 The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
 evaluated at fixed nodes, mostly on sums over groups of bins. Newton steps over all bins improve the
 best node until they are negligible. Every sum runs over the bins of one profile in a fixed order: a
-result does not depend on the rest of the batch.
+result does not depend on the rest of the batch. `solve_from` fits from a given extinction instead.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments

@@ -1,4 +1,7 @@
-"""Solvers of the homogeneous path, one for each method."""
+"""Solvers of the homogeneous path, one for each method.
+
+Where a background comes from elsewhere, `propagate` carries its noise into the fit above it.
+"""
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations

@@ -7,7 +7,8 @@ overlap, total backscatter is
 .. math:: \beta = K \frac{y_0}{y_R} e^{-\theta + 2 \tau_p}, \qquad
     \tau_p = \frac{\theta}{1 + \kappa},
 
-where :math:`K` makes it equal to the assumed one in the reference window.
+where :math:`K` makes it equal to the assumed one in the reference window. From it and the lidar
+ratio follows the overlap itself (`overlap_of`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Signals and air along the beam, and signals over those of clean air in cells."""
+"""What a retrieval assumes; signals and air along the beam, and in cells of several bins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Weighted means over time that propagate variances and skip gaps."""
+"""Weighted means over time, and parts of a mean that hold what the rest of it does not.
+
+The means propagate variances and skip gaps.
+"""
 
 from __future__ import annotations
 

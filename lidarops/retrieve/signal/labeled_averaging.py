@@ -1,4 +1,7 @@
-"""Averages of profiles in xarray over intervals of the clock, for profiles that come in chunks."""
+"""Averages of profiles in xarray over intervals of the clock, for profiles that come in chunks.
+
+`ClockAverage` averages all profiles, `ScreenedAverage` leaves out outlying parts of the intervals.
+"""
 
 from __future__ import annotations
 
