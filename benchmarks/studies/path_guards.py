@@ -30,7 +30,7 @@ def limits(**changes: float) -> Iterator[None]:
 
     def changed(*arguments: Any, **options: Any) -> Any:
         own = every(*arguments, **options)
-        return replace(own, **{k: np.full_like(own.widening, v) for k, v in changes.items()})
+        return own._replace(**{k: np.full_like(own.widening, v) for k, v in changes.items()})
 
     with mock.patch.object(_fit_quality, "_limits", changed):
         yield

@@ -1,4 +1,4 @@
-"""Types of arrays that retrievals take and return, tests of single values, and azimuths of beams."""
+"""Types of arrays of retrievals, tests of single values, and azimuths of several beams."""
 
 from __future__ import annotations
 
