@@ -270,6 +270,10 @@ def test_counts_reach_the_least_possible_scatter():
             assert 0.935 < coverage(fit, name, true) < 0.965, name
 
 
+# Bias of the published tables ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("length", "expected"), TABLE_BIAS)
 def test_published_bias_is_that_of_the_noise_and_the_fit_has_none(length, expected):
     r, power = table_profiles(2500.0, length, 2000, seed=15)
     published = cubic_and_tail.cubic(power, r, lag=1, variance=0.0).background

@@ -16,13 +16,12 @@ def by_hand(values, variance, shared, weights):
     valid = np.isfinite(values) & (weights > 0)
     w = weights[valid]
     if not valid.any():
-        return np.nan, np.nan, np.nan, 0
+        return np.nan, np.nan, np.nan
     total = w.sum()
     return (
         (w * values[valid]).sum() / total,
         (w**2 * variance[valid]).sum() / total**2,
         ((w * np.sqrt(shared[valid])).sum() / total) ** 2,
-        int(valid.sum()),
     )
 
 
@@ -53,7 +52,6 @@ def test_mean_follows_its_formulas(seed, length, bins):
             result.values[g, i],
             result.variance[g, i],
             result.shared_variance[g, i],
-            result.count[g, i],
         )
         np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-14)
 
@@ -81,7 +79,6 @@ def test_gaps_bias_neither_the_mean_nor_its_variance():
     profiles[:, :, 2] = np.inf
     profiles[1:, :, 3] = np.nan
     result = mean_of(profiles.reshape(8, -1))
-    np.testing.assert_array_equal(result.count[0, :4], [8, 3, 0, 1])
     np.testing.assert_allclose(result.variance[0, [0, 1, 3]], [1 / 8, 1 / 3, 1.0])
     assert np.isnan(result.values[0, 2::4]).all()
     assert np.isnan(result.variance[0, 2::4]).all()
@@ -96,7 +93,6 @@ def test_means_of_no_values_are_gaps():
     profiles[:, 1] = np.nan
     result = mean_of(profiles)
     np.testing.assert_array_equal(result.values, [[1.0, np.nan]])
-    np.testing.assert_array_equal(result.count, [[5, 0]])
     assert np.isnan(result.shared_variance[0, 1])
 
 
@@ -132,7 +128,6 @@ def test_no_bit_depends_on_the_chunks(dtype):
 
 def test_no_profiles_give_gaps():
     result = mean_of(np.empty((0, 4)))
-    np.testing.assert_array_equal(result.count, np.zeros((1, 4)))
     assert np.isnan(result.values).all()
     dark = mean_of(np.ones((3, 4)), weights=[0.0, 0.0, np.nan])
     assert np.isnan(dark.values).all()
