@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 from support.mean_counts import mean_profile_variance
 from support.oracles.homogeneous import (
     GEOMETRIES,
+    TABLE_BIAS,
     amplitude,
     linear_step,
     lowest_errors,
