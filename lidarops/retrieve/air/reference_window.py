@@ -249,13 +249,17 @@ def choose_reference(
     grid = inputs.range_grid(range)
     rows, leading, shape = inputs.profiles_and_air(power, molecular_attenuated, grid)
     windows, edges = _edges(candidates, grid)
+    mask = np.zeros(grid.size, dtype=np.bool_) if exclude is None else np.asarray(exclude)
+    if mask.dtype != np.bool_:
+        raise RetrievalInputError(f"holds {mask.dtype}, not booleans", field="exclude")
+    excluded = inputs.noise_rows(mask.astype(np.float64), "exclude", grid, leading)
     statistics = np.full((rows.shape[0], windows.shape[0], FIELDS), np.nan)
     _compare_with_air(
         frozen(rows),
         frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
         frozen(shape),
         frozen(grid.values),
-        frozen(_excluded(exclude, grid, leading)),
+        frozen(excluded > 0.0),
         edges,
         statistics,
     )
@@ -312,17 +316,6 @@ def _edges(
             field="candidates",
         )
     return windows, np.stack([first, stop], axis=-1).astype(np.int64)
-
-
-def _excluded(
-    exclude: npt.NDArray[np.bool_] | None, grid: inputs.RangeGrid, leading: tuple[int, ...]
-) -> Booleans:
-    if exclude is None:
-        return np.zeros((1, grid.size), dtype=np.bool_)
-    mask = np.asarray(exclude)
-    if mask.dtype != np.bool_:
-        raise RetrievalInputError(f"holds {mask.dtype}, not booleans", field="exclude")
-    return inputs.noise_rows(mask.astype(np.float64), "exclude", grid, leading) > 0.0
 
 
 def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:

@@ -143,9 +143,12 @@ class MeanProfiles:
         noise = actual_noise(averages)
         length = noise.correlation_length
         self.noise, self.correlation_length = noise.variance, length
-        counts = counts_per_power(averages, averages["shots"].to_numpy())
+        shots = averages["shots"].to_numpy()
+        counts = counts_per_power(averages, shots)
         self.exposure = None if counts is None else counts / (noise.excess * length)
-        self.quantum = _quantum(averages)
+        of_glued = counts_per_power(averages, shots, glued=True)
+        self.quantum: npt.ArrayLike = 0.0 if of_glued is None else 1.0 / of_glued
+        """Power of a single count in a bin of each mean, (time,); 0 of analog records."""
         self._bridge_outliers()
         self.variance = self.noise / self.overlap**2
         baseline = baseline_error(averages)
@@ -209,12 +212,6 @@ class MeanProfiles:
         return _layers.find_visible_air(
             power, self.distance, self.variance, cloudy=cloudy, **self._cloud
         )
-
-
-def _quantum(averages: xr.Dataset) -> npt.ArrayLike:
-    """Return the power of a single count in a bin of each mean, (time,); 0 of analog records."""
-    counts = counts_per_power(averages, averages["shots"].to_numpy(), glued=True)
-    return 0.0 if counts is None else 1.0 / counts
 
 
 def signal_and_clouds(

@@ -114,7 +114,9 @@ def judge_fit(
         if counts is not None:
             limits = _limits_of_counts(limits, fit.bins, counts, unknowns)
         variance = fit.extinction_variance * mean_noise * limits.widening**2 + added_variance
-        relative_error = _relative_error(fit, bin_width, np.sqrt(variance))
+        # Where the signal dies within a bin, the error is that of the transmission of one bin.
+        scale = np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width)
+        relative_error = np.asarray(np.sqrt(variance) / scale)
         determined = np.isfinite(
             fit.amplitude * np.sqrt(fit.amplitude_relative_variance * mean_noise)
         )
@@ -150,12 +152,6 @@ def _estimated_noise(fit: PathEstimate, unknowns: int) -> Array:
     enough = fit.difference_count >= THRESHOLDS.fewest_differences
     variance = np.where(enough, from_differences, from_residuals)
     return np.maximum(variance, fit.rounding)
-
-
-def _relative_error(fit: PathEstimate, bin_width: float, error: Array) -> Array:
-    """Return the error of extinction over the scale on which the signal falls."""
-    # Where the signal dies within a bin, the error is that of the transmission of one bin.
-    return np.asarray(error / np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width))
 
 
 def curved_widening(relative_error: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any, Final, cast
 import numpy as np
 
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
-from lidarops.retrieve.common.arrays import HUGE, Array, Block, Booleans, Flags, Integers, frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Block, Flags, frozen
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.homogeneous import _direct
 from lidarops.retrieve.homogeneous._fit_quality import (
@@ -132,20 +132,14 @@ def _estimate(
 ) -> PathEstimate:
     """Run a kernel with what is given beside the profiles."""
     table = np.full(problem.power.shape[0], np.nan, ROW)
-    grid = make_grid(problem.range, problem.bounds, _noise_spacing(problem))
+    # Second differences over more than a twentieth of a section would hold its misfit.
+    widest = min(SIGNAL.most_correlated_bins, problem.range.size // 20)
+    length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
+    spacing = np.where(length > 1.0, max(widest, 1), 1).astype(np.int64)
+    grid = make_grid(problem.range, problem.bounds, spacing)
     noise = (frozen(problem.noise), problem.known_variance, problem.rounding)
     solve(frozen(problem.power), *noise, *map(frozen, given), grid, table, **choice)
     return PathEstimate(**{name: table[name] for name in COLUMNS})
-
-
-def _noise_spacing(problem: PathProblem) -> Integers:
-    """Return the bins from one to the next of a second difference, (profile or 1,).
-
-    Differences over more than a twentieth of a section would hold its misfit.
-    """
-    widest = min(SIGNAL.most_correlated_bins, problem.range.size // 20)
-    length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
-    return np.where(length > 1.0, max(widest, 1), 1).astype(np.int64)
 
 
 def _count_moments(problem: PathProblem) -> CountMoments | None:
@@ -202,25 +196,22 @@ def _solution(
         )
         amplitude_error = np.abs(fit.amplitude) * relative_error
 
-    def masked(values: Array, valid: Booleans) -> Array:
-        return np.where(valid, values, np.nan)
-
     known = constant & problem.known_variance
     departure = THRESHOLDS.model_error * (np.abs(fit.extinction) + 1.0 / fit.mean_range)
     # A signal bent by c (x - 1/2)^2 has slopes of -c and c over the length at its ends.
     background_model = 2.0 * departure * np.abs(fit.background_bend)
     extinction_model = departure * np.hypot(1.0, 2.0 * np.abs(fit.extinction_bend))
     return HomogeneousResult(
-        background=masked(fit.background, fitted | constant),
-        background_standard_error=masked(background_error, fitted | known),
-        background_model_error=masked(background_model, fitted),
-        amplitude=np.where(constant, 0.0, masked(fit.amplitude, fitted)),
-        amplitude_standard_error=masked(amplitude_error, fitted),
-        extinction=masked(fit.extinction, fitted),
-        extinction_standard_error=masked(extinction_error, fitted),
-        extinction_model_error=masked(extinction_model, fitted),
-        signal_to_noise=masked(signal_to_noise, fitted),
-        reduced_chi2=masked(verdict.reduced_chi2, fitted),
+        background=np.where(fitted | constant, fit.background, np.nan),
+        background_standard_error=np.where(fitted | known, background_error, np.nan),
+        background_model_error=np.where(fitted, background_model, np.nan),
+        amplitude=np.where(constant, 0.0, np.where(fitted, fit.amplitude, np.nan)),
+        amplitude_standard_error=np.where(fitted, amplitude_error, np.nan),
+        extinction=np.where(fitted, fit.extinction, np.nan),
+        extinction_standard_error=np.where(fitted, extinction_error, np.nan),
+        extinction_model_error=np.where(fitted, extinction_model, np.nan),
+        signal_to_noise=np.where(fitted, signal_to_noise, np.nan),
+        reduced_chi2=np.where(fitted, verdict.reduced_chi2, np.nan),
         valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
         quality=verdict.quality | quality,
     )

@@ -128,7 +128,15 @@ def fit_homogeneous_path(
         {name: (dims, values) for name, values in zip(_VARIABLES, stacked, strict=True)},
         coords=power.coords,
     ).drop_dims("range")
-    return _described(result, edges, power.attrs.get("units", "1"))
+    for name, pattern in _UNITS.items():
+        result[name].attrs["units"] = pattern.format(power.attrs.get("units", "1")).removeprefix(
+            "1 "
+        )
+    return result.assign_coords(
+        section=("section", np.arange(len(edges), dtype=np.int32)),
+        section_range=("section", edges.mean(axis=1), {"units": "m"}),
+        section_bounds=(("section", "nv"), edges, {"units": "m"}),
+    )
 
 
 def _along(values: xr.DataArray, power: xr.DataArray, name: str) -> Block:
@@ -145,17 +153,6 @@ def _along(values: xr.DataArray, power: xr.DataArray, name: str) -> Block:
     own = [dim for dim in power.dims if dim in values.dims]
     sizes = [values.sizes.get(dim, 1) for dim in power.dims]
     return np.asarray(values.transpose(*own).to_numpy()).reshape(sizes)
-
-
-def _described(result: xr.Dataset, edges: Array, power_unit: str) -> xr.Dataset:
-    """Return values of sections with their units and coordinates."""
-    for name, pattern in _UNITS.items():
-        result[name].attrs["units"] = pattern.format(power_unit).removeprefix("1 ")
-    return result.assign_coords(
-        section=("section", np.arange(len(edges), dtype=np.int32)),
-        section_range=("section", edges.mean(axis=1), {"units": "m"}),
-        section_bounds=(("section", "nv"), edges, {"units": "m"}),
-    )
 
 
 def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:

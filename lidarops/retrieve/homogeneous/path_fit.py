@@ -179,7 +179,18 @@ def fit_homogeneous_path(
     )
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    noise, known_variance = _noise(variance, weights, grid, leading)
+    known_variance = variance is not None
+    if known_variance and weights is not None:
+        raise RetrievalInputError(
+            "is given together with variance", field="weights", remedy="give one of the two"
+        )
+    noise = inputs.noise_rows(
+        variance if known_variance else weights,
+        "variance" if known_variance else "weights",
+        grid,
+        leading,
+        negative=not known_variance,
+    )
     error = inputs.profile_values(background_standard_error, "background_standard_error", leading)
     if error is not None and np.any(error < 0):
         raise RetrievalInputError("is negative", field="background_standard_error")
@@ -213,21 +224,6 @@ def fit_homogeneous_path(
         lag=lag,
     )
     return inputs.with_leading_axes(_SOLVERS[chosen_method](problem), leading)
-
-
-def _noise(
-    variance: npt.ArrayLike | None,
-    weights: npt.ArrayLike | None,
-    grid: inputs.RangeGrid,
-    leading: tuple[int, ...],
-) -> tuple[Array, bool]:
-    if variance is None:
-        return inputs.noise_rows(weights, "weights", grid, leading), False
-    if weights is not None:
-        raise RetrievalInputError(
-            "is given together with variance", field="weights", remedy="give one of the two"
-        )
-    return inputs.noise_rows(variance, "variance", grid, leading, negative=False), True
 
 
 def _prior(

@@ -85,12 +85,13 @@ class RunningMean:
         RetrievalInputError
             For shapes that do not match, and negative weights or variances.
         """
-        values = _term(profiles, "profiles", (np.shape(groups)[0], self._count.shape[1]))
+        shape = np.shape(groups)[0], self._count.shape[1]
+        values = _term(profiles, "profiles", shape, negative=True)
         _add_profiles(
             values,
-            _positive(variance, "variance", values.shape),
-            _positive(shared_variance, "shared_variance", values.shape),
-            _positive(weights, "weights", values.shape[:1]),
+            _term(variance, "variance", values.shape),
+            _term(shared_variance, "shared_variance", values.shape),
+            _term(weights, "weights", values.shape[:1]),
             frozen(np.asarray(groups, dtype=np.intp)),
             self._sums,
             self._count,
@@ -128,18 +129,14 @@ def _averages(sums: Array, count: Integers) -> Averages:
     return Averages(value, noise, systematic)
 
 
-def _term(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
+def _term(
+    values: npt.ArrayLike, name: str, shape: tuple[int, ...], *, negative: bool = False
+) -> Array:
     """Return values that broadcast to a shape, in that shape."""
     array = inputs.real_array(values, name).astype(np.float64, copy=False)
-    return frozen(inputs.broadcast(array, shape, name))
-
-
-def _positive(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
-    """Return `_term`, of values that are not negative."""
-    array = _term(values, name, shape)
-    if np.any(array < 0):
+    if not negative and np.any(array < 0):
         raise RetrievalInputError("is negative", field=name)
-    return array
+    return frozen(inputs.broadcast(array, shape, name))
 
 
 @compiled

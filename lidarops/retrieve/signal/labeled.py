@@ -97,7 +97,7 @@ def condition(
     if range_offset:
         distance = distance + range_offset
     along = distance.astype(np.float64)
-    unit = channel_unit(archive, channel)
+    unit = "MHz" if counts.attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
     if unit == "MHz":
         signal = counts_to_signal.photon_signal(
             counts.to_numpy(),
@@ -426,11 +426,6 @@ def _stated_length(profiles: xr.Dataset) -> xr.DataArray:
     if "glue_top" in profiles:
         return profiles[CORRELATION_LENGTH]
     return xr.ones_like(profiles["power"].isel(range=0, drop=True))
-
-
-def channel_unit(archive: xr.Dataset, channel: str) -> str:
-    """Return the unit of the power of a channel: MHz for photon counting, mV for analog."""
-    return "MHz" if archive[channel].attrs["detection_mode"] == DetectionMode.PHOTON else "mV"
 
 
 def background_words(method: str, background_range: tuple[float, float]) -> str:
