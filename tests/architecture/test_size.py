@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 76_120,
-    "lines of code alone": 49_690,
-    "modules": 351,
-    "dataclasses": 330,
-    "lines of dataclasses": 8_050,
-    "tuning numbers": 254,
-    "tuning numbers that are assumed": 87,
+    "lines": 75_310,
+    "lines of code alone": 49_150,
+    "modules": 334,
+    "dataclasses": 319,
+    "lines of dataclasses": 7_900,
+    "tuning numbers": 252,
+    "tuning numbers that are assumed": 86,
     "copied thresholds": 1,
     "most parameters": 24,
     "lines of the largest package": 6_440,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 82, "functions": 758, "changes": 381},
-    "elastic": {"modules": 93, "functions": 892, "changes": 401},
+    "homogeneous": {"modules": 82, "functions": 745, "changes": 381},
+    "elastic": {"modules": 90, "functions": 880, "changes": 401},
 }
 
 
