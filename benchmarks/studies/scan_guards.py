@@ -28,19 +28,15 @@ from benchmarks.studies.ablation import Guard, measure, table, write_table
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import (
     _block,
-    _path_variation,
-    _sample_mask,
+    _calibration,
+    _horizontal_variation,
+    _smoothing,
+    altitude_correlation,
     robust_weights,
+    smooth_profile,
 )
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import (
-    _calibration,
-    _outliers,
-    _smoothing_choice,
-    smooth_profile,
-)
-from lidarops.retrieve.multiangle.vertical import correlation as air_correlation
 
 CLUSTERS: Final = 50
 PROFILES: Final = 8
@@ -80,8 +76,8 @@ def _never(*_: Any) -> bool:
     return False
 
 
-SCREEN: Final = (_outliers, "screen_outliers", lambda _, information: information.copy())
-BISQUARE: Final = (_outliers, "downweight_outliers", _nothing)
+SCREEN: Final = (robust_weights, "screen_outliers", lambda _, information: information.copy())
+BISQUARE: Final = (robust_weights, "downweight_outliers", _nothing)
 GUARDS: Final = (
     *(
         Guard(bit.name or "", int(bit))
@@ -96,8 +92,8 @@ GUARDS: Final = (
             MultiAngleQuality.INTERPOLATED,
         )
     ),
-    Guard("path variation", off=_off((_path_variation, "path_variation_from", _nothing))),
-    Guard("gradients that residuals show", off=_at(_block, gradient_noise=0.0)),
+    Guard("path variation", off=_off((_horizontal_variation, "path_variation_from", _nothing))),
+    Guard("gradients that residuals show", off=_at(_horizontal_variation, gradient_noise=0.0)),
     Guard("outlying beams", off=_off((_block, "_has_outliers", _never))),
     Guard(
         "outlying beams: moments", off=_off((robust_weights, "clean_moments", lambda _: (1.0, 1.0)))
@@ -114,12 +110,12 @@ GUARDS: Final = (
     ),
     Guard(
         "gaps",
-        off=_off((_sample_mask, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool))),
+        off=_off((_block, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool))),
     ),
     Guard("outlying estimates: screen", off=_off(SCREEN)),
     Guard("outlying estimates: bisquare", off=_off(BISQUARE)),
     Guard("outlying estimates: both", off=_off(SCREEN, BISQUARE)),
-    Guard("Cp beside the likelihood", off=_at(_smoothing_choice, rougher=np.inf)),
+    Guard("Cp beside the likelihood", off=_at(_smoothing, rougher=np.inf)),
     Guard("calibration", off=_off((smooth_profile, "_calibrate", _nothing))),
     Guard(
         "calibration: scale of profiles",
@@ -127,10 +123,12 @@ GUARDS: Final = (
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
     Guard("calibration: common altitudes", off=_off((_calibration, "_common", lambda c: c >= 1))),
-    Guard("correlation", off=_off((air_correlation, "fit_correlation", lambda *_: (0.0, 1.0)))),
+    Guard(
+        "correlation", off=_off((altitude_correlation, "fit_correlation", lambda *_: (0.0, 1.0)))
+    ),
     Guard(
         "correlation: amplitude",
-        off=_at(air_correlation, least_amplitude=1.0, largest_amplitude=1.0),
+        off=_at(altitude_correlation, least_amplitude=1.0, largest_amplitude=1.0),
     ),
 )
 

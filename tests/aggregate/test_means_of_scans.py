@@ -9,7 +9,7 @@ from support.oracles.angle_scenes import clear, estimates
 from lidarops.aggregate._sums import Sample, Sums
 from lidarops.aggregate.means_variables import budget_of
 from lidarops.netcdf.variables import layout_of
-from lidarops.retrieve.multiangle.vertical import smooth_profile
+from lidarops.retrieve.multiangle import smooth_profile
 
 CYCLES = 48
 

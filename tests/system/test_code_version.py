@@ -90,7 +90,7 @@ def test_a_change_of_what_pages_are_made_of_changes_their_version(
         ("retrieve/elastic/inversion.py", "elastic"),
         ("retrieve/elastic/__init__.py", "elastic"),
         ("retrieve/homogeneous/path_fit.py", "homogeneous"),
-        ("retrieve/multiangle/vertical/smooth_profile.py", "multiangle"),
+        ("retrieve/multiangle/smooth_profile.py", "multiangle"),
         ("retrieve/network/outlying_bins.py", "visibility"),
         *((f"products/{kind}/settings.py", kind) for kind in OWN),
         *((f"products/{kind}/retrieval.py", kind) for kind in OWN),

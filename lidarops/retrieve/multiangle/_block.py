@@ -1,28 +1,27 @@
-"""One block of a scan: logarithms, inhomogeneity of the air, and the fit at each altitude."""
+"""One block of a scan: its samples, inhomogeneity of the air, and the fit at each altitude."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.special import ndtri, stdtrit
+from scipy.special import ndtri
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle import _sample_mask, robust_weights
+from lidarops.retrieve.multiangle import robust_weights
 from lidarops.retrieve.multiangle.slant_paths import Scan, surrounds_zenith
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
-_UNKNOWNS: Final = 3
-"""Constant, optical depth and a gradient."""
-_LEAST_REST: Final = 1e-3
-"""Least share of an error that a fit leaves in a residual."""
-_DEPENDENT: Final = 1e-8
-"""Squared length of a column outside those before it, over its own, up to which it depends on
-them."""
+Ends = npt.NDArray[np.int32]
+
+_LARGEST_RATIO: Final = 1.0 / THRESHOLDS.lowest_snr**2
+"""Largest variance over squared signal for which the moments of the logarithm are corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +90,7 @@ def make_beam_block(
     logarithm = np.empty(signal.shape)
     noise = np.empty(signal.shape)
     ends = np.empty(signal.shape[:2], dtype=np.int32)
-    _sample_mask.take_logarithms(signal, variance, scan.usable, logarithm, noise, ends)
+    take_logarithms(signal, variance, scan.usable, logarithm, noise, ends)
     altitudes = np.arange(signal.shape[-1])
     alive = (ends[:, :, np.newaxis] > altitudes).sum(axis=1)
     return BeamBlock(
@@ -103,7 +102,7 @@ def make_beam_block(
         alive,
         surrounds_zenith(scan.tilted_azimuths),
         min(3, max(int(scan.usable.sum()), 2)),
-        _sample_mask.profiles_with_gaps(noise < np.inf, signal, variance),
+        profiles_with_gaps(noise < np.inf, signal, variance),
         dead_time_change,
     )
 
@@ -125,144 +124,6 @@ def regress(beams: BeamBlock, *, inhomogeneity: float | None, robust: bool) -> R
     if not robust or not _has_outliers(beams, plain):
         return plain
     return _fit_robustly(beams, inhomogeneity)
-
-
-def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
-    """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
-
-    It is the largest that is shown at any altitude of the block, by all profiles within 500 m of
-    it, beyond what an error of the dead time explains; 0 if none is shown. It holds at all
-    altitudes: an optical depth is that of the air below, too.
-
-    Parameters
-    ----------
-    beams : BeamBlock
-    fit : Regression
-    altitude : (altitude,) float
-        m.
-    """
-    if not beams.noise.size:
-        return 0.0
-    # Selection and logarithms bias noisy samples, which together would look like a gradient. The
-    # profiles decide together, lest a sample be selected by the noise around it.
-    middle = np.count_nonzero(beams.noise < np.inf, axis=0, keepdims=True) // 2
-    typical = np.take_along_axis(np.sort(beams.noise, axis=0), middle, axis=0)
-    clear = np.isfinite(fit.residual) & (typical < THRESHOLDS.gradient_noise)
-    weights = np.where(clear, weights_of(beams, fit), 0.0)
-    weights *= ((fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0))[:, np.newaxis]
-    plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
-    square = 0.0
-    for distance in _along_axes(beams.design[:2]):
-        left, length = orthogonal_columns(weights, (distance,), plain)[-1]
-        lever = np.where(np.isfinite(length), weights * left * altitude, 0.0)
-        square += _shown(beams, fit, lever, left, altitude) ** 2
-    return float(np.sqrt(square))
-
-
-def _shown(beams: BeamBlock, fit: Regression, lever: Array, left: Array, altitude: Array) -> float:
-    """Return the largest gradient along an axis that is beyond chance and the dead time, m-1.
-
-    The error by chance follows from the scatter of the beams of all profiles about the gradient,
-    whose altitudes may be correlated. An error of the dead time is common to all beams.
-
-    Parameters
-    ----------
-    beams : BeamBlock
-    fit : Regression
-    lever : (profile, angle, altitude) float
-        Weight of a residual in the sum that gives the gradient.
-    left : (profile, angle, altitude) float
-        Horizontal distance over altitude that constant and path do not explain.
-    altitude : (altitude,) float
-        m.
-    """
-    residual = np.nan_to_num(fit.residual)
-    # A fit leaves beams of large leverage less than their error.
-    whole = lever / np.sqrt(np.maximum(1.0 - np.nan_to_num(fit.leverage), _LEAST_REST))
-    arm = left * altitude
-    total, weight, product, part = (
-        _around(values, altitude)
-        for values in (lever * residual, lever * arm, whole * residual, whole * arm)
-    )
-    information = weight.sum(axis=1)
-    known = np.where(information > 0.0, information, np.inf)
-    gradient = total.sum(axis=1) / known
-    own = np.minimum(weight / known[:, np.newaxis], 1.0 - _LEAST_REST)
-    scatter = (((product - gradient[:, np.newaxis] * part) / (1.0 - own)) ** 2).sum(axis=1)
-    shift = np.zeros(altitude.size)
-    if beams.dead_time_change is not None:
-        expected = np.exp(beams.logarithm - residual)
-        change = np.where(lever != 0.0, beams.dead_time_change / expected, 0.0)
-        shift = _around(lever * change, altitude).sum(axis=1)
-    squares = (own**2).sum(axis=1)
-    # Beams with little weight do not tell the scatter of those that decide.
-    freedom = 1.0 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
-    tested = freedom >= 1.0
-    error = np.where(tested, np.sqrt(scatter) / known, np.inf)
-    chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(np.count_nonzero(tested)), 1)
-    limit = stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
-    explained = THRESHOLDS.gradient_dead_time * np.abs(shift) / known
-    size = np.abs(gradient)
-    return float(np.max(size, where=size - explained > limit * error, initial=0.0))
-
-
-def _around(values: Array, altitude: Array) -> Array:
-    """Return sums over the altitudes around each, (altitude, profile times angle)."""
-    inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
-    return np.asarray(inside @ values.reshape(-1, altitude.size).T)
-
-
-def _along_axes(distances: Array) -> list[Array]:
-    """Return horizontal distances along the axes of a scan, each (angle, altitude).
-
-    Beams of one vertical plane have one axis.
-
-    Parameters
-    ----------
-    distances : (2, angle, altitude) float
-        To the east and north.
-    """
-    lengths, axes = np.linalg.eigh(np.einsum("iak,jak->ij", distances, distances))
-    return [
-        np.tensordot(axis, distances, axes=1)
-        for length, axis in zip(lengths, axes.T, strict=True)
-        if length > _DEPENDENT * lengths[-1]
-    ]
-
-
-def orthogonal_columns(
-    weights: Array, columns: Iterable[Array], before: Sequence[tuple[Array, Array]] = ()
-) -> list[tuple[Array, Array]]:
-    """Return columns orthogonal to those before them, and their squared lengths.
-
-    Parameters
-    ----------
-    weights : (profile, angle, altitude) float
-    columns : iterable of (angle, altitude) or (altitude,) float
-    before : sequence of (Array, Array)
-        Columns returned earlier.
-
-    Returns
-    -------
-    list of (profile, angle, altitude) float, (profile, 1, altitude) float
-        Those before and the new ones. The squared length is infinite where a column depends on
-        those before it.
-    """
-    basis = list(before)
-    for column in columns:
-        left = np.broadcast_to(column, weights.shape)
-        weighted = weights * left
-        least = _DEPENDENT * sum_over_beams(weighted, left)
-        for other, square in basis:
-            left = left - sum_over_beams(weighted, other) / square * other
-        square = sum_over_beams(weights * left, left)
-        basis.append((left, np.where(square > least, square, np.inf)))
-    return basis
-
-
-def sum_over_beams(first: Array, second: Array) -> Array:
-    """Return the sums over beams of products, (profile, 1, altitude)."""
-    return np.asarray(np.einsum("tak,tak->tk", first, second))[:, np.newaxis]
 
 
 def weights_of(beams: BeamBlock, fit: Regression) -> Array:
@@ -449,3 +310,157 @@ def refit(beams: BeamBlock, inhomogeneity: Array, freedom: Array) -> Regression:
     keep = np.ones((beams.noise.shape[0], 0, beams.noise.shape[2]))
     fit = _fit_known(beams, keep, inhomogeneity, 1.0)
     return replace(fit, freedom=freedom)
+
+
+# Samples --------------------------------------------------------------------------------------
+#
+# The selection of a sample does not depend on its own value: where the signal is weak, dropping low
+# samples and keeping high ones would be the largest error of all.
+
+
+@compiled
+def _clean(signal: Array, variance: Array, row: Array) -> None:
+    """Fill signal, variance and 1 at altitudes with data, zeros elsewhere."""
+    values, spread, count = row[0], row[1], row[2]
+    for k in range(signal.size):
+        on = abs(signal[k]) < HUGE and 0.0 <= variance[k] < HUGE
+        values[k] = signal[k] if on else 0.0
+        spread[k] = variance[k] if on else 0.0
+        count[k] = 1.0 if on else 0.0
+
+
+@compiled
+def _window_sums(row: Array, size: int, sums: Array) -> None:
+    """Fill the sums of rows over windows, by the altitude at which a window starts."""
+    starts = row.shape[1] - size + 1
+    for i in range(row.shape[0]):
+        total = sums[i, :starts]
+        total[:] = 0.0
+        for shift in range(size):
+            values = row[i, shift : shift + starts]
+            for k in range(starts):
+                total[k] += values[k]
+
+
+@compiled
+def _first_loss(row: Array, before: int, size: int, lowest: float, sums: Array) -> int:
+    """Return the first altitude where the mean signal of the window is below `lowest` times noise.
+
+    The window begins `before` altitudes below, and is moved inside the grid.
+    """
+    altitudes = row.shape[1]
+    size = min(size, altitudes)
+    _window_sums(row, size, sums)
+    for k in range(altitudes):
+        j = max(min(k - before, altitudes - size), 0)
+        lost = not sums[0, j] > lowest * math.sqrt(sums[1, j] * sums[2, j])
+        if lost and sums[2, j] > 0.0:
+            return k
+    return int(altitudes)
+
+
+@compiled
+def _levels(row: Array, levels: Array, roots: Array) -> None:
+    """Fill the means of neighbours and their square roots, 0 where not positive.
+
+    Entry k is the mean of the two altitudes below k, entry k + 3 that of the two above, of those
+    that exist and have data.
+    """
+    altitudes = row.shape[1]
+    for j in range(altitudes + 3):
+        total = count = 0.0
+        if 2 <= j <= altitudes + 1:
+            total, count = total + row[0, j - 2], count + row[2, j - 2]
+        if 1 <= j <= altitudes:
+            total, count = total + row[0, j - 1], count + row[2, j - 1]
+        levels[j] = total / count if total > 0.0 else 0.0
+        roots[j] = math.sqrt(levels[j])
+
+
+@compiled
+def _expected(row: Array, levels: Array, roots: Array, k: int) -> float:
+    """Return the signal expected from the neighbours, within 3 standard deviations of the sample.
+
+    The geometric mean of both sides is exact for an exponential decay.
+    """
+    guess = roots[k] * roots[k + 3]
+    if guess == 0.0:
+        guess = max(levels[k], levels[k + 3])
+    own = float(row[0, k])
+    slack = THRESHOLDS.farthest_expected * math.sqrt(row[1, k])
+    return own if guess == 0.0 else min(max(guess, own - slack), own + slack)
+
+
+@compiled
+def take_logarithms(
+    signal: Array, variance: Array, usable: Booleans, logarithm: Array, noise: Array, ends: Ends
+) -> None:
+    """Take the logarithms of range-corrected signals without the bias caused by noise.
+
+    Formula 3 of ``docs/algorithms/multiangle.md``; the expectation of the signal is estimated from
+    neighbouring altitudes.
+
+    Parameters
+    ----------
+    signal, variance : (profile, angle, altitude) float
+    usable : (angle,) bool
+    logarithm, noise : (profile, angle, altitude) float64
+        Outputs: the logarithms and their variances; 0 and inf where there is no sample.
+    ends : (profile, angle) int32
+        Output: the first altitude of each beam that is lost in noise; the number of altitudes if
+        none is.
+    """
+    count, angles, altitudes = signal.shape
+    row, sums = np.empty((3, altitudes)), np.empty((3, altitudes))
+    levels, roots = np.empty(altitudes + 3), np.empty(altitudes + 3)
+    for t in range(count):
+        for a in range(angles):
+            _clean(signal[t, a], variance[t, a], row)
+            end = 0
+            if usable[a]:
+                end = _first_loss(row, 0, THRESHOLDS.ahead, THRESHOLDS.swallowed_snr, sums)
+                around, lowest = THRESHOLDS.around, THRESHOLDS.lowest_snr
+                end = min(end, _first_loss(row, around // 2, around, lowest, sums))
+            ends[t, a] = end
+            _levels(row, levels, roots)
+            for k in range(altitudes):
+                logarithm[t, a, k] = 0.0
+                noise[t, a, k] = np.inf
+                if k < end and row[0, k] > 0.0:
+                    ratio = (
+                        max(
+                            math.sqrt(row[1, k]) / _expected(row, levels, roots, k),
+                            THRESHOLDS.least_noise,
+                        )
+                        ** 2
+                    )
+                    # The series of the moments of the logarithm diverges for larger ratios.
+                    known = min(ratio, _LARGEST_RATIO)
+                    noise[t, a, k] = ratio * (1.0 + 2.5 * known)
+                    logarithm[t, a, k] = math.log(row[0, k]) + known * (0.5 + 0.75 * known)
+
+
+def profiles_with_gaps(used: Booleans, signal: Array, variance: Array) -> Booleans:
+    """Return which profiles miss samples between others of the same beam.
+
+    A weak signal that noise made negative is not used, but does not count as missing.
+
+    Parameters
+    ----------
+    used : (profile, beam, altitude) bool
+        Samples that are used.
+    signal, variance : (profile, beam, altitude) float
+        NaN where missing.
+
+    Returns
+    -------
+    (profile,) bool
+    """
+    gaps: Booleans = np.any(used[..., 1:] & ~used[..., :-1], axis=(1, 2))
+    rows = np.flatnonzero(gaps)
+    if rows.size:
+        below = np.logical_or.accumulate(used[rows], axis=-1)
+        above = np.logical_or.accumulate(used[rows, :, ::-1], axis=-1)[..., ::-1]
+        measured = np.isfinite(signal[rows]) & np.isfinite(variance[rows])
+        gaps[rows] = np.any(below & above & ~measured, axis=(1, 2))
+    return gaps

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
-from lidarops.retrieve.multiangle._result import MultiAngleResult
+from lidarops.retrieve.multiangle._methods import MultiAngleResult
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 

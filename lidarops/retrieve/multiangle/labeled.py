@@ -12,15 +12,15 @@ import xarray as xr
 from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
 from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
-from lidarops.retrieve.multiangle._path_variation import gradient_scale
+from lidarops.retrieve.multiangle._horizontal_variation import gradient_scale
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 from lidarops.retrieve.multiangle.labeled_altitudes import CARE
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
 )
+from lidarops.retrieve.multiangle.smooth_profile import nearest_rising
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical.smooth_profile import nearest_rising
 
 __all__ = ["retrieve_optical_depth"]
 

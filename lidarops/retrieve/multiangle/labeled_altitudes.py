@@ -17,8 +17,7 @@ from lidarops.retrieve.background import estimate, known_shape
 from lidarops.retrieve.common.arrays import Array, Block, Flags, Indices, Integers
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
-from lidarops.retrieve.multiangle._obstructions import obstruction_range
-from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline
+from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, obstruction_range
 from lidarops.retrieve.signal.averaging import RunningMean
 from lidarops.retrieve.signal.labeled import (
     BASELINE_ERROR,

@@ -14,8 +14,12 @@ from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.multiangle import _methods, slant_paths
-from lidarops.retrieve.multiangle._methods import BlockSettings
-from lidarops.retrieve.multiangle._result import MultiAngleFlags, MultiAngleResult, StepRecord
+from lidarops.retrieve.multiangle._methods import (
+    BlockSettings,
+    MultiAngleFlags,
+    MultiAngleResult,
+    StepRecord,
+)
 from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
 
 LARGEST_GRADIENT: Final = 5e-5

@@ -33,7 +33,7 @@ class Thresholds(NamedTuple):
     longest_path: float = 19.2
     """Slant over vertical path beyond which a beam is left out: 3 degrees of elevation."""
 
-    # Obstructions (`_obstructions`).
+    # Obstructions (`analog_baseline`).
     obstruction_block: float = 60.0
     """m, length of the blocks of bins that are compared; assumed."""
     obstruction_signal: float = 20.0
@@ -68,7 +68,7 @@ class Thresholds(NamedTuple):
     """Largest correlation of residuals at neighbouring altitudes: one altitude then counts as a
     hundredth; assumed."""
 
-    # Samples (`_sample_mask`).
+    # Samples (`_block`).
     lowest_snr: float = 3.0
     """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
     light (`test_kano_hamilton`)."""
@@ -130,7 +130,7 @@ class Thresholds(NamedTuple):
     median_of: int = 100_000
     """Residuals that suffice for the median of their sizes, which errs by 0.4 percent; formula."""
 
-    # Horizontal gradient (`_block`, `_methods`).
+    # Horizontal gradient (`_horizontal_variation`, `_methods`).
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_noise: float = 0.04
@@ -148,7 +148,7 @@ class Thresholds(NamedTuple):
     no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted
     analog signals of scans up to 25 degrees of elevation show 2e-3 and more."""
 
-    # Stratification (`_path_variation`).
+    # Stratification (`_horizontal_variation`).
     growth: float = 1.5**2
     """Ratio of the variances in the upper and the lower third up to which they count as equal;
     assumed."""
@@ -164,7 +164,7 @@ class Thresholds(NamedTuple):
     least_weight: float = 1e-3
     """Robust weight up to which a sample is left out of the test of growth; assumed."""
 
-    # Correlation along altitude (`vertical`).
+    # Correlation along altitude (`altitude_correlation`).
     least_amplitude: float = 0.5
     """Least amplitude of the correlation; assumed."""
     largest_amplitude: float = 1.05
@@ -178,7 +178,7 @@ class Thresholds(NamedTuple):
     least_correlated: float = 1e-6
     """Correlated share up to which noise counts as uncorrelated; limit of rounding."""
 
-    # Outlying estimates (`vertical`).
+    # Outlying estimates (`robust_weights`).
     jump: float = 5.0
     """Standard errors between neighbouring estimates from which a profile is screened; assumed."""
     outlying_estimate: float = 4.5
@@ -195,7 +195,7 @@ class Thresholds(NamedTuple):
     half_window: int = 7
     """Altitudes to either side of windows of medians and means; assumed."""
 
-    # Smoothness and its errors (`vertical`).
+    # Smoothness and its errors (`smooth_profile`).
     least_smooth_freedom: float = 2.0
     """Degrees of freedom below which a weight of smoothness is not allowed: a straight line and one
     more; by definition."""

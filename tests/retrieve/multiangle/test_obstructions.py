@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarops.retrieve.multiangle._obstructions import obstruction_range
+from lidarops.retrieve.multiangle.analog_baseline import obstruction_range
 
 DISTANCE = 100.0 + 3.75 * (np.arange(2000) + 0.5)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarops.retrieve.multiangle._path_variation import gradient_scale
+from lidarops.retrieve.multiangle._horizontal_variation import gradient_scale
 
 
 def test_three_planes_of_one_cycle_show_the_gradient_error_roughly():

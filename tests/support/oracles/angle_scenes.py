@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erf
 
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
-from lidarops.retrieve.multiangle.vertical.correlation import ResidualMoments, residual_moments
+from lidarops.retrieve.multiangle.altitude_correlation import ResidualMoments, residual_moments
 
 WINDOW = 15
 FEWEST_BEAMS = 3

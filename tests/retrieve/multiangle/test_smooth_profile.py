@@ -13,10 +13,10 @@ from support.oracles.angle_scenes import clear, clear_depth, cloud, estimates
 from support.oracles.banded_matrices import dense
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.multiangle.vertical import _banded, _outliers
-from lidarops.retrieve.multiangle.vertical import correlation as correlation_of_air
-from lidarops.retrieve.multiangle.vertical.correlation import residual_moments
-from lidarops.retrieve.multiangle.vertical.smooth_profile import (
+from lidarops.retrieve.multiangle import _smoothing, robust_weights
+from lidarops.retrieve.multiangle import altitude_correlation as correlation_of_air
+from lidarops.retrieve.multiangle.altitude_correlation import residual_moments
+from lidarops.retrieve.multiangle.smooth_profile import (
     nearest_rising,
     smooth_optical_depth,
 )
@@ -78,7 +78,7 @@ def test_smoothing_after_kano_hamilton_equals_one_joint_fit():
     altitude = 100.0 + 30.0 * np.arange(altitudes)
     result = smooth_optical_depth(depth[None], 4.0 * square[None], altitude)
     shares = result.fit.candidates.share
-    stiffness = dense(_banded.penalty(altitude))
+    stiffness = dense(_smoothing.penalty(altitude))
     together = np.zeros(altitudes)
     for lam, share in zip(result.fit.candidates.smoothing, shares, strict=True):
         normal = np.zeros((2 * altitudes, 2 * altitudes))
@@ -357,10 +357,10 @@ def test_screening_keeps_steep_profiles():
     """A cloud edge of any steepness is no outlier; a single estimate off the profile is."""
     steep = np.concatenate([np.zeros(20), np.linspace(0.0, 4.0, 40)])[np.newaxis]
     information = np.full(steep.shape, 1e6)
-    np.testing.assert_array_equal(_outliers.screen_outliers(steep, information), information)
+    np.testing.assert_array_equal(robust_weights.screen_outliers(steep, information), information)
     information = np.full(steep.shape, 400.0)
     steep[0, 33] -= 3.0
-    reduced = _outliers.screen_outliers(steep, information) < information
+    reduced = robust_weights.screen_outliers(steep, information) < information
     np.testing.assert_array_equal(np.flatnonzero(reduced), [33])
 
 

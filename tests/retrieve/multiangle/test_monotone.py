@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lidarops.retrieve.multiangle.vertical.smooth_profile import nearest_rising
+from lidarops.retrieve.multiangle.smooth_profile import nearest_rising
 
 ROWS = arrays(
     np.float64,

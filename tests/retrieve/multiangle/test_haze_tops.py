@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarops.retrieve.multiangle.vertical.smooth_profile import smooth_optical_depth
+from lidarops.retrieve.multiangle.smooth_profile import smooth_optical_depth
 
 
 @pytest.mark.parametrize("profiles", [1, 4, 12])

@@ -7,22 +7,22 @@ extinction changes gradually and the optical depth is zero at the lidar. The for
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
-from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import (
-    _banded,
+from lidarops.retrieve.multiangle import (
     _calibration,
-    _outliers,
-    _smoothing_choice,
+    _smoothing,
+    altitude_correlation,
+    robust_weights,
 )
-from lidarops.retrieve.multiangle.vertical import correlation as air_correlation
-from lidarops.retrieve.multiangle.vertical.correlation import ResidualMoments
+from lidarops.retrieve.multiangle._smoothing import Smoothing
+from lidarops.retrieve.multiangle.altitude_correlation import ResidualMoments
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _UNIFORM: Final = 1e-3
 """Largest relative deviation of a step from the mean step; allows for rounded altitudes."""
@@ -47,44 +47,13 @@ class _Block:
 
 
 @dataclass(frozen=True, slots=True)
-class _Candidates:
-    """Weights of smoothness with which each profile is solved, and their shares in the average."""
-
-    smoothing: Array
-    """(candidate,)"""
-    share: Array
-    """(candidate,), 1 in total."""
-
-    def solve(self, right: Array, bands: Array, stiffness: Array) -> Array:
-        """Return solutions and the bands of the inverse, (4, profile * candidate, altitude)."""
-        profiles, count = len(right), self.share.size
-        out = np.empty((4, profiles * count, right.shape[1]))
-        row, smoothing = np.repeat(np.arange(profiles), count), np.tile(self.smoothing, profiles)
-        _banded.solve_banded(bands, right, stiffness, row, smoothing, out)
-        return out
-
-    def mean(self, values: Array) -> Array:
-        """Average (profile * candidate, altitude) rows into (profile, altitude)."""
-        apart = values.reshape(-1, self.share.size, values.shape[1])
-        return np.asarray(np.einsum("tck,c->tk", apart, self.share))
-
-    def mixed(self, value: Array, variance: Array) -> tuple[Array, Array]:
-        """Return mean and variance of the mixture of the solutions of each profile."""
-        mean = self.mean(value)
-        away = value - np.repeat(mean, self.share.size, axis=0)
-        return mean, self.mean(variance + away**2)
-
-
-@dataclass(frozen=True, slots=True)
 class _Fit:
     """Solution of a block."""
 
     information: Array
     """After the loss of weight of outlying estimates."""
     bands: Array
-    saturated: bool
-    limited: bool
-    candidates: _Candidates
+    smoothing: Smoothing
     depth: Array
     variance: Array
     extinction: Array
@@ -156,15 +125,15 @@ class VerticalResult:
         right[:, upper] = 1.0
         if lower >= 0:
             right[:, lower] = -1.0
-        estimates = _banded.multiply_rows(fit.bands, block.estimates)
+        estimates = _smoothing.multiply_rows(fit.bands, block.estimates)
         inverse, solved = (
-            fit.candidates.solve(rows, fit.bands, block.stiffness)[0] for rows in (right, estimates)
+            fit.smoothing.solve(rows, fit.bands, block.stiffness)[0] for rows in (right, estimates)
         )
         posterior, value = (
             rows[:, [upper]] - (rows[:, [lower]] if lower >= 0 else 0.0)
             for rows in (inverse, solved)
         )
-        depth, variance = fit.candidates.mixed(value, posterior)
+        depth, variance = fit.smoothing.mixed(value, posterior)
         variance *= self.ratio.of(np.array([upper]), np.array([lower]))
         reached = np.isfinite(self.optical_depth[:, upper])
         return (
@@ -267,12 +236,12 @@ def _block(
     correlation, share = 0.0, np.zeros_like(depth)
     gaps = np.zeros(0, dtype=np.int64)
     if moments is not None:
-        correlation, amplitude = air_correlation.fit_correlation(
+        correlation, amplitude = altitude_correlation.fit_correlation(
             moments.lag_products, moments.lag_norms
         )
         share = np.clip(moments.inhomogeneity_share * amplitude, 0.0, 1.0)
         gaps = np.flatnonzero(moments.gaps)
-    stiffness = _banded.penalty(altitude)
+    stiffness = _smoothing.penalty(altitude)
     return _Block(
         altitude, depth, information, share, correlation, stiffness, float(altitude[highest]), gaps
     )
@@ -281,9 +250,9 @@ def _block(
 def _solve_block(block: _Block, *, robust: bool) -> _Fit:
     if not robust:
         return _fit(block, block.information)
-    screened = _outliers.screen_outliers(block.estimates, block.information)
-    fit = _fit(block, _outliers.reduce_information(block.information, screened))
-    reduced = _outliers.downweight_outliers(
+    screened = robust_weights.screen_outliers(block.estimates, block.information)
+    fit = _fit(block, robust_weights.reduce_information(block.information, screened))
+    reduced = robust_weights.downweight_outliers(
         block.estimates, block.information, block.share, fit.depth, fit.variance
     )
     return fit if reduced is None else _fit(block, reduced)
@@ -293,27 +262,23 @@ def _fit(block: _Block, information: Array) -> _Fit:
     """Choose the smoothness of a block and solve."""
     bands = _precision(block, information)
     unit = float(information[information > 0.0].mean()) * block.extent**3
-    choice = _smoothing_choice.choose_smoothing(
-        _smoothing_choice.score_smoothing(bands, block.estimates, block.stiffness, unit),
-        _largest_smoothing(block, information) / unit,
-    )
-    candidates = _Candidates(choice.smoothing * unit, choice.share)
-    right = _banded.multiply_rows(bands, block.estimates)
-    solved, diagonal, beside, second = candidates.solve(right, bands, block.stiffness)
+    scores = _smoothing.score_smoothing(bands, block.estimates, block.stiffness, unit)
+    largest = _largest_smoothing(block, information) / unit
+    smoothing = _smoothing.choose_smoothing(scores, largest).times(unit)
+    right = _smoothing.multiply_rows(bands, block.estimates)
+    solved, diagonal, beside, second = smoothing.solve(right, bands, block.stiffness)
     gained = np.diff(solved, axis=1, prepend=0.0)
     uncertain = diagonal.copy()
     uncertain[:, 1:] += diagonal[:, :-1] - 2.0 * beside[:, :-1]
-    repeated = np.repeat(bands, choice.share.size, axis=1)
+    repeated = np.repeat(bands, smoothing.share.size, axis=1)
     own = _own_weights(repeated, np.array([diagonal, beside, second]))
     return _Fit(
         information,
         bands,
-        choice.saturated,
-        choice.limited,
-        candidates,
-        *candidates.mixed(solved, diagonal),
-        *candidates.mixed(gained, uncertain),
-        candidates.mean(own),
+        smoothing,
+        *smoothing.mixed(solved, diagonal),
+        *smoothing.mixed(gained, uncertain),
+        smoothing.mean(own),
     )
 
 
@@ -326,10 +291,10 @@ def _largest_smoothing(block: _Block, information: Array) -> float:
 
 def _precision(block: _Block, information: Array) -> Array:
     share = _reduced_share(block, information)
-    bands = air_correlation.correlated_precision(information, share, block.correlation)
+    bands = altitude_correlation.correlated_precision(information, share, block.correlation)
     rows = block.gaps
     if rows.size and block.correlation > 0.0:
-        bands[:, rows] = air_correlation.gap_precision(
+        bands[:, rows] = altitude_correlation.gap_precision(
             information[rows], share[rows], block.correlation
         )
     return bands
@@ -348,8 +313,8 @@ def _reduced_share(block: _Block, information: Array) -> Array:
 
 def _respond(block: _Block, fit: _Fit, rows: Array) -> Array:
     """Apply the smoother of each profile to its row."""
-    right = _banded.multiply_rows(fit.bands, np.where(fit.information > 0.0, rows, 0.0))
-    return fit.candidates.mean(fit.candidates.solve(right, fit.bands, block.stiffness)[0])
+    right = _smoothing.multiply_rows(fit.bands, np.where(fit.information > 0.0, rows, 0.0))
+    return fit.smoothing.mean(fit.smoothing.solve(right, fit.bands, block.stiffness)[0])
 
 
 def _own_weights(bands: Array, inverse: Array) -> Array:
@@ -366,12 +331,12 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
     information, share = _calibration.typical_profile(
         fit.information, _reduced_share(block, fit.information)
     )
-    pilot = replace(fit.candidates, smoothing=fit.candidates.smoothing * THRESHOLDS.pilot)
-    right = _banded.multiply_rows(fit.bands, block.estimates)
+    right = _smoothing.multiply_rows(fit.bands, block.estimates)
+    pilot = fit.smoothing.times(THRESHOLDS.pilot)
     rough = pilot.solve(right, fit.bands, block.stiffness)[0]
-    right = _banded.multiply_rows(fit.bands, rough)
-    smooth = fit.candidates.solve(right, fit.bands, block.stiffness)[0]
-    bands = air_correlation.correlated_precision(
+    right = _smoothing.multiply_rows(fit.bands, rough)
+    smooth = fit.smoothing.solve(right, fit.bands, block.stiffness)[0]
+    bands = altitude_correlation.correlated_precision(
         information[np.newaxis], share[np.newaxis], block.correlation
     )
     return _calibration.Calibration(
@@ -380,7 +345,7 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
         share,
         block.correlation,
         block.stiffness,
-        float(fit.candidates.smoothing[0]),
+        float(fit.smoothing.weight[0]),
         np.where(within, rough - smooth, np.nan),
         _calibration.relative_squares(fit.depth, fit.variance, within),
     )
@@ -420,9 +385,9 @@ def _result(
         correlation=block.correlation,
         interpolated=within & ~used,
         downweighted=fit.information < THRESHOLDS.majority * block.information,
-        saturated=fit.saturated,
+        saturated=fit.smoothing.saturated,
         # Where the data are smoother than allowed, their noise is not mistaken for structure.
-        undersmoothed=(not fit.limited)
+        undersmoothed=(not fit.smoothing.limited)
         & (freedom > THRESHOLDS.most_freedom)
         & (freedom > THRESHOLDS.roughest * used.sum(axis=1)),
         high_correlation=block.correlation > THRESHOLDS.highest_correlation,

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles.banded_matrices import dense
 
-from lidarops.retrieve.multiangle.vertical import _banded
-from lidarops.retrieve.multiangle.vertical.correlation import correlated_precision
+from lidarops.retrieve.multiangle import _smoothing
+from lidarops.retrieve.multiangle.altitude_correlation import correlated_precision
 
 STATION = 35.0
 
@@ -25,15 +25,15 @@ def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
         information, rng.uniform(0.3, 1.0, (profiles, heights)), correlation
     )
     altitude = STATION + 120.0 + 30.0 * np.arange(heights)
-    stiffness = _banded.penalty(altitude - STATION)
+    stiffness = _smoothing.penalty(altitude - STATION)
     return bands, estimates, stiffness, 10.0 ** rng.uniform(3.0, 8.0, profiles)
 
 
 def solved(bands, estimates, stiffness, lam):
     profiles, heights = estimates.shape
     out = np.empty((4, profiles, heights))
-    right = _banded.multiply_rows(bands, estimates)
-    _banded.solve_banded(bands, right, stiffness, np.arange(profiles), lam, out)
+    right = _smoothing.multiply_rows(bands, estimates)
+    _smoothing.solve_banded(bands, right, stiffness, np.arange(profiles), lam, out)
     return out
 
 
@@ -55,9 +55,9 @@ def test_solution_and_inverse_equal_dense_algebra(heights, correlation):
 
 def test_scores_equal_dense_algebra():
     bands, estimates, stiffness, lam = systems(np.random.default_rng(1), 21, 33)
-    right = _banded.multiply_rows(bands, estimates)
+    right = _smoothing.multiply_rows(bands, estimates)
     which = np.array([20, 3, 3, 7, *range(15)])
-    scores = _banded.banded_scores(bands, right, estimates, stiffness, which, lam[which])
+    scores = _smoothing.banded_scores(bands, right, estimates, stiffness, which, lam[which])
     for i, t in enumerate(which):
         weight = dense(bands[:, t])
         system = weight + lam[t] * dense(stiffness)
@@ -82,11 +82,11 @@ def test_solution_keeps_8_digits_of_60(smoothing, correlation):
     truth = 1e-4 * altitude
     estimates = (truth + rng.normal(size=heights) / np.sqrt(information[0]))[np.newaxis]
     bands = correlated_precision(information, np.full((1, heights), 0.9), correlation)
-    stiffness = _banded.penalty(altitude)
+    stiffness = _smoothing.penalty(altitude)
     lam = np.array([smoothing * information.mean() * altitude[-1] ** 3])
-    right = _banded.multiply_rows(bands, estimates)
+    right = _smoothing.multiply_rows(bands, estimates)
     out = np.empty((4, 1, heights))
-    _banded.solve_banded(bands, right, stiffness, np.zeros(1, dtype=np.int64), lam, out)
+    _smoothing.solve_banded(bands, right, stiffness, np.zeros(1, dtype=np.int64), lam, out)
     with mp.workdps(60):
         exact, inverse_last = _exact(bands[:, 0], stiffness, float(lam[0]), estimates[0])
     assert np.abs(out[0, 0] - exact).max() <= 1e-8 * np.abs(exact).max()
@@ -134,7 +134,7 @@ def test_penalty_is_the_integral_of_the_squared_slope_of_extinction():
     extinction = np.diff(np.concatenate([[0.0], depth])) / np.diff(levels)
     middle = 0.5 * (levels[1:] + levels[:-1])
     expected = (np.diff(extinction) ** 2 / np.diff(middle)).sum()
-    stiffness = dense(_banded.penalty(altitude - STATION))
+    stiffness = dense(_smoothing.penalty(altitude - STATION))
     assert depth @ stiffness @ depth == pytest.approx(expected, rel=1e-12)
     constant = altitude - STATION
     assert np.abs(stiffness @ constant).max() < 1e-12 * np.abs(stiffness).max() * constant.max()

@@ -16,7 +16,7 @@ from support.oracles.multiangle import (
 )
 
 from lidarops.retrieve.multiangle import _block
-from lidarops.retrieve.multiangle._path_variation import path_variation_from
+from lidarops.retrieve.multiangle._horizontal_variation import path_variation_from
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from support.oracles.banded_matrices import dense
 
-from lidarops.retrieve.multiangle.vertical import _banded
-from lidarops.retrieve.multiangle.vertical._smoothing_choice import (
+from lidarops.retrieve.multiangle import _smoothing
+from lidarops.retrieve.multiangle._smoothing import (
     GRID,
     PER_DECADE,
     Scores,
     choose_smoothing,
     score_smoothing,
 )
-from lidarops.retrieve.multiangle.vertical.correlation import correlated_precision
+from lidarops.retrieve.multiangle.altitude_correlation import correlated_precision
 
 HEIGHTS = 25
 ALTITUDE = 100.0 + 30.0 * np.arange(HEIGHTS)
@@ -26,7 +26,7 @@ def block(profiles, correlation, rng):
     estimates = truth + rng.normal(size=(profiles, HEIGHTS)) / np.sqrt(information)
     bands = correlated_precision(information, np.ones_like(information), correlation)
     unit = information.mean() * ALTITUDE[-1] ** 3
-    return bands, estimates, _banded.penalty(ALTITUDE), unit
+    return bands, estimates, _smoothing.penalty(ALTITUDE), unit
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
@@ -59,7 +59,7 @@ def test_risk_estimates_the_true_error_without_bias():
     truth = 0.05 * np.sin(ALTITUDE / 100.0)
     bands = correlated_precision(information, np.ones_like(information), 0.5)
     covariance = np.linalg.inv(dense(bands[:, 0]))
-    stiffness, unit = _banded.penalty(ALTITUDE), 50.0 * ALTITUDE[-1] ** 3
+    stiffness, unit = _smoothing.penalty(ALTITUDE), 50.0 * ALTITUDE[-1] ** 3
     noise = rng.multivariate_normal(np.zeros(HEIGHTS), covariance, size=64)
     scored = score_smoothing(bands, truth + noise, stiffness, unit)
     weight = dense(bands[:, 0])
@@ -76,7 +76,7 @@ def test_risk_estimates_the_true_error_without_bias():
 def test_long_block_is_scored_on_every_nth_profile(profiles, heights, every):
     estimates = np.random.default_rng(3).normal(size=(profiles, heights))
     bands = correlated_precision(np.ones_like(estimates), np.zeros_like(estimates), 0.0)
-    stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1))
+    stiffness = _smoothing.penalty(30.0 * np.arange(1, heights + 1))
     chosen = np.ascontiguousarray(bands[:, ::every])
     thinned = score_smoothing(chosen, estimates[::every].copy(), stiffness, 1e8)
     whole = score_smoothing(bands, estimates, stiffness, 1e8)
@@ -92,26 +92,27 @@ def scores(likely, risky, profiles=300):
 
 
 def test_likelihood_decides_where_the_risk_agrees():
-    assert choose_smoothing(scores(30, 29), np.inf).smoothing == GRID[30]
-    assert choose_smoothing(scores(30, 35), np.inf).smoothing == GRID[30]
+    assert choose_smoothing(scores(30, 29), np.inf).weight == GRID[30]
+    assert choose_smoothing(scores(30, 35), np.inf).weight == GRID[30]
 
 
 def test_risk_decides_where_it_gives_more_freedom_up_to_a_decade():
-    assert choose_smoothing(scores(30, 25), np.inf).smoothing == GRID[25]
-    assert choose_smoothing(scores(30, 5), np.inf).smoothing == GRID[30 - PER_DECADE]
+    assert choose_smoothing(scores(30, 25), np.inf).weight == GRID[25]
+    assert choose_smoothing(scores(30, 5), np.inf).weight == GRID[30 - PER_DECADE]
 
 
 def test_at_least_two_degrees_of_freedom_are_left():
-    choice = choose_smoothing(scores(66, 66), np.inf)
+    straight = scores(66, 66)
+    choice = choose_smoothing(straight, np.inf)
     assert choice.saturated
-    assert 2.0 <= choice.effective_degrees_of_freedom < 2.1
+    assert 2.0 <= straight.freedom[choice.weight == GRID] < 2.1
     assert not choose_smoothing(scores(30, 30), np.inf).saturated
 
 
 @pytest.mark.parametrize("profiles", [1, 50])
 def test_no_weight_above_the_largest_is_chosen_and_none_there_is_saturated(profiles):
     choice = choose_smoothing(scores(40, 40, profiles), 1.5 * GRID[30])
-    assert choice.smoothing.max() == GRID[31]
+    assert choice.weight.max() == GRID[31]
     assert not choice.saturated
 
 
@@ -119,7 +120,7 @@ def test_small_block_is_averaged_by_likelihood():
     choice = choose_smoothing(scores(30, 5, profiles=7), np.inf)
     assert choice.share.sum() == pytest.approx(1.0)
     weight = np.exp(-0.5 * (np.arange(GRID.size) - 30.0) ** 2)
-    where = np.searchsorted(GRID, choice.smoothing)
+    where = np.searchsorted(GRID, choice.weight)
     expected = weight[where] / weight[where].sum()
     np.testing.assert_allclose(choice.share, expected, rtol=1e-12)
     assert weight[where].sum() / weight.sum() > 1.0 - 1e-4
@@ -129,4 +130,4 @@ def test_data_that_never_reach_two_degrees_of_freedom_are_saturated():
     low = Scores(np.arange(GRID.size)[::-1] * 1.0, np.zeros(GRID.size), np.ones(GRID.size), 50)
     choice = choose_smoothing(low, np.inf)
     assert choice.saturated
-    assert choice.smoothing == GRID[0]
+    assert choice.weight == GRID[0]

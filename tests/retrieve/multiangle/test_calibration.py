@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.oracles.banded_matrices import dense
 
+from lidarops.retrieve.multiangle import _calibration, _smoothing
+from lidarops.retrieve.multiangle.altitude_correlation import correlated_precision
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import _banded, _calibration
-from lidarops.retrieve.multiangle.vertical.correlation import correlated_precision
 
 HEIGHTS = 30
 ROWS = np.arange(HEIGHTS)
@@ -22,7 +22,7 @@ def calibration(correlation=0.6, heights=HEIGHTS):
     information[7] = 0.0
     share = rng.uniform(0.2, 1.0, heights)
     bands = correlated_precision(information[np.newaxis], share[np.newaxis], correlation)
-    stiffness = _banded.penalty(30.0 * np.arange(1, heights + 1))
+    stiffness = _smoothing.penalty(30.0 * np.arange(1, heights + 1))
     return _calibration.Calibration(
         bands[:, 0],
         information,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.oracles.multiangle import ANGLES, clear, cloud, rms, signals
 
-from lidarops.retrieve.multiangle import _sample_mask
+from lidarops.retrieve.multiangle import _block
+from lidarops.retrieve.multiangle import altitude_correlation as correlation_of_air
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
-from lidarops.retrieve.multiangle.vertical import correlation as correlation_of_air
 
 STEEP = np.linspace(0.0, 30.0, 6)
 
@@ -135,7 +135,7 @@ def test_only_samples_missing_between_others_are_gaps():
     signal[5, 0, 2] = -1.0
     variance = np.full(signal.shape, 0.1)
     present = signal > 0.0
-    gappy = _sample_mask.profiles_with_gaps(present, signal, variance)
+    gappy = _block.profiles_with_gaps(present, signal, variance)
     np.testing.assert_array_equal(gappy, [False, True, False, False, False, False])
     variance[0, 1, 3], present[0, 1, 3] = np.nan, False
-    assert _sample_mask.profiles_with_gaps(present, signal, variance)[0]
+    assert _block.profiles_with_gaps(present, signal, variance)[0]

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.multiangle import _smoothing
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.retrieve.multiangle.vertical import _banded
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ def sandwich(calibration: Calibration, upper: Integers, lower: Integers) -> Arra
     a[each, upper] = 1.0
     a[each[lower >= 0], lower[lower >= 0]] = -1.0
     solved = _inverse(calibration, 1.0, a)
-    x = _banded.multiply_rows(bands, solved)
-    y = _banded.multiply_rows(bands, _inverse(calibration, THRESHOLDS.pilot, a - x))
+    x = _smoothing.multiply_rows(bands, solved)
+    y = _smoothing.multiply_rows(bands, _inverse(calibration, THRESHOLDS.pilot, a - x))
     posterior = (a * solved).sum(axis=1)
     model = np.maximum(posterior - (solved * x).sum(axis=1), 0.0)
     return np.stack([posterior, _noise(calibration, x), model, _noise(calibration, y)])
@@ -73,7 +73,7 @@ def _inverse(calibration: Calibration, factor: float, rows: Array) -> Array:
     """Return rows times the inverse of the system, with a multiple of its smoothing."""
     count = len(rows)
     out = np.empty((4, *rows.shape))
-    _banded.solve_banded(
+    _smoothing.solve_banded(
         np.broadcast_to(calibration.bands[:, np.newaxis], (3, *rows.shape)).copy(),
         rows, calibration.stiffness, np.arange(count),
         np.full(count, factor * calibration.smoothing), out,

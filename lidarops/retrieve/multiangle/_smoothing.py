@@ -1,18 +1,20 @@
-"""Compiled solution of pentadiagonal systems: one sweep, with variances, 16 at a time.
+"""Smooth profiles: penalised solutions of pentadiagonal systems, and the choice of their weight.
 
-A system is the precision of the estimates of one profile plus a multiple of the penalty. The
-result of one lane does not depend on the data in the others.
+A system is the precision of the estimates of one profile plus a multiple of the penalty. Sixteen
+systems are solved in one sweep, with variances; the result of one does not depend on the others.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Integers
+from lidarops.retrieve.common.arrays import Array, Indices, Integers
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 LANES: Final = 16
 """Systems solved at a time, one in each lane of the vector registers."""
@@ -20,6 +22,12 @@ PAD: Final = 2
 """Rows of zeros at either end, in place of values outside the grid."""
 _LOGARITHM_EVERY: Final = 4
 """Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
+PER_DECADE: Final = 6
+GRID: Final = 10.0 ** (np.arange(11 * PER_DECADE + 1) / PER_DECADE - 10.0)
+"""Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
+_SCORED_PROFILES: Final = 64
+_SCORED_VALUES: Final = 25_600
+"""A block is scored on at most so many profiles, or profiles with so many values together."""
 
 
 def penalty(altitude: Array) -> Array:
@@ -269,3 +277,124 @@ def banded_scores(
         for j in range(min(LANES, profile.size - first)):
             out[:, first + j] = total[:, j]
     return out
+
+
+# Choice of the weight by restricted likelihood and Mallows' Cp on a fixed grid -------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Smoothing:
+    """Weights of smoothness with which each profile of a block is solved."""
+
+    weight: Array
+    """(candidate,): one weight, or several to be averaged over."""
+    share: Array
+    """(candidate,): share of each in the average, 1 in total."""
+    saturated: bool
+    """Whether the best weight leaves little more than a straight line."""
+    limited: bool
+    """Whether the best weight is the largest that is allowed, but leaves more than that."""
+
+    def times(self, factor: float) -> Smoothing:
+        """Return weights multiplied by a factor."""
+        return replace(self, weight=self.weight * factor)
+
+    def solve(self, right: Array, bands: Array, stiffness: Array) -> Array:
+        """Return solutions and the bands of the inverse, (4, profile * candidate, altitude)."""
+        profiles, count = len(right), self.share.size
+        out = np.empty((4, profiles * count, right.shape[1]))
+        row, weight = np.repeat(np.arange(profiles), count), np.tile(self.weight, profiles)
+        solve_banded(bands, right, stiffness, row, weight, out)
+        return out
+
+    def mean(self, values: Array) -> Array:
+        """Average (profile * candidate, altitude) rows into (profile, altitude)."""
+        apart = values.reshape(-1, self.share.size, values.shape[1])
+        return np.asarray(np.einsum("tck,c->tk", apart, self.share))
+
+    def mixed(self, value: Array, variance: Array) -> tuple[Array, Array]:
+        """Return mean and variance of the mixture of the solutions of each profile."""
+        mean = self.mean(value)
+        away = value - np.repeat(mean, self.share.size, axis=0)
+        return mean, self.mean(variance + away**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """The criteria on the grid, summed over the scored profiles of a block."""
+
+    likelihood: Array
+    """(smoothing,): minus twice the restricted log-likelihood, up to a constant."""
+    risk: Array
+    """(smoothing,): Mallows' Cp, up to a constant."""
+    freedom: Array
+    """(smoothing,): mean effective degrees of freedom of a profile."""
+    profiles: int
+    """Profiles of the block, scored or not."""
+
+
+def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
+    """Score every weight on the grid for the profiles of one block, formula 3 of the page.
+
+    A long block is scored on every n-th profile.
+
+    Parameters
+    ----------
+    bands : (3, profile, altitude) float64
+    estimates : (profile, altitude) float64
+        0 where there is none.
+    stiffness : (3, altitude) float64
+    unit : float
+        Factor of the dimensionless weights.
+    """
+    profiles, altitudes = estimates.shape
+    most = max(_SCORED_PROFILES, _SCORED_VALUES // altitudes)
+    scored = np.arange(0, profiles, -(-profiles // most))
+    right = multiply_rows(bands, estimates)
+    profile = np.repeat(scored, GRID.size)
+    lam = np.tile(GRID * unit, scored.size)
+    raw = banded_scores(bands, right, estimates, stiffness, profile, lam)
+    fit, misfit, freedom, logarithm = raw.reshape(4, scored.size, GRID.size)
+    likelihood = (fit + logarithm - (altitudes - 1) * np.log(GRID * unit)).sum(axis=0)
+    # Where a pivot lost all its digits, the weight is too large.
+    likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)
+    risk = misfit + 2.0 * freedom
+    return Scores(likelihood, risk.sum(axis=0), freedom.mean(axis=0), profiles)
+
+
+def choose_smoothing(scores: Scores, largest: float) -> Smoothing:
+    """Choose the dimensionless weight of a block, or the weights to average over.
+
+    Weights above `largest` are not allowed: without a limit, smooth extinction below would deny
+    the top of a layer above, where the data are too noisy to show it.
+
+    Profiles of a block have similar shapes, but the likelihood treats them as independent; in
+    clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
+    gives 1.2 times the degrees of freedom, and lowers the weight by at most a factor of 10.
+    """
+    admitted = np.flatnonzero(
+        (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
+    )
+    straight = int(admitted[-1]) if admitted.size else 0
+    last = min(straight, max(int(np.searchsorted(GRID, largest, side="right")) - 1, 0))
+    likely = int(np.argmin(scores.likelihood[: last + 1]))
+    if scores.profiles < THRESHOLDS.fewest_to_choose:
+        return _average(scores, last, straight)
+    risky = int(np.argmin(scores.risk[: last + 1]))
+    risky = max(risky, likely - PER_DECADE)
+    rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
+    best = risky if rougher else likely
+    return _smoothing(np.array([best]), np.ones(1), last, straight)
+
+
+def _average(scores: Scores, last: int, straight: int) -> Smoothing:
+    likelihood = scores.likelihood[: last + 1]
+    share = np.exp(-0.5 * (likelihood - likelihood.min()))
+    kept = np.flatnonzero(share > THRESHOLDS.negligible_likelihood)
+    share = share[kept] / share[kept].sum()
+    return _smoothing(kept, share, last, straight)
+
+
+def _smoothing(kept: Indices, share: Array, last: int, straight: int) -> Smoothing:
+    best = int(kept[np.argmax(share)])
+    return Smoothing(GRID[kept], share, saturated=best == straight, limited=best == last < straight)

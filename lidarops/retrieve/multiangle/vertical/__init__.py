@@ -1,1 +1,0 @@
-"""Optical depths of single altitudes combined into one profile with smooth extinction."""
