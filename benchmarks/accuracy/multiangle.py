@@ -19,6 +19,7 @@ from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share, with
 from benchmarks.harness.rows import CPU_TIME, Row, Score, Scores, rows_of_scores
 from benchmarks.harness.statistics import SIGMAS, over_blocks, root
 from benchmarks.harness.study import Chapter, Results, Study, Work
+from lidarops.flags import Quality
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 
 PUBLISHED_ANGLES: Final = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
@@ -496,6 +497,7 @@ def _outlier_score(outliers: float, size: StudySize, method: str, *, robust: boo
     results = [cases.retrieve(scan, method, robust=robust) for scan in scans]
     errors = [result.optical_depth - scene.optical_depth for result in results]
     stated = [result.optical_depth_standard_error for result in results]
+    outlying = [result.raised(Quality.OUTLIER) for result in results]
     pairs = list(zip(errors, stated, strict=True))
     return {
         "RMSE below 2 km": root(over_blocks([_mean(error[:, low] ** 2) for error in errors])),
@@ -504,7 +506,7 @@ def _outlier_score(outliers: float, size: StudySize, method: str, *, robust: boo
             name: share(over_blocks([_share_within(e, s, sigmas) for e, s in pairs]))
             for name, sigmas in zip(_WITHIN, SIGMAS, strict=True)
         },
-        "flagged": share(over_blocks([_mean(result.flags.outlier) for result in results]).value),
+        "flagged": share(over_blocks([_mean(bits) for bits in outlying]).value),
         "robust passes": share(float(np.mean([_robust_passes_ran(result) for result in results]))),
     }
 

@@ -9,7 +9,6 @@ from itertools import product
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.accuracy import multiangle_cases
 from benchmarks.accuracy.multiangle_cases import Scan, Scene
@@ -17,12 +16,18 @@ from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first, joined
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled import QUALITY_OF_FLAG
 
 Random = np.random.Generator
 
 _CALM: Final = (5e-3, 0.4)
 """Scatter of calm air, drawn uniformly in its logarithm."""
+_UNCERTAIN: Final = (
+    MultiAngleQuality.NO_RESIDUAL
+    | MultiAngleQuality.UNDERSMOOTHED
+    | MultiAngleQuality.HIGH_CORRELATION
+    | MultiAngleQuality.POOR_STRATIFICATION
+)
+"""Bits of values whose stated uncertainty may be too small."""
 _LAYER_WIDTH: Final = (2.0, 4.0)
 """Standard deviation of a layer in altitude steps: 5 to 9 of them are its width at half maximum."""
 
@@ -157,21 +162,12 @@ def score_scan_methods(cluster: int, profiles: int) -> Iterator[tuple[ScoredValu
         yield from _score_quantities(failure, scene, result, profiles)
 
 
-def _bits(result: optical_depth.MultiAngleResult) -> npt.NDArray[np.int32]:
-    """Return the quality bits of a result, with those of its flags."""
-    bits = np.asarray(result.quality).copy()
-    for name, bit in QUALITY_OF_FLAG.items():
-        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
-    return bits
-
-
 def _score_quantities(
     failure: Failure,
     scene: Scene,
     result: optical_depth.MultiAngleResult,
     profiles: int,
 ) -> Iterator[tuple[ScoredValues, int]]:
-    bits = _bits(result)
     truth: dict[str, Array] = {
         "optical depth": scene.optical_depth,
         "extinction": np.asarray(scene.extinction),
@@ -182,8 +178,8 @@ def _score_quantities(
         yield (
             ScoredValues(
                 failure, quantity, error, getattr(result, f"{name}_standard_error"),
-                getattr(result, f"{name}_gradient_error"), bits, MultiAngleQuality,
-                uncertain=result.flags.doubtful(), solvable=np.isfinite(error),
+                getattr(result, f"{name}_gradient_error"), result.quality, MultiAngleQuality,
+                uncertain=result.raised(_UNCERTAIN), solvable=np.isfinite(error),
             ),
             profiles,
         )  # fmt: skip
@@ -250,8 +246,8 @@ def _score_depth(
 ) -> ScoredValues:
     return ScoredValues(
         failure, "optical depth", result.optical_depth - depth,
-        result.optical_depth_standard_error, result.optical_depth_gradient_error, _bits(result),
-        MultiAngleQuality, uncertain=result.flags.doubtful(),
+        result.optical_depth_standard_error, result.optical_depth_gradient_error, result.quality,
+        MultiAngleQuality, uncertain=result.raised(_UNCERTAIN),
     )  # fmt: skip
 
 

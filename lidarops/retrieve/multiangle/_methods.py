@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.flags import Quality
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
 from lidarops.retrieve.multiangle import _block, _horizontal_variation, mld
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
@@ -19,50 +20,13 @@ from lidarops.retrieve.multiangle.altitude_correlation import (
     fit_correlation,
     residual_moments,
 )
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.slant_paths import Scan
 from lidarops.retrieve.multiangle.smooth_profile import smooth_optical_depth
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
 """Methods that do not use the horizontal gradient that the regression fits."""
-
-
-@dataclass(frozen=True, slots=True)
-class MultiAngleFlags:
-    """Reasons to reject a value or to doubt its uncertainty; each (..., altitude)."""
-
-    no_data: Booleans
-    """At no altitude do two different angles have a signal."""
-    extrapolated: Booleans
-    """Beyond the reach: fewer beams than the method needs are left. Values are withheld."""
-    interpolated: Booleans
-    """No estimate at this altitude; interpolated from those around."""
-    no_residual: Booleans
-    """As many unknowns as beams in all profiles of the block, at all altitudes around: the model
-    cannot be checked, and the inhomogeneity cannot be estimated."""
-    low_leverage: Booleans
-    """The slant paths differ by less than a tenth of the vertical path."""
-    poor_stratification: Booleans
-    """The beams scatter increasingly with altitude, by more than noise, chance and a gradient
-    explain, as when extinction varies along the horizontal; or the residuals show a gradient that
-    is too large for air. Extinction is withheld."""
-    prior_dominated: Booleans
-    """The best fit is little more than a straight line; the data share of "joint" is below 0.9 or
-    above 1.1; or that of "mld" and "mld_prior" is below 0.9, and extinction is withheld."""
-    undersmoothed: Booleans
-    """More than 10 degrees of freedom and more than 0.4 per altitude, which fit better than a
-    smoother profile: the standard error may be too small."""
-    high_correlation: Booleans
-    """Neighbouring altitudes are correlated by more than 0.85: the standard error may be too
-    small."""
-    outlier: Booleans
-    """At least one beam or estimate got less weight as an outlier."""
-
-    def doubtful(self) -> Booleans:
-        """Return where the stated uncertainty may be too small."""
-        return np.asarray(
-            self.no_residual | self.undersmoothed | self.high_correlation | self.poor_stratification
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +40,7 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class MultiAngleResult:
-    """Profiles of a multi-angle retrieval, (..., altitude) unless stated; NaN where withheld."""
+    """Profiles of a multi-angle retrieval, (profile, altitude) unless stated; NaN if withheld."""
 
     optical_depth: Array
     """From the lidar to the altitude."""
@@ -94,7 +58,7 @@ class MultiAngleResult:
     """ln of the range-corrected signal extrapolated to zero optical depth."""
     log_intercept_standard_error: Array
     effective_degrees_of_freedom: Array
-    """(...,): effective number of independent values in the profile."""
+    """(profile,): effective number of independent values in the profile."""
     data_share: Array
     """Share of the optical depth that comes from the data; 1 without prior and smoothing."""
     regularisation: Array
@@ -106,19 +70,19 @@ class MultiAngleResult:
     reduced_chi_square: Array
     """Reduced chi-square of the fit over angles; NaN where beams are not more than unknowns."""
     reach: Array
-    """(...,) m, the highest altitude with an estimate; NaN where there is none."""
+    """(profile,) m, the highest altitude with an estimate; NaN where there is none."""
     layer_optical_depth: Array
-    """(..., layer): between the bounds of the requested layers."""
+    """(profile, layer): between the bounds of the requested layers."""
     layer_optical_depth_standard_error: Array
-    """(..., layer): random error. Methods without smoothing over altitude treat the errors of both
-    bounds as independent, which is too large if they are correlated."""
+    """(profile, layer): random error. Methods without smoothing over altitude treat the errors of
+    both bounds as independent, which is too large if they are correlated."""
     layer_optical_depth_gradient_error: Array
-    """(..., layer): systematic, as `optical_depth_gradient_error`."""
+    """(profile, layer): systematic, as `optical_depth_gradient_error`."""
     residual: Array
-    """(..., angle, altitude): logarithms minus their fit over angles; NaN without a sample."""
-    flags: MultiAngleFlags
-    quality: npt.NDArray[np.int32]
-    """Bits of `lidarops.flags.Quality`."""
+    """(profile, angle, altitude): logarithms minus their fit over angles; NaN without a sample."""
+    quality: Flags
+    """Bits of `lidarops.flags.Quality` and `MultiAngleQuality`; each missing optical depth has one
+    that rejects it."""
     steps: tuple[StepRecord, ...]
     """Steps that ran or were left out."""
 
@@ -135,36 +99,17 @@ class MultiAngleResult:
         }
         profile = (profiles, altitudes)
         values: dict[str, Any] = {
-            name: np.full(shapes.get(name, profile), np.nan) for name in cls.value_names()
+            field.name: np.full(shapes.get(field.name, profile), np.nan) for field in fields(cls)
         }
-        flags = {field.name: np.zeros(profile, np.bool_) for field in fields(MultiAngleFlags)}
-        return cls(
-            **values,
-            flags=MultiAngleFlags(**flags),
-            quality=np.zeros(profile, dtype=np.int32),
-            steps=(),
-        )
+        return cls(**values | {"quality": np.zeros(profile, dtype=np.int32), "steps": ()})
 
-    @classmethod
-    def value_names(cls) -> Iterator[str]:
-        """Yield the names of the arrays of values."""
-        names = (field.name for field in fields(cls))
-        return (name for name in names if name not in ("flags", "quality", "steps"))
+    def raised(self, bits: int) -> Booleans:
+        """Return where any of the bits is raised."""
+        return np.asarray((self.quality & np.int32(bits)) != 0)
 
-    def with_leading_axes(self, leading: tuple[int, ...]) -> MultiAngleResult:
-        """Return the result with the leading axes of the signal in place of that of profiles."""
-
-        def restored(values: Any) -> Any:
-            return values.reshape((*leading, *values.shape[1:]))
-
-        flags = {
-            field.name: restored(getattr(self.flags, field.name))
-            for field in fields(MultiAngleFlags)
-        }
-        values = {name: restored(getattr(self, name)) for name in self.value_names()}
-        return replace(
-            self, **values, flags=MultiAngleFlags(**flags), quality=restored(self.quality)
-        )
+    def mark(self, bit: int, where: npt.ArrayLike) -> None:
+        """Raise a bit, where (profile, altitude) or what is broadcast to it is true."""
+        self.quality[:] |= np.where(where, np.int32(bit), np.int32(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +126,8 @@ class BlockSettings:
     largest_gradient: float
     """m-1."""
     robust: bool
-    layers: tuple[tuple[int, int], ...]
-    """Indices of the altitudes at bottom and top of layers, -1 for the lidar."""
+    layers: Indices
+    """(layer, 2) levels at bottom and top of layers: 0 for the lidar, k + 1 for altitude k."""
     regularisation: float | None = None
     """Strength of the penalty of "mld" and "mld_prior"; chosen from the noise where None."""
 
@@ -190,7 +135,7 @@ class BlockSettings:
 def solve_cycles(
     signal: Array, variance: Array, dead_time_change: Array | None, settings: BlockSettings
 ) -> MultiAngleResult:
-    """Return the solution of the profiles of one block, without quality bits.
+    """Return the solution of the profiles of one block, without the reasons for missing values.
 
     Parameters
     ----------
@@ -221,8 +166,9 @@ def _solve(
     profiles = _METHODS[method](beams, fit, settings)
     lowest = _horizontal_variation.path_variation_from(beams, fit)
     if lowest is not None:
-        profiles.flags.poor_stratification[:, lowest:] = True
-    _withhold_extinction(profiles, profiles.flags.poor_stratification)
+        above = np.arange(profiles.quality.shape[1]) >= lowest
+        profiles.mark(MultiAngleQuality.POOR_STRATIFICATION, above)
+    _withhold_extinction(profiles, profiles.raised(MultiAngleQuality.POOR_STRATIFICATION))
     _raise_common_flags(profiles, beams, fit)
     return profiles
 
@@ -233,11 +179,12 @@ def _doubt(profiles: MultiAngleResult) -> str:
     Errors that are common to neighbouring altitudes, such as those of the shot energy, look like
     structure of the profile. The standard errors of single altitudes remain valid.
     """
-    flags, valued = profiles.flags, np.isfinite(profiles.optical_depth)
-    if not valued.any() or not (flags.undersmoothed | flags.high_correlation)[valued].all():
+    valued = np.isfinite(profiles.optical_depth)
+    causes = MultiAngleQuality.UNDERSMOOTHED, MultiAngleQuality.HIGH_CORRELATION
+    if not valued.any() or not profiles.raised(causes[0] | causes[1])[valued].all():
         return ""
-    causes = [name for name in ("undersmoothed", "high_correlation") if getattr(flags, name).any()]
-    return f"its standard errors would be too small ({' and '.join(causes)})"
+    words = " and ".join(bit.word for bit in causes if profiles.raised(bit).any())
+    return f"its standard errors would be too small ({words})"
 
 
 def _steps(
@@ -346,7 +293,7 @@ def _mld(
     profiles.prior_optical_depth[within] = estimates.prior[within]
     with np.errstate(invalid="ignore"):
         dominated = np.asarray(profiles.data_share < THRESHOLDS.least_share)
-    profiles.flags.prior_dominated[:] |= dominated
+    profiles.mark(MultiAngleQuality.PRIOR_DOMINATED, dominated)
     _withhold_extinction(profiles, dominated)
     return profiles
 
@@ -381,13 +328,9 @@ def _fill_single(profiles: MultiAngleResult, single: _Single, settings: BlockSet
     _fill_gradient_errors(profiles, np.where(within, single.slopes, np.nan), settings)
     freedom = np.where(within, single.freedom, 0.0).sum(axis=1)
     profiles.effective_degrees_of_freedom[:] = np.where(within.any(axis=1), freedom, np.nan)
-    lidar = np.zeros((len(within), 1))
-    tau, square = np.hstack([profiles.optical_depth, lidar]), np.hstack([both, lidar])
-    for number, (bottom, top) in enumerate(settings.layers):
-        profiles.layer_optical_depth[:, number] = tau[:, top] - tau[:, bottom]
-        profiles.layer_optical_depth_standard_error[:, number] = np.sqrt(
-            square[:, top] + square[:, bottom]
-        )
+    depth, square = (_at_layers(values, settings) for values in (profiles.optical_depth, both))
+    profiles.layer_optical_depth[:] = depth[..., 1] - depth[..., 0]
+    profiles.layer_optical_depth_standard_error[:] = np.sqrt(square[..., 1] + square[..., 0])
 
 
 def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
@@ -403,30 +346,31 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
         settings.height,
         residuals=_moments(beams, fit).of(rows),
     )
-    profiles.optical_depth[rows] = smooth.optical_depth
-    profiles.optical_depth_standard_error[rows] = smooth.optical_depth_standard_error
-    profiles.extinction[rows] = smooth.extinction
-    profiles.extinction_standard_error[rows] = smooth.extinction_standard_error
-    profiles.effective_degrees_of_freedom[rows] = smooth.effective_degrees_of_freedom
-    profiles.data_share[rows] = smooth.data_share
+    for name in (
+        "optical_depth", "optical_depth_standard_error", "extinction", "extinction_standard_error",
+        "effective_degrees_of_freedom", "data_share",
+    ):  # fmt: skip
+        getattr(profiles, name)[rows] = getattr(smooth, name)
     slopes = np.full((2, *within.shape), np.nan)
     of_single = _gradient_slopes(profiles, beams, fit, settings)
     for slope, single in zip(slopes, of_single, strict=True):
         slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
     _fill_gradient_errors(profiles, slopes, settings)
     for number, (bottom, top) in enumerate(settings.layers):
-        depth, error = smooth.layer(bottom, top)
+        depth, error = smooth.layer(bottom - 1, top - 1)
         profiles.layer_optical_depth[rows, number] = depth
         profiles.layer_optical_depth_standard_error[rows, number] = error
-    flags = profiles.flags
-    flags.interpolated[rows] |= smooth.interpolated
-    flags.outlier[rows] |= smooth.downweighted
-    flags.prior_dominated[rows] |= smooth.saturated & np.isfinite(smooth.optical_depth)
     with np.errstate(invalid="ignore"):
-        deviating = np.abs(profiles.data_share - 1.0) > 1.0 - THRESHOLDS.least_share
-    flags.prior_dominated[:] |= deviating
-    flags.undersmoothed[rows] |= smooth.undersmoothed[:, np.newaxis]
-    flags.high_correlation[rows] |= smooth.high_correlation
+        deviating = np.abs(smooth.data_share - 1.0) > 1.0 - THRESHOLDS.least_share
+    for bit, raised in (
+        (MultiAngleQuality.INTERPOLATED, smooth.interpolated),
+        (Quality.OUTLIER, smooth.downweighted),
+        (MultiAngleQuality.PRIOR_DOMINATED, smooth.saturated & np.isfinite(smooth.optical_depth)),
+        (MultiAngleQuality.PRIOR_DOMINATED, deviating),
+        (MultiAngleQuality.UNDERSMOOTHED, smooth.undersmoothed[:, np.newaxis]),
+        (MultiAngleQuality.HIGH_CORRELATION, smooth.high_correlation),
+    ):
+        profiles.quality[rows] |= np.where(raised, np.int32(bit), np.int32(0))
     return profiles
 
 
@@ -458,10 +402,10 @@ def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     profiles.residual[:] = fit.residual
     top = np.where(within, settings.height, -np.inf).max(axis=1, initial=-np.inf)
     profiles.reach[:] = np.where(np.isfinite(top), top + settings.station_altitude, np.nan)
-    beyond = settings.height > np.where(np.isfinite(top), top, -np.inf)[:, np.newaxis]
-    profiles.flags.extrapolated[:] = beyond
-    empty = np.asarray(~within.any(axis=1))
-    profiles.flags.no_data[:] = empty[:, np.newaxis]
+    known = within.any(axis=1, keepdims=True)
+    beyond = known & (settings.height > top[:, np.newaxis])
+    profiles.mark(MultiAngleQuality.EXTRAPOLATED, beyond)
+    profiles.mark(MultiAngleQuality.NO_LEVERAGE, ~known)
     return profiles
 
 
@@ -469,13 +413,12 @@ def _raise_common_flags(profiles: MultiAngleResult, beams: BeamBlock, fit: Regre
     """Raise the flags common to all methods, wherever there is a value."""
     valued = np.isfinite(profiles.optical_depth)
     estimated = fit.column(kh.INFORMATION) > 0
-    profiles.flags.low_leverage[:] |= (
-        valued & estimated & (fit.column(kh.SPAN) < THRESHOLDS.least_span)
-    )
-    profiles.flags.no_residual[:] |= valued & (_block.pooled_freedom(fit) == 0)
+    short = valued & estimated & (fit.column(kh.SPAN) < THRESHOLDS.least_span)
+    profiles.mark(MultiAngleQuality.LOW_LEVERAGE, short)
+    profiles.mark(MultiAngleQuality.NO_RESIDUAL, valued & (_block.pooled_freedom(fit) == 0))
     if fit.robust:
         low = (fit.keep < 0.5) & (beams.noise < np.inf)
-        profiles.flags.outlier[:] |= low.any(axis=1)
+        profiles.mark(Quality.OUTLIER, low.any(axis=1))
 
 
 def _gradient_slopes(
@@ -484,11 +427,12 @@ def _gradient_slopes(
     """Return the error of optical depth by a gradient to the east and to the north.
 
     The gradient is the declared one, or that which the residuals show where it is larger. One that
-    is too large for air raises `poor_stratification`.
+    is too large for air raises `POOR_STRATIFICATION`.
     """
     shown = _horizontal_variation.visible_gradient(beams, fit, settings.height)
     if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
-        profiles.flags.poor_stratification[:] |= np.isfinite(profiles.optical_depth)
+        known = np.isfinite(profiles.optical_depth)
+        profiles.mark(MultiAngleQuality.POOR_STRATIFICATION, known)
     scale = max(settings.largest_gradient, shown) * settings.height
     return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
 
@@ -501,15 +445,18 @@ def _fill_gradient_errors(
     profiles.extinction_gradient_error[:] = np.hypot(
         *(_layer_means(slope, settings.height) for slope in slopes)
     )
-    levels = np.concatenate([slopes, np.zeros((*slopes.shape[:2], 1))], axis=2)
-    for number, (bottom, top) in enumerate(settings.layers):
-        across = levels[:, :, top] - levels[:, :, bottom]
-        profiles.layer_optical_depth_gradient_error[:, number] = np.hypot(*across)
+    across = (np.diff(_at_layers(slope, settings), axis=2)[..., 0] for slope in slopes)
+    profiles.layer_optical_depth_gradient_error[:] = np.hypot(*across)
 
 
 def _layer_means(optical_depth: Array, height: Array) -> Array:
     """Return the mean extinction of the layers between altitudes; the lidar has depth zero."""
     return (optical_depth - _below(optical_depth)) / np.diff(height, prepend=0.0)
+
+
+def _at_layers(values: Array, settings: BlockSettings) -> Array:
+    """Return values at bottom and top of the layers, (profile, layer, 2); 0 at the lidar."""
+    return np.pad(values, ((0, 0), (1, 0)))[:, settings.layers]
 
 
 def _below(values: Array) -> Array:

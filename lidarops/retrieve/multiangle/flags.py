@@ -65,5 +65,7 @@ class MultiAngleQuality(FlagBit):
     )
 
 
+CARE: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
+"""Bits that a bin passes on to every result that uses it."""
 REJECTING: Final = rejecting((*Quality, *MultiAngleQuality))
 """Union of the bits that reject a value."""

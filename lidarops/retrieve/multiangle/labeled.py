@@ -3,49 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
 from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._horizontal_variation import gradient_scale
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
-from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled_altitudes import CARE
-from lidarops.retrieve.multiangle.optical_depth import (
-    MultiAngleResult,
-)
+from lidarops.retrieve.multiangle.flags import CARE, REJECTING, MultiAngleQuality
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 from lidarops.retrieve.multiangle.smooth_profile import nearest_rising
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 __all__ = ["retrieve_optical_depth"]
 
 
-QUALITY_OF_FLAG: Final = {
-    "no_data": MultiAngleQuality.NO_LEVERAGE,
-    "extrapolated": MultiAngleQuality.EXTRAPOLATED,
-    "interpolated": MultiAngleQuality.INTERPOLATED,
-    "no_residual": MultiAngleQuality.NO_RESIDUAL,
-    "low_leverage": MultiAngleQuality.LOW_LEVERAGE,
-    "poor_stratification": MultiAngleQuality.POOR_STRATIFICATION,
-    "prior_dominated": MultiAngleQuality.PRIOR_DOMINATED,
-    "undersmoothed": MultiAngleQuality.UNDERSMOOTHED,
-    "high_correlation": MultiAngleQuality.HIGH_CORRELATION,
-    "outlier": Quality.OUTLIER,
-}
-"""Of `MultiAngleFlags`."""
 _PER_PROFILE: Final = ("effective_degrees_of_freedom", "reach")
+_PER_PLANE: Final = tuple(
+    f"{quantity}{error}"
+    for quantity in ("optical_depth", "extinction")
+    for error in ("", "_standard_error", "_gradient_error")
+)
+_PER_LAYER: Final = tuple(f"layer_{name}" for name in _PER_PLANE[:3])
 _PER_ALTITUDE: Final = (
-    "optical_depth",
-    "optical_depth_standard_error",
-    "optical_depth_gradient_error",
-    "extinction",
-    "extinction_standard_error",
-    "extinction_gradient_error",
+    *_PER_PLANE,
     "log_intercept",
     "log_intercept_standard_error",
     "data_share",
@@ -54,19 +38,6 @@ _PER_ALTITUDE: Final = (
 )
 _OF_PENALTY: Final = ("regularisation", "prior_optical_depth")
 """Of the methods with a penalty."""
-_PER_LAYER: Final = (
-    "layer_optical_depth",
-    "layer_optical_depth_standard_error",
-    "layer_optical_depth_gradient_error",
-)
-_PER_PLANE: Final = (
-    "optical_depth",
-    "optical_depth_standard_error",
-    "optical_depth_gradient_error",
-    "extinction",
-    "extinction_standard_error",
-    "extinction_gradient_error",
-)
 _SEVERAL: Final = 2
 """Planes of a volume."""
 _FEWEST_OF_PLANE: Final = 3
@@ -118,16 +89,16 @@ def retrieve_optical_depth(
         For invalid arguments.
     """
     altitude, zenith_angle = (beams[n].to_numpy() for n in ("altitude", "beam_zenith_angle"))
-    bounds = optical_depth.layer_bounds(layers, altitude, station_altitude=station_altitude)
+    levels, bounds = optical_depth.layer_levels(layers, altitude, station_altitude=station_altitude)
     settings: dict[str, Any] = {
         "azimuth": beams["beam_azimuth"].to_numpy() if "beam_azimuth" in beams.coords else None,
         "method": method,
         "station_altitude": station_altitude,
         "largest_gradient": largest_gradient,
         "regularisation": regularisation,
+        "signal_quality": beams["quality"].to_numpy(),
     }
     signals = _agreed_signals(beams, zenith_angle, altitude, settings)
-    levels = np.searchsorted(altitude, bounds, side="right")
     retrieval = _solve_all(signals, zenith_angle, altitude, levels, layers=layers, **settings)
     signal = signals.signal
     sampled = np.isfinite(signal).any(axis=-1)
@@ -137,7 +108,7 @@ def retrieve_optical_depth(
     }
     depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
-    quality = _quality(retrieval, beams["quality"].to_numpy(), np.isfinite(signal).sum(axis=1))
+    quality = _quality(retrieval)
     product = xr.Dataset(
         {
             **values,
@@ -207,9 +178,7 @@ def _plane_variables(
         own = settings | {"azimuth": settings["azimuth"][members]}
         nothing = np.empty((0, 2), dtype=np.intp)
         retrieval = _solve_all(part, zenith_angle[members], altitude, nothing, layers=(), **own)
-        samples = np.isfinite(part.signal).sum(axis=1)
-        quality = _quality(retrieval, beams["quality"].to_numpy(), samples)
-        rejected = (quality & np.int32(REJECTING)) != 0
+        rejected = retrieval.raised(REJECTING)
         for name, values in pieces.items():
             values.append(np.where(rejected, np.nan, getattr(retrieval, name)))
     stacked = {name: np.stack(values) for name, values in pieces.items()}
@@ -331,36 +300,14 @@ def _step_texts(retrieval: MultiAngleResult) -> str:
     )
 
 
-def _quality(retrieval: MultiAngleResult, carried: Flags, samples: Indices) -> Flags:
-    """Return the quality bits of each value; a missing value has at least one.
-
-    Parameters
-    ----------
-    retrieval : MultiAngleResult
-    carried : (time, altitude) int
-        Bits of the signals.
-    samples : (time, altitude) int
-        Number of beams with a signal.
-    """
-    raised = {field.name: getattr(retrieval.flags, field.name) for field in fields(retrieval.flags)}
-    raised["extrapolated"] = raised["extrapolated"] & ~raised["no_data"]
-    bits = carried & np.int32(CARE)
-    for name, bit in QUALITY_OF_FLAG.items():
-        bits |= np.where(raised[name], np.int32(bit), np.int32(0))
-    # Values missing at single altitudes take their reasons from the signals, below.
-    empty = (retrieval.quality & np.int32(Quality.INPUT_MISSING)).all(axis=-1, keepdims=True)
-    bits |= np.where(empty, np.int32(Quality.INPUT_MISSING), np.int32(0))
+def _quality(retrieval: MultiAngleResult) -> Flags:
+    """Return the bits of values, also of those without residual, below zero, or behind a gap."""
+    bits = retrieval.quality.copy()
     untested = np.isfinite(retrieval.optical_depth) & ~np.isfinite(retrieval.reduced_chi_square)
-    untested &= ~raised["interpolated"]
+    untested &= ~retrieval.raised(MultiAngleQuality.INTERPOLATED)
     bits |= np.where(untested, np.int32(MultiAngleQuality.NO_RESIDUAL), np.int32(0))
     unflagged = (bits & ~np.int32(CARE)) == 0
-    lost = ~np.isfinite(retrieval.optical_depth) & unflagged
-    reasons = np.where(
-        samples > 1, np.int32(MultiAngleQuality.NO_LEVERAGE), carried & np.int32(WITHHELD)
-    )
-    reasons = np.where(reasons == 0, np.int32(MultiAngleQuality.NO_LEVERAGE), reasons)
-    bits |= np.where(lost, reasons, np.int32(0))
-    negative = np.zeros(lost.shape, dtype=np.bool_)
+    negative = np.zeros(bits.shape, dtype=np.bool_)
     for name in ("optical_depth", "extinction"):
         error = getattr(retrieval, f"{name}_standard_error")
         negative |= getattr(retrieval, name) < -THRESHOLDS.negative * error
@@ -368,12 +315,9 @@ def _quality(retrieval: MultiAngleResult, carried: Flags, samples: Indices) -> F
     negative |= _below_others(depth, error, (bits == 0) & ~negative)
     bits |= np.where(negative, np.int32(MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH), np.int32(0))
     # The layer that ends at a valid altitude may begin in a gap.
-    gapped = np.zeros(lost.shape, dtype=bool)
-    for name in _PER_ALTITUDE:
-        gapped |= ~np.isfinite(getattr(retrieval, name))
-    return bits | np.where(
-        gapped & unflagged & ~lost, np.int32(MultiAngleQuality.INTERPOLATED), np.int32(0)
-    )
+    missing = [~np.isfinite(getattr(retrieval, name)) for name in _PER_ALTITUDE]
+    gapped = np.any(missing, axis=0) & unflagged
+    return bits | np.where(gapped, np.int32(MultiAngleQuality.INTERPOLATED), np.int32(0))
 
 
 def _below_others(depth: Array, error: Array, good: Booleans) -> Booleans:

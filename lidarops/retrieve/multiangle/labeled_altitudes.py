@@ -18,6 +18,7 @@ from lidarops.retrieve.common.arrays import Array, Block, Flags, Indices, Intege
 from lidarops.retrieve.multiangle import scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._cell_means import at_centres, average_over_cells
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, obstruction_range
+from lidarops.retrieve.multiangle.flags import CARE
 from lidarops.retrieve.signal.averaging import RunningMean
 from lidarops.retrieve.signal.labeled import (
     BASELINE_ERROR,
@@ -26,8 +27,6 @@ from lidarops.retrieve.signal.labeled import (
     dead_time_change,
 )
 
-CARE: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
-"""Bits that a bin passes on to every result that uses it."""
 _CUBE: Final = ("time", "beam", "altitude")
 _DIMENSIONS: Final = {
     "signal": _CUBE,

@@ -10,28 +10,22 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.arrays import Array, Flags, Indices
 from lidarops.retrieve.multiangle import _methods, slant_paths
-from lidarops.retrieve.multiangle._methods import (
-    BlockSettings,
-    MultiAngleFlags,
-    MultiAngleResult,
-    StepRecord,
-)
-from lidarops.retrieve.multiangle.flags import REJECTING, MultiAngleQuality
+from lidarops.retrieve.multiangle._methods import BlockSettings, MultiAngleResult, StepRecord
+from lidarops.retrieve.multiangle.flags import CARE, MultiAngleQuality
 
 LARGEST_GRADIENT: Final = 5e-5
 """m-1, default horizontal gradient of ln backscatter covered by the gradient errors."""
 
 __all__ = [
     "LARGEST_GRADIENT",
-    "MultiAngleFlags",
     "MultiAngleMethod",
     "MultiAngleResult",
     "StepRecord",
-    "layer_bounds",
+    "layer_levels",
     "retrieve_optical_depth",
 ]
 
@@ -73,6 +67,7 @@ def retrieve_optical_depth(
     layers: Sequence[tuple[float, float]] = (),
     regularisation: float | None = None,
     dead_time_change: npt.ArrayLike | None = None,
+    signal_quality: Flags | None = None,
 ) -> MultiAngleResult:
     """Retrieve optical depth and extinction from signals at several zenith angles.
 
@@ -81,14 +76,14 @@ def retrieve_optical_depth(
 
     Parameters
     ----------
-    signal : (..., angle, altitude) float
+    signal : (profile, angle, altitude) float
         Range-corrected, without background, in any unit, of altitude cells (see
         `lidarops.retrieve.multiangle._cell_means`), from full overlap upwards; NaN where missing.
     zenith_angle : (angle,) float
         degree, -90 to 90; a beam with a negative angle points opposite to its azimuth.
     altitude : (altitude,) float
         m, ascending, above `station_altitude`; uniform for "joint".
-    variance : (..., angle, altitude) float
+    variance : (profile, angle, altitude) float
         Variance of the noise alone, in the square of the unit of the signal, broadcast against it.
         For counts, give that of a smoothed rate (`lidarops.retrieve.signal.counts_to_signal`):
         variances from single counts make intervals too narrow.
@@ -112,9 +107,12 @@ def retrieve_optical_depth(
         Strength of the penalty of "mld" and "mld_prior", dimensionless, for slant paths scaled to a
         span of 1; by default the largest with residuals not larger than the noise, at each
         altitude.
-    dead_time_change : (..., angle, altitude) float, optional
+    dead_time_change : (profile, angle, altitude) float, optional
         Change of the signal with one standard error of the dead time, in all beams together, which
         looks like a horizontal gradient near the lidar; NaN where there is no signal.
+    signal_quality : (profile, altitude) int, optional
+        Bits of the signals of all beams, which tell why values are missing; by default
+        INPUT_MISSING where no beam has a signal and its variance.
 
     Returns
     -------
@@ -132,7 +130,13 @@ def retrieve_optical_depth(
     chosen = inputs.choice(method, MultiAngleMethod, "method")
     height = slant_paths.altitude_grid(altitude, station_altitude)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
-    rows, noise, leading = _cube(signal, variance, scan.path.shape)
+    rows = _cube(signal, "signal", scan.path.shape)
+    noise = inputs.real_array(variance, "variance")
+    if np.any(noise < 0):
+        raise RetrievalInputError(
+            "is negative", field="variance", remedy="give squares of the signal's unit"
+        )
+    noise = _cube(inputs.broadcast(noise, rows.shape, "variance"), "variance", rows.shape)
     settings = BlockSettings(
         chosen.value,
         height,
@@ -141,31 +145,21 @@ def retrieve_optical_depth(
         _positive(inhomogeneity, "inhomogeneity"),
         _positive(largest_gradient, "largest_gradient") or 0.0,
         robust,
-        _layers(layers, np.append(height, 0.0) + station_altitude),
+        layer_levels(layers, altitude, station_altitude=station_altitude)[0],
         _regularisation(regularisation, chosen),
     )
-    change: Array | None = None
+    change = None
     if dead_time_change is not None:
-        change = np.nan_to_num(
-            inputs.real_array(dead_time_change, "dead_time_change").astype(np.float64)
-        )
-        if change.shape != leading + scan.path.shape:
-            raise RetrievalInputError(
-                f"has the shape {change.shape}",
-                field="dead_time_change",
-                remedy="give that of the signal",
-            )
-        change = change.reshape(rows.shape)
+        change = np.nan_to_num(_cube(dead_time_change, "dead_time_change", rows.shape))
     result = _methods.solve_cycles(rows, noise, change, settings)
-    observed = np.asarray((np.isfinite(rows) & np.isfinite(noise)).any(axis=1))
-    result.quality[:] = _quality(result, observed)
-    return result.with_leading_axes(leading)
+    _with_reasons(result, rows, noise, signal_quality)
+    return result
 
 
-def layer_bounds(
+def layer_levels(
     layers: Sequence[tuple[float, float]], altitude: npt.ArrayLike, *, station_altitude: float
-) -> Array:
-    """Return the bounds of layers as `retrieve_optical_depth` moves them.
+) -> tuple[Indices, Array]:
+    """Return the levels at bottom and top of layers, as `retrieve_optical_depth` moves them.
 
     Parameters
     ----------
@@ -178,8 +172,10 @@ def layer_bounds(
 
     Returns
     -------
-    (layer, 2) float
-        m, moved to the nearest of the altitudes and the station.
+    levels : (layer, 2) int
+        0 for the station, k + 1 for the altitude k.
+    bounds : (layer, 2) float
+        m, their altitudes.
 
     Raises
     ------
@@ -187,62 +183,42 @@ def layer_bounds(
         For layers that contain no altitude of the grid, or extend beyond it.
     """
     height = slant_paths.altitude_grid(altitude, station_altitude)
-    levels = np.append(height, 0.0) + station_altitude
-    return levels[np.array(_layers(layers, levels), dtype=np.int64).reshape(-1, 2)]
-
-
-def _cube(
-    signal: npt.ArrayLike, variance: npt.ArrayLike, shape: tuple[int, ...]
-) -> tuple[Array, Array, tuple[int, ...]]:
-    """Return signal and variance as (profile, angle, altitude), and the leading axes.
-
-    Compiled functions have one version, for writable float64 in C order.
-    """
-    array = inputs.real_array(signal, "signal")
-    if array.ndim < 2 or array.shape[-2:] != shape:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}, with {shape[0]} angles and {shape[1]} altitudes",
-            field="signal",
-            remedy="give (..., angle, altitude)",
-        )
-    leading = array.shape[:-2]
-    count = int(np.prod(leading, dtype=np.int64))
-    noise = inputs.real_array(variance, "variance")
-    if np.any(noise < 0):
-        raise RetrievalInputError(
-            "is negative", field="variance", remedy="give squares of the signal's unit"
-        )
-    spread = inputs.broadcast(noise, array.shape, "variance")
-    cubes = (np.require(cube, np.float64, ["C", "W"]) for cube in (array, spread))
-    rows, variances = (np.asarray(cube).reshape(count, *shape) for cube in cubes)
-    return rows, variances, leading
-
-
-def _layers(layers: Sequence[tuple[float, float]], levels: Array) -> tuple[tuple[int, int], ...]:
-    """Return the altitudes nearest to the bounds of layers, -1 for the station."""
+    grid = np.append(0.0, height) + station_altitude
     try:
-        bounds = np.asarray(layers, dtype=np.float64)
+        wanted = np.asarray(layers, dtype=np.float64).reshape(len(layers), 2)
     except (TypeError, ValueError):
-        bounds = np.empty(0)
-    if len(layers) and (bounds.shape != (len(layers), 2) or not np.all(np.isfinite(bounds))):
+        wanted = np.full((len(layers), 2), np.nan)
+    if not np.all(np.isfinite(wanted)):
         raise RetrievalInputError(
             f"is {layers!r}", field="layers", remedy="give pairs (bottom, top) in m"
         )
-    indices = []
-    order = np.sort(levels)
-    for bottom, top in bounds:
-        low, high = (int(np.argmin(np.abs(levels - level))) for level in (bottom, top))
-        slack = 0.5 * np.max(np.diff(order), initial=0.0)
-        if max(abs(levels[low] - bottom), abs(levels[high] - top)) > slack or (
-            levels[low] >= levels[high]
-        ):
-            raise RetrievalInputError(
-                f"[{bottom:g}, {top:g}] m contains no altitude of the grid, or extends beyond it",
-                field="layers",
-                remedy=f"give bounds from {order[0]:g} to {order[-1]:g} m, bottom first",
-            )
-        indices.append((-1 if low == levels.size - 1 else low, high))
-    return tuple(indices)
+    levels = np.abs(grid - wanted[..., np.newaxis]).argmin(axis=-1)
+    bounds = grid[levels]
+    off = np.abs(bounds - wanted).max(axis=1) > 0.5 * np.max(np.diff(grid))
+    bad = np.flatnonzero(off | (levels[:, 0] >= levels[:, 1]))
+    if bad.size:
+        bottom, top = wanted[bad[0]]
+        raise RetrievalInputError(
+            f"[{bottom:g}, {top:g}] m contains no altitude of the grid, or extends beyond it",
+            field="layers",
+            remedy=f"give bounds from {grid[0]:g} to {grid[-1]:g} m, bottom first",
+        )
+    return levels, bounds
+
+
+def _cube(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
+    """Return values as (profile, angle, altitude).
+
+    Compiled functions have one version, for writable float64 in C order.
+    """
+    array = inputs.real_array(values, name)
+    if array.ndim != 3 or array.shape[-len(shape) :] != shape:
+        raise RetrievalInputError(
+            f"has the shape {array.shape}, with {shape[-2]} angles and {shape[-1]} altitudes",
+            field=name,
+            remedy="give (profile, angle, altitude)",
+        )
+    return np.require(array, np.float64, ["C", "W"])
 
 
 def _positive(value: float | None, name: str) -> float | None:
@@ -261,21 +237,15 @@ def _regularisation(strength: float | None, method: MultiAngleMethod) -> float |
     return _positive(strength, "regularisation")
 
 
-def _quality(profiles: MultiAngleResult, observed: Booleans) -> npt.NDArray[np.int32]:
-    """Return the common quality bits; each missing optical depth has a rejecting bit.
-
-    Parameters
-    ----------
-    profiles : MultiAngleResult
-    observed : (profile, altitude) bool
-        Whether any angle has a signal and its variance.
-    """
-    quality = np.zeros(profiles.optical_depth.shape, dtype=np.int32)
-    quality[~observed.any(axis=1)] |= np.int32(Quality.INPUT_MISSING)
-    lost = profiles.flags.extrapolated & ~profiles.flags.no_data
-    quality[lost] |= np.int32(Quality.LOW_SIGNAL)
-    quality[profiles.flags.outlier] |= np.int32(Quality.OUTLIER)
-    unexplained = np.isnan(profiles.optical_depth) & (quality & REJECTING == 0)
-    quality[unexplained & ~observed] |= np.int32(Quality.INPUT_MISSING)
-    quality[unexplained & observed] |= np.int32(MultiAngleQuality.NO_LEVERAGE)
-    return quality
+def _with_reasons(
+    result: MultiAngleResult, signal: Array, variance: Array, carried: Flags | None
+) -> None:
+    """Raise the bits of the signals and the reasons for missing values, in place."""
+    samples = np.sum(np.isfinite(signal) & np.isfinite(variance), axis=1)
+    if carried is None:
+        carried = np.where(samples > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
+    result.mark(Quality.INPUT_MISSING, ~np.any(samples, axis=1, keepdims=True))
+    lost = ~np.isfinite(result.optical_depth) & (result.quality == 0)
+    reasons = carried & np.int32(WITHHELD)
+    reasons[(samples > 1) | (reasons == 0)] = np.int32(MultiAngleQuality.NO_LEVERAGE)
+    result.quality[:] |= carried & np.int32(CARE) | np.where(lost, reasons, np.int32(0))

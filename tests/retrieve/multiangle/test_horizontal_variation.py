@@ -17,6 +17,7 @@ from support.oracles.multiangle import (
 
 from lidarops.retrieve.multiangle import _block
 from lidarops.retrieve.multiangle._horizontal_variation import path_variation_from
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -72,7 +73,8 @@ def test_an_error_common_to_all_profiles_leaves_the_lower_altitudes_alone():
     slant = scene.path[:, np.newaxis] * scene.altitude
     dim = scan.signal.mean(axis=0)[-1, -1] / slant[-1, -1] ** 2
     offset = 0.3 * dim * np.random.default_rng(3).normal(size=(12, 1)) * slant**2
-    flagged = replace(scan, signal=scan.signal + offset).retrieve().flags.poor_stratification
+    result = replace(scan, signal=scan.signal + offset).retrieve()
+    flagged = result.raised(MultiAngleQuality.POOR_STRATIFICATION)
     assert not flagged[:, :60].any()
     assert flagged[:, 70:].all()
 
@@ -89,7 +91,7 @@ def test_extinction_is_withheld_whatever_the_method():
     scan = replace(cloud_scene(0.8), variation=1.0).draw(16, 4)
     for method in ("two_angle", "kano_hamilton", "joint", "mld"):
         result = scan.retrieve(method)
-        assert result.flags.poor_stratification.all()
+        assert result.raised(MultiAngleQuality.POOR_STRATIFICATION).all()
         assert np.isfinite(result.optical_depth).any()
         assert np.isnan(result.extinction).all()
         assert np.isnan(result.extinction_standard_error).all()
@@ -126,7 +128,7 @@ def test_noise_is_no_variation_where_the_given_scatter_is_too_large(scatter):
         variance=(noise * clean) ** 2,
         inhomogeneity=0.05,
     )
-    assert not result.flags.poor_stratification.any()
+    assert not result.raised(MultiAngleQuality.POOR_STRATIFICATION).any()
     assert np.isfinite(result.extinction).any()
 
 
@@ -139,4 +141,4 @@ def test_signals_without_any_scatter_are_no_variation():
         variance=np.full((6, scene.zenith_angle.size, 49), 1e-6),
         inhomogeneity=0.05,
     )
-    assert not result.flags.poor_stratification.any()
+    assert not result.raised(MultiAngleQuality.POOR_STRATIFICATION).any()

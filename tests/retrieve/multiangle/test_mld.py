@@ -10,6 +10,7 @@ from support.oracles.multiangle import PER_KM, rms
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle import mld
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 LAYERS = np.array([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0]) * PER_KM
@@ -128,8 +129,8 @@ def test_published_claim_is_not_reproduced_at_15_degrees():
     assert error[:, -1].mean() == pytest.approx(-2.31, abs=0.1)
     assert np.median(result.data_share) == pytest.approx(0.23, abs=0.06)
     assert result.effective_degrees_of_freedom.mean() / 8 == pytest.approx(0.60, abs=0.06)
-    assert result.flags.prior_dominated.mean() > 0.95
-    assert np.all(np.isnan(result.extinction[result.flags.prior_dominated]))
+    assert result.raised(MultiAngleQuality.PRIOR_DOMINATED).mean() > 0.95
+    assert np.all(np.isnan(result.extinction[result.raised(MultiAngleQuality.PRIOR_DOMINATED)]))
     regression = retrieve(signal, angles, "kano_hamilton")
     assert rms(regression.optical_depth - TAU) == pytest.approx(2.38, abs=0.05)
     # Two angles at 30 degrees with 10 percent of noise do better.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidarops.retrieve.multiangle import optical_depth
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 from lidarops.retrieve.multiangle.slant_paths import slant_path
 
@@ -72,7 +73,8 @@ def one_sided(
 
 def rejected(result: MultiAngleResult) -> float:
     """Return the share of optical depths that `poor_stratification` rejects."""
-    return float(result.flags.poor_stratification[np.isfinite(result.optical_depth)].mean())
+    poor = result.raised(MultiAngleQuality.POOR_STRATIFICATION)
+    return float(poor[np.isfinite(result.optical_depth)].mean())
 
 
 def test_level_air_shows_no_gradient():

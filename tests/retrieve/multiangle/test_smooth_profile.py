@@ -77,10 +77,10 @@ def test_smoothing_after_kano_hamilton_equals_one_joint_fit():
     depth = -0.5 * (weight * centred * y).sum(axis=0) / square
     altitude = 100.0 + 30.0 * np.arange(altitudes)
     result = smooth_optical_depth(depth[None], 4.0 * square[None], altitude)
-    shares = result.fit.candidates.share
+    shares = result.fit.smoothing.share
     stiffness = dense(_smoothing.penalty(altitude))
     together = np.zeros(altitudes)
-    for lam, share in zip(result.fit.candidates.smoothing, shares, strict=True):
+    for lam, share in zip(result.fit.smoothing.weight, shares, strict=True):
         normal = np.zeros((2 * altitudes, 2 * altitudes))
         normal[:altitudes, :altitudes] = np.diag(total)
         cross = -2.0 * (weight * x[:, None]).sum(axis=0)

@@ -14,7 +14,6 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled import QUALITY_OF_FLAG
 from support.stiff.cases import (
     Accepted,
     Answer,
@@ -36,9 +35,6 @@ _case = partial(StiffCase, retrieval=Retrieval.MULTIANGLE)
 def _solve_scan(altitudes: slice = slice(None), **arguments: Any) -> Answer:
     """Return some altitudes of the solution; its standard errors include the gradient error."""
     result = optical_depth.retrieve_optical_depth(**arguments)
-    bits = np.asarray(result.quality).copy()
-    for name, bit in QUALITY_OF_FLAG.items():
-        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
     values = {
         "optical_depth": result.optical_depth,
         "optical_depth_standard_error": np.hypot(
@@ -52,7 +48,7 @@ def _solve_scan(altitudes: slice = slice(None), **arguments: Any) -> Answer:
     }
     selected = {name: value[..., altitudes] for name, value in values.items()}
     top = np.asarray(result.optical_depth_standard_error)[..., -1]
-    return Answer(selected | {"random error at the top": top}, bits[..., altitudes])
+    return Answer(selected | {"random error at the top": top}, result.quality[:, altitudes])
 
 
 @cache
@@ -134,7 +130,9 @@ def _blocks_of_constant() -> Answer:
     ]
     return Answer({
         "optical depth at the top": np.stack([result.optical_depth[:, -1] for result in results]),
-        "share doubted": np.mean([result.flags.prior_dominated.any() for result in results]),
+        "share doubted": np.mean([
+            result.raised(MultiAngleQuality.PRIOR_DOMINATED).any() for result in results
+        ]),
     })  # fmt: skip
 
 
