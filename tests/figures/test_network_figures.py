@@ -14,7 +14,7 @@ from lidarops.errors import ProductError
 from lidarops.figures.panels import Curve, Words
 from lidarops.figures.series_data import compare, join
 from lidarops.flags import Quality
-from lidarops.products.visibility.figure_data import instruments_of, read_crossings, read_map
+from lidarops.products.visibility.figures import instruments_of, read_crossings, read_map
 from lidarops.products.visibility.retrieval import NetworkSettings
 from lidarops.records import LeftOut, Plan, PlannedStep, SceneOutcome
 

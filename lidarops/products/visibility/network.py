@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
+from lidarops.campaign.model import Campaign, InstrumentFacts, Station, channel_facts
 from lidarops.products.visibility.settings import VisibilityProductSettings
 from lidarops.records import ChannelLayout, Granule, Scene
 from lidarops.retrieve.network import geometry
@@ -122,23 +122,6 @@ class MemberCase:
             )
 
 
-def _beams_of(
-    beams: Sequence[BeamPlan], scene: Scene, campaign: Campaign
-) -> tuple[geometry.Beam, ...]:
-    """Return the position and direction of the beams."""
-    stations = {member.instrument: campaign.stations[member.station] for member in scene.members}
-    return tuple(
-        geometry.Beam(
-            latitude=stations[beam.instrument].latitude,
-            longitude=stations[beam.instrument].longitude,
-            altitude=stations[beam.instrument].altitude,
-            azimuth=beam.azimuth,
-            elevation=90.0 - beam.zenith_angle,
-        )
-        for beam in beams
-    )
-
-
 def _granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
     """Return zenith angle and azimuth of a granule; facts of the campaign override headers."""
     zenith = granule.zenith_angle if facts.zenith_angle is None else facts.zenith_angle
@@ -163,15 +146,26 @@ def angle_between(pointing: tuple[float, float], other: tuple[float, float]) -> 
 
 def crossings(
     beams: Sequence[BeamPlan],
-    scene: Scene,
-    campaign: Campaign,
-    settings: VisibilityProductSettings,
+    stations: Mapping[str, Station],
+    *,
+    tolerance: float,
+    smallest_angle: float,
 ) -> geometry.Network:
-    """Return the crossings of beams; see `lidarops.retrieve.network.geometry.build_network`."""
+    """Return the crossings of beams of instruments at stations; see `geometry.build_network`."""
+    places = [stations[beam.instrument] for beam in beams]
     return geometry.build_network(
-        _beams_of(beams, scene, campaign),
-        tolerance=settings.tolerance,
+        [
+            geometry.Beam(
+                place.latitude,
+                place.longitude,
+                place.altitude,
+                beam.azimuth,
+                90.0 - beam.zenith_angle,
+            )
+            for place, beam in zip(places, beams, strict=True)
+        ],
+        tolerance=tolerance,
         nearest=[beam.nearest for beam in beams],
         farthest=[beam.farthest for beam in beams],
-        smallest_angle=settings.smallest_angle,
+        smallest_angle=smallest_angle,
     )

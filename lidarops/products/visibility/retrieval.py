@@ -169,6 +169,10 @@ class _NetworkPlan:
         self._members = [
             MemberCase(member, case.campaign, case.request) for member in case.scene.members
         ]
+        self._stations = {
+            member.instrument: case.campaign.stations[member.station]
+            for member in case.scene.members
+        }
 
     def entries(self) -> Entries:
         """Yield the entries of the members that take part, then those of the whole network."""
@@ -193,7 +197,9 @@ class _NetworkPlan:
         if reason is None:
             kept = beams
             yield from self._without_lonely_beams(kept)
-            reason = self._why_no_crossing(kept)
+            if not kept:
+                why = "no beam has two crossings with other beams, between which it is attenuated"
+                reason = self._joint_case.leave(NAME, why, number=0.0, rule="some_meet")
         if reason is not None:
             yield reason
             return
@@ -249,7 +255,13 @@ class _NetworkPlan:
         return None
 
     def _crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
-        return crossings(beams, self._scene, self._campaign, self._settings)
+        settings = self._settings
+        return crossings(
+            beams,
+            self._stations,
+            tolerance=settings.tolerance,
+            smallest_angle=settings.smallest_angle,
+        )
 
     def _without_lonely_beams(self, beams: list[BeamPlan]) -> Entries:
         """Take out beams with fewer than two crossings, until all remaining beams have two."""
@@ -264,13 +276,6 @@ class _NetworkPlan:
                 beams.remove(beam)
             if not lonely:
                 return
-
-    def _why_no_crossing(self, beams: Sequence[BeamPlan]) -> Entry | None:
-        """Return why the remaining beams form no network."""
-        if not beams:
-            reason = "no beam has two crossings with other beams, between which it is attenuated"
-            return self._joint_case.leave(NAME, reason, number=0.0, rule="some_meet")
-        return None
 
     def _joint(self, beams: Sequence[BeamPlan], wavelength: float) -> Entries:
         """Yield the read windows of the instruments, and the steps of the whole network."""
@@ -336,10 +341,15 @@ class _NetworkStream(NetworkStream):
     def result(self) -> xr.Dataset:
         """Return the variables of the product."""
         settings = self._settings
-        signals = [beam.signals() for beam in self._beams]
+        stations = {beam.member.instrument: beam.member.station for beam in self._beams}
         retrieved = labeled.retrieve_network(
-            signals,
-            self._network(signals),
+            [beam.signals() for beam in self._beams],
+            crossings(
+                settings.beams,
+                stations,
+                tolerance=settings.tolerance,
+                smallest_angle=settings.smallest_angle,
+            ),
             labeled.NetworkSettings(
                 block_intervals=round(settings.block_seconds / self._seconds),
                 visibility=settings.definition,
@@ -354,21 +364,6 @@ class _NetworkStream(NetworkStream):
         if settings.multiplier is not None:
             method = "triangles"
         return retrieved.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
-
-    def _network(self, signals: Sequence[BeamAverages]) -> geometry.Network:
-        settings = self._settings
-        return geometry.build_network(
-            [
-                geometry.Beam(
-                    *beam.station, azimuth=beam.azimuth, elevation=90.0 - beam.zenith_angle
-                )
-                for beam in signals
-            ],
-            tolerance=settings.tolerance,
-            nearest=[beam.nearest for beam in settings.beams],
-            farthest=[beam.farthest for beam in settings.beams],
-            smallest_angle=settings.smallest_angle,
-        )
 
 
 class _Beam:
