@@ -11,9 +11,12 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
-from lidarops.retrieve.network import _condensed_signals, _fit_layout
-from lidarops.retrieve.network._condensed_signals import NOT_POSITIVE, CondensedSignals
-from lidarops.retrieve.network._fit_layout import FitLayout
+from lidarops.retrieve.network import _condensed_signals
+from lidarops.retrieve.network._condensed_signals import (
+    NOT_POSITIVE,
+    CondensedSignals,
+    FitLayout,
+)
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -52,15 +55,31 @@ def prepare_signals(
     bins: int,
 ) -> BeamSignals:
     """Validate and condense signals. Arguments are those of `extinction_field.retrieve_network`."""
-    ranges, descending = _grids(range_, network.beams)
-    signal, leading = _signal(power, ranges, descending=descending)
-    nearest, overlap_function = _overlap(overlap, full_overlap_range, ranges, descending=descending)
+    ranges = _ranges(range_, network.beams)
+    signal = inputs.real_array(power, "power").astype(np.float64, copy=False)
+    if signal.ndim < 2 or signal.shape[-2:] != ranges.shape:
+        raise RetrievalInputError(
+            f"has the shape {signal.shape}",
+            field="power",
+            remedy=f"its last two axes are beam and range, here {ranges.shape}",
+        )
+    leading = signal.shape[:-2]
+    variances = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
+    if np.any(variances < 0):
+        raise RetrievalInputError(
+            "is negative", field="variance", remedy="give squares of the power's unit"
+        )
+    variances = inputs.broadcast(variances, signal.shape, "variance")
+    signal, variances = (
+        np.ascontiguousarray(values.reshape(-1, *ranges.shape)) for values in (signal, variances)
+    )
+    block = _blocks(blocks, leading)
+    nearest, overlap_function = _overlap(overlap, full_overlap_range, ranges)
     if not (isinstance(bins, int | np.integer) and 3 <= bins <= 99):
         raise RetrievalInputError(f"is {bins}", field="bins", remedy="choose 3 to 99")
-    exponents = _exponents(exponent, network.beams)
-    layout = _fit_layout.lay_out_fits(network, ranges, overlap_function, nearest, int(bins))
-    block = _blocks(blocks, leading)
-    variances = _variances(variance, leading, signal.shape, descending=descending)
+    exponents = _per_beam(exponent, network.beams, "exponent", *THRESHOLDS.exponents)
+    layout = _condensed_signals.lay_out_fits(network, ranges, overlap_function, nearest, int(bins))
+    signal = np.where(np.isnan(ranges), np.nan, signal)
     data = _condensed_signals.condense(signal, variances, exponents, layout)
     with np.errstate(all="ignore"):
         weak, negative = _weak_passages(signal, variances, layout, block)
@@ -70,12 +89,11 @@ def prepare_signals(
     return BeamSignals(layout, exponents, data, block, weak, leading)
 
 
-def _grids(values: npt.ArrayLike, beams: int) -> tuple[Array, bool]:
-    """Return (beam, bin) ascending ranges, and whether they were descending."""
+def _ranges(values: npt.ArrayLike, beams: int) -> Array:
+    """Return (beam, bin) ascending ranges; NaN after the last bin of a beam."""
     array = inputs.real_array(values, "range").astype(np.float64)
     if array.ndim == 1:
-        grid = inputs.range_grid(array)
-        return np.tile(grid.values, (beams, 1)), grid.descending
+        array = np.tile(array, (beams, 1))
     if array.ndim != 2 or array.shape[0] != beams:
         raise RetrievalInputError(
             f"has the shape {array.shape}",
@@ -92,29 +110,11 @@ def _grids(values: npt.ArrayLike, beams: int) -> tuple[Array, bool]:
             )
         if inputs.range_grid(row[known]).descending:
             raise RetrievalInputError("descends", field="range", remedy="reverse range and power")
-    return np.ascontiguousarray(array), False
-
-
-def _signal(
-    power: npt.ArrayLike, grid: Array, *, descending: bool
-) -> tuple[Array, tuple[int, ...]]:
-    """Return (profile, beam, bin) power over ascending ranges, and the shape of its other axes."""
-    array = inputs.real_array(power, "power").astype(np.float64, copy=False)
-    if array.ndim < 2 or array.shape[-2:] != grid.shape:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}",
-            field="power",
-            remedy=f"its last two axes are beam and range, here {grid.shape}",
-        )
-    leading = array.shape[:-2]
-    profiles = array[..., ::-1] if descending else array
-    count = int(np.prod(leading, dtype=np.int64))
-    profiles = np.ascontiguousarray(profiles.reshape(count, *grid.shape))
-    return np.where(np.isnan(grid), np.nan, profiles), leading
+    return np.ascontiguousarray(array)
 
 
 def _overlap(
-    overlap: npt.ArrayLike | None, nearest: npt.ArrayLike | None, grid: Array, *, descending: bool
+    overlap: npt.ArrayLike | None, nearest: npt.ArrayLike | None, ranges: Array
 ) -> tuple[Array, Array | None]:
     """Return the nearest usable range of each beam, and the overlap function if there is one."""
     if overlap is None and nearest is None:
@@ -124,75 +124,40 @@ def _overlap(
             remedy="give one of them: an error of 1 percent in the overlap at the first crossing"
             " changes extinction there by 5 percent",
         )
-    limits = inputs.real_array(0.0 if nearest is None else nearest, "full_overlap_range")
-    if limits.shape not in {(), (grid.shape[0],)} or not np.all(limits >= 0):
-        raise RetrievalInputError(
-            "is negative, NaN or of a wrong shape",
-            field="full_overlap_range",
-            remedy="give one range in m, or one per beam",
-        )
-    first = np.broadcast_to(limits, grid.shape[:1]).astype(np.float64)
+    limits = 0.0 if nearest is None else nearest
+    first = _per_beam(limits, len(ranges), "full_overlap_range", 0.0, np.inf)
     if overlap is None:
         return first, None
     array = inputs.real_array(overlap, "overlap").astype(np.float64)
-    if array.shape not in {grid.shape, grid.shape[1:]}:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}", field="overlap", remedy=f"give {grid.shape}"
-        )
     if np.any(array < 0) or np.any(array > 1.5):
         raise RetrievalInputError(
             "is not between 0 and 1.5", field="overlap", remedy="give 1 for full overlap"
         )
-    return first, np.broadcast_to(array[..., ::-1] if descending else array, grid.shape)
+    return first, inputs.broadcast(array, ranges.shape, "overlap")
 
 
-def _exponents(exponent: npt.ArrayLike, beams: int) -> Array:
-    array = inputs.real_array(exponent, "exponent").astype(np.float64)
-    low, high = THRESHOLDS.exponents
+def _per_beam(values: npt.ArrayLike, beams: int, name: str, low: float, high: float) -> Array:
+    """Return one value per beam, which lie within limits."""
+    array = inputs.real_array(values, name).astype(np.float64)
     if array.shape not in {(), (beams,)} or not np.all((array >= low) & (array <= high)):
         raise RetrievalInputError(
             f"is not from {low:g} to {high:g}, or of a wrong shape",
-            field="exponent",
-            remedy=f"give m of backscatter ~ extinction^(1/m): one, or one per beam ({beams})",
+            field=name,
+            remedy=f"give one value, or one per beam ({beams})",
         )
     return np.broadcast_to(array, (beams,)).copy()
 
 
 def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
     """Return (profile,) block numbers."""
-    count = int(np.prod(leading, dtype=np.int64))
-    if blocks is None:
-        return np.zeros(count, dtype=np.intp)
-    labels = np.asarray(blocks)
-    if labels.shape != leading or labels.dtype.kind not in "iuUS":
+    labels = np.zeros(leading, dtype=np.intp) if blocks is None else np.asarray(blocks)
+    if labels.shape != leading or labels.dtype.kind not in "iu":
         raise RetrievalInputError(
             f"has the shape {labels.shape} of {labels.dtype}",
             field="blocks",
-            remedy=f"give one whole number or name per profile, {leading}",
+            remedy=f"give one whole number per profile, {leading}",
         )
-    _, inverse = np.unique(labels.reshape(count), return_inverse=True)
-    return inverse.reshape(count).astype(np.intp)
-
-
-def _variances(
-    variance: npt.ArrayLike, leading: tuple[int, ...], shape: tuple[int, ...], *, descending: bool
-) -> Array:
-    array = inputs.real_array(variance, "variance").astype(np.float64, copy=False)
-    if np.any(array < 0):
-        raise RetrievalInputError(
-            "is negative", field="variance", remedy="give squares of the power's unit"
-        )
-    if descending and array.ndim > 0:
-        array = array[..., ::-1]
-    try:
-        full = np.broadcast_to(array, (*leading, *shape[1:]))
-    except ValueError:
-        raise RetrievalInputError(
-            f"has the shape {array.shape}",
-            field="variance",
-            remedy=f"give (..., beam, range), here (..., {shape[1]}, {shape[2]})",
-        ) from None
-    return full.reshape(shape)
+    return np.unique(labels.ravel(), return_inverse=True)[1].astype(np.intp)
 
 
 def _weak_passages(

@@ -19,8 +19,7 @@ from scipy import special
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network import _joint_solution
-from lidarops.retrieve.network._condensed_signals import CondensedSignals
-from lidarops.retrieve.network._fit_layout import FitLayout
+from lidarops.retrieve.network._condensed_signals import CondensedSignals, FitLayout
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _UNDETERMINED_COST: Final = 1e3

@@ -145,7 +145,7 @@ def retrieve_network(
         Background-subtracted, in any unit. Each lidar has its own constant, which may change
         from profile to profile.
     range : (range,) or (beam, range) float
-        m.
+        m, ascending; NaN after the last bin of a beam.
     network : Network
         From `lidarops.retrieve.network.geometry`, with the same beams as `power`.
     variance : (..., beam, range) float
@@ -157,9 +157,9 @@ def retrieve_network(
         m; nearer bins are not used. Either this or `overlap` is required.
     exponent : float or (beam,) float
         m of backscatter ~ extinction^(1/m) along a beam.
-    blocks : (...) int or str, optional
-        Labels of the profiles that share a prior; by default, all. Results
-        of a block depend on its own profiles only.
+    blocks : (...) int, optional
+        Numbers of the blocks of profiles that share a prior; by default, all. Results of a block
+        depend on its own profiles only.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.
     multiplier : float or (..., crossing) float or "chosen", optional

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network._beam_signals import BeamSignals
-from lidarops.retrieve.network._fit_layout import FitLayout
+from lidarops.retrieve.network._condensed_signals import FitLayout
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 

@@ -20,7 +20,6 @@ from support.oracles.network import (
 from lidarops.retrieve.network import (
     _block_errors,
     _condensed_signals,
-    _fit_layout,
     extinction_field,
 )
 
@@ -63,7 +62,7 @@ def deviations(net, result, field):
 def test_a_curvature_error_is_the_difference_of_a_line_and_the_truth(bins):
     net = triangle()
     r = np.tile(grid(net, 3.0), (net.beams, 1)) + np.array([[0.0], [0.7], [1.9]])
-    layout = _fit_layout.lay_out_fits(net, r, None, np.full(3, 100.0), bins)
+    layout = _condensed_signals.lay_out_fits(net, r, None, np.full(3, 100.0), bins)
     weights = layout.curvature_weights
     rng = np.random.default_rng(4)
     for c, (beam, location) in enumerate(
@@ -84,7 +83,7 @@ def test_the_noise_of_a_curvature_error_is_as_stated():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 3000, additive=0.0)
-    layout = _fit_layout.lay_out_fits(net, np.tile(r, (6, 1)), None, np.full(6, 100.0), 7)
+    layout = _condensed_signals.lay_out_fits(net, np.tile(r, (6, 1)), None, np.full(6, 100.0), 7)
     data = _condensed_signals.condense(
         power, np.broadcast_to(variance, power.shape), np.ones(6), layout
     )

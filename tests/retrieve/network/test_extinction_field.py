@@ -306,7 +306,7 @@ def test_blocks_are_independent():
     net = triangle()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 60)
-    labels = np.repeat(["a", "b", "c"], [20, 10, 30])
+    labels = np.repeat([1, 2, 3], [20, 10, 30])
     settings = {"full_overlap_range": 100.0}
     whole = retrieve_network(power, r, net, variance=variance, blocks=labels, **settings)
     shuffled = np.random.default_rng(0).permutation(60)
@@ -336,9 +336,6 @@ def test_unusual_arrays_are_accepted_and_shapes_kept():
     assert result.flags.flagged.shape == (2, 3, 3)
     assert result.reduced_chi_square.shape == (2, 3)
     assert np.array_equal(result.extinction.reshape(6, 3), expected.extinction, equal_nan=True)
-    reversed_result = retrieve_network(power[..., ::-1], r[::-1], net, variance=variance[..., ::-1],
-                   full_overlap_range=100.0)  # fmt: skip
-    assert np.array_equal(reversed_result.extinction, expected.extinction, equal_nan=True)
     rows = retrieve_network(power, np.tile(r, (3, 1)), net, variance=np.tile(variance, (6, 1, 1)),
                  full_overlap_range=100.0)  # fmt: skip
     assert np.array_equal(rows.extinction, expected.extinction, equal_nan=True)
@@ -551,6 +548,7 @@ def test_invalid_settings_raise_with_the_field_name(settings, field):
         (np.ones(100), np.linspace(100.0, 1200.0, 100), "power"),
         (np.ones((4, 3, 100)), np.linspace(0.1, 1.2, 100), "range"),
         (np.ones((4, 3, 100)), np.ones((2, 100)), "range"),
+        (np.ones((4, 3, 100)), np.linspace(1200.0, 100.0, 100), "range"),
         (np.ones((4, 3, 100)), np.full((3, 100), np.nan), "range"),
         (np.full((4, 3, 100), "x"), np.linspace(100.0, 1200.0, 100), "power"),
     ],

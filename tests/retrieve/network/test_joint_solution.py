@@ -22,7 +22,6 @@ from support.oracles.network import (
 from lidarops.retrieve.network import (
     _condensed_signals,
     _empirical_prior,
-    _fit_layout,
     outlying_bins,
 )
 from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Prior, Problem
@@ -33,7 +32,7 @@ from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
     r = grid(net, step)
-    layout = _fit_layout.lay_out_fits(
+    layout = _condensed_signals.lay_out_fits(
         net, np.tile(r, (net.beams, 1)), None, np.full(net.beams, 100.0), bins
     )
     power = np.atleast_3d(power).reshape(-1, net.beams, r.size)

@@ -18,7 +18,7 @@ from support.oracles.network import (
     triangle,
 )
 
-from lidarops.retrieve.network import _condensed_signals, _fit_layout, outlying_bins
+from lidarops.retrieve.network import _condensed_signals, outlying_bins
 from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -48,7 +48,7 @@ def solved(net, r, power, variance, **settings):
 
 def condensed(net, r, power, variance, *, screened=True, nearest=100.0):
     ranges = np.tile(r, (net.beams, 1))
-    layout = _fit_layout.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
+    layout = _condensed_signals.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
     variances = np.broadcast_to(variance, power.shape)
     patched = nullcontext() if screened else patch.object(outlying_bins, "search")
     with patched:
