@@ -38,9 +38,13 @@ FLAGS: Final = Flags(
 """Published places are in `tests/products/test_flags.py`."""
 
 _LEVELS: Final = ("time", "altitude")
+_OF_PENALTY: Final[dict[str, Any]] = {
+    "coverage": Coverage.AUXILIARY,
+    "bits": VALUE_BITS,
+    "optional": True,
+}
 _POINT: Final = "time: mean altitude: point"
 _MEAN: Final = "time: mean altitude: mean"
-_OF_VALUE: Final = ("data_share", "inhomogeneity", "quality_flag", "beams", "shots")
 
 
 def _direction(name: str, whose: str, **changes: Any) -> Row:
@@ -160,7 +164,19 @@ def _of_planes(row: Row) -> Row:
     )
 
 
+def _of_fit(name: str, long_name: str, comment: str, **changes: Any) -> Row:
+    """Return the row of what tells how a value comes about and how well it is determined."""
+    row = Row(name, _LEVELS, "1", long_name, Coverage.QUALITY, comment, bits=8)
+    return replace(row, **changes)
+
+
 # Noise, and smoothing error that profiles share, are not stated separately.
+_RETRIEVED: Final[dict[str, Any]] = {
+    "ancillaries": ("data_share", "inhomogeneity", "quality_flag", "beams", "shots"),
+    "bits": VALUE_BITS,
+    "uncertain": True,
+    "error_kind": ErrorKind.BOTH,
+}
 _OPTICAL_DEPTH: Final = Row(
     "vertical_optical_depth",
     _LEVELS,
@@ -168,11 +184,8 @@ _OPTICAL_DEPTH: Final = Row(
     "optical depth of molecules and particles from the station to the altitude",
     comment="Along the vertical, at the wavelength of the channel.",
     cell_methods=_POINT,
-    ancillaries=_OF_VALUE,
-    bits=VALUE_BITS,
-    uncertain=True,
     errors=_errors("optical depth"),
-    error_kind=ErrorKind.BOTH,
+    **_RETRIEVED,
 )
 _EXTINCTION: Final = total_extinction(
     _LEVELS,
@@ -180,11 +193,8 @@ _EXTINCTION: Final = total_extinction(
     " is a mean over altitudes, too small in thin layers: within simulated layers of a few"
     f" altitudes, some values differ by more than 4 standard errors. {MEASURED_SHARES}",
     cell_methods=_MEAN,
-    ancillaries=_OF_VALUE,
-    bits=VALUE_BITS,
-    uncertain=True,
     errors=_errors("extinction"),
-    error_kind=ErrorKind.BOTH,
+    **_RETRIEVED,
 )
 
 LAYOUT: Final = Layout(
@@ -243,59 +253,39 @@ LAYOUT: Final = Layout(
             ancillaries=("quality_flag", "beams", "shots"),
             uncertain=True,
         ),
-        Row(
+        _of_fit(
             "data_share",
-            _LEVELS,
-            "1",
             "share of the optical depth that the data determine",
-            Coverage.QUALITY,
             "1 where neither smoothness nor a prior has an effect.",
-            bits=8,
         ),
-        Row(
+        _of_fit(
             "regularisation",
-            _LEVELS,
-            "1",
             "strength of the penalty on the derivative along the slant path",
-            Coverage.AUXILIARY,
             "For slant paths scaled to a span of 1, and residuals scaled to their noise. Given by"
             " the settings, or the largest one whose residuals are not larger than the noise.",
             valid_min=0.0,
-            bits=VALUE_BITS,
-            optional=True,
+            **_OF_PENALTY,
         ),
-        Row(
+        _of_fit(
             "prior_vertical_optical_depth",
-            _LEVELS,
-            "1",
             "optical depth to which the penalty pulls",
-            Coverage.AUXILIARY,
             "0, or that of the altitude below. The share 1 - data_share of the optical depth comes"
             " from it.",
-            bits=VALUE_BITS,
-            optional=True,
+            **_OF_PENALTY,
         ),
-        Row(
+        _of_fit(
             "inhomogeneity",
-            _LEVELS,
-            "1",
             "standard deviation of ln(signal) between beams in excess of noise",
-            Coverage.QUALITY,
             "Inhomogeneity of the air between the beams, common to all cycles of the file.",
             valid_min=0.0,
-            bits=8,
         ),
-        Row(
+        _of_fit(
             "reduced_chi2",
-            _LEVELS,
-            "1",
             "reduced chi-square of the fit over the beams",
-            Coverage.QUALITY,
             "Sum of squared residuals divided by their variances, per degree of freedom. About 1,"
             " because the inhomogeneity is estimated from the residuals; less where the noise is"
             " overstated. Missing where no beam is redundant.",
             valid_min=0.0,
-            bits=8,
             optional=True,
         ),
         replace(
@@ -360,14 +350,11 @@ LAYOUT: Final = Layout(
         ),
         _blocked("zenith_angle"),
         _blocked("azimuth"),
-        Row(
+        _of_fit(
             "residual",
-            ("time", "beam", "altitude"),
-            "1",
             "natural logarithm of the signal of a beam minus the fit over the beams",
-            Coverage.QUALITY,
             "Missing where the beam has no usable signal.",
-            bits=8,
+            dims=("time", "beam", "altitude"),
         ),
         retrieval_method(
             tuple(name for name in get_args(Method) if name != "auto"),
@@ -376,14 +363,13 @@ LAYOUT: Final = Layout(
         ),
         BACKGROUND_METHOD,
         quality(_LEVELS, FLAGS),
-        Row(
+        _of_fit(
             "effective_degrees_of_freedom",
-            ("time",),
-            "1",
             "number of independent values of the profile that the data determine",
-            Coverage.QUALITY,
             "Missing where there is no profile.",
+            dims=("time",),
             valid_min=0.0,
+            bits=None,
         ),
         Row(
             "reach",

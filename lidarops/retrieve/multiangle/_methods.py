@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from enum import StrEnum
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,28 @@ from lidarops.retrieve.multiangle.slant_paths import Scan
 from lidarops.retrieve.multiangle.smooth_profile import smooth_optical_depth
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
-_BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
+
+class MultiAngleMethod(StrEnum):
+    """Method of retrieving optical depths."""
+
+    AUTO = "auto"
+    """`TWO_ANGLE` for two beams, else `JOINT`; `KANO_HAMILTON` where all standard errors of `JOINT`
+    would be too small."""
+    TWO_ANGLE = "two_angle"
+    """Only the shortest and the longest path."""
+    KANO_HAMILTON = "kano_hamilton"
+    """Weighted regression on the slant path, each altitude on its own."""
+    JOINT = "joint"
+    """`KANO_HAMILTON`, then one smooth profile through all altitudes."""
+    MLD = "mld"
+    """Regularised derivative along the slant path, formula 3 of `gobrusenko1989`."""
+    MLD_PRIOR = "mld_prior"
+    """`MLD` applied to the difference from the altitude below, its formula 4."""
+
+
+REGULARISED: Final = frozenset({MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR})
+"""Methods with a penalty, which accept `regularisation`."""
+WITHOUT_GRADIENT: Final = REGULARISED | {MultiAngleMethod.TWO_ANGLE}
 """Methods that do not use the horizontal gradient that the regression fits."""
 
 
@@ -209,7 +231,7 @@ def _steps(
     yield StepRecord("robust_passes", fit.robust, why)
     around = "beams point to all sides"
     free = "a half turn around the zenith has no beam"
-    if method in _BLIND:
+    if method in WITHOUT_GRADIENT:
         yield StepRecord("horizontal_gradient", ran=False, reason=f"{method} fits none")
     else:
         yield StepRecord("horizontal_gradient", beams.sides, around if beams.sides else free)
@@ -237,12 +259,14 @@ def _single_altitudes(
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
     correlation, amplitude = fit_correlation(moments.lag_products, moments.lag_norms)
     share = np.clip(_correlated_share(beams, fit) * amplitude, 0.0, 1.0)
-    single = _Single(
-        profiles.optical_depth, error, np.ones_like(error), np.ones_like(error),
-        _gradient_slopes(profiles, beams, fit, settings),
-        correlation * np.sqrt(share * _below(share)),
-    )  # fmt: skip
-    _fill_single(profiles, single, settings)
+    _fill_single(
+        profiles,
+        settings,
+        depth=profiles.optical_depth,
+        error=error,
+        slopes=_gradient_slopes(profiles, beams, fit, settings),
+        correlation=correlation * np.sqrt(share * _below(share)),
+    )
     return profiles
 
 
@@ -282,12 +306,15 @@ def _mld(
     estimates = mld.solve_mld(
         beams, fit.inhomogeneity, from_below=from_below, strength=settings.regularisation
     )
-    single = _Single(
-        estimates.optical_depth, np.sqrt(estimates.variance), estimates.data_share,
-        estimates.freedom, settings.largest_gradient * settings.height * estimates.slopes,
-        np.zeros_like(estimates.variance),
-    )  # fmt: skip
-    _fill_single(profiles, single, settings)
+    _fill_single(
+        profiles,
+        settings,
+        depth=estimates.optical_depth,
+        error=np.sqrt(estimates.variance),
+        slopes=settings.largest_gradient * settings.height * estimates.slopes,
+        data_share=estimates.data_share,
+        freedom=estimates.freedom,
+    )
     within = np.isfinite(profiles.data_share)
     profiles.regularisation[within] = estimates.strength[within]
     profiles.prior_optical_depth[within] = estimates.prior[within]
@@ -298,39 +325,40 @@ def _mld(
     return profiles
 
 
-class _Single(NamedTuple):
-    """Estimates of single altitudes, (profile, altitude), and their gradient errors."""
+def _fill_single(
+    profiles: MultiAngleResult,
+    settings: BlockSettings,
+    *,
+    depth: Array,
+    error: Array,
+    slopes: Array,
+    data_share: Array | float = 1.0,
+    freedom: Array | float = 1.0,
+    correlation: Array | float = 0.0,
+) -> None:
+    """Fill estimates of single altitudes within the reach, and what follows from them.
 
-    optical_depth: Array
-    standard_error: Array
-    data_share: Array
-    freedom: Array
-    slopes: Array
-    """(2, profile, altitude): error by the largest gradient to the east and north."""
-    correlation: Array
-    """Of the error with that at the altitude below."""
-
-
-def _fill_single(profiles: MultiAngleResult, single: _Single, settings: BlockSettings) -> None:
-    """Fill optical depth within the reach, and what follows from it."""
-    within = np.isfinite(profiles.optical_depth) & np.isfinite(single.optical_depth)
+    `slopes`, (2, profile, altitude), are the errors by the largest gradient to the east and north,
+    `correlation` is that of the error with the one at the altitude below.
+    """
+    within = np.isfinite(profiles.optical_depth) & np.isfinite(depth)
     for values, estimates in (
-        (profiles.optical_depth, single.optical_depth),
-        (profiles.optical_depth_standard_error, single.standard_error),
-        (profiles.data_share, single.data_share),
+        (profiles.optical_depth, depth),
+        (profiles.optical_depth_standard_error, error),
+        (profiles.data_share, data_share),
     ):
         values[:] = np.where(within, estimates, np.nan)
     profiles.extinction[:] = _layer_means(profiles.optical_depth, settings.height)
     both = profiles.optical_depth_standard_error**2
     step = np.diff(settings.height, prepend=0.0)
-    common = 2.0 * single.correlation * np.sqrt(both * _below(both))
+    common = 2.0 * correlation * np.sqrt(both * _below(both))
     profiles.extinction_standard_error[:] = np.sqrt(both + _below(both) - common) / step
-    _fill_gradient_errors(profiles, np.where(within, single.slopes, np.nan), settings)
-    freedom = np.where(within, single.freedom, 0.0).sum(axis=1)
-    profiles.effective_degrees_of_freedom[:] = np.where(within.any(axis=1), freedom, np.nan)
-    depth, square = (_at_layers(values, settings) for values in (profiles.optical_depth, both))
-    profiles.layer_optical_depth[:] = depth[..., 1] - depth[..., 0]
-    profiles.layer_optical_depth_standard_error[:] = np.sqrt(square[..., 1] + square[..., 0])
+    _fill_gradient_errors(profiles, np.where(within, slopes, np.nan), settings)
+    total = np.where(within, freedom, 0.0).sum(axis=1)
+    profiles.effective_degrees_of_freedom[:] = np.where(within.any(axis=1), total, np.nan)
+    bounds, squares = (_at_layers(values, settings) for values in (profiles.optical_depth, both))
+    profiles.layer_optical_depth[:] = bounds[..., 1] - bounds[..., 0]
+    profiles.layer_optical_depth_standard_error[:] = np.sqrt(squares[..., 1] + squares[..., 0])
 
 
 def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -14,7 +13,13 @@ from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Flags, Indices
 from lidarops.retrieve.multiangle import _methods, slant_paths
-from lidarops.retrieve.multiangle._methods import BlockSettings, MultiAngleResult, StepRecord
+from lidarops.retrieve.multiangle._methods import (
+    REGULARISED,
+    BlockSettings,
+    MultiAngleMethod,
+    MultiAngleResult,
+    StepRecord,
+)
 from lidarops.retrieve.multiangle.flags import CARE, MultiAngleQuality
 
 LARGEST_GRADIENT: Final = 5e-5
@@ -22,34 +27,13 @@ LARGEST_GRADIENT: Final = 5e-5
 
 __all__ = [
     "LARGEST_GRADIENT",
+    "REGULARISED",
     "MultiAngleMethod",
     "MultiAngleResult",
     "StepRecord",
     "layer_levels",
     "retrieve_optical_depth",
 ]
-
-
-class MultiAngleMethod(StrEnum):
-    """Method of retrieving optical depths."""
-
-    AUTO = "auto"
-    """`TWO_ANGLE` for two beams, else `JOINT`; `KANO_HAMILTON` where all standard errors of `JOINT`
-    would be too small."""
-    TWO_ANGLE = "two_angle"
-    """Only the shortest and the longest path."""
-    KANO_HAMILTON = "kano_hamilton"
-    """Weighted regression on the slant path, each altitude on its own."""
-    JOINT = "joint"
-    """`KANO_HAMILTON`, then one smooth profile through all altitudes."""
-    MLD = "mld"
-    """Regularised derivative along the slant path, formula 3 of `gobrusenko1989`."""
-    MLD_PRIOR = "mld_prior"
-    """`MLD` applied to the difference from the altitude below, its formula 4."""
-
-
-REGULARISED: Final = frozenset({MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR})
-"""Methods with a penalty, which accept `regularisation`."""
 
 
 def retrieve_optical_depth(
@@ -138,7 +122,7 @@ def retrieve_optical_depth(
         )
     noise = _cube(inputs.broadcast(noise, rows.shape, "variance"), "variance", rows.shape)
     settings = BlockSettings(
-        chosen.value,
+        chosen,
         height,
         scan,
         float(station_altitude),

@@ -7,7 +7,9 @@ extinction changes gradually and the optical depth is zero at the lidar. The for
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -95,7 +97,8 @@ class VerticalResult:
     """The correlation exceeds 0.85; standard errors may be too small."""
     block: _Block
     fit: _Fit
-    ratio: _Ratio
+    factor: Callable[[Integers, Integers], Array]
+    """Of the variances of differences of optical depths; see `_variance_factor`."""
 
     def respond(self, rows: Array) -> Array:
         """Return the solution for other estimates with the same weights, NaN beyond the reach.
@@ -134,34 +137,12 @@ class VerticalResult:
             for rows in (inverse, solved)
         )
         depth, variance = fit.smoothing.mixed(value, posterior)
-        variance *= self.ratio.of(np.array([upper]), np.array([lower]))
+        variance *= self.factor(np.array([upper]), np.array([lower]))
         reached = np.isfinite(self.optical_depth[:, upper])
         return (
             np.where(reached, depth[:, 0], np.nan),
             np.where(reached, np.sqrt(variance[:, 0]), np.nan),
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Ratio:
-    """Factors on the posterior variances of a block."""
-
-    calibration: _calibration.Calibration | None
-    """None if the block is too small to be calibrated."""
-    inflation: Array
-    """(altitude,): because the noise is estimated from few residuals."""
-
-    def of(self, upper: Integers, lower: Integers) -> Array:
-        """Return the factor on the variance of differences of optical depths.
-
-        The shape is (profile, difference), or (difference,) if common to all profiles.
-        """
-        below = np.where(lower >= 0, self.inflation[np.maximum(lower, 0)], 1.0)
-        few: Array = np.maximum(self.inflation[upper], below)
-        if self.calibration is None:
-            return few
-        factor: Array = few * _calibration.variance_ratio(self.calibration, upper, lower)
-        return factor
 
 
 def smooth_optical_depth(
@@ -213,11 +194,12 @@ def smooth_optical_depth(
     fit = _solve_block(block, robust=robust and not few)
     within = np.cumsum(used[:, ::-1], axis=1)[:, ::-1] > 0
     calibrated = len(within) >= THRESHOLDS.fewest_to_choose
-    ratio = _Ratio(
+    factor = partial(
+        _variance_factor,
         _calibrate(block, fit, within) if calibrated else None,
         _inflation(freedom, block.correlation, altitude.size),
     )
-    return _result(block, fit, ratio, within, np.diff(altitude, prepend=0.0))
+    return _result(block, fit, factor, within, np.diff(altitude, prepend=0.0))
 
 
 def _require_uniform(altitude: Array) -> None:
@@ -364,12 +346,35 @@ def _inflation(freedom: Array | None, correlation: float, altitudes: int) -> Arr
     return factor
 
 
+def _variance_factor(
+    calibration: _calibration.Calibration | None,
+    inflation: Array,
+    upper: Integers,
+    lower: Integers,
+) -> Array:
+    """Return the factor on the posterior variance of differences of optical depths.
+
+    The shape is (profile, difference), or (difference,) if common to all profiles: without a
+    calibration, where the block is too small.
+    """
+    below = np.where(lower >= 0, inflation[np.maximum(lower, 0)], 1.0)
+    few: Array = np.maximum(inflation[upper], below)
+    if calibration is None:
+        return few
+    factor: Array = few * _calibration.variance_ratio(calibration, upper, lower)
+    return factor
+
+
 def _result(
-    block: _Block, fit: _Fit, ratio: _Ratio, within: Booleans, step: Array
+    block: _Block,
+    fit: _Fit,
+    factor: Callable[[Integers, Integers], Array],
+    within: Booleans,
+    step: Array,
 ) -> VerticalResult:
     rows = np.arange(step.size)
-    error = np.sqrt(fit.variance * ratio.of(rows, np.full(step.size, -1)))
-    extinction_error = np.sqrt(fit.extinction_variance * ratio.of(rows, rows - 1)) / step
+    error = np.sqrt(fit.variance * factor(rows, np.full(step.size, -1)))
+    extinction_error = np.sqrt(fit.extinction_variance * factor(rows, rows - 1)) / step
     certain = within & (np.abs(fit.depth) > error)
     response = _respond(block, fit, fit.depth)
     share = np.where(certain, response / np.where(certain, fit.depth, 1.0), np.nan)
@@ -393,7 +398,7 @@ def _result(
         high_correlation=block.correlation > THRESHOLDS.highest_correlation,
         block=block,
         fit=fit,
-        ratio=ratio,
+        factor=factor,
     )
 
 

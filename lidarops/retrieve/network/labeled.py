@@ -148,6 +148,7 @@ def retrieve_network(
     near = np.flatnonzero(network.near_crossing)
     extinction = result.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
+    freedom, deviation = result.degrees_of_freedom, result.prior_deviation
     dimensions = ("time", "crossing")
     visibility = labeled.visibility_of_extinction(
         xr.DataArray(extinction, dims=dimensions),
@@ -156,6 +157,9 @@ def retrieve_network(
         settings.visibility,
     )
     flags = _quality_flags(result, errors, signals, network)[:, near]
+    multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
+    if settings.multiplier is None:
+        multiplier = {}
     return xr.Dataset(
         {
             **visibility.data_vars,
@@ -166,17 +170,11 @@ def retrieve_network(
             "quality_flag": (dimensions, flags),
             "path_optical_depth": ("time", _optical_depth(extinction, network)),
             "reduced_chi2": ("time", result.reduced_chi_square),
-            "degrees_of_freedom": (
-                "time",
-                np.where(result.degrees_of_freedom >= 0, result.degrees_of_freedom, np.nan),
-            ),
-            "prior_deviation": (
-                "time",
-                np.where(np.isfinite(result.prior_deviation), result.prior_deviation, np.nan),
-            ),
+            "degrees_of_freedom": ("time", np.where(freedom >= 0, freedom, np.nan)),
+            "prior_deviation": ("time", np.where(np.isfinite(deviation), deviation, np.nan)),
             "shots": ("time", _shots(beams, intervals)),
             "beam_range": (("beam", "crossing"), _distances(network)[:, near]),
-            **_multiplier_variable(result.multiplier[:, near], settings),
+            **multiplier,
         },
         coords=_coordinates(beams, intervals, network, near),
         attrs={"steps": _describe_steps(beams, network, settings)},
@@ -249,16 +247,11 @@ class _Solver:
     ) -> None:
         self.network, self.signals = network, signals
         self.exponent = np.array([beam.exponent for beam in beams])
-        names = [beam.instrument for beam in beams]
-        instruments = list(dict.fromkeys(names))
-        self.beam_groups = (
-            [[index] for index in range(len(beams))]
-            if len(beams) <= THRESHOLDS.most_separate_beams
-            else [
-                [index_of_beam for index_of_beam, name in enumerate(names) if name == instrument]
-                for instrument in instruments
-            ]
-        )
+        together = len(beams) > THRESHOLDS.most_separate_beams
+        groups: dict[int | str, list[int]] = {}
+        for index, beam in enumerate(beams):
+            groups.setdefault(beam.instrument if together else index, []).append(index)
+        self.beam_groups = list(groups.values())
         """Beams that are changed together."""
         self._arguments: dict[str, Any] = {
             "prior": settings.prior,
@@ -332,26 +325,18 @@ class _Errors:
     def estimate(solver: _Solver, result: NetworkResult, settings: NetworkSettings) -> _Errors:
         """Return the errors from noise and background, and from the systematic effects."""
         signals = solver.signals
-        background_error = np.nan_to_num(signals.background_error)[..., np.newaxis]
-        random = _root_sum_square(
-            [
-                result.extinction_standard_error,
-                *solver.extinction_changes(
-                    result, np.broadcast_to(background_error, signals.power.shape)
-                ),
-            ]
+        shape = signals.power.shape
+        background = np.broadcast_to(
+            np.nan_to_num(signals.background_error)[..., np.newaxis], shape
         )
-        overlap_change = _root_sum_square(
-            list(
-                solver.extinction_changes(
-                    result, THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
-                )
-            )
-        )
+        by_background = solver.extinction_changes(result, background)
+        random = _root_sum_square([result.extinction_standard_error, *by_background])
+        overlap = THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
+        overlap_change = _root_sum_square([*solver.extinction_changes(result, overlap)])
         with np.errstate(invalid="ignore", divide="ignore"):
             condition = overlap_change / THRESHOLDS.relative_change / result.extinction
-        tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], signals.power.shape)
-        tail_signal = _root_sum_square(list(solver.extinction_changes(result, tail)))
+        tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], shape)
+        tail_signal = _root_sum_square([*solver.extinction_changes(result, tail)])
         exponent = _changed_exponents(solver.exponent, settings.exponent_relative_error)
         by_exponent = solver.solve(signals.power, exponent).extinction - result.extinction
         by_lidar_ratio = _lidar_ratio_error(solver, result, settings.lidar_ratio_relative_error)
@@ -416,13 +401,6 @@ def _quality_flags(
         result.flags.weak_signal, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION)
     )
     return bits | np.where(unexplained, reason, np.int32(0))
-
-
-def _multiplier_variable(multiplier: Array, settings: NetworkSettings) -> dict[str, Any]:
-    """Return the multipliers of triangles; nothing where all beams are solved together."""
-    if settings.multiplier is None:
-        return {}
-    return {"multiplier": (("time", "crossing"), multiplier)}
 
 
 def _optical_depth(extinction: Array, network: Network) -> Array:
