@@ -182,7 +182,7 @@ def crossing_errors(result: NetworkResult, truth: Array, near: Mask) -> Crossing
         np.clip(extinction / truth - 1.0, -CLIPPED, CLIPPED),
         np.clip(truth / extinction - 1.0, -CLIPPED, CLIPPED),
         (extinction - truth) / stated,
-        result.flags.flagged[:, near],
+        result.flagged[:, near],
         result.reduced_chi_square,
     )
 
@@ -409,7 +409,7 @@ def _visibilities(results: Sequence[NetworkResult], signals: Signals, noise: flo
     truth = np.concatenate([signals.truth(len(result.extinction))[:, near] for result in results])
     extinction = np.concatenate([result.extinction[:, near] for result in results])
     stated = np.concatenate([result.extinction_standard_error[:, near] for result in results])
-    flagged = np.concatenate([result.flags.flagged[:, near] for result in results])
+    flagged = np.concatenate([result.flagged[:, near] for result in results])
     kept = ~flagged & np.isfinite(extinction) & np.isfinite(stated)
     return {
         (_percent(noise), f"{contrast:.4g}"): _visibility_score(

@@ -186,7 +186,7 @@ def score_networks(
         if solved is None:
             continue
         result, truth = solved
-        bits = np.where(result.flags.flagged, _DOUBTED, np.int32(0))
+        bits = np.where(result.flagged, _DOUBTED, np.int32(0))
         error = np.where(result.near_crossing, result.extinction - truth, np.nan)
         stated = result.extinction_standard_error
         # Values with a small standard error should not be flagged.
@@ -265,7 +265,7 @@ def score_short_blocks(
 def _scored(
     failure: Failure, result: extinction_field.NetworkResult, truth: Array, systematic: Any
 ) -> ScoredValues:
-    bits = np.where(result.flags.flagged, _DOUBTED, np.int32(0))
+    bits = np.where(result.flagged, _DOUBTED, np.int32(0))
     error = np.where(result.near_crossing, result.extinction - truth, np.nan)
     return ScoredValues(
         failure, "extinction", error, result.extinction_standard_error, systematic, bits,

@@ -165,7 +165,7 @@ def _own_counts(
     truth, near = clean.truth(PROFILES), net.near_crossing
     return _count(
         (result.extinction - truth)[:, near], result.extinction_standard_error[:, near],
-        result.flags.flagged[:, near], truth[:, near],
+        result.flagged[:, near], truth[:, near],
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ beams cannot show it goes undetected. ``docs/algorithms/network.md`` has the rat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, Literal
 
@@ -28,19 +28,21 @@ import numpy.typing as npt
 from scipy import special
 
 from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
 from lidarops.retrieve.network import _beam_signals, _block_errors
 from lidarops.retrieve.network._beam_signals import BeamSignals
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
 from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Problem, solve_block
+from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.network.triangles import CHOSEN, solve_triangles
 
-_HARMLESS: Final = frozenset({"weak_signal", "bridged"})
-"""Flags that do not reject a value."""
+_HARMLESS: Final = NetworkQuality.LOW_LEVERAGE | Quality.OUTLIER
+"""Bits of beams that were left out or bridged, which do not reject a value."""
 
 
 class FieldPrior(StrEnum):
@@ -49,49 +51,6 @@ class FieldPrior(StrEnum):
     BLOCK = "block"
     """What the profiles of a block share: how much ln extinction deviates from a linear field."""
     NONE = "none"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CrossingFlags:
-    """Reasons to doubt a value: one (..., crossing) array of booleans each."""
-
-    ill_conditioned: Booleans
-    """The value is less than 3 standard errors, in the profile or typically in its block. Or the
-    beams are too few to determine the field, and contradict the prior."""
-    not_finite: Booleans
-    """There is no positive solution."""
-    uncertain: Booleans
-    """The standard error exceeds the value."""
-    signal_not_positive: Booleans
-    """A beam of the crossing has a bin before the crossing that is zero or negative."""
-    signal_missing: Booleans
-    """A beam of the crossing has a bin before it with a power or variance that is not finite."""
-    weak_signal: Booleans
-    """A beam of the crossing is too noisy there, or its variance is invalid (zero), so it was left
-    out. The value from the other beams is valid."""
-    bridged: Booleans
-    """A beam of the crossing has outlying bins. Single ones were interpolated from their
-    neighbours. Several adjacent ones, which may be air, were left in place; the change that
-    they and the bins between two edges make is part of the standard error. The value is
-    valid."""
-    outlying: Booleans
-    """A beam of the crossing has so many outlying bins before it that it was left out."""
-    unsettled: Booleans
-    """The network solution did not converge."""
-    poor_fit: Booleans
-    """The beams disagree by more than their noise."""
-    not_measured: Booleans
-    """Fewer than two beams have full overlap and a signal there; with a multiplier, also where no
-    triangle of beams leads away from the crossing."""
-
-    @property
-    def flagged(self) -> Booleans:
-        """Union of all flags except `weak_signal` and `bridged`, which leave a value valid."""
-        union = np.zeros_like(self.not_finite)
-        for field in fields(self):
-            if field.name not in _HARMLESS:
-                union = union | getattr(self, field.name)
-        return union
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +64,10 @@ class NetworkResult:
     field that deviates by twice the prior's standard deviation, or by four times the strongest
     prior where the beams leave a crossing open, as far as the mean of a block allows, and from the
     bias that noise gives all profiles of a block."""
-    flags: CrossingFlags
+    quality: Flags
+    """(..., crossing) quality bits, by beams of the crossing or the whole network."""
+    no_solution: Booleans
+    """(..., crossing) True where there is no positive solution."""
     near_crossing: Booleans
     """(crossing,) True where extinction is reported."""
     reduced_chi_square: Array
@@ -119,6 +81,15 @@ class NetworkResult:
     multiplier_error: Array
     """(..., crossing) m-1, systematic: what the multiplier adds to extinction in homogeneous air;
     0 where all beams are solved together."""
+
+    def raised(self, bits: int) -> Booleans:
+        """Return where any of the bits is raised."""
+        return np.asarray((self.quality & np.int32(bits)) != 0)
+
+    @property
+    def flagged(self) -> Booleans:
+        """Where there is no solution, or a bit that a value does not stay valid with."""
+        return self.no_solution | self.raised(~_HARMLESS)
 
 
 def retrieve_network(
@@ -326,19 +297,19 @@ def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
     poor = np.any(_improbable(estimate.chi_square, estimate.degrees_of_freedom), axis=1)
     converged = estimate.settled | ~np.isfinite(estimate.chi_square[:, 1])
     too_weak = beams.weak | (estimate.left_out[:, passages.beam] & beams.data.usable)
-    flags = {
-        "ill_conditioned": doubted & finite,
-        "not_finite": ~finite,
-        "uncertain": uncertain,
-        "signal_not_positive": _lost_signal(beams, NOT_POSITIVE),
-        "signal_missing": _lost_signal(beams, MISSING),
-        "weak_signal": _by_crossing(beams, too_weak),
-        "bridged": _by_crossing(beams, beams.data.bridged[:, passages.beam]),
-        "outlying": _lost_signal(beams, OUTLYING),
-        "unsettled": np.broadcast_to(~converged[:, np.newaxis], shape),
-        "poor_fit": np.broadcast_to(poor[:, np.newaxis], shape),
-        "not_measured": np.broadcast_to(~beams.layout.measured | estimate.open, shape),
-    }
+    quality = np.zeros(shape, dtype=np.int32)
+    for bit, where in (
+        (NetworkQuality.POORLY_DETERMINED, (doubted & finite) | uncertain),
+        (Quality.LOW_SIGNAL, _lost_signal(beams, NOT_POSITIVE)),
+        (Quality.INPUT_MISSING, _lost_signal(beams, MISSING)),
+        (NetworkQuality.LOW_LEVERAGE, _by_crossing(beams, too_weak)),
+        (Quality.OUTLIER, _by_crossing(beams, beams.data.bridged[:, passages.beam])),
+        # Where so many bins deviate that the beam is left out, the stated noise is wrong.
+        (NetworkQuality.POOR_FIT, _lost_signal(beams, OUTLYING)),
+        (NetworkQuality.POOR_FIT, (poor | ~converged)[:, np.newaxis]),
+        (Quality.INPUT_MISSING, ~beams.layout.measured | estimate.open),
+    ):
+        quality |= np.where(where, np.int32(bit), np.int32(0))
     crossings = (*beams.leading, shape[1])
     freedom, chi_square = estimate.degrees_of_freedom[:, 0], estimate.chi_square[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -346,7 +317,8 @@ def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
     return NetworkResult(
         np.where(finite & near, estimate.extinction, np.nan).reshape(crossings),
         np.sqrt(np.where(finite & near, estimate.variance, np.nan)).reshape(crossings),
-        CrossingFlags(**{name: flag.reshape(crossings).copy() for name, flag in flags.items()}),
+        quality.reshape(crossings),
+        ~finite.reshape(crossings),
         near,
         reduced.reshape(beams.leading),
         freedom.reshape(beams.leading),

@@ -27,19 +27,6 @@ _UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
 """Bits of a bin that is not used. Bins before full overlap are excluded by range."""
 _WARNINGS: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
 """Bits of bins that are passed on to the values they contribute to."""
-_QUALITY_OF_FLAG: Final = {
-    "ill_conditioned": NetworkQuality.POORLY_DETERMINED,
-    "uncertain": NetworkQuality.POORLY_DETERMINED,
-    "signal_not_positive": Quality.LOW_SIGNAL,
-    "signal_missing": Quality.INPUT_MISSING,
-    "weak_signal": NetworkQuality.LOW_LEVERAGE,
-    "bridged": Quality.OUTLIER,
-    "outlying": NetworkQuality.POOR_FIT,
-    "unsettled": NetworkQuality.POOR_FIT,
-    "poor_fit": NetworkQuality.POOR_FIT,
-    "not_measured": Quality.INPUT_MISSING,
-}
-"""Quality bits of `CrossingFlags`. `not_finite` is used where no other flag rejects the value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -380,9 +367,7 @@ def _quality_flags(
     result: NetworkResult, errors: _Errors, signals: _Signals, network: Network
 ) -> Flags:
     """Return the quality bits of each value, with a reason for each missing one."""
-    bits = np.zeros(result.extinction.shape, dtype=np.int32)
-    for name, bit in _QUALITY_OF_FLAG.items():
-        bits |= np.where(getattr(result.flags, name), np.int32(bit), np.int32(0))
+    bits = result.quality.copy()
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
         bits[:, crossing] |= signals.warnings[:, index]
     with np.errstate(invalid="ignore"):
@@ -397,9 +382,8 @@ def _quality_flags(
     with np.errstate(invalid="ignore"):
         bits[result.degrees_of_freedom < 0] |= np.int32(NetworkQuality.PRIOR_DOMINATED)
     unexplained = ~np.isfinite(result.extinction) & ((bits & np.int32(REJECTING)) == 0)
-    reason = np.where(
-        result.flags.weak_signal, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION)
-    )
+    weak = result.raised(NetworkQuality.LOW_LEVERAGE)
+    reason = np.where(weak, np.int32(Quality.LOW_SIGNAL), np.int32(Quality.NO_REAL_SOLUTION))
     return bits | np.where(unexplained, reason, np.int32(0))
 
 

@@ -122,7 +122,7 @@ def test_stated_errors_are_not_generous_where_a_block_shows_the_field(field):
     near, truth = net.near_crossing, at_crossings(net, field)
     result = with_noise(net, field, 0.05, 500)
     ratio = ((result.extinction - truth) / result.extinction_standard_error)[:, near]
-    kept = ~result.flags.flagged[:, near]
+    kept = ~result.flagged[:, near]
     assert kept.mean() > 0.98
     ratio = ratio[kept]
     assert 0.8 < np.sqrt(np.mean(ratio**2)) < 1.1
@@ -191,4 +191,4 @@ def test_contradictory_beams_of_a_profile_do_not_change_the_others(factor):
     others, near = np.arange(50) != 7, net.near_crossing
     ratio = result.extinction_standard_error / clean.extinction_standard_error
     np.testing.assert_allclose(ratio[others][:, near], 1.0, rtol=0.05)
-    np.testing.assert_array_equal(result.flags.flagged[others], clean.flags.flagged[others])
+    np.testing.assert_array_equal(result.flagged[others], clean.flagged[others])

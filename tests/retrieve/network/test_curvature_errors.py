@@ -46,7 +46,7 @@ def solved(net, field, relative, profiles, *, step=5.0, additive=0.0, seed=1, **
 def deviations(net, result, field):
     """Return errors over stated ones, relative errors and stated ones, of unflagged values."""
     truth = at_crossings(net, field)
-    unflagged = np.isfinite(result.extinction) & ~result.flags.flagged
+    unflagged = np.isfinite(result.extinction) & ~result.flagged
     stated = result.extinction_standard_error
     return (
         (np.abs(result.extinction - truth) / stated)[unflagged],
@@ -134,7 +134,7 @@ def test_the_error_covers_a_layer_that_rises_within_a_block(deep, rise):
     result = extinction_field.retrieve_network(
         power, r, net, variance=deviation**2, full_overlap_range=100.0
     )
-    kept = np.isfinite(result.extinction) & ~result.flags.flagged
+    kept = np.isfinite(result.extinction) & ~result.flagged
     errors = (np.abs(result.extinction - truth) / result.extinction_standard_error)[kept]
     assert kept.sum() > 30
     assert np.mean(errors > 4.0) < 0.02

@@ -24,7 +24,9 @@ from support.oracles.network import (
 )
 
 from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.flags import NetworkQuality
 
 # Without noise ------------------------------------------------------------------------------
 
@@ -128,7 +130,7 @@ def test_a_prior_is_far_better_than_the_exact_triangle(name, relative, bound, ex
     truth = at_crossings(net, field)
     result = with_noise(net, field, relative)
     assert root_mean_square(relative_errors(result, truth))[0] <= bound
-    assert result.flags.flagged[:, 0].mean() < 0.02
+    assert result.flagged[:, 0].mean() < 0.02
     alone = with_noise(net, field, relative, prior="none")
     assert root_mean_square(relative_errors(alone, truth))[0] > exact
     # The stated error is correct.
@@ -143,7 +145,7 @@ def test_three_lidars_with_two_beams(name):
     result = with_noise(net, field, 0.05, 300)
     assert np.median(root_mean_square(relative_errors(result, truth))[near]) <= 0.08
     assert 0.7 < np.mean(result.reduced_chi_square) < 1.3
-    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    usable = ~result.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
     assert usable[:, near].mean() > 0.9
@@ -161,13 +163,13 @@ def test_values_stay_within_3_errors_while_a_plume_moves(relative):
     power = clean + deviation * np.random.default_rng(2).standard_normal(clean.shape)
     result = retrieve_network(power, r, net, variance=deviation**2, full_overlap_range=100.0,
                    blocks=np.arange(100) // 50)  # fmt: skip
-    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    usable = ~result.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
     assert usable[50:, 0].mean() > 0.9
     # Two beams reach behind the plume of the first block: they show it, but not its size.
     assert np.all(result.degrees_of_freedom[:50] < 0)
-    assert result.flags.flagged[:50].all()
+    assert result.flagged[:50].all()
 
 
 def test_long_chains_are_not_biased():
@@ -179,7 +181,7 @@ def test_long_chains_are_not_biased():
     )
     assert net.crossings > 20
     result = with_noise(net, homogeneous(1e-3), 0.01, 60, prior="none")
-    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    usable = ~result.flagged & np.isfinite(result.extinction)
     error = (result.extinction - 1e-3) / result.extinction_standard_error
     assert usable[:, net.near_crossing].mean() > 0.5
     assert np.std(error[usable]) < 1.3
@@ -199,7 +201,7 @@ def test_a_prior_that_the_beams_contradict_is_weakened_or_dropped():
     settings = {"variance": variance, "full_overlap_range": 100.0}
     result = retrieve_network(power, r, net, **settings)
     assert np.all(result.prior_deviation > 0.2)
-    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    usable = ~result.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - truth) / result.extinction_standard_error)[usable]
     assert np.mean(np.abs(score) < 3) >= 0.98
     assert abs(np.mean(score)) < 0.5
@@ -223,7 +225,7 @@ def test_values_in_a_steep_field_and_high_noise_are_right_or_flagged():
     net = fan([-600.0, -200.0, 200.0, 600.0], [(40, 55), (60, 85), (95, 120), (125, 140)],
               farthest=1500.0)  # fmt: skip
     result = with_noise(net, steep, 0.2, 100, seed=11)
-    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    kept = ~result.flagged & np.isfinite(result.extinction)
     score = (result.extinction - at_crossings(net, steep)) / result.extinction_standard_error
     assert np.mean((np.abs(score) > 4.0) & kept) < 0.02
 
@@ -250,7 +252,7 @@ def test_values_from_an_untested_prior_are_flagged(scale, relative, net):
     """All values were once unflagged, and half of them off by more than 4 errors."""
     result, score = scores_with_weak_far_crossings(scale, relative, net)
     assert np.median(result.degrees_of_freedom) < 0
-    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    kept = ~result.flagged & np.isfinite(result.extinction)
     assert np.mean((np.abs(score) > 4.0)[:, net.near_crossing] & kept[:, net.near_crossing]) < 0.01
 
 
@@ -258,7 +260,7 @@ def test_a_field_with_too_few_beams_has_large_errors():
     net = three_by_two()
     result, score = scores_with_weak_far_crossings(500.0, 0.1, net)
     assert np.median(result.degrees_of_freedom) < 0
-    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    kept = ~result.flagged & np.isfinite(result.extinction)
     assert kept.sum() > 40
     assert np.all(np.abs(score[kept]) < 4.0)
     stated = result.extinction_standard_error / result.extinction
@@ -275,7 +277,7 @@ def test_missing_beams_of_profiles_cost_only_their_crossings(name):
         retrieve_network(entry, r, net, variance=variance, full_overlap_range=100.0)
         for entry in (power, np.where(missing, np.nan, power))
     ]
-    kept = [np.isfinite(entry.extinction) & ~entry.flags.flagged for entry in result]
+    kept = [np.isfinite(entry.extinction) & ~entry.flagged for entry in result]
     # At a crossing of two beams, at most (3 / 4)^2 of the values are unflagged.
     assert kept[1].sum() > 0.4 * kept[0].sum()
     score = (result[1].extinction - at_crossings(net, field)) / result[1].extinction_standard_error
@@ -333,7 +335,7 @@ def test_unusual_arrays_are_accepted_and_shapes_kept():
     swapped.setflags(write=False)
     result = retrieve_network(swapped, r, net, variance=variance, full_overlap_range=[100.0] * 3)
     assert result.extinction.shape == (2, 3, 3)
-    assert result.flags.flagged.shape == (2, 3, 3)
+    assert result.flagged.shape == (2, 3, 3)
     assert result.reduced_chi_square.shape == (2, 3)
     assert np.array_equal(result.extinction.reshape(6, 3), expected.extinction, equal_nan=True)
     rows = retrieve_network(power, np.tile(r, (3, 1)), net, variance=np.tile(variance, (6, 1, 1)),
@@ -368,13 +370,13 @@ def test_beams_may_have_different_ranges():
 def test_crossings_without_full_overlap_are_not_measured():
     net = three_by_two()
     result = with_noise(net, homogeneous(), 0.02, 5)
-    assert not result.flags.not_measured.any()
+    assert not result.raised(Quality.INPUT_MISSING).any()
     r = grid(net)
     power = signals(net, r, homogeneous())
     far = retrieve_network(power, r, net, variance=1e-6 * power**2, full_overlap_range=650.0)
-    assert far.flags.not_measured.any()
-    assert np.isnan(far.extinction[far.flags.not_measured]).all()
-    assert np.isfinite(far.extinction[~far.flags.not_measured & far.near_crossing]).any()
+    assert far.raised(Quality.INPUT_MISSING).any()
+    assert np.isnan(far.extinction[far.raised(Quality.INPUT_MISSING)]).all()
+    assert np.isfinite(far.extinction[~far.raised(Quality.INPUT_MISSING) & far.near_crossing]).any()
 
 
 def apart(first, second):
@@ -388,8 +390,8 @@ def test_weak_signals_are_left_out_and_flagged():
     clean = signals(net, r, homogeneous(4e-3))
     power, variance = noisy(net, r, clean, 0.02, 50, additive=0.2)
     result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-    assert result.flags.weak_signal.any()
-    usable = ~result.flags.flagged & np.isfinite(result.extinction)
+    assert result.raised(NetworkQuality.LOW_LEVERAGE).any()
+    usable = ~result.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - 4e-3) / result.extinction_standard_error)[usable]
     assert score.size == 0 or np.mean(np.abs(score) < 3) > 0.97
 
@@ -411,7 +413,7 @@ def test_a_noisy_profile_does_not_change_the_others(factor):
         np.delete(power, 3, axis=0), r, net, variance=variance, full_overlap_range=100.0
     )
     others, kept = np.arange(50) != 3, np.isfinite(clean.extinction)
-    np.testing.assert_array_equal(result.flags.flagged[others], clean.flags.flagged[others])
+    np.testing.assert_array_equal(result.flagged[others], clean.flagged[others])
     assert np.all(apart(result, clean)[others][kept[others]] < 0.05)
     stated_error = result.extinction_standard_error[others]
     # The medians of 50 profiles and of 49 differ.
@@ -420,11 +422,15 @@ def test_a_noisy_profile_does_not_change_the_others(factor):
         without.extinction_standard_error[kept[others]],
         rtol=0.0 if factor > 50.0 or np.isnan(factor) else 0.025,
     )
-    selected = np.isfinite(result.extinction[3]) & ~result.flags.flagged[3]
+    selected = np.isfinite(result.extinction[3]) & ~result.flagged[3]
     if factor > 50.0 or np.isnan(factor):
         assert not selected.any()
-        stated = result.flags.weak_signal | result.flags.signal_not_positive | result.flags.outlying
-        stated |= result.flags.signal_missing
+        stated = result.raised(
+            NetworkQuality.LOW_LEVERAGE
+            | Quality.LOW_SIGNAL
+            | NetworkQuality.POOR_FIT
+            | Quality.INPUT_MISSING
+        )
         assert stated[3, net.near_crossing].all()
         np.testing.assert_array_equal(result.extinction[others], without.extinction)
     score = (result.extinction - 2e-3) / result.extinction_standard_error
@@ -451,8 +457,8 @@ def test_a_bin_of_unknown_variance_does_not_change_the_other_profiles(factor):
     whole = retrieve_network(power, r, net, variance=variance, **settings)
     others = np.arange(60) != 7
     np.testing.assert_array_equal(result.prior_deviation, whole.prior_deviation)
-    np.testing.assert_array_equal(result.flags.flagged[others], whole.flags.flagged[others])
-    kept = ~whole.flags.flagged & np.isfinite(whole.extinction)
+    np.testing.assert_array_equal(result.flagged[others], whole.flagged[others])
+    kept = ~whole.flagged & np.isfinite(whole.extinction)
     assert np.all(apart(result, whole)[others][kept[others]] < 0.05)
 
 
@@ -472,9 +478,9 @@ def test_a_bin_of_unknown_variance_counts_as_missing(bad):
     for name in ("extinction", "extinction_standard_error", "degrees_of_freedom"):
         np.testing.assert_allclose(getattr(result, name)[7], getattr(other, name)[7], rtol=1e-9)
     crossings = net.on_beam(beam)[0]
-    assert result.flags.signal_missing[7, crossings[-1]]
-    assert not result.flags.signal_missing[7, crossings[0]]
-    assert np.delete(result.flags.signal_missing, 7, axis=0).sum() == 0
+    assert result.raised(Quality.INPUT_MISSING)[7, crossings[-1]]
+    assert not result.raised(Quality.INPUT_MISSING)[7, crossings[0]]
+    assert np.delete(result.raised(Quality.INPUT_MISSING), 7, axis=0).sum() == 0
 
 
 def test_a_beam_without_noise_is_left_out_and_flagged():
@@ -485,9 +491,9 @@ def test_a_beam_without_noise_is_left_out_and_flagged():
     stated[3, 0] = 0.0
     result = retrieve_network(power, r, net, variance=stated, full_overlap_range=100.0)
     clean = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-    selected = np.zeros_like(result.flags.weak_signal)
+    selected = np.zeros_like(result.raised(NetworkQuality.LOW_LEVERAGE))
     selected[3, net.on_beam(0)[0]] = True
-    np.testing.assert_array_equal(result.flags.weak_signal, selected)
+    np.testing.assert_array_equal(result.raised(NetworkQuality.LOW_LEVERAGE), selected)
     assert result.degrees_of_freedom[3] < clean.degrees_of_freedom[3]
     wider = result.extinction_standard_error[3] > 1.5 * clean.extinction_standard_error[3]
     assert wider[net.near_crossing].any()
@@ -502,7 +508,7 @@ def test_a_profile_of_more_energy_is_not_noisy():
     result = retrieve_network(
         scale * power, r, net, variance=scale**2 * variance, full_overlap_range=100.0
     )
-    assert not result.flags.weak_signal.any()
+    assert not result.raised(NetworkQuality.LOW_LEVERAGE).any()
     np.testing.assert_allclose(result.extinction, clean.extinction, rtol=1e-9)
 
 
@@ -565,7 +571,7 @@ def test_signals_that_reach_no_crossing_have_no_values():
     power = np.tile(1 / r**2, (4, 3, 1))
     result = retrieve_network(power, r, net, variance=power**2, full_overlap_range=100.0)
     assert np.isnan(result.extinction).all()
-    assert result.flags.not_measured.all()
+    assert result.raised(Quality.INPUT_MISSING).all()
 
 
 def test_beams_that_do_not_meet_raise():

@@ -16,14 +16,16 @@ from support.oracles.network import (
     with_noise,
 )
 
+from lidarops.flags import Quality
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.flags import NetworkQuality
 
 
 def test_extreme_d_clear_air_is_flagged():
     net = triangle()
     network = with_noise(net, homogeneous(2e-5), 0.005, 200)
-    assert network.flags.ill_conditioned[:, 0].any()
-    usable = ~network.flags.flagged[:, 0]
+    assert network.raised(NetworkQuality.POORLY_DETERMINED)[:, 0].any()
+    usable = ~network.flagged[:, 0]
     score = (network.extinction[:, 0] - 2e-5) / network.extinction_standard_error[:, 0]
     assert not usable.any() or np.mean(np.abs(score[usable]) < 3) >= 0.98
 
@@ -50,12 +52,10 @@ def test_extreme_h_a_bad_signal_is_always_flagged(bad, prior):
         power, r, net, prior=prior, variance=variance, full_overlap_range=100.0
     )
     assert np.isnan(whole.extinction[5]).all()
-    assert whole.flags.not_finite[5].all()
-    missing = (
-        whole.flags.signal_missing if not np.isfinite(bad) else whole.flags.signal_not_positive
-    )
+    assert whole.no_solution[5].all()
+    missing = whole.raised(Quality.LOW_SIGNAL if np.isfinite(bad) else Quality.INPUT_MISSING)
     assert missing[[3, 5], 1].all()
-    assert whole.flags.flagged[3, 1]
+    assert whole.flagged[3, 1]
     # The other profiles do not change.
     assert np.isfinite(whole.extinction[[0, 1, 2, 4], 0]).all()
     assert not missing[[0, 1, 2, 4]].any()
@@ -66,4 +66,4 @@ def test_extreme_i_too_few_beams_without_prior_have_no_values():
     assert net.crossings == 2
     result = with_noise(net, homogeneous(), 0.01, 20, prior="none")
     assert np.isnan(result.extinction).all()
-    assert result.flags.not_finite.all()
+    assert result.no_solution.all()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from support.oracles.network import grid, homogeneous, noisy, plume, signals, three_by_two
 
+from lidarops.flags import Quality
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.flags import NetworkQuality
 
 FULL = {"full_overlap_range": 100.0}
 
@@ -18,7 +20,9 @@ def test_a_profile_far_noisier_than_its_block_is_weak_only_where_its_own_signal_
     variances = np.broadcast_to(variance, power.shape).copy()
     power[3], variances[3] = 30.0 * power[3], 900.0 * variances[3]
     variances[7] = power[7] ** 2
-    weak = retrieve_network(power, r, net, variance=variances, **FULL).flags.weak_signal
+    weak = retrieve_network(power, r, net, variance=variances, **FULL).raised(
+        NetworkQuality.LOW_LEVERAGE
+    )
     assert weak[7].any()
     assert not weak[np.arange(50) != 7].any()
 
@@ -30,10 +34,10 @@ def test_an_unknown_beam_is_missing_and_not_weak():
     stated = np.broadcast_to(variance, power.shape).copy()
     power[3, 0], stated[3, 0] = np.nan, np.nan
     result = retrieve_network(power, r, net, variance=stated, **FULL)
-    assert not result.flags.weak_signal.any()
-    selected = np.zeros_like(result.flags.signal_missing)
+    assert not result.raised(NetworkQuality.LOW_LEVERAGE).any()
+    selected = np.zeros_like(result.raised(Quality.INPUT_MISSING))
     selected[3, net.on_beam(0)[0]] = True
-    np.testing.assert_array_equal(result.flags.signal_missing, selected)
+    np.testing.assert_array_equal(result.raised(Quality.INPUT_MISSING), selected)
 
 
 def test_a_signal_that_noise_makes_negative_is_weak():
@@ -43,8 +47,8 @@ def test_a_signal_that_noise_makes_negative_is_weak():
     power, variance = noisy(net, r, signals(net, r, homogeneous(8e-3)), 0.01, 20, additive=0.05)
     result = retrieve_network(power, r, net, variance=variance, **FULL)
     assert (np.median(power, axis=0) <= 0.0).any()
-    assert result.flags.weak_signal.any(axis=0).any()
-    assert not result.flags.signal_not_positive.any()
+    assert result.raised(NetworkQuality.LOW_LEVERAGE).any(axis=0).any()
+    assert not result.raised(Quality.LOW_SIGNAL).any()
     power[:, 0] -= 10.0 * np.sqrt(variance[0])
     result = retrieve_network(power, r, net, variance=variance, **FULL)
-    assert result.flags.signal_not_positive[:, net.on_beam(0)[0][1:]].all()
+    assert result.raised(Quality.LOW_SIGNAL)[:, net.on_beam(0)[0][1:]].all()

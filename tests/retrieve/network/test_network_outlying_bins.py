@@ -18,8 +18,10 @@ from support.oracles.network import (
     triangle,
 )
 
+from lidarops.flags import Quality
 from lidarops.retrieve.network import _condensed_signals, outlying_bins
 from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 BINS = 7
@@ -98,8 +100,8 @@ def test_low_photon_counts_are_no_outliers():
     level = signals(net, r, ALL["homogeneous"])
     counts = rng.poisson(np.maximum(60 * level / level[:, [60]], 15), (300, *level.shape))
     result = solved(net, r, counts.astype(float), counts.astype(float))
-    assert not result.flags.bridged.any()
-    assert not result.flags.outlying.any()
+    assert not result.raised(Quality.OUTLIER).any()
+    assert not result.raised(NetworkQuality.POOR_FIT).any()
 
 
 # With outlying bins ------------------------------------------------------------------------
@@ -113,9 +115,9 @@ def test_a_spike_at_a_crossing_is_bridged_and_flagged(relative, size):
     clean = solved(net, r, power, variance)
     result = solved(net, r, hit(power, variance, 7, 0, at, size), variance)
     selected = net.on_beam(0)[0]
-    assert result.flags.bridged[7, selected].all()
-    assert not result.flags.bridged[np.arange(50) != 7].any()
-    np.testing.assert_array_equal(result.flags.flagged, clean.flags.flagged)
+    assert result.raised(Quality.OUTLIER)[7, selected].all()
+    assert not result.raised(Quality.OUTLIER)[np.arange(50) != 7].any()
+    np.testing.assert_array_equal(result.flagged, clean.flagged)
     assert np.nanmax(apart(result, clean)[7]) < 1.0
     np.testing.assert_allclose(
         result.extinction_standard_error[7], clean.extinction_standard_error[7], rtol=0.3
@@ -129,7 +131,7 @@ def test_a_spike_in_the_middle_of_a_long_beam_changes_nothing(size):
     at = bin_at(r, (low + high) / 2)
     clean = solved(net, r, power, variance)
     result = solved(net, r, hit(power, variance, 3, 1, at, size), variance)
-    np.testing.assert_array_equal(result.flags.flagged, clean.flags.flagged)
+    np.testing.assert_array_equal(result.flagged, clean.flagged)
     assert np.nanmax(apart(result, clean)[3]) < 0.3
 
 
@@ -168,8 +170,8 @@ def test_the_ends_of_a_beam_are_tested_too(place):
     result = solved(
         net, r, hit(power, variance, 9, 0, at, 120.0), variance, full_overlap_range=nearest
     )
-    assert (result.flags.bridged | result.flags.outlying)[9, net.on_beam(0)[0]].any()
-    kept = ~result.flags.flagged & ~clean.flags.flagged & np.isfinite(result.extinction)
+    assert result.raised(Quality.OUTLIER | NetworkQuality.POOR_FIT)[9, net.on_beam(0)[0]].any()
+    kept = ~result.flagged & ~clean.flagged & np.isfinite(result.extinction)
     assert (apart(result, clean)[9][kept[9]] < 1.5).all()
 
 
@@ -179,7 +181,7 @@ def test_gaps_among_neighbours_are_skipped():
     power[:, 0, last + 5] = np.nan
     clean = solved(net, r, power, variance)
     result = solved(net, r, hit(power, variance, 9, 0, last + 3, 60.0), variance)
-    assert result.flags.bridged[9, net.on_beam(0)[0]].all()
+    assert result.raised(Quality.OUTLIER)[9, net.on_beam(0)[0]].all()
     assert np.nanmax(apart(result, clean)[9]) < 1.0
 
 
@@ -236,7 +238,7 @@ def test_outlying_bins_in_curved_air_leave_values_within_their_errors(field, ste
         net, r, power + outlying * np.sqrt(variance), variance, blocks=np.arange(150) // 50
     )  # fmt: skip
     near = result.near_crossing
-    kept = (~result.flags.flagged & np.isfinite(result.extinction))[:, near]
+    kept = (~result.flagged & np.isfinite(result.extinction))[:, near]
     score = (result.extinction - field(*net.crossing.T)) / result.extinction_standard_error
     assert kept.mean() > 0.95
     assert np.mean(np.abs(score[:, near][kept]) > 4.0) <= 7e-3
@@ -283,14 +285,14 @@ def test_noise_far_above_the_stated_one_is_flagged():
     net, r, power, variance = scene(relative=0.05)
     result = solved(net, r, power, variance / 400.0)
     used = np.isfinite(result.extinction)
-    assert (result.flags.outlying | result.flags.poor_fit | ~used).all()
+    assert (result.raised(NetworkQuality.POOR_FIT) | ~used).all()
 
 
 def test_a_variance_of_zero_sets_no_flag_of_outlying_bins():
     net, r, power, _ = scene(ALL["plume"], relative=0.02)
     result = solved(net, r, power, 0.0)
-    assert not result.flags.bridged.any()
-    assert not result.flags.outlying.any()
+    assert not result.raised(Quality.OUTLIER).any()
+    assert not result.raised(NetworkQuality.POOR_FIT).any()
 
 
 # Stated errors ------------------------------------------------------------------------------
@@ -356,11 +358,13 @@ def test_results_do_not_depend_on_other_profiles():
     rng = np.random.default_rng(8)
     damaged = power + (rng.random(power.shape) < 0.02) * 50 * np.sqrt(variance)
     together = solved(net, r, damaged, variance, prior="none")
-    assert together.flags.bridged.any()
+    assert together.raised(Quality.OUTLIER).any()
     for n in (0, 11, 23):
         single = solved(net, r, damaged[n], variance, prior="none")
         np.testing.assert_array_equal(single.extinction, together.extinction[n])
-        np.testing.assert_array_equal(single.flags.bridged, together.flags.bridged[n])
+        np.testing.assert_array_equal(
+            single.raised(Quality.OUTLIER), together.raised(Quality.OUTLIER)[n]
+        )
     reversed_result = solved(net, r, damaged[::-1], variance, prior="none")
     np.testing.assert_array_equal(reversed_result.extinction[::-1], together.extinction)
 
@@ -377,7 +381,7 @@ def test_one_percent_of_outlying_bins_leaves_values_within_their_errors(exponent
         net, r, power + outlying * np.sqrt(variance), variance, exponent=exponent,
         blocks=np.arange(150) // 50,
     )  # fmt: skip
-    kept = ~result.flags.flagged & np.isfinite(result.extinction)
+    kept = ~result.flagged & np.isfinite(result.extinction)
     score = ((result.extinction - 2e-3) / result.extinction_standard_error)[kept]
     assert kept[:, result.near_crossing].mean() > 0.9
     assert np.mean(np.abs(score) > 4.0) <= 3e-3

@@ -22,6 +22,7 @@ from support.oracles.network import (
 )
 
 from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
 from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.triangles import systematic_error
 
@@ -162,7 +163,7 @@ def test_all_beams_together_are_better_than_a_triangle(air, share):
     assert (errors[0] < errors[1]).all()
     stated = np.hypot(chosen.extinction_standard_error, chosen.multiplier_error)
     inside = abs(chosen.extinction - truth) < 1.96 * stated
-    covered = inside[:, :2][~chosen.flags.flagged[:, :2]].mean()
+    covered = inside[:, :2][~chosen.flagged[:, :2]].mean()
     assert covered == pytest.approx(share, abs=6e-3)
 
 
@@ -187,7 +188,7 @@ def test_a_crossing_without_a_triangle_is_not_measured():
     """Two beams of one lidar meet two of another one: four crossings in a quadrilateral."""
     net = fan([0.0, 400.0], [[50.0, 70.0], [110.0, 130.0]])
     result = without_noise(net, homogeneous(), multiplier=1.0)
-    assert result.flags.not_measured.all()
+    assert result.raised(Quality.INPUT_MISSING).all()
     assert np.isnan(result.extinction).all()
 
 

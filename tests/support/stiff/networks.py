@@ -42,7 +42,7 @@ _PROFILES: Final = 200
 
 def _answer(result: NetworkResult) -> Answer:
     """Return the values, with a quality bit where any flag doubts them."""
-    bits = np.where(result.flags.flagged, np.int32(FLAGGED), np.int32(0))
+    bits = np.where(result.flagged, np.int32(FLAGGED), np.int32(0))
     return Answer(
         {
             "extinction": result.extinction,
