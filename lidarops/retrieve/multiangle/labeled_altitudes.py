@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -111,41 +110,53 @@ class AltitudeCycles:
     ) -> None:
         directions = scan_cycles.directions(zenith_angle, azimuth)
         numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
-        levels = np.asarray(altitude_grid, dtype=np.float64)
-        height = slant_paths.altitude_grid(levels, station_altitude)
+        self._altitude = np.asarray(altitude_grid, dtype=np.float64)
+        height = slant_paths.altitude_grid(self._altitude, station_altitude)
         if height.size < 2:
             raise RetrievalInputError(
                 "holds one altitude", field="altitude_grid", remedy="give at least two, in m"
             )
-        self._order = order = _order(directions, numbers, height)
-        slant_edges = _slant_edges(order.zenith_angle, height)
-        self._settings = _Settings(
-            distance=distance,
-            overlap=overlap,
-            background_range=background_range,
-            shapes=None
-            if molecules is None
-            else _kept_shapes(
-                {} if shapes is None else shapes,
-                molecules,
-                (wavelength, order.zenith_angle, distance, station_altitude),
-            ),
-            altitude=levels,
-            slant_edges=slant_edges,
-            baseline=baseline,
-        )
-        self._weights = np.asarray(shots, dtype=np.float64)
-        self._bounds = np.asarray(time_bnds)
-        self._sides_known = (
-            azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any()
-        )
-        self._batches = list(_batches(order))
+        usable = slant_paths.rising_beams(directions.zenith_angle, height)
+        if usable.size == 0:
+            raise RetrievalInputError(
+                "has no direction more than 3 degrees above the horizon",
+                field="zenith_angle",
+                remedy="leave the multi-angle retrieval out of this scene",
+            )
+        self._zenith_angle = directions.zenith_angle[usable]
+        self._azimuth = None
+        if azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any():
+            self._azimuth = directions.azimuth[usable]
+        self._profile, self._cycle, self._beam = _sorted_profiles(directions, usable, numbers)
+        self._slant_edges = _slant_edges(self._zenith_angle, height)
+        self._bounds, self._shots = np.asarray(time_bnds), np.asarray(shots, dtype=np.float64)
+        self._tail, self._baseline = background_range, baseline
+        self._set_bins(distance, overlap)
+        self._shapes = None
+        if molecules is not None:
+            kept = {} if shapes is None else shapes
+            place = self._zenith_angle, distance, station_altitude
+            self._shapes = _shapes(kept, molecules, wavelength, *place)
+        self._batches = list(_batches(self._cycle))
         self._pieces: list[dict[str, Block]] = []
+
+    def _set_bins(self, distance: Array, overlap: Array | None) -> None:
+        """Set which bins are in front of the lidar, and which all cells of all beams need."""
+        # A range offset may put bins behind the lidar, without light.
+        front = int(np.searchsorted(distance, 0.0, side="right"))
+        farthest = float(np.max(self._slant_edges[:, -1]))
+        past = max(int(np.searchsorted(distance, farthest)) + _BESIDE, front) + _BESIDE
+        self._front, self._covered = slice(front, None), slice(front, past)
+        self._distance, self._overlap = distance, overlap
+        self._gain = distance[self._covered] ** 2
+        if overlap is not None:
+            near = overlap[self._covered]
+            self._gain = self._gain / np.where(near > 0.0, near, np.nan)
 
     def ends(self) -> Integers:
         """Return the profiles before which a chunk may end: those that begin a cycle."""
-        profiles = self._order.profile
-        return np.array([profiles[batch].min() for batch in self._batches[1:]], dtype=np.int64)
+        starts = [self._profile[batch].min() for batch in self._batches[1:]]
+        return np.array(starts, dtype=np.int64)
 
     def add(self, conditioned: xr.Dataset, first: int) -> None:
         """Add consecutive profiles, which end where a cycle does.
@@ -161,39 +172,28 @@ class AltitudeCycles:
             Number of the first of the profiles in the scene.
         """
         past = first + conditioned.sizes["time"]
-        profiles = tuple(
+        profiles = [
             conditioned[name].to_numpy()
             for name in ("power", "variance", "quality", CORRELATION_LENGTH)
-        )
+        ]
         changes = dead_time_change(conditioned), self._baseline_error(conditioned)
         while len(self._pieces) < len(self._batches):
             batch = self._batches[len(self._pieces)]
-            members = self._order.profile[batch]
+            members = self._profile[batch]
             if members.max() >= past:
                 break
-            cycle = self._order.cycle[batch] - self._order.cycle[batch.start]
-            self._pieces.append(
-                _batch_on_altitudes(
-                    profiles,
-                    changes,
-                    members - first,
-                    self._weights[members],
-                    cycle,
-                    self._order.beam[batch],
-                    self._settings,
-                )
-            )
+            self._pieces.append(self._on_altitudes(profiles, *changes, batch, members - first))
 
     def _baseline_error(self, conditioned: xr.Dataset) -> Array | None:
         """Return the error of the baseline of analog profiles, (time, range covered)."""
-        error, settings = baseline_error(conditioned), self._settings
+        error = baseline_error(conditioned)
         if error is None:
             return None
         # A stated value has no share of the light; it replaces what blocked beams show.
         given = conditioned["power"].attrs.get(BASELINE_ERROR, (0.0, 1.0))[1] == 0.0
-        if settings.baseline is None or given:
-            return error.transpose("time", "range").to_numpy()[:, settings.covered]
-        measured = settings.baseline.error_at(settings.distance[settings.covered])
+        if self._baseline is None or given:
+            return error.transpose("time", "range").to_numpy()[:, self._covered]
+        measured = self._baseline.error_at(self._distance[self._covered])
         return np.broadcast_to(measured, (error.sizes["time"], measured.size))
 
     def result(self, obstructions: Mapping[int, float] | None = None) -> xr.Dataset:
@@ -219,27 +219,31 @@ class AltitudeCycles:
             the square of range over overlap, m2) over (beam, altitude); and ``shots`` over time.
             ``time`` is the middle of ``time_bnds``, which span the profiles of a cycle.
         """
-        order = self._order
         cycles = {
-            name: (_DIMENSIONS[name], np.concatenate([piece[name] for piece in self._pieces]))
+            name: np.concatenate([piece[name] for piece in self._pieces])
             for name in self._pieces[0]
         }
-        self._end_beams({name: values for name, (_, values) in cycles.items()}, obstructions or {})
-        bounds = _cycle_bounds(self._bounds, order)
+        self._end_beams(cycles, obstructions or {})
+        # From the first start to the last end of the profiles of each cycle.
+        first = np.flatnonzero(np.diff(self._cycle, prepend=-1))
+        starts = np.minimum.reduceat(self._bounds[self._profile, 0], first)
+        bounds = np.stack(
+            [starts, np.maximum.reduceat(self._bounds[self._profile, 1], first)], axis=-1
+        )
         coordinates = {
-            "time": bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2,
+            "time": starts + (bounds[:, 1] - starts) // 2,
             "time_bnds": (("time", "nv"), bounds),
-            "beam": np.arange(order.zenith_angle.size, dtype=np.int32),
-            "beam_zenith_angle": ("beam", order.zenith_angle),
-            "altitude": self._settings.altitude,
+            "beam": np.arange(self._zenith_angle.size, dtype=np.int32),
+            "beam_zenith_angle": ("beam", self._zenith_angle),
+            "altitude": self._altitude,
         }
-        if self._sides_known:
-            coordinates["beam_azimuth"] = ("beam", order.azimuth)
-        total = np.bincount(order.cycle, weights=self._weights[order.profile])
+        if self._azimuth is not None:
+            coordinates["beam_azimuth"] = ("beam", self._azimuth)
+        total = np.bincount(self._cycle, weights=self._shots[self._profile])
         return xr.Dataset(
             {
-                **cycles,
-                "response": (("beam", "altitude"), self._settings.response()),
+                **{name: (_DIMENSIONS[name], values) for name, values in cycles.items()},
+                "response": (("beam", "altitude"), self._response()),
                 "shots": ("time", np.rint(total).astype(np.int32)),
             },
             coords=coordinates,
@@ -247,207 +251,125 @@ class AltitudeCycles:
 
     def _end_beams(self, cycles: Mapping[str, Block], obstructions: Mapping[int, float]) -> None:
         """Remove the cells of beams behind obstructions, in place."""
-        order = self._order
-        ends = np.array([obstructions.get(int(number), np.inf) for number in order.profile])
+        ends = np.array([obstructions.get(int(number), np.inf) for number in self._profile])
         for row in np.flatnonzero(np.isfinite(ends)):
-            visit = order.cycle[row], order.beam[row]
+            visit = self._cycle[row], self._beam[row]
             cycles["obstruction"][visit] = np.fmin(cycles["obstruction"][visit], ends[row])
-            behind = self._settings.slant_edges[order.beam[row], 1:] > ends[row]
+            behind = self._slant_edges[self._beam[row], 1:] > ends[row]
             for name in _OF_CELLS & cycles.keys():
                 cycles[name][visit][behind] = np.nan
 
-
-@dataclass(frozen=True, slots=True)
-class _Order:
-    """Cycle and beam of each profile that is used, sorted by cycle, then beam."""
-
-    profile: Integers
-    """(kept,) number of the profile in the scene."""
-    cycle: Integers
-    """(kept,) from 0, without gaps."""
-    beam: Integers
-    """(kept,) from 0."""
-    zenith_angle: Array
-    """(beam,) degree, 0 to 90."""
-    azimuth: Array
-    """(beam,) degree."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Settings:
-    """Inputs that are common to all profiles of a scene."""
-
-    distance: Array
-    overlap: Array | None
-    background_range: tuple[float, float]
-    shapes: Array | None
-    """(beam, range): signal of clean air."""
-    altitude: Array
-    slant_edges: Array
-    """(beam, altitude + 1) m: the range at which a beam crosses the edges of the cells."""
-    baseline: AnalogBaseline | None
-
-    @property
-    def in_front(self) -> slice:
-        """Bins in front of the lidar: a range offset may put others behind it, without light."""
-        return slice(int(np.searchsorted(self.distance, 0.0, side="right")), None)
-
-    @property
-    def covered(self) -> slice:
-        """Bins needed for all cells of all beams."""
-        farthest = float(np.max(self.slant_edges[:, -1]))
-        first = self.in_front.start
-        bins = int(np.searchsorted(self.distance, farthest)) + _BESIDE
-        return slice(first, max(bins, first) + _BESIDE)
-
-    @property
-    def gain(self) -> Array:
-        """Square of range over overlap of the bins that are covered, m2."""
-        distance = self.distance[self.covered]
-        if self.overlap is None:
-            return distance**2
-        overlap = self.overlap[self.covered]
-        return distance**2 / np.where(overlap > 0.0, overlap, np.nan)
-
-    def response(self) -> Array:
+    def _response(self) -> Array:
         """Return the change of signals per change of the background, (beam, altitude) m2."""
-        distance = self.distance[self.covered]
+        distance = self._distance[self._covered]
         dark = np.zeros((1, distance.size))
         nothing = dark, dark, dark.astype(np.int32)
         return np.stack(
             [
-                average_over_cells(*nothing, self.gain, distance, edges).response
-                for edges in self.slant_edges
+                average_over_cells(*nothing, self._gain, distance, edges).response
+                for edges in self._slant_edges
             ]
         )
 
+    def _on_altitudes(
+        self,
+        profiles: list[Block],
+        dead_time: tuple[Block, float] | None,
+        baseline: Array | None,
+        batch: slice,
+        rows: Integers,
+    ) -> dict[str, Block]:
+        """Return the arrays of the cycles of a batch by name.
 
-def _slant_edges(zenith_angle: Array, height: Array) -> Array:
-    """Return the ranges at which beams cross the edges of cells around heights, (beam, edge) m."""
-    middles = 0.5 * (height[:-1] + height[1:])
-    lowest = max(height[0] - 0.5 * (height[1] - height[0]), 0.0)
-    highest = height[-1] + 0.5 * (height[-1] - height[-2])
-    edges = np.concatenate([[lowest], middles, [highest]])
-    above = np.where(edges > 0.0, edges, 1.0)
-    return np.where(edges > 0.0, slant_paths.slant_path(zenith_angle, above) * edges, 0.0)
+        `dead_time` holds the change of the power by the dead time with that of the background over
+        its square, `baseline` that by the baseline; None where a channel has none. `rows` are those
+        of the batch in the profiles.
+        """
+        cycle, beam = self._cycle[batch] - self._cycle[batch.start], self._beam[batch]
+        shots = self._shots[self._profile[batch]]
+        beams = self._zenith_angle.size
+        sizes = {"time": int(cycle[-1]) + 1, "beam": beams, "altitude": self._altitude.size}
+        missing = {"dead_time_error": dead_time is None, "baseline_error": baseline is None}
+        cycles: dict[str, Block] = {
+            name: np.full([sizes[dim] for dim in dims], np.nan)
+            for name, dims in _DIMENSIONS.items()
+            if not missing.get(name)
+        }
+        cycles["quality"] = np.zeros_like(cycles["quality"], dtype=np.int32)
+        first = np.flatnonzero(np.diff(cycle * beams + beam, prepend=-1))
+        for few, visits in _few_visits(first, rows.size):
+            bins = self._net_bins([values[rows[few]] for values in profiles], beam[few])
+            changes = {}
+            if dead_time is not None:
+                of_sky = dead_time[1] * bins.background**2
+                change = dead_time[0][rows[few], self._covered] - of_sky[:, np.newaxis]
+                changes["dead_time_error"] = change
+            if baseline is not None:
+                changes["baseline_error"] = baseline[rows[few]]
+            known = np.isfinite(bins.power)
+            bins = bins._replace(
+                changes={name: np.where(known, change, np.nan) for name, change in changes.items()}
+            )
+            if visits.size < bins.left.size:
+                bins = _visit_means(bins, shots[few], visits - few.start)
+            self._fill_cells(cycles, bins, cycle[visits], beam[visits])
+        return cycles
 
+    def _net_bins(self, profiles: list[Block], beam: Integers) -> _Bins:
+        """Return the bins to average, without their background."""
+        power, variance, quality, length = profiles
+        bits = quality & np.int32(WITHHELD | CARE)
+        front, near = self._front, self._covered
+        if self._overlap is not None:
+            unknown = ~(np.isfinite(self._overlap) & (self._overlap > 0))
+            bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
+        values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
+        if self._baseline is not None:
+            values -= self._baseline.at(self._distance)
+        of_means = variance * length[:, np.newaxis]
+        data = (values[:, front], self._distance[front], of_means[:, front])
+        if self._shapes is None:
+            sky = estimate.from_bounded_tail(*data, None, self._tail)
+        else:
+            # Within the altitudes of the retrieval, the air is not taken as clean.
+            highest = self._slant_edges[beam, -1:]
+            shapes = self._shapes[beam][:, front]
+            sky = estimate.from_far_range(*data, shapes, self._tail, mask=data[1] > highest)
+        uncertain = np.where(sky.unjudged, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
+        # Farther bins serve the background only.
+        net = values[:, near] - sky.background[:, np.newaxis]
+        bits = bits[:, near] | uncertain[:, np.newaxis]
+        unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
+        bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
+        left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
+        distance, variance = self._distance[near], of_means[:, near]
+        blocked = obstruction_range(net, variance, distance)
+        net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)
+        level_variance = sky.standard_error**2
+        return _Bins(net, variance, bits, level_variance, left, blocked, sky.background)
 
-def _order(directions: scan_cycles.Directions, numbers: Integers, height: Array) -> _Order:
-    usable = slant_paths.rising_beams(directions.zenith_angle, height)
-    if usable.size == 0:
-        raise RetrievalInputError(
-            "has no direction more than 3 degrees above the horizon",
-            field="zenith_angle",
-            remedy="leave the multi-angle retrieval out of this scene",
+    def _fill_cells(
+        self, cycles: dict[str, Block], bins: _Bins, cycle: Integers, beam: Integers
+    ) -> None:
+        """Average the bins of visits over the cells of their beams, in place."""
+        cycles["left"][cycle, beam] = bins.left
+        cycles["obstruction"][cycle, beam] = np.where(
+            np.isfinite(bins.obstruction), bins.obstruction, np.nan
         )
-    rank = np.full(directions.zenith_angle.size + 1, -1, dtype=np.int64)
-    rank[usable] = np.arange(usable.size)
-    beam = rank[directions.index]
-    kept = np.flatnonzero(beam >= 0)
-    kept = kept[np.lexsort((beam[kept], numbers[kept]))]
-    cycle = np.unique(numbers[kept], return_inverse=True)[1].astype(np.int64)
-    return _Order(
-        kept, cycle, beam[kept], directions.zenith_angle[usable], directions.azimuth[usable]
-    )
-
-
-def _cycle_bounds(bounds: npt.NDArray[np.datetime64], order: _Order) -> npt.NDArray[np.datetime64]:
-    """Return the first start and the last end of the profiles of each cycle."""
-    first = np.flatnonzero(np.diff(order.cycle, prepend=-1))
-    starts = np.minimum.reduceat(bounds[order.profile, 0], first)
-    stops = np.maximum.reduceat(bounds[order.profile, 1], first)
-    return np.stack([starts, stops], axis=-1)
-
-
-def _batches(order: _Order) -> Iterator[slice]:
-    """Yield batches of whole cycles as slices of the kept profiles."""
-    first = np.append(np.flatnonzero(np.diff(order.cycle, prepend=-1)), order.cycle.size)
-    low = 0
-    for high in range(1, first.size):
-        if high == first.size - 1 or first[high + 1] - first[low] > BATCH:
-            yield slice(int(first[low]), int(first[high]))
-            low = high
-
-
-def _batch_on_altitudes(
-    profiles: tuple[Block, ...],
-    systematic: tuple[tuple[Block, float] | None, Array | None],
-    rows: Integers,
-    shots: Array,
-    cycle: Integers,
-    beam: Integers,
-    settings: _Settings,
-) -> dict[str, Block]:
-    """Return the arrays of the cycles of a batch by name.
-
-    `systematic` holds the change of the power by the dead time with that of the background over its
-    square, and that by the baseline; None where a channel has none. `rows` are those of the batch
-    in the profiles, sorted by cycle and beam, as `shots`, `cycle` and `beam` are.
-    """
-    beams = len(settings.slant_edges)
-    shape = (int(cycle[-1]) + 1, beams, settings.altitude.size)
-    cycles: dict[str, Block] = {
-        "signal": np.full(shape, np.nan),
-        "variance": np.full(shape, np.nan),
-        "quality": np.zeros((shape[0], shape[2]), dtype=np.int32),
-        "left": np.full(shape[:2], np.nan),
-        "obstruction": np.full(shape[:2], np.nan),
-    }
-    dead_time, baseline = systematic
-    for name, change in (("dead_time_error", dead_time), ("baseline_error", baseline)):
-        if change is not None:
-            cycles[name] = np.full(shape, np.nan)
-    first = np.flatnonzero(np.diff(cycle * beams + beam, prepend=-1))
-    for few, visits in _few_visits(first, rows.size):
-        power, variance, quality, length = (values[rows[few]] for values in profiles)
-        bins = _net_bins(power, variance, quality, length, beam[few], settings)
-        changes = {}
-        if dead_time is not None:
-            of_sky = dead_time[1] * bins.background**2
-            changes["dead_time_error"] = dead_time[0][rows[few], settings.covered] - of_sky[:, None]
-        if baseline is not None:
-            changes["baseline_error"] = baseline[rows[few]]
-        known = np.isfinite(bins.power)
-        bins = bins._replace(
-            changes={name: np.where(known, change, np.nan) for name, change in changes.items()}
-        )
-        if visits.size < bins.left.size:
-            bins = _visit_means(bins, shots[few], visits - few.start)
-        _fill_cells(cycles, bins, cycle[visits], beam[visits], settings)
-    return cycles
-
-
-def _few_visits(first: Integers, profiles: int) -> Iterator[tuple[slice, Integers]]:
-    """Yield the profiles of some visits of directions, and the first profile of each."""
-    ends = np.append(first[1:], profiles)
-    low = 0
-    while low < first.size:
-        high = max(int(np.searchsorted(ends, first[low] + _FEW, side="right")), low + 1)
-        yield slice(int(first[low]), int(ends[high - 1])), first[low:high]
-        low = high
-
-
-def _fill_cells(
-    cycles: dict[str, Block], bins: _Bins, cycle: Integers, beam: Integers, settings: _Settings
-) -> None:
-    """Average the bins of visits over the cells of their beams, in place."""
-    cycles["left"][cycle, beam] = bins.left
-    cycles["obstruction"][cycle, beam] = np.where(
-        np.isfinite(bins.obstruction), bins.obstruction, np.nan
-    )
-    distance, gain = settings.distance[settings.covered], settings.gain
-    for number in np.unique(beam):
-        rows = np.flatnonzero(beam == number)
-        noise = bins.variance[rows], bins.quality[rows]
-        cells = gain, distance, settings.slant_edges[number]
-        means = average_over_cells(bins.power[rows], *noise, *cells)
-        # The background is common to all bins of a beam.
-        variance = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
-        visits = cycle[rows], number
-        cycles["signal"][visits], cycles["variance"][visits] = at_centres(means.signal, variance)
-        cycles["quality"][cycle[rows]] |= means.quality
-        for name, change in bins.changes.items():
-            cycles[name][visits] = average_over_cells(change[rows], *noise, *cells).signal
+        for number in np.unique(beam):
+            rows = np.flatnonzero(beam == number)
+            noise = bins.variance[rows], bins.quality[rows]
+            cells = self._gain, self._distance[self._covered], self._slant_edges[number]
+            means = average_over_cells(bins.power[rows], *noise, *cells)
+            # The background is common to all bins of a beam.
+            variance = means.variance + means.response**2 * bins.level_variance[rows, np.newaxis]
+            visits = cycle[rows], number
+            cycles["signal"][visits], cycles["variance"][visits] = at_centres(
+                means.signal, variance
+            )
+            cycles["quality"][cycle[rows]] |= means.quality
+            for name, change in bins.changes.items():
+                cycles[name][visits] = average_over_cells(change[rows], *noise, *cells).signal
 
 
 class _Bins(NamedTuple):
@@ -471,83 +393,82 @@ class _Bins(NamedTuple):
     """(profile, range): of the power, with one standard error of dead time or baseline."""
 
 
-def _net_bins(
-    power: Block,
-    variance: Block,
-    quality: Block,
-    length: Block,
-    beam: Integers,
-    settings: _Settings,
-) -> _Bins:
-    """Return the bins to average, without their background."""
-    bits = quality & np.int32(WITHHELD | CARE)
-    front, near, overlap = settings.in_front, settings.covered, settings.overlap
-    if overlap is not None:
-        unknown = ~(np.isfinite(overlap) & (overlap > 0))
-        bits |= np.where(unknown, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    values = np.where((bits & int(WITHHELD)) != 0, np.nan, power)
-    if settings.baseline is not None:
-        values -= settings.baseline.at(settings.distance)
-    of_means = variance * length[:, np.newaxis]
-    data = (values[:, front], settings.distance[front], of_means[:, front])
-    tail = settings.background_range
-    if settings.shapes is None:
-        sky = estimate.from_bounded_tail(*data, None, tail)
-    else:
-        # Within the altitudes of the retrieval, the air is not taken as clean.
-        highest = settings.slant_edges[beam, -1:]
-        sky = estimate.from_far_range(
-            *data, settings.shapes[beam][:, front], tail, mask=data[1] > highest
-        )
-    uncertain = np.where(sky.unjudged, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
-    # Farther bins serve the background only.
-    net = values[:, near] - sky.background[:, np.newaxis]
-    bits = bits[:, near] | uncertain[:, np.newaxis]
-    unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
-    bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
-    left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
-    distance = settings.distance[near]
-    blocked = obstruction_range(net, of_means[:, near], distance)
-    net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)
-    return _Bins(net, of_means[:, near], bits, sky.standard_error**2, left, blocked, sky.background)
+def _slant_edges(zenith_angle: Array, height: Array) -> Array:
+    """Return the ranges at which beams cross the edges of cells around heights, (beam, edge) m."""
+    middles = 0.5 * (height[:-1] + height[1:])
+    lowest = max(height[0] - 0.5 * (height[1] - height[0]), 0.0)
+    highest = height[-1] + 0.5 * (height[-1] - height[-2])
+    edges = np.concatenate([[lowest], middles, [highest]])
+    above = np.where(edges > 0.0, edges, 1.0)
+    return np.where(edges > 0.0, slant_paths.slant_path(zenith_angle, above) * edges, 0.0)
 
 
-def _kept_shapes(
-    kept: dict[Any, Any], molecules: MolecularProfile, arguments: tuple[float, Array, Array, float]
-) -> Array:
-    """Return `_shapes`, or those that were kept for the same arguments; only the last are kept."""
-    wavelength, zenith_angle, distance, station_altitude = arguments
-    arrays = (zenith_angle, distance, *(getattr(molecules, name) for name in _LEVELS))
-    key = (wavelength, station_altitude, *(array.tobytes() for array in arrays))
-    if key not in kept:
-        kept.clear()
-        kept[key] = _shapes(molecules, *arguments)
-    shapes: Array = kept[key]
-    return shapes
+def _sorted_profiles(
+    directions: scan_cycles.Directions, usable: Indices, numbers: Integers
+) -> tuple[Integers, Integers, Integers]:
+    """Return number, cycle and beam of each profile that is used, sorted by cycle, then beam."""
+    rank = np.full(directions.zenith_angle.size + 1, -1, dtype=np.int64)
+    rank[usable] = np.arange(usable.size)
+    beam = rank[directions.index]
+    kept = np.flatnonzero(beam >= 0)
+    kept = kept[np.lexsort((beam[kept], numbers[kept]))]
+    cycle = np.unique(numbers[kept], return_inverse=True)[1].astype(np.int64)
+    return kept, cycle, beam[kept]
+
+
+def _batches(cycle: Integers) -> Iterator[slice]:
+    """Yield batches of whole cycles as slices of the kept profiles."""
+    first = np.append(np.flatnonzero(np.diff(cycle, prepend=-1)), cycle.size)
+    low = 0
+    for high in range(1, first.size):
+        if high == first.size - 1 or first[high + 1] - first[low] > BATCH:
+            yield slice(int(first[low]), int(first[high]))
+            low = high
+
+
+def _few_visits(first: Integers, profiles: int) -> Iterator[tuple[slice, Integers]]:
+    """Yield the profiles of some visits of directions, and the first profile of each."""
+    ends = np.append(first[1:], profiles)
+    low = 0
+    while low < first.size:
+        high = max(int(np.searchsorted(ends, first[low] + _FEW, side="right")), low + 1)
+        yield slice(int(first[low]), int(ends[high - 1])), first[low:high]
+        low = high
 
 
 def _shapes(
+    kept: dict[Any, Any],
     molecules: MolecularProfile,
     wavelength: float,
     zenith_angle: Array,
     distance: Array,
     station_altitude: float,
 ) -> Array:
-    """Return the shape of the signal of clean air along each beam; 0 behind the lidar."""
+    """Return the shape of the signal of clean air along each beam; 0 behind the lidar.
+
+    It is kept for the same arguments; only the last one is.
+    """
     if not wavelength > 0:
         raise RetrievalInputError(
             f"is {wavelength}", field="wavelength", remedy="give m, or leave the molecules out"
         )
-    in_front = distance > 0
-    # The vertical planes of a volume have the same zenith angles.
-    angles, place = np.unique(zenith_angle, return_inverse=True)
-    climb = np.cos(np.radians(angles))[:, np.newaxis]
-    altitude = station_altitude + climb * distance[in_front]
-    shapes = np.zeros((angles.size, distance.size))
-    extinction = molecules.extinction(altitude, wavelength)
-    backscatter = extinction / molecular_lidar_ratio(wavelength)
-    shapes[:, in_front] = known_shape.molecular_shape(backscatter, extinction, distance[in_front])
-    return shapes[place]
+    arrays = (zenith_angle, distance, *(getattr(molecules, name) for name in _LEVELS))
+    key = (wavelength, station_altitude, *(array.tobytes() for array in arrays))
+    if key not in kept:
+        in_front = distance > 0
+        # The vertical planes of a volume have the same zenith angles.
+        angles, place = np.unique(zenith_angle, return_inverse=True)
+        climb = np.cos(np.radians(angles))[:, np.newaxis]
+        altitude = station_altitude + climb * distance[in_front]
+        shapes = np.zeros((angles.size, distance.size))
+        extinction = molecules.extinction(altitude, wavelength)
+        backscatter = extinction / molecular_lidar_ratio(wavelength)
+        shapes[:, in_front] = known_shape.molecular_shape(
+            backscatter, extinction, distance[in_front]
+        )
+        kept.clear()
+        kept[key] = shapes[place]
+    return np.asarray(kept[key])
 
 
 def _visit_means(bins: _Bins, shots: Array, first: Indices) -> _Bins:
