@@ -17,8 +17,7 @@ from lidarops.flags import FIRST_OWN, PLACES, FlagBit, Flags, Quality, Severity
 from lidarops.kinds import flags_of
 from lidarops.netcdf.variables import layout_of, summarize_flags
 from lidarops.netcdf.write import write_product
-from lidarops.retrieve.multiangle import labeled as multiangle
-from lidarops.retrieve.network import labeled as network
+from lidarops.retrieve.multiangle import _methods
 
 SHARED = {
     "input_missing": 0,
@@ -176,35 +175,26 @@ SCENES = {
     "HomogeneousQuality.NOISE_UNCERTAIN": "test_homogeneous_limits::"
     "test_errors_from_estimated_noise_are_widened_as_the_page_tells",
     "NetworkQuality.PRIOR_DOMINATED": "test_labeled_network::test_a_missing_beam_gives_a_reason",
+    "NetworkQuality.POORLY_DETERMINED": "test_network_extremes",
+    "NetworkQuality.POOR_FIT": "test_network_outlying_bins",
+    "NetworkQuality.LOW_LEVERAGE": "test_network_noise",
+    "MultiAngleQuality.PRIOR_DOMINATED": "test_mld::"
+    "test_published_claim_is_not_reproduced_at_15_degrees",
+    "MultiAngleQuality.INTERPOLATED": "test_optical_depth::"
+    "test_invalid_profiles_do_not_affect_others",
+    "MultiAngleQuality.LOW_LEVERAGE": "test_optical_depth::"
+    "test_tiny_leverage_is_flagged_and_has_a_correct_error",
+    "MultiAngleQuality.NO_RESIDUAL": "test_optical_depth::test_two_beams_have_no_residual",
 }
 """The test of a scene that raises the bit; the bit stands in it by name."""
 
 BY_FIELD = {
-    "MultiAngleQuality.PRIOR_DOMINATED": (
-        "prior_dominated",
-        "test_mld::test_published_claim_is_not_reproduced_at_15_degrees",
-    ),
-    "MultiAngleQuality.INTERPOLATED": (
-        "interpolated",
-        "test_optical_depth::test_invalid_profiles_do_not_affect_others",
-    ),
-    "MultiAngleQuality.LOW_LEVERAGE": (
-        "low_leverage",
-        "test_optical_depth::test_tiny_leverage_is_flagged_and_has_a_correct_error",
-    ),
-    "MultiAngleQuality.NO_RESIDUAL": (
-        "no_residual",
-        "test_optical_depth::test_two_beams_have_no_residual",
-    ),
     "MultiAngleQuality.UNDERSMOOTHED": (
-        "undersmoothed",
+        "smooth.undersmoothed",
         "test_smooth_profile::test_profile_with_too_much_structure_for_smoothing_is_flagged",
     ),
-    "NetworkQuality.POORLY_DETERMINED": ("ill_conditioned", "test_network_extremes"),
-    "NetworkQuality.POOR_FIT": ("outlying", "test_network_outlying_bins"),
-    "NetworkQuality.LOW_LEVERAGE": ("weak_signal", "test_network_noise"),
 }
-"""As above, where the bit is a boolean of a result that the shell `labeled` turns into it."""
+"""As above, where the bit is a boolean of a profile that the methods of scans turn into it."""
 
 GUARDS = {"Quality.NO_REAL_SOLUTION"}
 """Raised only where arithmetic fails; no scene is known that does it."""
@@ -305,10 +295,9 @@ def test_every_bit_is_documented_and_raised_by_some_scene(bit: FlagBit, reposito
         assert name in source(repository, SCENES[name])
     elif name in BY_FIELD:
         field, scene = BY_FIELD[name]
-        assert f".{field}" in source(repository, scene)
-        shell = network if name.startswith("Network") else multiangle
-        written = Path(str(shell.__file__)).read_text(encoding="utf-8")
-        assert f'"{field}": {name}' in written
+        assert f".{field.partition('.')[2]}" in source(repository, scene)
+        written = Path(str(_methods.__file__)).read_text(encoding="utf-8")
+        assert f"({name}, {field}" in written
     else:
         assert name in GUARDS, "name a scene that raises it"
 

@@ -28,25 +28,27 @@ _ALONG_BOTH: Final = (
     *(f"{name}{error}" for name in QUANTITIES for error in _ERRORS),
     "quality_flag",
 )
-_OF_CHANNEL: Final = tuple(
-    f"{name}_{cause}_error" for name in QUANTITIES for cause in ("dead_time", "baseline")
-)
-"""Optional variables."""
+_CAUSES: Final = ("dead_time", "baseline")
+"""Of errors that products of some channels have."""
 _PROFILES: Final = ("time", "altitude", "reach", *_ALONG_BOTH)
 CYCLE_VARIABLES: Final = (
-    *_PROFILES, *_OF_CHANNEL, "time_bnds", "station_altitude", "wavelength"
-)  # fmt: skip
+    *_PROFILES,
+    *(f"{name}_{cause}_error" for name in QUANTITIES for cause in _CAUSES),
+    "time_bnds",
+    "station_altitude",
+    "wavelength",
+)
 """Variables that `clearest_cycle` reads."""
 EXTINCTION_VARIABLES: Final = (*_PROFILES, TIME_BOUNDS)
 """Variables that `read_extinction` needs."""
-RESIDUAL_VARIABLES: Final = (
-    "time",
-    "altitude",
-    "beam_zenith_angle",
-    "beam_azimuth",
-    "quality_flag",
-    "residual",
-)
+_OF_RESIDUALS: Final = {
+    "time": ("time",),
+    "altitude": ("altitude",),
+    "beam_zenith_angle": ("beam",),
+    "quality_flag": ("time", "altitude"),
+    "residual": ("time", "beam", "altitude"),
+}
+RESIDUAL_VARIABLES: Final = (*_OF_RESIDUALS, "beam_azimuth")
 """Variables that `read_residuals` needs."""
 _REJECTED: Final = flags_of("multiangle").rejecting
 _WITH_CARE: Final = flags_of("multiangle").caring
@@ -77,11 +79,10 @@ class ProfileEstimate:
     """Rejected values; NaN elsewhere."""
     standard_error: Floats
     """Of noise and smoothing."""
-    dead_time_error: Floats
-    baseline_error: Floats
-    """Standard error from the dead time; NaN where the product has none."""
     gradient_error: Floats
     """Largest systematic error from a horizontal gradient."""
+    of_channel: dict[str, Floats]
+    """Standard errors by what the product states of its channel: dead time or baseline."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,12 +187,12 @@ def clearest_cycle(
     index = int(np.lexsort((earlier, known.sum(axis=1), usable, clear))[-1])
     altitude = product["altitude"].values.astype(np.float64)
     reach = float(product["reach"].values[index])
-    shown = _shown(altitude, reach)
-    chosen = product.isel(time=index, altitude=shown)
-    bits = flag[index, shown]
+    drawn = _to_reach(altitude, reach)
+    chosen = product.isel(time=index, altitude=drawn)
+    bits = flag[index, drawn]
     return ScanProfile(
         time=product["time"].values.astype("datetime64[ns]")[index],
-        altitude=altitude[shown],
+        altitude=altitude[drawn],
         estimates={name: _estimate(chosen, name, bits) for name in QUANTITIES},
         flag=bits,
         reach=reach,
@@ -199,29 +200,28 @@ def clearest_cycle(
     )
 
 
-def _shown(altitude: Floats, reach: float) -> Mask:
+def _to_reach(altitude: Floats, reach: float) -> Mask:
     if not np.isfinite(reach):
         return np.ones(altitude.size, dtype=np.bool_)
     return np.asarray(altitude <= altitude[0] + _BEYOND * max(reach - altitude[0], 0.0))
 
 
 def _estimate(cycle: xr.Dataset, name: str, bits: NDArray[np.int64]) -> ProfileEstimate:
-    value = cycle[name].values.astype(np.float64)
     rejected = (bits & _REJECTED) != 0
 
-    def kept(suffix: str) -> Floats:
-        variable = f"{name}_{suffix}"
-        if variable in _OF_CHANNEL and variable not in cycle.variables:
-            return np.full(value.shape, np.nan)
+    def kept(variable: str) -> Floats:
         return np.where(rejected, np.nan, cycle[variable].values.astype(np.float64))
 
     return ProfileEstimate(
-        value=np.where(rejected, np.nan, value),
-        rejected=np.where(rejected, value, np.nan),
-        standard_error=kept("standard_error"),
-        dead_time_error=kept("dead_time_error"),
-        baseline_error=kept("baseline_error"),
-        gradient_error=kept("gradient_error"),
+        value=kept(name),
+        rejected=np.where(rejected, cycle[name].values.astype(np.float64), np.nan),
+        standard_error=kept(f"{name}_standard_error"),
+        gradient_error=kept(f"{name}_gradient_error"),
+        of_channel={
+            cause.replace("_", " "): kept(f"{name}_{cause}_error")
+            for cause in _CAUSES
+            if f"{name}_{cause}_error" in cycle.variables
+        },
     )
 
 
@@ -354,27 +354,17 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
         If a variable is missing or has other dimensions; ``beam_azimuth`` may be missing.
     """
     known = {"beam_azimuth": ("beam",)} if "beam_azimuth" in product.variables else {}
-    require(
-        product,
-        known
-        | {
-            "time": ("time",),
-            "altitude": ("altitude",),
-            "beam_zenith_angle": ("beam",),
-            "quality_flag": ("time", "altitude"),
-            "residual": ("time", "beam", "altitude"),
-        },
-    )
-    sums = _sums(product)
-    if not sums.count.any():
+    require(product, known | _OF_RESIDUALS)
+    total, squares, count, cycles = _sums(product)
+    if not count.any():
         return None
     zenith = product["beam_zenith_angle"].values.astype(np.float64)
     azimuth = product["beam_azimuth"].values if known else np.full(zenith.size, np.nan)
     zenith, plane, azimuths, order = _in_the_sky(zenith, azimuth.astype(np.float64))
-    top = int(np.flatnonzero(sums.count.any(axis=0))[-1]) + 1
+    top = int(np.flatnonzero(count.any(axis=0))[-1]) + 1
     size = -(-top // _MAP_ROWS)
     starts = np.arange(0, top, size)
-    count, total = sums.count[order, :top], sums.total[order, :top]
+    count, total = count[order, :top], total[order, :top]
     in_row = np.add.reduceat(count, starts, axis=1)
     by_row = _ratio(np.add.reduceat(total, starts, axis=1), in_row)
     squares_of_means = (total**2 / np.maximum(count, 1.0)).sum(axis=1)
@@ -386,35 +376,29 @@ def read_residuals(product: xr.Dataset) -> ScanResiduals | None:
         edges=_edges(product["altitude"].values.astype(np.float64))[[*starts, top]],
         mean=100.0 * by_row.T,
         count=in_row.T,
-        rms=100.0 * np.sqrt(_ratio(sums.squares[order].sum(axis=1), beam_count)),
+        rms=100.0 * np.sqrt(_ratio(squares[order].sum(axis=1), beam_count)),
         rms_of_mean=100.0 * np.sqrt(_ratio(squares_of_means, beam_count)),
-        cycles=sums.cycles,
+        cycles=cycles,
     )
 
 
-@dataclass(slots=True)
-class _Sums:
-    """Sums of residuals over cycles, (beam, altitude)."""
+def _sums(product: xr.Dataset) -> tuple[Floats, Floats, Floats, int]:
+    """Return sums of residuals, of their squares and of their number, and the number of cycles.
 
-    total: Floats
-    squares: Floats
-    count: Floats
-    cycles: int = 0
-
-
-def _sums(product: xr.Dataset) -> _Sums:
-    shape = product["residual"].shape[1:]
-    sums = _Sums(np.zeros(shape), np.zeros(shape), np.zeros(shape))
+    The sums are those over cycles, (beam, altitude).
+    """
+    total, squares, count = np.zeros((3, *product["residual"].shape[1:]))
+    cycles = 0
     for part in _parts(product):
         no_residual = (quality_bits(part["quality_flag"]) & int(MultiAngleQuality.NO_RESIDUAL)) != 0
         residual = part["residual"].values.astype(np.float64)
         known = np.isfinite(residual) & ~no_residual[:, np.newaxis, :]
         residual = np.where(known, residual, 0.0)
-        sums.total += residual.sum(axis=0)
-        sums.squares += (residual**2).sum(axis=0)
-        sums.count += known.sum(axis=0)
-        sums.cycles += int(known.any(axis=(1, 2)).sum())
-    return sums
+        total += residual.sum(axis=0)
+        squares += (residual**2).sum(axis=0)
+        count += known.sum(axis=0)
+        cycles += int(known.any(axis=(1, 2)).sum())
+    return total, squares, count, cycles
 
 
 def _parts(product: xr.Dataset) -> Iterator[xr.Dataset]:

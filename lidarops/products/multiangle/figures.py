@@ -104,10 +104,7 @@ def _cycle(profile: ScanProfile, quantity: str, y: Axis) -> Panel:
     """Return a quantity of one cycle with its errors, flags, reach and truth."""
     scale, label = _SCALES[quantity]
     estimate, z = profile.estimates[quantity], profile.altitude / 1e3
-    of_channel = {
-        "dead time": np.nan_to_num(estimate.dead_time_error),
-        "baseline": np.nan_to_num(estimate.baseline_error),
-    }
+    of_channel = {cause: np.nan_to_num(part) for cause, part in estimate.of_channel.items()}
     value = scale * estimate.value
     error = scale * np.sqrt(
         estimate.standard_error**2 + sum(part**2 for part in of_channel.values())

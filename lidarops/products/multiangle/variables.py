@@ -164,7 +164,7 @@ def _of_planes(row: Row) -> Row:
     )
 
 
-def _of_fit(name: str, long_name: str, comment: str, **changes: Any) -> Row:
+def _diagnostic(name: str, long_name: str, comment: str, **changes: Any) -> Row:
     """Return the row of what tells how a value comes about and how well it is determined."""
     row = Row(name, _LEVELS, "1", long_name, Coverage.QUALITY, comment, bits=8)
     return replace(row, **changes)
@@ -253,12 +253,12 @@ LAYOUT: Final = Layout(
             ancillaries=("quality_flag", "beams", "shots"),
             uncertain=True,
         ),
-        _of_fit(
+        _diagnostic(
             "data_share",
             "share of the optical depth that the data determine",
             "1 where neither smoothness nor a prior has an effect.",
         ),
-        _of_fit(
+        _diagnostic(
             "regularisation",
             "strength of the penalty on the derivative along the slant path",
             "For slant paths scaled to a span of 1, and residuals scaled to their noise. Given by"
@@ -266,20 +266,20 @@ LAYOUT: Final = Layout(
             valid_min=0.0,
             **_OF_PENALTY,
         ),
-        _of_fit(
+        _diagnostic(
             "prior_vertical_optical_depth",
             "optical depth to which the penalty pulls",
             "0, or that of the altitude below. The share 1 - data_share of the optical depth comes"
             " from it.",
             **_OF_PENALTY,
         ),
-        _of_fit(
+        _diagnostic(
             "inhomogeneity",
             "standard deviation of ln(signal) between beams in excess of noise",
             "Inhomogeneity of the air between the beams, common to all cycles of the file.",
             valid_min=0.0,
         ),
-        _of_fit(
+        _diagnostic(
             "reduced_chi2",
             "reduced chi-square of the fit over the beams",
             "Sum of squared residuals divided by their variances, per degree of freedom. About 1,"
@@ -350,7 +350,7 @@ LAYOUT: Final = Layout(
         ),
         _blocked("zenith_angle"),
         _blocked("azimuth"),
-        _of_fit(
+        _diagnostic(
             "residual",
             "natural logarithm of the signal of a beam minus the fit over the beams",
             "Missing where the beam has no usable signal.",
@@ -363,7 +363,7 @@ LAYOUT: Final = Layout(
         ),
         BACKGROUND_METHOD,
         quality(_LEVELS, FLAGS),
-        _of_fit(
+        _diagnostic(
             "effective_degrees_of_freedom",
             "number of independent values of the profile that the data determine",
             "Missing where there is no profile.",
