@@ -240,7 +240,7 @@ def _solve_without_noise(span: float, scale: float) -> Answer:
     path = np.linspace(1.0, 1.0 + span, 6)
     height = np.array([1000.0, 2000.0, 3000.0])
     depth = np.array([0.1, 0.2, 0.3])
-    signal = scale * np.exp(-2.0 * path[:, np.newaxis] * depth)
+    signal = scale * np.exp(-2.0 * path[np.newaxis, :, np.newaxis] * depth)
     result = optical_depth.retrieve_optical_depth(
         signal, np.degrees(np.arccos(1.0 / path)), height, variance=1e-12 * signal**2,
         method="kano_hamilton",
