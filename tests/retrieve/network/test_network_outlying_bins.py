@@ -99,9 +99,9 @@ def test_low_photon_counts_are_no_outliers():
     r = grid(net)
     level = signals(net, r, ALL["homogeneous"])
     counts = rng.poisson(np.maximum(60 * level / level[:, [60]], 15), (300, *level.shape))
-    result = solved(net, r, counts.astype(float), counts.astype(float))
-    assert not result.raised(Quality.OUTLIER).any()
-    assert not result.raised(NetworkQuality.POOR_FIT).any()
+    data, _ = condensed(net, r, counts.astype(float), counts.astype(float))
+    assert not data.bridged.any()
+    assert not (data.status == _condensed_signals.OUTLYING).any()
 
 
 # With outlying bins ------------------------------------------------------------------------
