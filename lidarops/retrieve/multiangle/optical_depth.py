@@ -167,7 +167,7 @@ def layer_levels(
         For layers that contain no altitude of the grid, or extend beyond it.
     """
     height = slant_paths.altitude_grid(altitude, station_altitude)
-    grid = np.append(0.0, height) + station_altitude
+    grid = np.append(height, 0.0) + station_altitude
     try:
         wanted = np.asarray(layers, dtype=np.float64).reshape(len(layers), 2)
     except (TypeError, ValueError):
@@ -176,18 +176,18 @@ def layer_levels(
         raise RetrievalInputError(
             f"is {layers!r}", field="layers", remedy="give pairs (bottom, top) in m"
         )
-    levels = np.abs(grid - wanted[..., np.newaxis]).argmin(axis=-1)
-    bounds = grid[levels]
-    off = np.abs(bounds - wanted).max(axis=1) > 0.5 * np.max(np.diff(grid))
-    bad = np.flatnonzero(off | (levels[:, 0] >= levels[:, 1]))
+    nearest = np.abs(grid - wanted[..., np.newaxis]).argmin(axis=-1)
+    bounds = grid[nearest]
+    off = np.abs(bounds - wanted).max(axis=1) > 0.5 * np.max(np.diff(np.sort(grid)))
+    bad = np.flatnonzero(off | (bounds[:, 0] >= bounds[:, 1]))
     if bad.size:
         bottom, top = wanted[bad[0]]
         raise RetrievalInputError(
             f"[{bottom:g}, {top:g}] m contains no altitude of the grid, or extends beyond it",
             field="layers",
-            remedy=f"give bounds from {grid[0]:g} to {grid[-1]:g} m, bottom first",
+            remedy=f"give bounds from {grid.min():g} to {grid.max():g} m, bottom first",
         )
-    return levels, bounds
+    return (nearest + 1) % grid.size, bounds
 
 
 def _cube(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
