@@ -25,7 +25,7 @@ MOST = {
     "tuning numbers that are assumed": 86,
     "copied thresholds": 1,
     "most parameters": 24,
-    "lines of the largest package": 6_440,
+    "lines of the largest package": 6_390,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 82, "functions": 745, "changes": 381},

@@ -98,7 +98,7 @@ def _variables() -> dict[str, Any]:
     zenith_angle = np.linspace(0.0, 60.0, 5)
     altitude = np.arange(100.0, 900.0, 100.0)
     path = 1.0 / np.cos(np.radians(zenith_angle))
-    signal = np.exp(-2e-3 * path[:, np.newaxis] * altitude)
+    signal = np.exp(-2e-3 * path[np.newaxis, :, np.newaxis] * altitude)
     return {
         "range": distance, "power": power, "variance": 1.0, "network": network,
         "r": distance, "sigma": np.full(distance.size, 1e-4), "k": 1.0,

@@ -17,10 +17,11 @@ A scan passes through these modules in order:
    best (`beam_backgrounds`), and turns the result into the ``multiangle`` product.
 """
 
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleMethod,
     MultiAngleResult,
     retrieve_optical_depth,
 )
 
-__all__ = ["MultiAngleMethod", "MultiAngleResult", "retrieve_optical_depth"]
+__all__ = ["MultiAngleMethod", "MultiAngleQuality", "MultiAngleResult", "retrieve_optical_depth"]
