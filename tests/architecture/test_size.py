@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 75_310,
-    "lines of code alone": 49_150,
-    "modules": 334,
-    "dataclasses": 319,
-    "lines of dataclasses": 7_900,
+    "lines": 74_870,
+    "lines of code alone": 48_830,
+    "modules": 326,
+    "dataclasses": 312,
+    "lines of dataclasses": 7_720,
     "tuning numbers": 252,
     "tuning numbers that are assumed": 86,
     "copied thresholds": 1,
