@@ -3,6 +3,7 @@
 - `reprocess`: bring the products of a campaign up to date.
 - `catalog`: update the catalog only.
 - `maintenance`: end runs whose process is dead.
+- `start`: what a flow does before its work.
 - `notifications`: set up automations that report failed or missing runs.
 
 Importing this package sets the environment variables that a temporary Prefect server needs and that

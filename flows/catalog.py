@@ -12,15 +12,19 @@ import typer
 from prefect import flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 
-from flows.child_processes import keep_main_module_out
 from flows.reprocess import Seconds, Workers
-from flows.temporary_server import tie_to_this_process
-from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
+from flows.start import (
+    CatalogUrl,
+    Location,
+    catalog_parameter,
+    keep_main_module_out,
+    plain_errors,
+    tie_to_this_process,
+)
 from lidarops.campaign.model import load_campaign
-from lidarops.catalog.access import check_archive_and_catalog
+from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
-from lidarops.records import Status
 from lidarops.run.archive import update_catalog
 
 
@@ -57,7 +61,7 @@ def catalog(
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
-        refused = store.granules(status=Status.REFUSED)
+        refused = store.refused()
     get_run_logger().info("catalog of %s: %s", settings.name, asdict(summary))
     create_table_artifact(
         key=f"{settings.name.lower()}-refused",

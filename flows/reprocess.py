@@ -39,13 +39,18 @@ from prefect.utilities.annotations import quote
 from pydantic import AfterValidator, Field
 
 from flows import WITH_FAILURES
-from flows.child_processes import keep_main_module_out
-from flows.temporary_server import tie_to_this_process
-from flows.usage import CatalogUrl, Location, catalog_parameter, plain_errors
+from flows.start import (
+    CatalogUrl,
+    Location,
+    catalog_parameter,
+    keep_main_module_out,
+    plain_errors,
+    tie_to_this_process,
+)
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.catalog.access import check_archive_and_catalog
-from lidarops.catalog.ledger import RunStatus
-from lidarops.catalog.store import Store
+from lidarops.catalog.database import check_archive_and_catalog
+from lidarops.catalog.product_files import publish_products
+from lidarops.catalog.store import RunStatus, Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
@@ -60,9 +65,7 @@ from lidarops.run.archive import (
     report_earlier_runs,
     report_run,
 )
-from lidarops.run.options import missing_report
-from lidarops.run.publication import publish_products
-from lidarops.run.selection import check_selection, selects_no_scene
+from lidarops.run.options import check_selection, missing_report, selects_no_scene
 from lidarops.settings import Instant
 
 _T = TypeVar("_T")
@@ -353,7 +356,6 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
     for name, trace in list(result.internal.items())[:_MOST_NAMED]:
         logger.error("scene %s, internal error: please report it\n%s", name, trace)
     numbers = {kind: len(reasons) for kind, reasons in problems.items()}
-    numbers["more unused scenes and files on unchanged days"] = result.more_unused
     summary = ", ".join(f"{number} {kind}" for kind, number in numbers.items() if number)
     logger.warning("campaign %s: %s", campaign.name, summary)
     return summary
@@ -378,14 +380,14 @@ def main(
     catalog: Annotated[
         str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger.")
     ] = None,
-    instrument: Annotated[
-        list[str] | None, typer.Option(help="Only this one; may be repeated.")
+    instruments: Annotated[
+        list[str] | None, typer.Option("--instrument", help="Only this one; may be repeated.")
     ] = None,
-    station: Annotated[
-        list[str] | None, typer.Option(help="Only this one; may be repeated.")
+    stations: Annotated[
+        list[str] | None, typer.Option("--station", help="Only this one; may be repeated.")
     ] = None,
-    product: Annotated[
-        list[str] | None, typer.Option(help="Only this kind of product; may be repeated.")
+    products: Annotated[
+        list[str] | None, typer.Option("--product", help="Only this kind; may be repeated.")
     ] = None,
     since: Annotated[
         datetime | None, typer.Option(help="Only scenes that end after this UTC time.")
@@ -415,26 +417,10 @@ def main(
     ] = False,
 ) -> None:
     """Bring the products of a campaign up to date as a Prefect flow."""
+    # Those of the flow have the same names.
+    parameters: dict[str, Any] = dict(locals())
     with plain_errors():
-        stored_url = catalog_parameter(catalog)
-    parameters: dict[str, Any] = {
-        "campaign": campaign,
-        "archive": archive,
-        "out": out,
-        "catalog": stored_url,
-        "instruments": instrument,
-        "stations": station,
-        "products": product,
-        "since": since,
-        "until": until,
-        "workers": workers,
-        "scheduler": scheduler,
-        "cluster": cluster,
-        "memory_limit": memory_limit,
-        "wait": wait,
-        "publish": publish,
-        "full": full,
-    }
+        parameters["catalog"] = catalog_parameter(catalog)
     # Check before the flow, which would start a server first and show tracebacks.
     with plain_errors():
         valid = reprocess.validate_parameters(parameters)

@@ -11,11 +11,18 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from datetime import datetime
+from datetime import UTC, date, datetime
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, Self
 
 from lidarops.kinds import kinds
+
+_EPOCH: Final = date(1970, 1, 1).toordinal()
+
+
+def day_of(moment: datetime) -> int:
+    """Return the UTC day of a time, in days since 1970-01-01."""
+    return moment.astimezone(UTC).toordinal() - _EPOCH
 
 
 class DetectionMode(StrEnum):

@@ -13,11 +13,10 @@ import yaml
 
 from benchmarks.throughput.campaigns import campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
-from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
+from lidarops.catalog.headers import row_of
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.rows import row_of
 from lidarops.catalog.scan import scan_keys
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Store
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import (
     ChannelLayout,

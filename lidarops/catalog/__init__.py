@@ -1,11 +1,11 @@
 """The catalog of raw files and the ledger of products, in one SQL database per campaign.
 
-- `scan`: lists an archive (`sources`), reads the headers of new files (`headers`) and updates the
-  catalog.
-- `store`: the database that the other packages use, made of `database` (connection and
-  transactions), `granules` (raw files) and `ledger` (runs, products and their inputs).
-- `schema`: the tables; `rows`: granules as rows of a table.
+- `scan`: lists an archive (`sources`), reads the headers of new files into rows (`headers`) and
+  updates the catalog.
+- `store`: the database that the other packages use: the ledger of runs, products and their inputs,
+  on top of `granules` (raw files) and `database` (connection and transactions).
+- `schema`: the tables.
 - `lock`: one writer at a time.
-- `versions`: keeps replaced versions of products.
-- `verify`: compares products and inputs with the digests in the ledger.
+- `product_files`: keeps replaced versions of products, removes temporary files, compares products
+  and inputs with the digests in the ledger, and copies products to an object store.
 """

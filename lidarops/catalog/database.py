@@ -9,18 +9,21 @@ import sqlite3
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
+from lidarops.campaign.model import Campaign
+from lidarops.catalog.schema import METADATA, REMADE, SCHEMA, SCHEMA_VERSION
+from lidarops.catalog.sources import Source
 from lidarops.errors import CatalogError, LidarOpsError
 
 _T = TypeVar("_T")
 
+_UPGRADED: Final = 11
+"""Version of a schema that is brought to the present one."""
 _BATCH: Final = 1000
 """Largest number of values in the list of one statement."""
 _MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all products again"
@@ -62,6 +65,7 @@ class Database:
                 raise self._absent()
             _make_folder(Path(self._url.database).parent)
         self._copied = ExitStack()
+        self._upserts: dict[tuple[str, bool], sa.TextClause] = {}
         self._engine = _engine(self._url if create else self._readable())
         if self._sqlite:
             sa.event.listen(self._engine, "connect", _tune_sqlite)
@@ -136,15 +140,29 @@ class Database:
 
     def insert(self, table: sa.Table) -> Any:
         """Return an insert statement that can handle rows that already exist."""
-        return _insert(table, in_sqlite=self._sqlite)
+        return sqlite.insert(table) if self._sqlite else postgresql.insert(table)
 
-    def insert_new(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of complete rows that leaves existing rows unchanged."""
-        return _conflicting(table, in_sqlite=self._sqlite, replacing=False)
+    def upsert(self, table: sa.Table, *, replacing: bool = True) -> sa.TextClause:
+        """Return an insert of complete rows that replaces existing rows, or leaves them.
 
-    def upsert(self, table: sa.Table) -> sa.TextClause:
-        """Return an insert of complete rows that replaces existing rows."""
-        return _conflicting(table, in_sqlite=self._sqlite, replacing=True)
+        As text: SQLAlchemy does not cache the compiled form of such an insert, and compiling it
+        each time takes longer than executing it.
+        """
+        key = table.name, replacing
+        if key not in self._upserts:
+            statement = self.insert(table)
+            if replacing:
+                others = {c.name: statement.excluded[c.name] for c in table.c if not c.primary_key}
+                keys = table.primary_key.columns.keys()
+                statement = statement.on_conflict_do_update(index_elements=keys, set_=others)
+            else:
+                statement = statement.on_conflict_do_nothing()
+            dialect = (sqlite if self._sqlite else postgresql).dialect(paramstyle="named")
+            # Types are needed because a text statement does not know how times are stored.
+            typed = [sa.bindparam(column.name, type_=column.type) for column in table.columns]
+            text = str(statement.compile(dialect=dialect))
+            self._upserts[key] = sa.text(text).bindparams(*typed)
+        return self._upserts[key]
 
     def clock(self) -> sa.ColumnElement[float]:
         """Return the time of the database in s, the one clock that all its users share."""
@@ -199,8 +217,14 @@ class Database:
             if not self._create:
                 raise self._absent()
             METADATA.create_all(connection)
-            connection.execute(self.insert_new(SCHEMA), {"version": SCHEMA_VERSION})
+            connection.execute(self.upsert(SCHEMA, replacing=False), {"version": SCHEMA_VERSION})
         version = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+        if version == _UPGRADED:
+            for table in REMADE:
+                connection.execute(sa.text(f"DROP TABLE IF EXISTS {table}"))
+            METADATA.create_all(connection)
+            connection.execute(sa.update(SCHEMA).values(version=SCHEMA_VERSION))
+            return
         if version != SCHEMA_VERSION:
             raise self._other_version(version)
 
@@ -229,32 +253,27 @@ class Database:
         return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
 
 
-def _insert(table: sa.Table, *, in_sqlite: bool) -> Any:
-    return sqlite.insert(table) if in_sqlite else postgresql.insert(table)
+def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> None:
+    """Refuse an archive that does not exist and a catalog whose URL names no database.
 
+    Parameters
+    ----------
+    campaign : Campaign
+        As loaded.
+    archive : str, optional
+        Archive that overrides the campaign file. It is wrong use if this one does not exist; the
+        archive of a campaign file may be temporarily unavailable.
 
-@cache
-def _conflicting(table: sa.Table, *, in_sqlite: bool, replacing: bool) -> sa.TextClause:
-    """Return an insert with a rule for existing rows, as text.
-
-    SQLAlchemy does not cache the compiled form of such an insert, and compiling it each time takes
-    longer than executing it.
+    Raises
+    ------
+    CatalogError
     """
-    statement = _insert(table, in_sqlite=in_sqlite)
-    if replacing:
-        keys = table.primary_key.columns.keys()
-        others = {
-            column.name: statement.excluded[column.name]
-            for column in table.columns
-            if not column.primary_key
-        }
-        statement = statement.on_conflict_do_update(index_elements=keys, set_=others)
-    else:
-        statement = statement.on_conflict_do_nothing()
-    dialect = (sqlite if in_sqlite else postgresql).dialect(paramstyle="named")
-    # Types are needed because a text statement does not know how times are stored.
-    typed = [sa.bindparam(column.name, type_=column.type) for column in table.columns]
-    return sa.text(str(statement.compile(dialect=dialect))).bindparams(*typed)
+    refuse_wrong_url(campaign.catalog_url)
+    try:
+        Source.of(campaign.archive).refuse_absent()
+    except CatalogError as error:
+        error.wrong_use = error.wrong_use or bool(archive)
+        raise
 
 
 def refuse_wrong_url(url: str) -> None:
@@ -266,6 +285,26 @@ def refuse_wrong_url(url: str) -> None:
         If the URL is invalid or its driver is not installed.
     """
     _engine(_parsed(url)).dispose()
+
+
+@contextmanager
+def without_writing(campaign: Campaign) -> Iterator[Campaign]:
+    """Yield a campaign whose catalog may be updated without a trace in its output folder.
+
+    A catalog in a folder that does not exist, or cannot be written, is replaced by a temporary one,
+    which starts as its copy. Any other is the campaign's own: its update saves the next run work.
+    """
+    file = Path(sa.make_url(campaign.catalog_url).database or "")
+    in_file = campaign.catalog_url.startswith("sqlite") and file.name
+    if not in_file or os.access(file.parent, os.W_OK):
+        yield campaign
+        return
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        copy = Path(folder, file.name)
+        if file.exists():
+            with closing(Database(campaign.catalog_url, campaign.name, create=False)) as source:
+                source.copy_to(copy)
+        yield campaign.model_copy(update={"catalog": f"sqlite:///{copy}"})
 
 
 def holds_password(url: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
@@ -14,10 +14,18 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import Database
-from lidarops.catalog.rows import NO_NOTES, GranuleRow, day_of, naive
+from lidarops.catalog.headers import NO_NOTES, GranuleRow, naive
 from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
 from lidarops.raw.header import Names, recorder_names
-from lidarops.records import ChannelLayout, DetectionMode, FileNote, Granule, Holding, Role, Status
+from lidarops.records import (
+    ChannelLayout,
+    DetectionMode,
+    FileNote,
+    Granule,
+    Holding,
+    Role,
+    Status,
+)
 
 _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
@@ -107,7 +115,7 @@ class Granules(Database):
         layouts = {row.values["layout"]: row.layout for row in rows}
         with self.transaction() as connection:
             connection.execute(
-                self.insert_new(LAYOUT),
+                self.upsert(LAYOUT, replacing=False),
                 [{"hash": key, "channels": text} for key, text in layouts.items()],
             )
             connection.execute(self.upsert(GRANULE), [row.values for row in rows])
@@ -286,7 +294,7 @@ class Granules(Database):
         ]
         if rows:
             with self.transaction() as connection:
-                connection.execute(self.insert_new(CHANNEL_NAME), rows)
+                connection.execute(self.upsert(CHANNEL_NAME, replacing=False), rows)
 
     def days_of_instruments(
         self, first: int | None = None, last: int | None = None
@@ -309,18 +317,6 @@ class Granules(Database):
             query = query.where(_C.day <= last)
         return {name: (begin, end) for name, begin, end in self.read(query, tuple)}
 
-    def has_files(
-        self, instrument: str, since: datetime | None = None, until: datetime | None = None
-    ) -> bool:
-        """Return whether an instrument has good signal granules that start in [since, until)."""
-        query = sa.select(_C.path).where(*self._signals(), _C.instrument == instrument).limit(1)
-        # Days have an index.
-        if since is not None:
-            query = query.where(_C.day >= day_of(since), _C.start >= naive(since))
-        if until is not None:
-            query = query.where(_C.day <= day_of(until), _C.start < naive(until))
-        return bool(self.read(query, tuple))
-
     def file_notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
         """Return the notes on good signal granules, contradictions first, then by frequency.
 
@@ -333,31 +329,16 @@ class Granules(Database):
         query = (
             sa.select(*columns, sa.func.count()).where(*self._signals(), noted).group_by(*columns)
         )
-        files: Counter[tuple[bool, str, str]] = Counter()
-        sentences = self.read(
+        rows = self.read(
             query, lambda row: (row, _sentences(row.notes), _sentences(row.contradictions))
         )
-        for (instrument, *_, count), *stored in sentences:
-            if instrument in instruments:
-                for texts, contradicts in zip(stored, (False, True), strict=True):
-                    for text in texts:
-                        files[contradicts, instrument, text] += count
-        ordered = sorted(
-            by_wording(files).items(), key=lambda item: (not item[0][0], -item[1], item[0])
-        )
-        notes = [
+        return joined_notes(
             FileNote(instrument, text, contradicts, count)
-            for (contradicts, instrument, text), count in ordered
-        ]
-        # Notes that state a value of each file would fill the report.
-        more: Counter[tuple[str, bool]] = Counter()
-        for note in notes[MOST_NOTES:]:
-            more[note.instrument, note.contradicts] += note.files
-        others = (
-            FileNote(instrument, "other notes", contradicts, count)
-            for (instrument, contradicts), count in more.items()
+            for (instrument, *_, count), *stored in rows
+            if instrument in instruments
+            for texts, contradicts in zip(stored, (False, True), strict=True)
+            for text in texts
         )
-        return (*notes[:MOST_NOTES], *others)
 
     def paths_by_digest(self, digests: Collection[str]) -> dict[str, str]:
         """Return SHA-256 -> path of the granules with these digests."""
@@ -378,20 +359,31 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
     )
 
 
-def by_wording(files: Counter[tuple[bool, str, str]]) -> Counter[tuple[bool, str, str]]:
-    """Return counts of notes, with one note for many that differ by numbers only."""
-    groups: dict[tuple[bool, str, str], list[tuple[int, str]]] = defaultdict(list)
-    for (contradicts, instrument, text), count in files.items():
-        groups[contradicts, instrument, _NUMBER.sub("#", text)].append((count, text))
-    found: Counter[tuple[bool, str, str]] = Counter()
-    for (contradicts, instrument, _), notes in groups.items():
-        if len(notes) > _MOST_VALUES:
-            text = f"{max(notes)[1]}; {len(notes) - 1} other values in other files"
-            found[contradicts, instrument, text] = sum(count for count, _ in notes)
-            continue
-        for count, text in notes:
-            found[contradicts, instrument, text] = count
-    return found
+def joined_notes(notes: Iterable[FileNote]) -> tuple[FileNote, ...]:
+    """Return notes, contradictions first, then by frequency; equal ones are one.
+
+    So are many that differ by numbers only, and those beyond the most that are reported: notes that
+    state a value of each file would fill the report.
+    """
+    wordings: dict[tuple[str, bool, str], Counter[str]] = defaultdict(Counter)
+    for note in notes:
+        wording = note.instrument, note.contradicts, _NUMBER.sub("#", note.text)
+        wordings[wording][note.text] += note.files
+    joined = []
+    for (instrument, contradicts, _), texts in wordings.items():
+        found = dict(texts)
+        if len(texts) > _MOST_VALUES:
+            _, text = max((files, text) for text, files in texts.items())
+            found = {f"{text}; {len(texts) - 1} other values in other files": texts.total()}
+        joined += [FileNote(instrument, text, contradicts, files) for text, files in found.items()]
+    joined.sort(key=lambda note: (not note.contradicts, -note.files, note.instrument, note.text))
+    more: Counter[tuple[str, bool]] = Counter()
+    for note in joined[MOST_NOTES:]:
+        more[note.instrument, note.contradicts] += note.files
+    rest = (
+        FileNote(name, "other notes", contradicts, n) for (name, contradicts), n in more.items()
+    )
+    return (*joined[:MOST_NOTES], *rest)
 
 
 def _sentences(stored: str) -> tuple[str, ...]:

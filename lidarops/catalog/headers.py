@@ -1,25 +1,43 @@
-"""Make granules from the headers of raw files.
+"""Make granules from the headers of raw files, and rows of the catalog from granules.
 
-Its sources decide whether a header is read again, so it imports little.
+Its sources decide whether a header is read again, and processes that read headers load it, so it
+imports little, and no database.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from datetime import datetime, timedelta
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
-from lidarops.catalog.rows import RETRY, GranuleRow, row_of
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, read_start
 from lidarops.raw.header import RawHeader
-from lidarops.records import UNKNOWN_FORMAT, UNREADABLE, Granule, Role, Status
+from lidarops.records import (
+    UNKNOWN_FORMAT,
+    UNREADABLE,
+    ChannelLayout,
+    Granule,
+    Role,
+    Status,
+    day_of,
+)
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, Station
 
+RETRY: Final = ""
+"""Scan key of a file that could not be read: every scan tries it again."""
+NO_NOTES: Final = "[]"
+"""Stored notes of a file that has none."""
+
+_FIELDS: Final = tuple(item.name for item in fields(Granule))
+_HALF: Final = (1 << 31) - 1
 _TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
 
@@ -27,6 +45,25 @@ HEADER_BYTES: Final = 16384
 """Bytes that hold the header of any format."""
 _ROUNDING_OF_ANGLES: Final = 1.0
 """degree; headers hold whole degrees."""
+
+
+class GranuleRow(NamedTuple):
+    """A granule for the catalog."""
+
+    values: dict[str, Any]
+    """By column."""
+    layout: str
+    """JSON text of its layout of channels."""
+
+
+def naive(moment: datetime | None) -> datetime | None:
+    """Return a time as stored in the tables: UTC, without a zone."""
+    return None if moment is None else moment.astimezone(UTC).replace(tzinfo=None)
+
+
+def aware(moment: datetime | None) -> datetime | None:
+    """Return a stored time with its zone, UTC."""
+    return None if moment is None else moment.replace(tzinfo=UTC)
 
 
 class UnreadFile(NamedTuple):
@@ -64,8 +101,8 @@ class Headers:
     """The source of raw files and the settings with which their headers are read."""
 
     source: Source
-    _campaign: str
-    _lidars: Mapping[str, _Lidar]
+    campaign: str
+    lidars: Mapping[str, _Lidar]
 
     @classmethod
     def of(cls, campaign: Campaign, source: Source, entered_as: str) -> Self:
@@ -79,19 +116,12 @@ class Headers:
         }
         return cls(source, entered_as, lidars)
 
-    def lidar(self, instrument: str) -> _Lidar:
-        """Return an instrument with its station."""
-        return self._lidars[instrument]
-
-    def row(self, due: UnreadFile, granule: Granule) -> GranuleRow:
-        """Return the row of a granule."""
-        retry = granule.reason.startswith(_TRY_AGAIN)
-        return row_of(granule, self._campaign, RETRY if retry else due.scan_key)
-
 
 def read_row(headers: Headers, due: UnreadFile) -> GranuleRow:
     """Read the header of a file and return its row; see `read_header`."""
-    return headers.row(due, read_header(headers, due))
+    granule = read_header(headers, due)
+    retry = granule.reason.startswith(_TRY_AGAIN)
+    return row_of(granule, headers.campaign, RETRY if retry else due.scan_key)
 
 
 def read_header(headers: Headers, due: UnreadFile) -> Granule:
@@ -106,10 +136,10 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
     try:
         head = headers.source.head(file.path, HEADER_BYTES)
         header = parse_raw_header(head, file=file.path, size=file.size)
-        return _accepted(due, header, headers.lidar(due.instrument))
+        return _accepted(due, header, headers.lidars[due.instrument])
     except RawFormatError as error:
         reason = str(error).removeprefix(f"{file.path}: ")
-        return _refused(due, reason, _start(head, headers.lidar(due.instrument)))
+        return _refused(due, reason, _start(head, headers.lidars[due.instrument]))
     except OSError as error:
         return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
 
@@ -215,3 +245,64 @@ def _overridden(header: RawHeader, facts: InstrumentFacts, lidar: _Lidar) -> Ite
             yield f"header_position: ignore overrides {pair[0]:g}, {pair[1]:g} of the header"
         if altitude is not None and not lidar.is_level(altitude):
             yield f"header_position: ignore overrides the altitude {altitude:g} m of the header"
+
+
+def row_of(granule: Granule, campaign: str, scan_key: str) -> GranuleRow:
+    """Return the row of a granule.
+
+    Parameters
+    ----------
+    granule : Granule
+    campaign : str
+        Its name.
+    scan_key : str
+        Digest of the settings with which it was read; `RETRY` if it could not be read.
+    """
+    layout, text = _layout_row(granule.layout)
+    low, high = _stamp(granule, scan_key, layout)
+    values = {
+        **{name: getattr(granule, name) for name in _FIELDS},
+        "campaign": campaign,
+        "scan_key": scan_key,
+        "role": granule.role.value,
+        "status": granule.status.value,
+        "notes": json.dumps(granule.notes),
+        "contradictions": json.dumps(granule.contradictions),
+        "start": naive(granule.start),
+        "stop": naive(granule.stop),
+        "layout": layout,
+        "day": None if granule.start is None else day_of(granule.start),
+        "stamp_low": low,
+        "stamp_high": high,
+    }
+    return GranuleRow(values, text)
+
+
+def _stamp(granule: Granule, scan_key: str, layout: str) -> tuple[int, int]:
+    """Return two numbers that change with anything that a scan reads from a file."""
+    facts = (
+        granule.path,
+        granule.size,
+        granule.mtime_ns,
+        scan_key,
+        granule.instrument,
+        granule.role.value,
+        granule.status.value,
+        granule.reason,
+        # As numbers: the repr of a time takes twice as long.
+        None if granule.start is None else granule.start.timestamp(),
+        None if granule.stop is None else granule.stop.timestamp(),
+        granule.zenith_angle,
+        granule.azimuth,
+        granule.format,
+        layout,
+    )
+    digest = hashlib.sha256(repr(facts).encode("utf-8", "backslashreplace")).digest()
+    return int.from_bytes(digest[:4], "big") & _HALF, int.from_bytes(digest[4:8], "big") & _HALF
+
+
+# An archive has few different layouts.
+@lru_cache(maxsize=128)
+def _layout_row(layout: tuple[ChannelLayout, ...]) -> tuple[str, str]:
+    text = json.dumps([asdict(channel) for channel in layout], separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16], text

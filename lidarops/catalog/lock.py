@@ -10,13 +10,15 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import sqlalchemy as sa
 
+from lidarops.campaign.model import Campaign
 from lidarops.catalog.database import Database
 from lidarops.catalog.schema import LOCK
 from lidarops.errors import CatalogError
@@ -63,7 +65,7 @@ class Holder:
         return process_start(self.process) != self.process_started
 
 
-class Lock:
+class Lock(AbstractContextManager["Lock"]):
     """The right to write to the catalog of one campaign.
 
     It is acquired before the first write, so that a run with nothing to do writes nothing. The
@@ -83,9 +85,7 @@ class Lock:
         self._thread: threading.Thread | None = None
         self.token = secrets.token_hex(16)
         self.held = False
-
-    def __enter__(self) -> Self:
-        return self
+        self._row = (_L.campaign == database.campaign, _L.token == self.token)
 
     def __exit__(self, *_: object) -> None:
         self.release()
@@ -134,11 +134,12 @@ class Lock:
         CatalogError
             If the holder, which the message names, does not release the lock in time.
         """
-        self._wait_for(self._is_free)
+        self._wait_for(lambda: not self.is_taken())
 
-    def _is_free(self) -> bool:
+    def is_taken(self) -> bool:
+        """Return whether a living process holds the lock."""
         holder = self.holder()
-        return holder is None or holder.dead
+        return holder is not None and not holder.dead
 
     def _wait_for(self, attempt: Callable[[], bool]) -> bool:
         """Repeat an attempt until it succeeds; return whether it failed at first."""
@@ -162,7 +163,7 @@ class Lock:
         _held.discard(self.token)
         try:
             with self._database.transaction() as connection:
-                connection.execute(sa.delete(LOCK).where(*self._own_row()))
+                connection.execute(sa.delete(LOCK).where(*self._row))
         except CatalogError as error:
             # The disk is full: the next process takes over when this one has ended.
             _LOG.warning("the lock stays until the next run: %s", error)
@@ -182,9 +183,6 @@ class Lock:
         with self._database.transaction() as connection:
             rows = connection.execute(query).all()
         return [Holder(*(*known, silent)) for _campaign, *known, _heartbeat, silent in rows]
-
-    def _own_row(self) -> tuple[sa.ColumnElement[bool], ...]:
-        return _L.campaign == self._database.campaign, _L.token == self.token
 
     def _try(self) -> bool:
         current = self.holder()
@@ -215,7 +213,7 @@ class Lock:
             )
         with database.transaction() as connection:
             connection.execute(statement)
-            own = sa.select(sa.func.count()).select_from(LOCK).where(*self._own_row())
+            own = sa.select(sa.func.count()).select_from(LOCK).where(*self._row)
             return bool(connection.scalar(own))
 
     def _beat(self) -> None:
@@ -223,9 +221,7 @@ class Lock:
             try:
                 with self._database.transaction() as connection:
                     connection.execute(
-                        sa.update(LOCK)
-                        .where(*self._own_row())
-                        .values(heartbeat=self._database.clock())
+                        sa.update(LOCK).where(*self._row).values(heartbeat=self._database.clock())
                     )
             except CatalogError:
                 # The disk is busy or full: the next write reports it; the next beat may succeed.
@@ -246,16 +242,32 @@ class Lock:
         )
 
 
+def refuse_held_catalog(campaign: Campaign) -> None:
+    """Refuse a catalog that a living process holds.
+
+    Raises
+    ------
+    CatalogError
+        Names the holder.
+    """
+    try:
+        database = Database(campaign.catalog_url, campaign.name, create=False)
+    except CatalogError:
+        # There is none yet, or the run says what is wrong with it.
+        return
+    with database:
+        lock = Lock(database)
+        if lock.is_taken():
+            raise lock.refusal()
+
+
 def _machine() -> str:
     """Return host, boot and process namespace, within which a process number is unique."""
-    return ":".join((socket.gethostname(), _read("/proc/sys/kernel/random/boot_id"), _namespace()))
-
-
-def _namespace() -> str:
     try:
-        return os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - the target is no path
+        namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - the target is no path
     except OSError:
-        return ""
+        namespace = ""
+    return ":".join((socket.gethostname(), _read("/proc/sys/kernel/random/boot_id"), namespace))
 
 
 def process_start(process: int) -> str:
@@ -264,10 +276,6 @@ def process_start(process: int) -> str:
     fields = _read(f"/proc/{process}/stat").rpartition(")")[2].split()
     if len(fields) > 19:
         return "" if fields[0] == "Z" else fields[19]
-    return _alive(process)
-
-
-def _alive(process: int) -> str:
     if Path("/proc/self/stat").exists():
         return ""
     try:

@@ -15,8 +15,7 @@ from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
-from lidarops.catalog.headers import Headers, UnreadFile, read_row
-from lidarops.catalog.rows import GranuleRow
+from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
@@ -164,7 +163,7 @@ class _Scan:
         self.source = Source.of(campaign.archive)
         self._archive = campaign.archive
         self._store = store
-        self._progress = progress
+        self._progress = progress or (lambda _: None)
         self._write = before_write or (lambda: None)
         self._claims = _claims(campaign)
         self._folder: str | None = None
@@ -172,7 +171,6 @@ class _Scan:
         self._idle = set(self._claims)
         self._unclaimed = _Unclaimed()
         self._files = self._changed = 0
-        self._reported = 0
         self._judged: deque[Fingerprint | None] = deque()
         self._pending: list[GranuleRow] = []
         # With an empty catalog, no new file can be a moved one.
@@ -198,11 +196,13 @@ class _Scan:
                 continue
             self._files += 1
             if self._files % _BATCH == 0:
-                self._report_progress()
+                self._progress(_BATCH)
             key = _key(owners)
             if before is None or not self._is_known(before, file, key):
                 self._judged.append(before)
-                yield _due(file, owners, key)
+                first = owners[0].instrument
+                rivals = sorted({claim.instrument for claim in owners} - {first})
+                yield UnreadFile(file, first, owners[0].role, tuple(rivals), key)
             else:
                 self._readable = True
 
@@ -275,11 +275,6 @@ class _Scan:
         self._store.replace(self._pending)
         self._pending.clear()
 
-    def _report_progress(self) -> None:
-        if self._progress and self._files > self._reported:
-            self._progress(self._files - self._reported)
-        self._reported = self._files
-
     def finish(self) -> ScanSummary:
         """Write the remaining rows, and return the numbers."""
         if self._gone and not self._files:
@@ -301,7 +296,7 @@ class _Scan:
         if self._gone:
             self._write()
             self._store.forget([before.path for before in self._gone])
-        self._report_progress()
+        self._progress(self._files % _BATCH)
         added = self._added - len(moved)
         return ScanSummary(
             files=self._files,
@@ -444,9 +439,3 @@ def _key(owners: list[_Claim]) -> str:
     if len(owners) == 1:
         return owners[0].scan_key
     return hashlib.sha256("+".join(owner.scan_key for owner in owners).encode()).hexdigest()[:16]
-
-
-def _due(file: RawFile, owners: list[_Claim], key: str) -> UnreadFile:
-    owner = owners[0]
-    rivals = {claim.instrument for claim in owners} - {owner.instrument}
-    return UnreadFile(file, owner.instrument, owner.role, tuple(sorted(rivals)), key)

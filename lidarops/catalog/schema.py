@@ -6,8 +6,10 @@ from typing import Final
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION: Final = 11
+SCHEMA_VERSION: Final = 12
 """Raised with every change of a table; a database of another version is refused."""
+REMADE: Final = ("superseded", "verdict")
+"""Tables of version 11 that a database of it loses: a folder tells of the first, a run of both."""
 
 METADATA: Final = sa.MetaData()
 
@@ -142,19 +144,6 @@ FILE_SET = sa.Table(
     sqlite_with_rowid=False,
 )
 
-SUPERSEDED = sa.Table(
-    "superseded",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
-    sa.Column("path", _PATH, primary_key=True),
-    sa.Column("sha256", _DIGEST, primary_key=True),
-    sa.Column("run", sa.ForeignKey("run.id"), primary_key=True),
-    # The run that wrote the version, and the one that replaced it.
-    sa.Column("replaced_by", sa.ForeignKey("run.id"), nullable=False),
-    # Path of the kept old file below the output folder; empty if it was not kept.
-    sa.Column("kept", _PATH, nullable=False),
-)
-
 SCENE = sa.Table(
     "scene",
     METADATA,
@@ -192,12 +181,8 @@ VERDICT = sa.Table(
     sa.Column("day", sa.Integer, primary_key=True),
     # State of the day (see Signature) when all its requested products were fresh.
     sa.Column("signature", _DIGEST, nullable=False),
-    # Scenes of the day without product.
-    sa.Column("empty_scenes", sa.Integer, nullable=False),
-    # Good granules of the day that belong to no scene.
-    sa.Column("set_aside", sa.Integer, nullable=False),
-    # JSON of the ancillary files that the steps of the day read -> SHA-256.
-    sa.Column("files", sa.Text, nullable=False),
+    # JSON of the other fields of `Verdict`.
+    sa.Column("facts", sa.Text, nullable=False),
     sqlite_with_rowid=False,
 )
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from lidarops.campaign.model import Campaign
     from lidarops.records import Findings
-    from lidarops.run.selection import Selection
+    from lidarops.run.options import Selection
 
 
 app = typer.Typer(
@@ -365,7 +365,7 @@ def loaded_campaign(
 ) -> Campaign:
     """Return the campaign of a file, with the places that options override."""
     from lidarops.campaign.model import load_campaign
-    from lidarops.catalog.access import check_archive_and_catalog
+    from lidarops.catalog.database import check_archive_and_catalog
 
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     check_archive_and_catalog(settings, archive=archive)
@@ -380,7 +380,7 @@ def selection_of(
     until: datetime | None,
 ) -> Selection:
     """Return the selection that options describe; refuse an unknown kind of product."""
-    from lidarops.run.selection import Selection
+    from lidarops.run.options import Selection
 
     for name in products or ():
         if name not in kinds():

@@ -103,7 +103,7 @@ def catalog(
     Example: lidarops catalog catalogs/demo.yaml --rebuild
     """
     from lidarops.catalog.store import Store
-    from lidarops.plan.channel_names import ChannelNames
+    from lidarops.plan.channels import ChannelNames
     from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
 
@@ -219,7 +219,7 @@ def reprocess(
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
-    from lidarops.catalog.access import refuse_held_catalog
+    from lidarops.catalog.lock import refuse_held_catalog
 
     set_up_log(log_level, as_json=log_json, file=log_file)
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
@@ -227,8 +227,7 @@ def reprocess(
         # Before what follows loads modules for seconds.
         refuse_held_catalog(settings)
     from lidarops.run import archive as pipeline
-    from lidarops.run.options import missing_report
-    from lidarops.run.selection import selects_no_scene
+    from lidarops.run.options import missing_report, selects_no_scene
 
     selection = selection_of(instrument, station, product, since, until)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
@@ -352,7 +351,6 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         "frozen_products": dict(result.frozen),
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
-        "more_of_both": result.more_unused,
         **findings_document(result.findings),
         "disagreements": [
             {"scene": scene.scene, **asdict(pair)}
@@ -470,10 +468,9 @@ def _show_changes(result: Result) -> None:
 
 
 def _show_unused(result: Result, listed: Collection[str]) -> None:
-    more = f" ({result.more_unused} more on other days)" if result.more_unused else ""
     set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
     rows = (*set_aside, *result.empty_scenes.items())
-    show_rows(f"Not used{more}", ("file or scene", "reason"), rows)
+    show_rows("Not used", ("file or scene", "reason"), rows)
 
 
 def _show_orphans(result: Result, removed: int | None) -> None:

@@ -23,7 +23,7 @@ from lidarops.cli.app import (
 )
 
 if TYPE_CHECKING:
-    from lidarops.catalog.ledger import Run
+    from lidarops.catalog.store import Run
 
 
 @command()
@@ -77,9 +77,9 @@ def verify(
     Example: lidarops verify catalogs/demo.yaml
     """
     from lidarops.campaign.model import load_campaign
-    from lidarops.catalog.access import check_archive_and_catalog
+    from lidarops.catalog.database import check_archive_and_catalog
+    from lidarops.catalog.product_files import verify_archive
     from lidarops.catalog.store import Store
-    from lidarops.catalog.verify import verify_archive
 
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     if archive and not products_only:
@@ -123,7 +123,7 @@ def publish(
     Example: lidarops publish catalogs/demo.yaml s3://bucket/demo --site
     """
     from lidarops.campaign.model import load_campaign
-    from lidarops.run.publication import publish_products, publish_site
+    from lidarops.catalog.product_files import publish_products, publish_site
     from lidarops.system.stores import without_keys
 
     settings = load_campaign(campaign, output=out, catalog=catalog)

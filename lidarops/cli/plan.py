@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
     from lidarops.records import LeftOut, Plan, PlannedStep
     from lidarops.run.archive import EarlierProblems
-    from lidarops.run.selection import Selection
+    from lidarops.run.options import Selection
     from lidarops.run.staleness import Judgement
 
 
@@ -85,7 +85,7 @@ def show_plan(
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops.catalog.access import without_writing
+    from lidarops.catalog.database import without_writing
 
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
@@ -104,7 +104,7 @@ def _plan(
 ) -> None:
     from lidarops.catalog.store import Store
     from lidarops.run.archive import assess, earlier_problems, survey
-    from lidarops.run.selection import selects_no_scene
+    from lidarops.run.options import selects_no_scene
     from lidarops.scene.memory import scene_memory
 
     findings = survey(settings, selection=selection, wait=wait)

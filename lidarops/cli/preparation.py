@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import tempfile
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -21,6 +23,7 @@ from lidarops.cli.app import (
     progress_bar,
     say,
 )
+from lidarops.errors import SceneError
 
 _SCHEMA: Final = "campaign.schema.json"
 _OUTPUT: Final = "out"
@@ -99,7 +102,7 @@ def simulate(
 
     from lidarops.campaign.model import load_campaign
     from lidarops.netcdf.write import write_plain
-    from lidarops.run.executor import local_client
+    from lidarops.run.clusters import local_client
     from lidarops.simulate.campaign import plan_simulation, write_simulation
 
     settings = load_campaign(campaign, archive=archive, output=out)
@@ -128,7 +131,40 @@ def compile_code() -> None:
 
     Example: lidarops compile
     """
-    from lidarops.run.compilation import compile_retrievals
-
     say("compiling the retrievals: about two minutes")
-    say(f"compiled code is kept in {compile_retrievals()}")
+    say(f"compiled code is kept in {_compile_retrievals()}")
+
+
+def _compile_retrievals() -> Path:
+    """Compile what products of all kinds need, and return the folder that keeps the result.
+
+    Later processes load the compiled code from there. What is kept for another processor is not
+    used, but compiled again.
+
+    Raises
+    ------
+    SceneError
+        If a product of the small campaign that is simulated for it is not made, so that its code
+        was not compiled.
+    """
+    from numba import config
+
+    from lidarops.campaign.model import load_campaign
+    from lidarops.netcdf.write import write_plain
+    from lidarops.run.archive import bring_up_to_date
+    from lidarops.simulate.campaign import plan_simulation, write_simulation
+
+    with (
+        tempfile.TemporaryDirectory(prefix="lidarops-compile-") as folder,
+        resources.as_file(resources.files("lidarops.run") / "compile.yaml") as path,
+    ):
+        campaign = load_campaign(path, archive=f"{folder}/raw", output=f"{folder}/out")
+        simulated = write_simulation(plan_simulation(campaign))
+        write_plain(simulated.truth, campaign.truth_path)
+        result = bring_up_to_date(campaign)
+    if result.has_failures:
+        raise SceneError(
+            "not all products of the campaign for compilation were made",
+            remedy="report it: the installation is incomplete, or lidarops has a bug",
+        )
+    return Path(str(vars(config)["CACHE_DIR"]))

@@ -8,14 +8,12 @@ than one file.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any, Final, NamedTuple
 
-from lidarops.catalog.granules import by_wording
-from lidarops.catalog.rows import day_of
 from lidarops.raw.header import RawChannel, RawHeader
-from lidarops.records import FEWEST_ALIKE, FileNote, Granule, Role, Status
+from lidarops.records import FEWEST_ALIKE, FileNote, Granule, Role, Status, day_of
 
 NEAR_DAYS: Final = 1
 """Days before and after that of a file whose files are compared with it."""
@@ -86,15 +84,6 @@ def new_notes(
         for text in granule.notes[known[granule.path] :]:
             if granule.start and day_of(granule.start) in days:
                 yield FileNote(granule.instrument, text, contradicts=False, files=1)
-
-
-def joined_notes(notes: Iterable[FileNote]) -> Iterator[FileNote]:
-    """Yield notes on files of equal wording as one, with their number of files."""
-    files: Counter[tuple[bool, str, str]] = Counter()
-    for note in notes:
-        files[note.contradicts, note.instrument, note.text] += note.files
-    for (contradicts, instrument, text), number in sorted(by_wording(files).items()):
-        yield FileNote(instrument, text, contradicts, number)
 
 
 def outlying_headers(

@@ -7,6 +7,8 @@ where the channels or the range grid of the files change, because a product has 
 
 A scene of a network holds one member scene for each instrument, in the same window. It is split
 where the facts about any member change.
+
+A run with nothing to do imports this module, so it imports numerics where they are needed.
 """
 
 from __future__ import annotations
@@ -17,16 +19,20 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from typing import Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.errors import RetrievalInputError, SceneError
-from lidarops.plan.windows import DARK_REACH, STAMP, Window, window_at
 from lidarops.records import ChannelLayout, FileNote, Granule, Role, Scene, Status
-from lidarops.retrieve.multiangle import scan_cycles
-from lidarops.scene.pointing import LEAST_SPREAD
 
+DARK_REACH: Final = timedelta(hours=24)
+"""Longest time between a scene and the dark files that it uses."""
+STAMP: Final = "%Y%m%dT%H%M%S"
+"""Format of the start time in the id of a scene."""
+Window = tuple[datetime, datetime]
+"""Start and end of a window."""
 MOST_NOTES = 20
 """Different notes on the files of a scene that are kept."""
 
@@ -133,14 +139,14 @@ def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
 
 
 def _grids_key(members: Sequence[Scene]) -> str:
-    text = " ".join(_layout_key(member.granules[0]) for member in members)
+    text = " ".join(_layout_key(member.layout) for member in members)
     return hashlib.sha256(text.encode()).hexdigest()[:6]
 
 
 def as_recorded(scene: Scene, recorded: Collection[str]) -> Scene:
     """Return a scene with its suffix if a recorded one has it, whose window held others then."""
     members = tuple(as_recorded(member, recorded) for member in scene.members)
-    whole = f"{scene.id}-{_grids_key(members) if members else _layout_key(scene.granules[0])}"
+    whole = f"{scene.id}-{_grids_key(members) if members else _layout_key(scene.layout)}"
     return replace(scene, id=whole if whole in recorded else scene.id, members=members)
 
 
@@ -201,6 +207,10 @@ def _cycles(granules: Sequence[Granule]) -> list[int]:
     """Return the scan cycle of each granule; all differ where the beam does not scan."""
     angles = [granule.zenith_angle for granule in granules]
     known = [angle for angle in angles if angle is not None]
+    # A run with nothing to do needs no numerics.
+    from lidarops.retrieve.multiangle import scan_cycles  # noqa: PLC0415
+    from lidarops.scene.pointing import LEAST_SPREAD  # noqa: PLC0415
+
     if len(known) < len(angles) or max(known) - min(known) < LEAST_SPREAD:
         return list(range(len(granules)))
     azimuth = [math.nan if g.azimuth is None else g.azimuth for g in granules]
@@ -222,7 +232,7 @@ def _by_layout(
 ) -> list[Scene]:
     layouts: dict[str, list[Granule]] = defaultdict(list)
     for granule in members:
-        layouts[_layout_key(granule)].append(granule)
+        layouts[_layout_key(granule.layout)].append(granule)
     scenes = []
     for key, group in sorted(layouts.items()):
         suffix = f"-{key}" if len(layouts) > 1 else ""
@@ -239,7 +249,7 @@ def _by_layout(
                     granule
                     for granule in dark
                     if granule.instrument == instrument
-                    and _layout_key(granule) == key
+                    and _layout_key(granule.layout) == key
                     and [c.recorder for c in granule.layout]
                     == [c.recorder for c in group[0].layout]
                     and _start(group[0]) - DARK_REACH
@@ -261,12 +271,45 @@ def _notes(granules: Sequence[Granule]) -> tuple[str, ...]:
     return (*shown[:MOST_NOTES], *more)
 
 
-def _layout_key(granule: Granule) -> str:
-    return _key_of(granule.layout)
-
-
 # An archive has few layouts.
 @lru_cache(maxsize=128)
-def _key_of(layout: tuple[ChannelLayout, ...]) -> str:
+def _layout_key(layout: tuple[ChannelLayout, ...]) -> str:
     text = repr([(c.name, c.bins, c.bin_width, c.adc_bits) for c in layout])
     return hashlib.sha256(text.encode()).hexdigest()[:6]
+
+
+def parse_scene_id(scene: str) -> tuple[str, datetime]:
+    """Return the instrument or network, and the start time, from the id of a scene."""
+    instrument, _, rest = scene.rpartition("_")
+    return instrument, datetime.strptime(rest.partition("-")[0], STAMP).replace(tzinfo=UTC)
+
+
+def scene_stop(scene: str, campaign: Campaign) -> datetime:
+    """Return when a scene with this id would end with the present campaign file."""
+    key, start = parse_scene_id(scene)
+    members = campaign.networks[key].instruments if key in campaign.networks else [key]
+    return window_at(campaign, [name for name in members if name in campaign.instruments], start)[1]
+
+
+def window_at(campaign: Campaign, instruments: Sequence[str], start: datetime) -> Window:
+    """Return the window that holds `start`, narrowed so that no fact changes within it."""
+    length = timedelta(days=1) if campaign.scenes.window == "day" else campaign.scenes.window
+    midnight = start.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
+    opens = midnight + (start - midnight) // length * length
+    closes = opens + length
+    for instrument in instruments:
+        for fact in campaign.instruments[instrument].facts:
+            opens, closes = _narrow(fact, start, opens, closes)
+    return opens, closes
+
+
+def _narrow(
+    fact: InstrumentFacts, moment: datetime, opens: datetime, closes: datetime
+) -> tuple[datetime, datetime]:
+    """Narrow a window around `moment` so that no edge of the validity period lies inside."""
+    for edge in (fact.valid_from, fact.valid_to):
+        if opens < edge <= moment:
+            opens = edge
+        elif moment < edge < closes:
+            closes = edge
+    return opens, closes

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
-from lidarops.plan.windows import DARK_REACH, window_at
+from lidarops.plan.scenes import DARK_REACH, window_at
 from lidarops.records import Granule, Role, Scene, UnusedFile
 
 MOST_IN_DOUBT: Final = 10

@@ -1,12 +1,11 @@
 """Bring the archive of a campaign up to date.
 
 - `archive`: catalog, plan, process and report; what the command line and the flows call.
-- `options`, `selection`: how to run, and which part of the campaign.
+- `options`: how to run and which part of the campaign, and what a run returns.
 - `staleness`: decides which products are stale, and why; `leftovers`: scenes without product, and
   products that the campaign no longer requests.
-- `executor`: processes scenes, in this process or on dask workers (`worker`); `clusters` starts or
-  reaches such workers on this machine, Slurm or Kubernetes (`kubernetes`).
+- `executor`: processes scenes, in this process or on dask workers; `clusters` starts or reaches
+  such workers on this machine, Slurm or Kubernetes.
 - `session`: enters one run in the ledger, scene by scene.
 - `reproduction`: makes one product again from its provenance, which `recipe` reads.
-- `publication`: copies products to an object store.
 """

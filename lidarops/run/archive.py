@@ -11,17 +11,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.ledger import RunStatus
+from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock, OvertakenError
 from lidarops.catalog.scan import ScanSummary, scan_archive
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import RunStatus, Store, Verdict
 from lidarops.errors import LidarOpsError
 from lidarops.records import Findings, RunRecord
 from lidarops.reports import run_record
 from lidarops.run.day_states import DayStates, Signature
 from lidarops.run.findings import find
-from lidarops.run.options import NO_USABLE_VALUE, Options, Result, is_littered
-from lidarops.run.selection import Selection, check_selection
+from lidarops.run.options import (
+    NO_USABLE_VALUE,
+    Options,
+    Result,
+    Selection,
+    check_selection,
+    unused,
+)
 from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen
 
@@ -151,7 +157,7 @@ def assess(
 
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection)
-        days = _days_to_judge(judge, judge.signatures(), everything=everything)
+        days = _days_to_judge(judge, judge.signatures(), store.verdicts(), everything=everything)
         for batch in judge.batches(days):
             for judged in judge.days(batch).judgements:
                 if everything or judged.due or judged.held or judged.frozen or judged.kept:
@@ -223,9 +229,12 @@ def update_catalog(
 
 
 def _days_to_judge(
-    states: DayStates, signatures: Mapping[int, Signature], *, everything: bool
+    states: DayStates,
+    signatures: Mapping[int, Signature],
+    verdicts: Mapping[int, Verdict],
+    *,
+    everything: bool,
 ) -> list[int]:
-    verdicts = states.store.verdicts()
     return states.selection.days(
         day
         for day, now in signatures.items()
@@ -237,15 +246,14 @@ def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None
     """Update the catalog, and do what the days that changed need."""
     campaign, store, write = states.campaign, states.store, lock.acquire_unchanged
     summary = scan_archive(campaign, store, before_write=write, workers=options.workers)
-    signatures = states.signatures()
-    days = _days_to_judge(states, signatures, everything=options.force)
+    signatures, verdicts = states.signatures(), store.verdicts()
+    days = _days_to_judge(states, signatures, verdicts, everything=options.force)
     if days or _is_something_left(states, signatures):
         from lidarops.run.processing import Pass  # noqa: PLC0415 - loads the numerics
 
         work = Pass(campaign, store, lock, states.selection, options, summary, days, signatures)
         return work.carry_out(client)
-    # A day is settled only if the ancillary files of its plans can be used.
-    usable = {name for found in store.verdicts().values() for name in found.files}
+    empty_scenes, set_aside = unused(verdicts, signatures)
     return Result(
         record=None,
         status=RunStatus.FINISHED,
@@ -253,7 +261,9 @@ def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None
         failures=store.failures(),
         internal=store.internal_errors(),
         unusable=tuple(store.unusable_scenes()),
-        findings=find(states, summary.idle_patterns, usable=usable),
+        empty_scenes=empty_scenes,
+        set_aside=set_aside,
+        findings=find(states, summary.idle_patterns, settled=verdicts),
     )
 
 
@@ -262,10 +272,9 @@ def _is_something_left(states: DayStates, signatures: Mapping[int, Signature]) -
     campaign, store = states.campaign, states.store
     return (
         bool(campaign.acknowledged)
-        or any(day in signatures and found.unused for day, found in store.verdicts().items())
         or bool(store.scenes_of_other_days(signatures))
         or store.has_dead_run()
-        or is_littered(campaign, store)
+        or product_files.is_littered(Path(campaign.output), store)
     )
 
 

@@ -7,11 +7,17 @@ from more. Workers need the software and access to the archive and the folder of
 
 from __future__ import annotations
 
+import json
+import logging
+import signal
+import ssl
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from urllib.parse import urlsplit
 
 import dask.config
@@ -27,12 +33,44 @@ from pydantic import (
 )
 
 from lidarops.campaign.yaml_errors import duplicate_keys
-from lidarops.errors import LidarOpsError
-from lidarops.run import kubernetes
-from lidarops.run.executor import MALLOC_TRIM_VARIABLE, local_client
+from lidarops.errors import LidarOpsError, SceneError
+from lidarops.system.processes import keep_memory, start_method
 
 if TYPE_CHECKING:
     from distributed import Client, Security
+
+WORKER_TIMEOUT: Final = 120.0
+"""s without any worker after which a warning is logged; local workers are then considered lost."""
+MALLOC_TRIM_VARIABLE: Final = "MALLOC_TRIM_THRESHOLD_"
+"""Environment variable by which dask makes the C library return small pieces of memory at once."""
+_DASK: Final = {
+    # This module counts the deaths of workers, per scene.
+    "distributed.scheduler.allowed-failures": 0,
+    # Profiling would wake every process 100 times a second, and the tick 50 times, for a dashboard
+    # that is not served.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    # Pages that any user of the machine could read.
+    "distributed.scheduler.http.routes": [],
+    # For the same dashboard, each process would read a dozen system files twice a second.
+    "distributed.admin.system-monitor.interval": "10s",
+    # With it, small scenes spend much of their time on mapping and returning every array.
+    f"distributed.nanny.pre-spawn-environ.{MALLOC_TRIM_VARIABLE}": None,
+}
+
+_SILENCED: Final = (
+    "distributed.scheduler",
+    "distributed.nanny",
+    "distributed.worker.state_machine",
+)
+"""Loggers that report, partly in tracebacks, what lidarops reports itself: workers that died, and
+abandoned scenes. Another logger warns about the memory of a worker, and stays."""
+IDENTITY = Path("/var/run/secrets/kubernetes.io/serviceaccount")
+"""Folder in which Kubernetes gives a pod its ``token`` and the API's ``ca.crt``."""
+_API_TIMEOUT: Final = 30.0
+"""s."""
+
+_LOG = logging.getLogger(__name__)
 
 # Exceptions of a cluster that is absent, refuses, or is configured wrongly.
 _FAILURES = (OSError, TimeoutError, RuntimeError, ValueError, TypeError)
@@ -316,7 +354,7 @@ def _address(cluster: Scheduler | Slurm | Kubernetes) -> Iterator[Any]:
     if isinstance(cluster, Scheduler):
         yield cluster.address
     elif isinstance(cluster, Kubernetes):
-        with kubernetes.scaled(
+        with scaled_deployment(
             cluster.api, cluster.namespace, cluster.deployment, replicas=cluster.workers
         ):
             yield cluster.address
@@ -380,3 +418,135 @@ def _security(tls: Tls | None) -> Security | None:
             for name, path in files.items()
         },
     )
+
+
+@contextmanager
+def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]:
+    """Start a dask cluster of single-threaded processes on this machine.
+
+    netCDF4 writes from only one thread of a process, and BLAS and numba gain nothing from more.
+    Only processes that hold its certificate, made for this run, can use the cluster.
+
+    Parameters
+    ----------
+    workers : int
+    memory : str, optional
+        Memory limit of a worker, such as ``2GiB``; default an equal share of the machine's memory.
+        A worker that exceeds it is restarted, and its scene is tried again.
+    """
+    import dask  # noqa: PLC0415 - takes a second to import
+    from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
+
+    started = {"distributed.worker.multiprocessing-method": start_method()}
+    with (
+        _quiet(),
+        dask.config.set({**_DASK, **started}),
+        LocalCluster(
+            # Workers start below: a signal during the start here would leave an unclosed cluster.
+            n_workers=0,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            # With certificates of this run: any user of the machine reaches its loopback, and who
+            # reaches a scheduler can run code on its workers.
+            security=True,
+            dashboard_address=None,
+            # Without a dashboard dask still serves HTTP, by default on all interfaces.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            memory_limit=memory or "auto",
+            preload=__name__,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        cluster.scale(workers)
+        _await_workers(client, workers)
+        yield client
+
+
+def _await_workers(client: Client, workers: int) -> None:
+    """Wait for starting workers; go on with fewer if some do not start."""
+    try:
+        client.wait_for_workers(workers, timeout=WORKER_TIMEOUT)
+    except TimeoutError as error:
+        started = len(client.nthreads())
+        if not started:
+            raise SceneError(
+                f"no worker started within {WORKER_TIMEOUT:.0f} s",
+                remedy="give each worker more memory, or start fewer",
+            ) from error
+        _LOG.warning("%d of %d workers started within %.0f s", started, workers, WORKER_TIMEOUT)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the loggers of dask that repeat what lidarops reports."""
+    before = {name: logging.getLogger(name).level for name in _SILENCED}
+    _silence()
+    try:
+        yield
+    finally:
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)
+
+
+def _silence() -> None:
+    for name in _SILENCED:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def dask_setup(_worker: object) -> None:
+    """Prepare a worker; dask calls a function of this name."""
+    _silence()
+    keep_memory()
+    # Ctrl-C reaches all processes of a terminal, but workers should finish their scenes.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def scaled_deployment(
+    api: str, namespace: str, deployment: str, *, replicas: int
+) -> Iterator[None]:
+    """Run a Kubernetes deployment with some replicas, with the rights of this pod; at the end none.
+
+    Raises
+    ------
+    OSError
+        If the API cannot be reached or refuses.
+    """
+    _scale(api, namespace, deployment, replicas)
+    try:
+        yield
+    finally:
+        _scale(api, namespace, deployment, 0)
+
+
+def _scale(api: str, namespace: str, deployment: str, replicas: int) -> None:
+    path = f"/apis/apps/v1/namespaces/{namespace}/deployments/{deployment}/scale"
+    connection = _to_api(api)
+    try:
+        connection.request(
+            "PATCH",
+            path,
+            body=json.dumps({"spec": {"replicas": replicas}}),
+            headers={
+                "Content-Type": "application/merge-patch+json",
+                "Authorization": f"Bearer {(IDENTITY / 'token').read_text().strip()}",
+            },
+        )
+        response = connection.getresponse()
+        text = response.read().decode(errors="replace")
+    except HTTPException as error:
+        raise ConnectionError(f"{api}{path}: {error!r}") from error
+    finally:
+        connection.close()
+    if response.status >= 300:
+        raise ConnectionError(f"{api}{path}: {response.status} {text[:500]}")
+
+
+def _to_api(api: str) -> HTTPConnection:
+    address = urlsplit(api)
+    if address.scheme == "http":
+        return HTTPConnection(address.netloc, timeout=_API_TIMEOUT)
+    context = ssl.create_default_context(cafile=str(IDENTITY / "ca.crt"))
+    return HTTPSConnection(address.netloc, timeout=_API_TIMEOUT, context=context)

@@ -14,16 +14,14 @@ from math import ceil
 from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.model import OPERATION, Campaign, as_settings
-from lidarops.catalog.ledger import RecordedProduct, Verdict
-from lidarops.catalog.rows import day_of
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import RecordedProduct, Store, Verdict
 from lidarops.errors import AncillaryError
-from lidarops.plan.channel_names import ChannelNames
+from lidarops.plan.channels import ChannelNames
 from lidarops.plan.outlying_headers import NEAR_DAYS
+from lidarops.plan.scenes import DARK_REACH
 from lidarops.plan.unused_files import Refused, dated
-from lidarops.plan.windows import DARK_REACH
-from lidarops.records import Role, UnusedFile, digest
-from lidarops.run.selection import Selection, requested_kinds
+from lidarops.records import Role, UnusedFile, day_of, digest
+from lidarops.run.options import Selection, requested_kinds
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 
@@ -32,12 +30,11 @@ REACH: Final = NEAR_DAYS + DARK_DAYS
 """Days before and after a file on which products may use it."""
 
 _PLANNING: Final = (
-    "lidarops.plan.channel_names",
+    "lidarops.plan.channels",
     "lidarops.plan.outlying_headers",
     "lidarops.scene.plan",
     "lidarops.plan.scenes",
     "lidarops.plan.unused_files",
-    "lidarops.plan.windows",
 )
 """Modules that decide which scenes and plans a day has. A product records its own scene and plan,
 so that a change of these modules makes it stale only if they changed."""

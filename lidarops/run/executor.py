@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
 from lidarops.records import Plan, Scene, SceneOutcome
-from lidarops.run import worker
-from lidarops.run.memory import fitted
+from lidarops.run.clusters import WORKER_TIMEOUT
 from lidarops.scene.guard import Failure, guarded
 from lidarops.scene.job import Job
+from lidarops.scene.memory import scene_memory
 from lidarops.system.code_version import joint_code_version
-from lidarops.system.processes import keep_memory, start_method
+from lidarops.system.processes import keep_memory
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -39,8 +39,6 @@ LEAST_SCENES_AHEAD: Final = 4
 """Least number of scenes submitted to a cluster."""
 RECOUNT_INTERVAL: Final = 5.0
 """s between counts of the threads of a cluster, which may grow and shrink."""
-WORKER_TIMEOUT: Final = 120.0
-"""s without any worker after which a warning is logged; local workers are then considered lost."""
 START_DELAY: Final = 1.0
 """s before a new worker gets a scene that may kill it: dask replaces no worker that dies before its
 nanny, which polls every few hundredths of a second, has seen it running."""
@@ -48,22 +46,9 @@ GRACE_PERIOD: Final = 20.0
 """s that running scenes get to end on a cluster after a request to stop."""
 MOST_TRIES: Final = 3
 """A scene that kills its worker this often is refused."""
-MALLOC_TRIM_VARIABLE: Final = "MALLOC_TRIM_THRESHOLD_"
-"""Environment variable by which dask makes the C library return small pieces of memory at once."""
-_DASK: Final = {
-    # This module counts the deaths of workers, per scene.
-    "distributed.scheduler.allowed-failures": 0,
-    # Profiling would wake every process 100 times a second, and the tick 50 times, for a dashboard
-    # that is not served.
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.tick.interval": "500ms",
-    # Pages that any user of the machine could read.
-    "distributed.scheduler.http.routes": [],
-    # For the same dashboard, each process would read a dozen system files twice a second.
-    "distributed.admin.system-monitor.interval": "10s",
-    # With it, small scenes spend much of their time on mapping and returning every array.
-    f"distributed.nanny.pre-spawn-environ.{MALLOC_TRIM_VARIABLE}": None,
-}
+USABLE: Final = 0.9
+"""Share of a limit that a scene may use; dask ends a worker at 0.95."""
+_MEGABYTE: Final = 1e6
 
 _LOG = logging.getLogger(__name__)
 
@@ -148,63 +133,6 @@ def read_bytes(job: Job) -> int:
     return sum(granule.size for granule in job.scene.granules)
 
 
-@contextmanager
-def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]:
-    """Start a dask cluster of single-threaded processes on this machine.
-
-    netCDF4 writes from only one thread of a process, and BLAS and numba gain nothing from more.
-    Only processes that hold its certificate, made for this run, can use the cluster.
-
-    Parameters
-    ----------
-    workers : int
-    memory : str, optional
-        Memory limit of a worker, such as ``2GiB``; default an equal share of the machine's memory.
-        A worker that exceeds it is restarted, and its scene is tried again.
-    """
-    import dask  # noqa: PLC0415 - takes a second to import
-    from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
-
-    started = {"distributed.worker.multiprocessing-method": start_method()}
-    with (
-        worker.quiet(),
-        dask.config.set({**_DASK, **started}),
-        LocalCluster(
-            # Workers start below: a signal during the start here would leave an unclosed cluster.
-            n_workers=0,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            # With certificates of this run: any user of the machine reaches its loopback, and who
-            # reaches a scheduler can run code on its workers.
-            security=True,
-            dashboard_address=None,
-            # Without a dashboard dask still serves HTTP, by default on all interfaces.
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-            memory_limit=memory or "auto",
-            preload=worker.__name__,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        cluster.scale(workers)
-        _await_workers(client, workers)
-        yield client
-
-
-def _await_workers(client: Client, workers: int) -> None:
-    """Wait for starting workers; go on with fewer if some do not start."""
-    try:
-        client.wait_for_workers(workers, timeout=WORKER_TIMEOUT)
-    except TimeoutError as error:
-        started = len(client.nthreads())
-        if not started:
-            raise SceneError(
-                f"no worker started within {WORKER_TIMEOUT:.0f} s",
-                remedy="give each worker more memory, or start fewer",
-            ) from error
-        _LOG.warning("%d of %d workers started within %.0f s", started, workers, WORKER_TIMEOUT)
-
-
 def process_jobs(
     jobs: Iterable[Job],
     *,
@@ -233,18 +161,9 @@ def process_jobs(
     EndedScene
     """
     stop = StopRequest() if stop is None else stop
-    if client is None:
-        yield from _process_here(jobs, stop, taken, memory)
-    else:
+    if client is not None:
         yield from _ClusterQueue(client, stop, taken).run(jobs)
-
-
-def _process_here(
-    jobs: Iterable[Job],
-    stop: StopRequest,
-    taken: Callable[[Job], None] | None,
-    memory: int | None,
-) -> Iterator[EndedScene]:
+        return
     keep_memory()
     for job in jobs:
         if stop:
@@ -252,6 +171,49 @@ def _process_here(
         if taken:
             taken(job)
         yield EndedScene(*_attempt(job, memory))
+
+
+def fitted(job: Job, limit: int | None) -> Job:
+    """Return a job with chunks that fit into a limit; results do not depend on chunks.
+
+    Parameters
+    ----------
+    job : Job
+        Unchanged where it states the profiles of a chunk.
+    limit : int or None
+        Bytes of the process; None for no limit.
+
+    Raises
+    ------
+    SceneError
+        If the scene does not fit even with one profile in a chunk.
+    """
+    if limit is None or job.profiles_per_chunk is not None:
+        return job
+    memory = scene_memory(job.scene, job.plan)
+    if memory.total <= USABLE * limit:
+        return job
+    profiles = memory.profiles_within(USABLE * limit)
+    if not profiles:
+        megabytes = {
+            name: f"{size / _MEGABYTE:.0f} MB"
+            for name, size in {
+                "all": memory.of(1),
+                "process": memory.process,
+                "held": memory.held,
+                "limit": limit,
+                "least": memory.of(1) / USABLE,
+            }.items()
+        }
+        raise SceneError(
+            f"needs about {megabytes['all']} of memory even with one profile in a chunk"
+            f" ({megabytes['process']} for the process, {megabytes['held']} held for the whole"
+            f" scene); {USABLE:.0%} of the limit of {megabytes['limit']} may be used",
+            remedy=f"raise --memory-limit, or the limit of the workers, to {megabytes['least']};"
+            " or give a shorter window of scenes or longer averaging intervals in the campaign"
+            " file; --profiles-per-chunk 1 tries it nevertheless",
+        )
+    return replace(job, profiles_per_chunk=profiles)
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from lidarops.campaign.model import Campaign
-from lidarops.catalog.store import Store
-from lidarops.plan import availability
-from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, UnusableFile
+from lidarops.campaign.model import Campaign, InstrumentFacts
+from lidarops.catalog.store import Verdict
+from lidarops.plan import channels
+from lidarops.records import FactsNote, Findings, Holding, IdlePattern, Role, Unmade, UnusableFile
 from lidarops.run.day_states import DayStates
-from lidarops.run.selection import station_of
-from lidarops.scene.channels import READ_STEP
+from lidarops.run.options import request_key, requested_products, station_of
 
 if TYPE_CHECKING:
     from lidarops.run.leftovers import Lost
-    from lidarops.run.staleness import Judgement
 
 _NO_OVERLAP: Final = (
     "give neither full_overlap_range nor overlap_profile: bins near the lidar are used as they are,"
     " and a rise of the signal there is no cloud unless clean air beyond shows that"
+)
+_NEVER_TOGETHER: Final = (
+    "its instruments have no files at the same time, on the first and the last day"
 )
 
 
@@ -29,7 +31,7 @@ def find(
     orphans: Collection[str] = (),
     *,
     lost: Lost | None = None,
-    usable: Collection[str] = (),
+    settled: Mapping[int, Verdict] = MappingProxyType({}),
 ) -> Findings:
     """Return the findings on the instruments and networks that are selected.
 
@@ -43,8 +45,8 @@ def find(
         Paths of products that would not be made again.
     lost : Lost, optional
         Raw files of products that are lost; None where no day changed and none is acknowledged.
-    usable : collection of str
-        Ancillary files that need no look.
+    settled : mapping of int to Verdict
+        Days that are settled. Their ancillary files can be used.
     """
     campaign, store, selection = states.campaign, states.store, states.selection
     owners = [
@@ -53,9 +55,10 @@ def find(
         if selection.owner(name, station_of(campaign, name))
     ]
     instruments = {member for name in owners for member in _members(campaign, name)}
-    exchanged = availability.exchanged_recorders(states.names.holdings)
+    usable = {name for verdict in settled.values() for name in verdict.files}
+    exchanged = channels.exchanged_recorders(states.names.holdings)
     return Findings(
-        unmet=availability.unavailable_channels(
+        unmet=channels.unavailable_channels(
             campaign,
             states.names.holdings,
             instruments=instruments,
@@ -66,13 +69,13 @@ def find(
         file_notes=(*store.file_notes(instruments), *states.names.notes(instruments)),
         idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
         unusable_files=tuple(_unusable_files(states, sorted(instruments), usable)),
-        unmade=tuple(_unmade(states, owners, orphans)),
+        unmade=tuple(_unmade(states, owners, orphans, settled)),
         incomplete_facts=(
-            *_incomplete_facts(campaign, store, sorted(instruments)),
+            *_incomplete_facts(states, sorted(instruments)),
             *(note for note in exchanged if note.instrument in instruments),
         ),
         idle_facts=(
-            *_idle_facts(campaign, store, sorted(instruments)),
+            *_idle_facts(states, sorted(instruments)),
             *(lost.idle if lost else ()),
         ),
         lost_files=tuple(
@@ -87,31 +90,33 @@ def _members(campaign: Campaign, owner: str) -> Collection[str]:
     return (owner,) if network is None else network.instruments
 
 
-def _incomplete_facts(
-    campaign: Campaign, store: Store, instruments: Iterable[str]
-) -> Iterator[FactsNote]:
+def _incomplete_facts(states: DayStates, instruments: Iterable[str]) -> Iterator[FactsNote]:
     """Yield the facts of instruments with files that state no overlap."""
     for name in instruments:
-        for facts in campaign.instruments[name].facts:
+        for facts in states.campaign.instruments[name].facts:
             stated = facts.full_overlap_range or facts.overlap_profile
-            if not stated and store.has_files(name, facts.valid_from, facts.valid_to):
-                yield FactsNote(name, availability.period_of(facts), _NO_OVERLAP)
+            if not stated and _hold_for_files(facts, states.names.holdings, name):
+                yield FactsNote(name, channels.period_of(facts), _NO_OVERLAP)
 
 
-def _idle_facts(
-    campaign: Campaign, store: Store, instruments: Iterable[str]
-) -> Iterator[FactsNote]:
+def _idle_facts(states: DayStates, instruments: Iterable[str]) -> Iterator[FactsNote]:
     """Yield the facts that no file or product uses, of instruments with files."""
-    for name in instruments:
-        instrument = campaign.instruments[name]
-        if not (instrument.facts and store.has_files(name)):
-            continue
+    holdings = states.names.holdings
+    for name in {held.instrument: None for held in holdings if held.instrument in instruments}:
+        instrument = states.campaign.instruments[name]
         for facts in instrument.facts:
-            if store.has_files(name, facts.valid_from, facts.valid_to):
-                yield from availability.unused_lidar_ratios(name, facts, instrument)
+            if _hold_for_files(facts, holdings, name):
+                yield from channels.unused_lidar_ratios(name, facts, instrument)
             else:
                 reason = "hold for no file: their period and the times of the files do not overlap"
-                yield FactsNote(name, availability.period_of(facts), reason)
+                yield FactsNote(name, channels.period_of(facts), reason)
+
+
+def _hold_for_files(facts: InstrumentFacts, holdings: Iterable[Holding], instrument: str) -> bool:
+    return any(
+        held.instrument == instrument and facts.valid_from <= held.since < facts.valid_to
+        for held in holdings
+    )
 
 
 def _unusable_files(
@@ -138,13 +143,18 @@ def _unusable_files(
                 yield UnusableFile(name, key, path, problem)
 
 
-def _unmade(states: DayStates, owners: Iterable[str], orphans: Collection[str]) -> Iterator[Unmade]:
+def _unmade(
+    states: DayStates,
+    owners: Iterable[str],
+    orphans: Collection[str],
+    settled: Mapping[int, Verdict],
+) -> Iterator[Unmade]:
     """Yield the requested products that have files and that no selected scene has."""
     campaign, store, selection = states.campaign, states.store, states.selection
     missing = [
         (owner, kind, channel)
         for owner in owners
-        for kind, channel in _requested(campaign, owner)
+        for kind, channel in requested_products(campaign, owner)
         if (not selection.kinds or kind in selection.kinds)
         and not any(
             selection.scene(scene, campaign)
@@ -153,36 +163,32 @@ def _unmade(states: DayStates, owners: Iterable[str], orphans: Collection[str]) 
     ]
     if not missing:
         return
-    from lidarops.run.staleness import Judge  # noqa: PLC0415 - loads the numerics
-
-    judge = Judge(campaign, store, selection=selection)
     spans = store.days_of_instruments(*selection.day_limits)
-    judged: dict[int, Sequence[Judgement]] = {}
+    # Within an interval, some scenes of a day may not be selected.
+    limited = selection.since or selection.until
+    told = {} if limited else {day: verdict.unmade for day, verdict in settled.items()}
     for owner, kind, channel in missing:
         days = _first_and_last_day(campaign, owner, spans)
-        for day in days:
-            if day not in judged:
-                judged[day] = judge.days([day]).judgements
-        scenes = [
-            scene
-            for day in days
-            for scene in judged[day]
-            if scene.scene.instrument == owner and selection.scene(scene.scene.id, campaign)
+        found = [
+            _unmade_on(states, day, told).get(request_key(owner, kind, channel)) for day in days
         ]
-        reason = _why_not(scenes, kind, channel)
-        if days and reason:
-            yield Unmade(owner, kind, channel, reason)
+        if days and None not in found:
+            reasons = dict.fromkeys(reason for told in found for reason in told or ())
+            reason = "; ".join(filter(None, reasons)) if reasons else _NEVER_TOGETHER
+            if reason:
+                yield Unmade(owner, kind, channel, reason)
 
 
-def _requested(campaign: Campaign, owner: str) -> Iterator[tuple[str, str]]:
-    """Yield kind and channel of the requested products; an empty channel if all are requested."""
-    if owner in campaign.networks:
-        for kind, joint in campaign.networks[owner].requested().items():
-            yield kind, joint.channel
-        return
-    for kind, settings in campaign.instruments[owner].products.requested().items():
-        for channel in settings.named or [""]:
-            yield kind, channel
+def _unmade_on(
+    states: DayStates, day: int, told: dict[int, dict[str, list[str]]]
+) -> dict[str, list[str]]:
+    """Return what no selected scene of a day gives; the day is judged unless it is told."""
+    if day not in told:
+        from lidarops.run.staleness import Judge  # noqa: PLC0415 - loads the numerics
+
+        judge = Judge(states.campaign, states.store, selection=states.selection)
+        told[day] = judge.days([day]).unmade[day]
+    return told[day]
 
 
 def _first_and_last_day(
@@ -191,25 +197,3 @@ def _first_and_last_day(
     """Return the first and last day on which an owner has files."""
     days = [day for name in _members(campaign, owner) for day in spans.get(name, ())]
     return sorted({min(days), max(days)}) if days else []
-
-
-def _why_not(scenes: Sequence[Judgement], kind: str, channel: str) -> str:
-    """Return why no scene gives a product; empty if one should, but failed or is yet to run."""
-    if not scenes:
-        return "its instruments have no files at the same time, on the first and the last day"
-    from lidarops.scene import dependence  # noqa: PLC0415 - loads the numerics
-    from lidarops.scene.case import REQUEST  # noqa: PLC0415
-
-    reasons: dict[str, None] = {}
-    for judged in scenes:
-        planned = dependence.planned_products(judged.requested)
-        if any(made == kind and channel in ("", name) for made, name in planned):
-            return ""
-        reasons |= dict.fromkeys(
-            left.reason
-            for left in judged.requested.left_out
-            if left.name in (kind, READ_STEP)
-            and channel in ("", left.channel)
-            and left.rule != REQUEST
-        )
-    return "; ".join(reasons)

@@ -1,20 +1,20 @@
-"""Options of a run, and its result."""
+"""What a run is asked for: a selection and options; and its result."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from pathlib import Path
+from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog import versions
-from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.scan import ScanSummary
-from lidarops.catalog.store import Store
-from lidarops.records import Findings, RunRecord, SceneOutcome
+from lidarops.catalog.store import RecordedProduct, RunStatus, Store, Verdict
+from lidarops.errors import CampaignError
+from lidarops.kinds import kinds
+from lidarops.plan.scenes import parse_scene_id, scene_stop
+from lidarops.records import Findings, RunRecord, SceneOutcome, day_of
 from lidarops.reports import run_record
 
 if TYPE_CHECKING:
@@ -24,6 +24,56 @@ if TYPE_CHECKING:
 
 Progress = Callable[[SceneOutcome], None]
 NO_USABLE_VALUE: Final = "its retrievals gave no usable value"
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Stations, instruments, kinds of product and times to process; empty fields select all."""
+
+    stations: tuple[str, ...] = ()
+    instruments: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+    since: datetime | None = None
+    until: datetime | None = None
+
+    @property
+    def everything(self) -> bool:
+        """Whether the selection contains everything."""
+        return self == Selection()
+
+    @property
+    def day_limits(self) -> tuple[int | None, int | None]:
+        """The first and the last day that may hold selected scenes; None without a limit."""
+        return (
+            None if self.since is None else day_of(self.since),
+            None if self.until is None else day_of(self.until),
+        )
+
+    def days(self, days: Iterable[int]) -> list[int]:
+        """Return the days that may hold selected scenes."""
+        first, last = self.day_limits
+        return [
+            day for day in days if (first is None or day >= first) and (last is None or day <= last)
+        ]
+
+    def product(self, made: RecordedProduct, campaign: Campaign) -> bool:
+        """Return whether a product is selected; its scene may no longer exist."""
+        return (not self.kinds or made.kind in self.kinds) and self.scene(made.scene, campaign)
+
+    def scene(self, scene: str, campaign: Campaign) -> bool:
+        """Return whether the scene of an id is selected; it may no longer exist."""
+        owner, start = parse_scene_id(scene)
+        return (
+            self.owner(owner, station_of(campaign, owner))
+            and (self.since is None or scene_stop(scene, campaign) > self.since)
+            and (self.until is None or start < self.until)
+        )
+
+    def owner(self, name: str, station: str) -> bool:
+        """Return whether an instrument or network, and its station, are selected."""
+        return (not self.instruments or name in self.instruments) and (
+            not self.stations or station in self.stations
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +120,6 @@ class Result:
     set_aside: Mapping[str, str] = field(default_factory=dict)
     """Path of a good granule that belongs to no scene -> why."""
     orphans: tuple[Orphan, ...] = ()
-    more_unused: int = 0
-    """Number of further empty scenes and granules set aside, on unchanged days."""
     frozen: Mapping[str, str] = field(default_factory=dict)
     """Product of a frozen period that would be replaced -> why."""
     findings: Findings = field(default_factory=Findings)
@@ -117,12 +165,24 @@ class Result:
             or self.unusable
             or self.empty_scenes
             or self.set_aside
-            or self.more_unused
             or self.findings.failed
             or self.lost
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)
         )
+
+
+def unused(
+    verdicts: Mapping[int, Verdict], days: Collection[int]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the empty scenes and the files set aside of some days, as verdicts state them."""
+    empty_scenes: dict[str, str] = {}
+    set_aside: dict[str, str] = {}
+    for day, verdict in verdicts.items():
+        if day in days:
+            empty_scenes |= verdict.empty_scenes
+            set_aside |= verdict.set_aside
+    return empty_scenes, set_aside
 
 
 def missing_report(campaign: Campaign) -> str:
@@ -142,9 +202,92 @@ def missing_report(campaign: Campaign) -> str:
     return ""
 
 
-def is_littered(campaign: Campaign, store: Store) -> bool:
-    """Return whether there are temporary files that no run writes and this one may remove."""
-    files = versions.temporary_files(Path(campaign.output))
-    if store.in_use() or store.others_at_work():
+def check_selection(campaign: Campaign, selection: Selection) -> None:
+    """Refuse a selection that names what the campaign does not have.
+
+    Raises
+    ------
+    CampaignError
+        If the campaign has no such station or instrument or requests no such kind of product, or if
+        the interval of time is empty.
+    """
+    known = {
+        "instrument": (selection.instruments, (*campaign.instruments, *campaign.networks)),
+        "station": (selection.stations, (*campaign.stations, *campaign.networks)),
+    }
+    for word, (selected, names) in known.items():
+        for name in selected:
+            if name not in names:
+                raise CampaignError(
+                    f"the campaign has no {word} {name!r}",
+                    remedy=f"known: {', '.join(sorted(set(names)))}",
+                )
+    requested = requested_kinds(campaign)
+    for kind in selection.kinds:
+        if kind not in requested:
+            raise CampaignError(
+                f"no instrument or network of the campaign requests product {kind!r}",
+                remedy=f"requested: {', '.join(requested) or 'none'}",
+            )
+    since, until = selection.since, selection.until
+    if since is not None and until is not None and since >= until:
+        raise CampaignError(
+            f"the interval from {since.isoformat()} to {until.isoformat()} is empty",
+            field="since, until",
+            remedy="since must be earlier than until",
+        )
+
+
+def requested_kinds(campaign: Campaign) -> list[str]:
+    """Return the kinds of product that a campaign requests."""
+    owners = (*campaign.instruments, *campaign.networks)
+    requested = {kind for owner in owners for kind, _ in requested_products(campaign, owner)}
+    return [kind for kind in kinds() if kind in requested]
+
+
+def requested_products(campaign: Campaign, owner: str) -> Iterator[tuple[str, str]]:
+    """Yield kind and channel of the products that are requested of an instrument or network.
+
+    The channel is empty if all are requested.
+    """
+    if owner in campaign.networks:
+        for kind, joint in campaign.networks[owner].requested().items():
+            yield kind, joint.channel
+        return
+    for kind, settings in campaign.instruments[owner].products.requested().items():
+        for channel in settings.named or [""]:
+            yield kind, channel
+
+
+def request_key(owner: str, kind: str, channel: str) -> str:
+    """Return the key by which a verdict names a requested product."""
+    return f"{owner} {kind} {channel}"
+
+
+def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
+    """Return whether a selection is limited and contains no scene of the catalog.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        A catalog must exist.
+    selection : Selection
+    """
+    if selection.everything:
         return False
-    return any(os.access(file.parent, os.W_OK) for file in files)
+    from lidarops.plan.scenes import cut_scenes  # noqa: PLC0415 - loads numerics
+
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        days = selection.days(sorted({day_sum.day for day_sum in store.day_sums()}))
+        # No scene is longer than a day; the first selected scene decides.
+        return not any(
+            selection.scene(scene.id, campaign)
+            for day in days
+            for scene in cut_scenes(campaign, store.granules_of(day, day, dark_days=0)).scenes
+        )
+
+
+def station_of(campaign: Campaign, name: str) -> str:
+    """Return the station of an instrument; of a network, its name."""
+    owner = campaign.instruments.get(name)
+    return owner.station if owner else name

@@ -12,26 +12,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog import versions
-from lidarops.catalog.ledger import RunStatus, Verdict
+from lidarops.catalog import product_files
+from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
-from lidarops.catalog.store import Store
-from lidarops.plan.outlying_headers import joined_notes
+from lidarops.catalog.store import RunStatus, Store, Verdict
 from lidarops.records import FileNote, Findings, Granule, RunRecord
+from lidarops.run.clusters import local_client
 from lidarops.run.day_states import REACH, Signature
 from lidarops.run.executor import (
     EndedScene,
     StopRequest,
-    local_client,
     process_jobs,
     process_one_by_one,
     read_bytes,
 )
 from lidarops.run.findings import find
 from lidarops.run.leftovers import Orphan
-from lidarops.run.options import Options, Result, is_littered
-from lidarops.run.selection import Selection
+from lidarops.run.options import Options, Result, Selection, unused
 from lidarops.run.session import Session
 from lidarops.run.staleness import DaysJudged, Judge, Judgement
 from lidarops.scene.job import Job
@@ -43,11 +41,6 @@ if TYPE_CHECKING:
 
 MOST_FAILURES_IN_A_ROW = 5
 """The run stops after this many scenes in a row failed for a cause that may pass (a full disk)."""
-
-MOST_DAYS_JUDGED_AGAIN: Final = 30
-"""Unchanged days that are judged again to name their unused files and scenes; the unused ones of
-other days are only counted."""
-
 
 _WORKER_MODULES: Final = (
     "distributed.nanny",
@@ -111,12 +104,8 @@ class Pass:
         """
         self.judge = self._new_judge()
         days, signatures = self.days, self.signatures
-        verdicts, workers = self.store.verdicts(), self.options.workers
-        clean = [
-            day
-            for day in sorted(signatures.keys() - set(days))
-            if day in verdicts and verdicts[day].unused
-        ]
+        workers = self.options.workers
+        clean = unused(self.store.verdicts(), signatures.keys() - set(days))
         self._forget(self.store.scenes_of_other_days(signatures))
         status, caught = RunStatus.FINISHED, 0
         if days:
@@ -141,7 +130,6 @@ class Pass:
         file_notes = (*findings.file_notes, *joined_notes(self.file_notes))
         findings = replace(findings, file_notes=file_notes)
         record = self._conclude(status, findings)
-        self._collect_unused(clean[:MOST_DAYS_JUDGED_AGAIN])
         return Result(
             record=record,
             status=status,
@@ -151,21 +139,12 @@ class Pass:
             internal=self.store.internal_errors(),
             # Orphans are never made again, so they would be reported for ever.
             unusable=tuple(self.store.unusable_scenes(without=self.orphans.keys())),
-            empty_scenes=self.empty_scenes,
-            set_aside={path: granule.reason for path, granule in self.set_aside.items()},
-            more_unused=sum(verdicts[day].unused for day in clean[MOST_DAYS_JUDGED_AGAIN:]),
+            empty_scenes=self.empty_scenes | clean[0],
+            set_aside={path: granule.reason for path, granule in self.set_aside.items()} | clean[1],
             frozen=self.frozen,
             findings=findings,
             signal=caught,
         )
-
-    def _collect_unused(self, days: Sequence[int]) -> None:
-        """Collect the unused scenes and files of settled days."""
-        judge = Judge(self.campaign, self.store)
-        for batch in judge.batches(days):
-            judged = judge.days(batch)
-            self.set_aside |= {granule.path: granule for granule in judged.set_aside}
-            self.empty_scenes |= _empty_scenes(judged)
 
     def _new_judge(self, *, again: bool = False) -> Judge:
         force = self.options.force and not again
@@ -294,7 +273,9 @@ class Pass:
         self.set_aside |= {granule.path: granule for granule in judged.set_aside}
         self.file_notes += judged.file_notes
         self.verdicts.update(judged.verdicts)
-        self.empty_scenes |= _empty_scenes(judged)
+        self.empty_scenes |= {
+            one.scene.id: one.empty_reason for one in judged.judgements if one.empty_reason
+        }
         for scene in judged.judgements:
             self.held.pop(scene.scene.id, None)
         self.held |= {scene.scene.id: scene for scene in judged.judgements if scene.held}
@@ -348,7 +329,8 @@ class Pass:
                 judged = judge.days(batch)
                 # Of a forced scene that failed, the former products are fresh: the next run judges
                 # its day, and forgets the failure.
-                settled |= _signed(after, judged.verdicts, {*judged.open, *judged.gone.values()})
+                due = (one.day for one in judged.judgements if one.due)
+                settled |= _signed(after, judged.verdicts, {*due, *judged.gone.values()})
         known = self.store.verdicts()
         new = {day: verdict for day, verdict in settled.items() if known.get(day) != verdict}
         if new:
@@ -357,10 +339,11 @@ class Pass:
 
     def _clear_up(self) -> None:
         """Remove what a killed run left, if this one has not; another run may be at work."""
-        littered = self.store.has_dead_run() or is_littered(self.campaign, self.store)
+        output = Path(self.campaign.output)
+        littered = self.store.has_dead_run() or product_files.is_littered(output, self.store)
         if self.session is None and littered:
             self.lock.acquire_unchanged()
-            if versions.sweep(Path(self.campaign.output), self.store.others_at_work):
+            if product_files.sweep(output, self.store):
                 self.store.close_runs(self.lock.token)
 
     def _conclude(self, status: RunStatus, findings: Findings) -> RunRecord | None:
@@ -387,10 +370,6 @@ def _bytes(size: str | None) -> int | None:
     from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
 
     return int(parse_bytes(size))
-
-
-def _empty_scenes(judged: DaysJudged) -> dict[str, str]:
-    return {one.scene.id: one.empty_reason for one in judged.judgements if one.empty_reason}
 
 
 def _signed(

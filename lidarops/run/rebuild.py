@@ -14,10 +14,8 @@ from typing import Final
 import numpy as np
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.ledger import Dependence, NewProduct, RunStatus, SceneEntry
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.rows import day_of
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import Dependence, NewProduct, RunStatus, SceneEntry, Store
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.figures.series_data import blocks
 from lidarops.kinds import flags_of, kinds
@@ -25,8 +23,8 @@ from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.plan.windows import parse_scene_id
-from lidarops.records import ProductRecord, Role, SceneOutcome
+from lidarops.plan.scenes import parse_scene_id
+from lidarops.records import ProductRecord, Role, SceneOutcome, day_of
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
 from lidarops.run.staleness import Judge, settings_digest

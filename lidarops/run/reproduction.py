@@ -131,47 +131,34 @@ def _staged(
         staged = Path(name)
         store = RemoteStore(archive) if is_url(archive) else None
         place = archive if store is None else store.url
-        bring = _from_folder(Path(archive), staged) if store is None else _from_store(store, staged)
-        bring({record.path: record.path for record in records})
+        source = Path(archive) if store is None else store
+        _bring(source, staged, {record.path: record.path for record in records})
         wrong = list(_changed(staged, records, place))
         lost = [record for record in records if record.path in {each.name for each in wrong}]
         moved = _moved(recipe, lost, catalog)
         if moved:
-            bring(moved)
+            _bring(source, staged, moved)
             still = {each.name for each in _changed(staged, lost, place)}
             wrong = [each for each in wrong if each.name in still]
         yield staged, wrong
 
 
-def _from_store(store: RemoteStore, staged: Path) -> Callable[[Mapping[str, str]], None]:
-    """Return a function that copies files, recorded name -> present name, from a store."""
-
-    def bring(names: Mapping[str, str]) -> None:
-        with tempfile.TemporaryDirectory(prefix="lidarops-") as fetched:
-            store.fetch(sorted(set(names.values())), Path(fetched))
-            for old, now in names.items():
-                if (Path(fetched) / now).is_file():
-                    # Copied, not moved: two recorded names may have the same present name.
-                    shutil.copyfile(Path(fetched) / now, _cleared(staged / old))
-
-    return bring
-
-
-def _from_folder(folder: Path, staged: Path) -> Callable[[Mapping[str, str]], None]:
-    """Return a function that links to files, recorded name -> present name, of a folder."""
-
-    def bring(names: Mapping[str, str]) -> None:
+def _bring(source: Path | RemoteStore, staged: Path, names: Mapping[str, str]) -> None:
+    """Link to files of a folder, or copy those of a store: recorded name -> present name."""
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as fetched:
+        folder = source if isinstance(source, Path) else Path(fetched)
+        if not isinstance(source, Path):
+            source.fetch(sorted(set(names.values())), folder)
         for old, now in names.items():
             if (folder / now).is_file():
-                _cleared(staged / old).symlink_to((folder / now).absolute())
-
-    return bring
-
-
-def _cleared(target: Path) -> Path:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    return target
+                target = staged / old
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.unlink(missing_ok=True)
+                if folder is source:
+                    target.symlink_to((folder / now).absolute())
+                else:
+                    # Not moved: two recorded names may have the same present name.
+                    shutil.copyfile(folder / now, target)
 
 
 def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
@@ -218,9 +205,9 @@ def _folder(
     last_read = [Path(known)] if known and not is_url(known) else []
     local = [*_folders_above(recipe.file), *last_read]
     own = [folder for folder in local if folder.parent != folder.parent.parent] + last_read
-    for holds, folders in ((_holds_content, local), (_holds_name, own)):
+    for content, folders in ((True, local), (False, own)):
         for folder in folders:
-            if holds(folder, digests) or holds(folder, moved):
+            if any(_holds(folder, names, content=content) for names in (digests, moved)):
                 return str(folder)
         if is_url(known):
             return known
@@ -232,16 +219,12 @@ def _folder(
     )
 
 
-def _holds_content(folder: Path, digests: Mapping[str, str]) -> bool:
-    """Return whether any named file has the digest of its name."""
+def _holds(folder: Path, digests: Mapping[str, str], *, content: bool) -> bool:
+    """Return whether there is any named file, on request with the digest of its name."""
     return any(
-        (folder / name).is_file() and sha256_of(folder / name) == digest
+        (folder / name).is_file() and (not content or sha256_of(folder / name) == digest)
         for name, digest in digests.items()
     )
-
-
-def _holds_name(folder: Path, digests: Mapping[str, str]) -> bool:
-    return any((folder / name).is_file() for name in digests)
 
 
 def _folders_above(file: Path) -> Iterator[Path]:

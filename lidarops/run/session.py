@@ -13,10 +13,9 @@ from typing import Final
 
 from lidarops import __version__
 from lidarops.campaign.model import Campaign
-from lidarops.catalog import versions
-from lidarops.catalog.ledger import NewProduct, Run, RunStatus, SceneEntry
+from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Store
 from lidarops.errors import CatalogError
 from lidarops.records import (
     Findings,
@@ -86,7 +85,6 @@ class Session:
         self._lock = lock
         self._judge = judge
         self._output = Path(campaign.output)
-        self._kept: dict[str, str] = {}
         self._outcomes: dict[str, SceneOutcome] = {}
         self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
         self._named = 0
@@ -98,7 +96,7 @@ class Session:
 
     def begin(self) -> None:
         """Enter the run in the ledger, and remove temporary files of killed runs."""
-        swept = versions.sweep(self._output, self._store.others_at_work)
+        swept = product_files.sweep(self._output, self._store)
         self._store.begin_run(self._run, self._lock.token, swept=swept)
         if self._journal:
             self._journal.begin(self._record((), Findings()))
@@ -117,8 +115,7 @@ class Session:
             reason = stale.reason
             _LOG.info("%s %s of %s: %s", stale.kind, stale.channel, judged.scene.id, reason)
             if stale.before is not None and self._campaign.superseded == "keep":
-                path, sha256 = stale.before.path, stale.before.sha256
-                self._kept[path] = versions.keep(self._output, path, sha256)
+                product_files.keep(self._output, stale.before.path, stale.before.sha256)
         if note:
             self._store.begin_scene(judged.scene.id, judged.day, self.id, self._lock.token)
 
@@ -188,7 +185,7 @@ class Session:
             Whether a worker may have left half a file.
         """
         if lost_worker:
-            versions.sweep(self._output, self._store.others_at_work)
+            product_files.sweep(self._output, self._store)
         unused = (*self._store.refused(), *set_aside)
         stated = {file.path for outcome in self._outcomes.values() for file in outcome.refused}
         refused = tuple(granule for granule in unused if granule.path not in stated)
@@ -250,9 +247,7 @@ class Session:
             depends_on, used = self._judge.depends_on(
                 judged.scene, judged.plan, product, outcome.inputs
             )
-            new.append(
-                NewProduct(record, mtime_ns, depends_on, used, self._kept.get(record.path, ""))
-            )
+            new.append(NewProduct(record, mtime_ns, depends_on, used))
         return new, outcome
 
     def _written(self, record: ProductRecord) -> int | None:
@@ -265,12 +260,10 @@ class Session:
     def _settle_versions(self, judged: Judgement, outcome: SceneOutcome) -> None:
         """Drop kept versions that were not replaced."""
         now = {record.path: record.sha256 for record in outcome.products}
-        for stale in judged.stale:
-            if stale.before is not None:
-                path = stale.before.path
-                kept = self._kept.pop(path, "")
-                if now.get(path, stale.before.sha256) == stale.before.sha256:
-                    versions.drop(self._output, kept)
+        kept = [stale.before for stale in judged.stale if self._campaign.superseded == "keep"]
+        for before in filter(None, kept):
+            if now.get(before.path, before.sha256) == before.sha256:
+                product_files.drop(self._output, before.path, before.sha256)
 
     def _log(self, outcome: SceneOutcome) -> None:
         fields = {

@@ -7,7 +7,7 @@ other product is stale, and the reason is stated.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -16,10 +16,8 @@ from typing import Any, Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.headers import HEADER_BYTES
-from lidarops.catalog.ledger import Dependence, LastTry, RecordedProduct, Verdict
-from lidarops.catalog.rows import day_of
 from lidarops.catalog.sources import Source
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import Dependence, LastTry, RecordedProduct, Store, Verdict
 from lidarops.errors import ProductError, RawFormatError
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
@@ -36,6 +34,7 @@ from lidarops.records import (
     Role,
     Scene,
     Stamp,
+    day_of,
     digest,
 )
 from lidarops.run.day_states import DARK_DAYS, DayStates
@@ -46,8 +45,9 @@ from lidarops.run.leftovers import (
     find_lost,
     product_file,
     scenes_without_product,
+    unmade_products,
 )
-from lidarops.run.selection import Selection
+from lidarops.run.options import Selection
 from lidarops.scene import dependence
 from lidarops.scene.context import recorded_settings
 from lidarops.scene.dependence import ProductKey, ancillary_files
@@ -159,8 +159,8 @@ class DaysJudged:
     """Notes on files that only the files around them show."""
     verdicts: Mapping[int, Verdict]
     """Of days that may be settled, without signature."""
-    open: frozenset[int]
-    """Days with stale products; they may be settled after processing."""
+    unmade: Mapping[int, dict[str, list[str]]]
+    """What no selected scene of each day gives; see `unmade_products`."""
     gone: Mapping[str, int]
     """Scenes with a recorded failure that no longer exist or are all fresh -> day."""
     touched: Mapping[str, int]
@@ -270,13 +270,18 @@ class Judge(DayStates):
             for known in [stale.before]
             if known
         ]
-        selected_scenes = self.selection.scenes(cut.scenes)
-        selected = {scene.id for scene in selected_scenes}
+        own = [one for one in judgements if self.selection.scene(one.scene.id, self.campaign)]
+        unmade = {
+            day: unmade_products(
+                self.campaign, [(one.scene, one.requested) for one in own if one.day == day]
+            )
+            for day in days
+        }
         instruments = {
-            member.instrument for scene in selected_scenes for member in scene.members or (scene,)
+            member.instrument for one in own for member in one.scene.members or (one.scene,)
         }
         return DaysJudged(
-            judgements=tuple(judged for judged in judgements if judged.scene.id in selected),
+            judgements=tuple(own),
             orphans=tuple(
                 orphan
                 for product, orphan in orphans
@@ -284,8 +289,8 @@ class Judge(DayStates):
             ),
             set_aside=cut.set_aside,
             file_notes=tuple(note for note in cut.file_notes if note.instrument in instruments),
-            verdicts=_verdicts(settled, judgements, cut.set_aside),
-            open=frozenset(judged.day for judged in judgements if judged.due),
+            verdicts=_verdicts(settled, judgements, cut.set_aside, unmade),
+            unmade=unmade,
             gone=self._gone(judgements, tried, within),
             touched=self._touched,
             digests=self._digests,
@@ -613,15 +618,22 @@ def settings_digest(settings: Mapping[str, Any]) -> str:
 
 
 def _verdicts(
-    days: Iterable[int], judgements: Iterable[Judgement], set_aside: Iterable[Granule]
+    days: Iterable[int],
+    judgements: Iterable[Judgement],
+    set_aside: Iterable[Granule],
+    unmade: Mapping[int, dict[str, list[str]]],
 ) -> dict[int, Verdict]:
     """Return the verdicts on some days, without signature."""
-    empty = Counter(judged.day for judged in judgements if judged.empty_reason)
-    aside = Counter(day_of(_moment(granule)) for granule in set_aside)
-    files: dict[int, dict[str, str]] = defaultdict(dict)
+    verdicts = {day: Verdict("", {}, {}, {}, unmade[day]) for day in days}
     for judged in judgements:
-        files[judged.day] |= {used.path: used.sha256 for used in judged.ancillaries}
-    return {day: Verdict("", empty[day], aside[day], files[day]) for day in days}
+        if verdict := verdicts.get(judged.day):
+            verdict.files.update({used.path: used.sha256 for used in judged.ancillaries})
+            if judged.empty_reason:
+                verdict.empty_scenes[judged.scene.id] = judged.empty_reason
+    for granule in set_aside:
+        if verdict := verdicts.get(day_of(_moment(granule))):
+            verdict.set_aside[granule.path] = granule.reason
+    return verdicts
 
 
 def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> str:

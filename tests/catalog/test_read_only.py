@@ -168,7 +168,7 @@ def test_a_plan_makes_no_folder(made: Archive, tmp_path: Path) -> None:
         ("granule", "notes", b"no JSON"),
         ("granule", "start", b"no time"),
         ("product", "written", b"no time"),
-        ("verdict", "files", b"[1"),
+        ("verdict", "facts", b"[1"),
         ("granule", "role", b"no role"),
         ("run", "status", b"no status"),
     ],

@@ -22,7 +22,7 @@ import pytest
 import yaml
 from support.servers import loopback
 
-from lidarops.run import clusters, kubernetes
+from lidarops.run import clusters
 
 
 def test_choices_of_the_command_line(tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ class FakeApi(http.server.BaseHTTPRequestHandler):
 def api(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[str]:
     monkeypatch.setattr(FakeApi, "seen", [])
     monkeypatch.setattr(FakeApi, "status", 200)
-    monkeypatch.setattr(kubernetes, "IDENTITY", tmp_path)
+    monkeypatch.setattr(clusters, "IDENTITY", tmp_path)
     (tmp_path / "token").write_text("secret\n")
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), FakeApi) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -307,7 +307,7 @@ def test_kubernetes_workers_are_scaled_up_and_down(api: str) -> None:
 
     with (
         pytest.raises(Interrupted),
-        kubernetes.scaled(api, "lidarops", "lidarops-worker", replicas=7),
+        clusters.scaled_deployment(api, "lidarops", "lidarops-worker", replicas=7),
     ):
         raise Interrupted
     path = "/apis/apps/v1/namespaces/lidarops/deployments/lidarops-worker/scale"

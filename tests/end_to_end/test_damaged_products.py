@@ -15,8 +15,8 @@ from support.damage import OF_ANY_FILE
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.store import Store
-from lidarops.catalog.verify import verify_archive
 from lidarops.cli import app
 from lidarops.netcdf import read
 from lidarops.netcdf.comparison import compare_products

@@ -15,8 +15,8 @@ from benchmarks.throughput import memory as peaks
 from lidarops.cli.app import app
 from lidarops.errors import SceneError
 from lidarops.run.archive import Options, reprocess
-from lidarops.run.executor import local_client
-from lidarops.run.memory import USABLE, fitted
+from lidarops.run.clusters import local_client
+from lidarops.run.executor import USABLE, fitted
 from lidarops.scene.job import Job
 from lidarops.scene.memory import PROCESS, SceneMemory, scene_memory
 

@@ -44,15 +44,13 @@ import flows.catalog
 import flows.reprocess
 from flows import WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
-from flows.child_processes import keep_main_module_out
 from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
-from flows.temporary_server import tie_to_this_process
+from flows.start import keep_main_module_out, tie_to_this_process
 from lidarops.campaign.model import load_campaign
-from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import RunStatus, Store
 from lidarops.cli import app as cli
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.records import SceneOutcome

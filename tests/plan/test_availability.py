@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from support import factories
 
-from lidarops.catalog.rows import row_of
+from lidarops.catalog.headers import row_of
 from lidarops.catalog.store import Store
-from lidarops.plan.availability import (
+from lidarops.plan.channels import (
     unavailable_channels,
     validity_edges,
 )

@@ -8,10 +8,9 @@ from datetime import timedelta
 
 from support import factories
 
-from lidarops.plan.scenes import cut_scenes
-from lidarops.plan.windows import scene_stop
+from lidarops.plan.scenes import cut_scenes, scene_stop
 from lidarops.records import Granule, Role, Status
-from lidarops.run.selection import Selection
+from lidarops.run.options import Selection
 
 
 def test_one_scene_for_each_utc_day() -> None:
@@ -130,8 +129,10 @@ def test_refused_granules_are_passed_over() -> None:
 
 
 def test_a_selection_of_times_holds_the_scenes_that_touch_it() -> None:
-    scenes = cut_scenes(
-        factories.campaign(), [factories.granule(0), factories.granule(1500)]
-    ).scenes
-    assert len(Selection(since=factories.DAY + timedelta(days=1)).scenes(scenes)) == 1
-    assert len(Selection(until=factories.DAY + timedelta(hours=1)).scenes(scenes)) == 1
+    campaign = factories.campaign()
+    scenes = cut_scenes(campaign, [factories.granule(0), factories.granule(1500)]).scenes
+    for selection in (
+        Selection(since=factories.DAY + timedelta(days=1)),
+        Selection(until=factories.DAY + timedelta(hours=1)),
+    ):
+        assert sum(selection.scene(scene.id, campaign) for scene in scenes) == 1

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.store import Store
-from lidarops.catalog.verify import verify_archive
 from lidarops.cli import app
 from lidarops.run.archive import reprocess
 

@@ -16,10 +16,9 @@ from typing import Any
 import pytest
 from support.archives import crash_archive, crash_runs
 
-from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import Store
-from lidarops.catalog.verify import verify_archive
+from lidarops.catalog.product_files import verify_archive
+from lidarops.catalog.store import RunStatus, Store
 from lidarops.errors import CatalogError
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 

@@ -18,16 +18,15 @@ from support.archives.scene_jobs import catalogued_scenes, scene_jobs
 from support.archives.small_archive import Archive
 from support.poison import HALF, Poison
 
-from lidarops.catalog.ledger import RunStatus
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import RunStatus, Store
 from lidarops.errors import SceneError
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
+from lidarops.run.clusters import local_client
 from lidarops.run.executor import (
     EndedScene,
     StopRequest,
-    local_client,
     process_jobs,
     process_one_by_one,
 )

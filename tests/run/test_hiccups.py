@@ -12,8 +12,8 @@ import xarray as xr
 from support.archives.small_archive import Archive, made
 
 from lidarops.campaign.model import Campaign
+from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.store import Store
-from lidarops.catalog.verify import verify_archive
 from lidarops.netcdf.comparison import compare_products
 from lidarops.records import Grade
 from lidarops.run.archive import Options, bring_up_to_date, reprocess

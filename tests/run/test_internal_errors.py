@@ -14,13 +14,13 @@ from support.archives.scene_jobs import scene_jobs
 from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
+from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.store import Store
-from lidarops.catalog.verify import verify_archive
 from lidarops.cli import app
 from lidarops.records import RunRecord
 from lidarops.run import staleness
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
-from lidarops.run.executor import local_client
+from lidarops.run.clusters import local_client
 from lidarops.scene.processing import process_scene
 
 DAY = "2026-03-02"

@@ -16,15 +16,14 @@ import pytest
 from support.archives.small_archive import DAY, Archive
 from typer.testing import CliRunner
 
-from lidarops.catalog import versions
-from lidarops.catalog.ledger import Run, RunStatus
+from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import Store
+from lidarops.catalog.store import Run, RunStatus, Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
 from lidarops.reports import gallery, run_journal, run_record
 from lidarops.run import archive as pipeline
-from lidarops.run import processing, session
+from lidarops.run import session, staleness
 from lidarops.run.archive import (
     Options,
     Selection,
@@ -184,16 +183,17 @@ def test_a_channel_of_a_new_laser_is_reported_without_failure(archive: Archive) 
     assert not any(each["nowhere"] for each in files.values())
 
 
-def test_unused_files_of_some_days_are_named_and_the_others_counted(
+def test_unused_files_of_unchanged_days_are_named_without_judging_them(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for day in range(4):
         archive.raw(f"poor/h-twin{day}", day * DAY + 600, seed=1)
     campaign = archive.write()
-    assert len(bring_up_to_date(campaign).set_aside) == 4
-    monkeypatch.setattr(processing, "MOST_DAYS_JUDGED_AGAIN", 3)
+    first = bring_up_to_date(campaign)
+    assert len(first.set_aside) == 4
+    monkeypatch.setattr(staleness.Judge, "days", None)
     again = bring_up_to_date(campaign)
-    assert (len(again.set_aside), again.more_unused, again.has_failures) == (3, 1, True)
+    assert (again.set_aside, again.has_failures) == (first.set_aside, True)
 
 
 # Forgotten -----------------------------------------------------------------------------------
@@ -700,7 +700,7 @@ def test_a_report_that_somebody_builds_keeps_its_temporary_files(archive: Archiv
     half, old = (folder / f".index.html.{name}.tmp" for name in ("half", "old"))
     for file in (half, old):
         file.write_bytes(b"half of a page")
-    long_ago = time.time() - 2 * versions.LONGEST_WRITE
+    long_ago = time.time() - 2 * product_files.LONGEST_WRITE
     os.utime(old, (long_ago, long_ago))
     assert reprocess(archive.write()) is not None
     assert (half.exists(), old.exists()) == (True, False)

@@ -11,6 +11,7 @@ from support.archives.small_archive import Archive
 
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
+from lidarops.run.archive import bring_up_to_date
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -43,11 +44,30 @@ def test_a_run_that_the_lock_refuses_loads_nothing_for_its_work(archive: Archive
     assert not {"lidarops.run.archive", "numba", "xarray"} & modules
 
 
-def test_a_run_with_nothing_to_do_loads_nothing_for_scenes_and_reports(archive: Archive) -> None:
+def _assert_light(modules: set[str]) -> None:
     """Each of them takes a tenth of a second and more; numpy is needed to read headers."""
-    code, modules, _ = _reprocessed(archive)
-    assert code == 0
     of_others = {"dask", "distributed", "h5py", "jinja2", "matplotlib", "netCDF4", "numba"}
     of_others |= {"pandas", "pyarrow", "scipy", "xarray"}
     own = {"figures.svg", "retrieve", "run.processing", "run.staleness", "scene.processing"}
     assert not (of_others | {f"lidarops.{name}" for name in own}) & modules
+
+
+def test_a_run_with_nothing_to_do_loads_nothing_for_scenes_and_reports(archive: Archive) -> None:
+    code, modules, _ = _reprocessed(archive)
+    assert code == 0
+    _assert_light(modules)
+
+
+def test_a_run_knows_without_planning_why_a_product_is_not_made(archive: Archive) -> None:
+    steep = {"channels": ["photon_532o"], "sections": [[750, 2000]]}
+    archive.tree["instruments"]["poor"]["products"]["homogeneous"] = steep
+    archive.raw("poor/h-twin", 600, seed=1)
+    campaign = archive.write()
+    first, again = (bring_up_to_date(campaign) for _ in range(2))
+    (unmade,) = first.findings.unmade
+    assert "the beam climbs" in unmade.reason
+    assert list(first.set_aside) == ["poor/h00"]
+    assert (again.findings, again.set_aside) == (first.findings, first.set_aside)
+    code, modules, _ = _reprocessed(archive)
+    assert code == 1
+    _assert_light(modules)

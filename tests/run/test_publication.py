@@ -15,9 +15,9 @@ from support.archives import raw_archives
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import load_campaign
+from lidarops.catalog.product_files import publish_products
 from lidarops.cli import app
 from lidarops.run.archive import reprocess
-from lidarops.run.publication import publish_products
 from lidarops.system.stores import RemoteStore
 
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CampaignError
-from lidarops.run import executor
+from lidarops.run import clusters
 from lidarops.simulate import campaign as module
 from lidarops.simulate.campaign import plan_simulation, simulate_campaign
 from lidarops.simulate.files import Simulator
@@ -20,7 +20,7 @@ from lidarops.simulate.files import Simulator
 @pytest.fixture(scope="module")
 def client():
     """A client of two processes."""
-    with executor.local_client(2) as started:
+    with clusters.local_client(2) as started:
         yield started
 
 
@@ -91,7 +91,7 @@ def test_the_command_line_writes_the_same_with_workers(small, client, tmp_path, 
         started.append(workers)
         return nullcontext(client)
 
-    monkeypatch.setattr(executor, "local_client", started_before)
+    monkeypatch.setattr(clusters, "local_client", started_before)
     campaign = small(_scenery, archive="called")
     expected = _contents(simulate_campaign(campaign).archive)
     file = tmp_path / "small.yaml"

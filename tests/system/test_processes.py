@@ -251,7 +251,7 @@ if __name__ == "__main__":
 
 WORKERS = """
 import os
-from lidarops.run.executor import local_client
+from lidarops.run.clusters import local_client
 from lidarops.system.processes import preload_modules, start_method
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Find channels that a campaign requests or gives facts of, and that no or not all files hold.
+"""The channels of the files of a campaign: their names, and those that no or not all files hold.
 
-A channel that no file holds is a typing error, one that some files lack is a changed lidar.
+Names follow from recorders, and from what the facts state. A requested channel that no file holds
+is a typing error, one that some files lack is a changed lidar.
 """
 
 from __future__ import annotations
@@ -8,12 +9,24 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Final
 
-from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.raw.header import label_of
-from lidarops.records import ChannelLayout, FactsNote, Holding, LeftOut, Unmet, is_glued
+from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, channel_facts
+from lidarops.catalog.granules import joined_notes
+from lidarops.catalog.store import Store
+from lidarops.raw.header import Layout, label_of, named_layout, recorder_names
+from lidarops.records import (
+    ChannelLayout,
+    FactsNote,
+    FileNote,
+    Granule,
+    Holding,
+    LeftOut,
+    Unmet,
+    is_glued,
+)
 from lidarops.scene.channels import (
     ABSENT,
     LAG_STEP,
@@ -23,6 +36,8 @@ from lidarops.scene.channels import (
     named_channels,
 )
 
+_ROUNDING_OF_WAVELENGTHS: Final = 1e-9
+"""m; headers hold whole nanometres."""
 FACTS: Final = "facts"
 _FIRST: Final = datetime.min.replace(tzinfo=UTC)
 _LAST: Final = datetime.max.replace(tzinfo=UTC)
@@ -163,3 +178,61 @@ def period_of(facts: InstrumentFacts) -> str:
     first = "" if facts.valid_from == _FIRST else f" from {facts.valid_from:%Y-%m-%dT%H:%M:%SZ}"
     last = "" if facts.valid_to == _LAST else f" to {facts.valid_to:%Y-%m-%dT%H:%M:%SZ}"
     return f"{FACTS}{first}{last}"
+
+
+def overridden_wavelengths(layout: Layout, facts: InstrumentFacts) -> Iterator[str]:
+    """Yield facts of the campaign that override the wavelengths of headers."""
+    for channel in layout if facts.channels else ():
+        wavelength = channel_facts(facts, channel.name).wavelength
+        # Not where the wavelength of the header is implausible, and so NaN.
+        if wavelength and abs(wavelength - channel.wavelength) > _ROUNDING_OF_WAVELENGTHS:
+            yield (
+                f"{channel.name}: wavelength {wavelength * 1e9:.5g} nm of the campaign overrides"
+                f" {channel.wavelength * 1e9:.5g} nm of the header"
+            )
+
+
+class ChannelNames:
+    """Names that mean one recorder in all files of an instrument that the catalog knows."""
+
+    def __init__(self, campaign: Campaign, store: Store) -> None:
+        self._instruments = campaign.instruments
+        self._stored = store.holdings(validity_edges(campaign))
+        self._bound = store.channel_names()
+        self._layouts: dict[tuple[object, Layout], Layout] = {}
+        self.holdings = [
+            replace(held, layout=self._layout(held.instrument, held.layout, held.since))
+            for held in self._stored
+            if held.instrument in campaign.instruments
+        ]
+        """Those of the instruments of the campaign, with these names."""
+
+    def granule(self, granule: Granule) -> Granule:
+        """Return a good granule whose channels have these names."""
+        if granule.instrument not in self._instruments or granule.start is None:
+            return granule
+        layout = self._layout(granule.instrument, granule.layout, granule.start)
+        facts = self._instruments[granule.instrument].facts_at(granule.start)
+        notes = (*granule.notes, *overridden_wavelengths(layout, facts))
+        return replace(granule, layout=layout, notes=notes)
+
+    def notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
+        """Return a note for each wavelength in the headers of instruments that facts override."""
+        return joined_notes(
+            FileNote(held.instrument, text, contradicts=False, files=held.files)
+            for held in self.holdings
+            if held.instrument in instruments
+            for facts in [self._instruments[held.instrument].facts_at(held.since)]
+            for text in overridden_wavelengths(held.layout, facts)
+        )
+
+    def _layout(self, instrument: str, layout: Layout, moment: datetime) -> Layout:
+        facts = self._instruments[instrument].facts_at(moment)
+        stated = {name: fact.recorder for name, fact in facts.channels.items() if fact.recorder}
+        key = (instrument, *stated.items())
+        if (key, layout) not in self._layouts:
+            own = (held for held in self._stored if held.instrument == instrument)
+            files = ((held.layout, held.files, held.first) for held in own)
+            names = recorder_names(files, stated, self._bound.get(instrument))
+            self._layouts[key, layout] = named_layout(layout, names)
+        return self._layouts[key, layout]
