@@ -11,7 +11,7 @@ from lidarops.catalog.store import Verdict
 from lidarops.plan import channels
 from lidarops.records import FactsNote, Findings, Holding, IdlePattern, Role, Unmade, UnusableFile
 from lidarops.run.day_states import DayStates
-from lidarops.run.options import request_key, requested_products, station_of
+from lidarops.run.options import requested_products, station_of
 
 if TYPE_CHECKING:
     from lidarops.run.leftovers import Lost
@@ -169,9 +169,7 @@ def _unmade(
     told = {} if limited else {day: verdict.unmade for day, verdict in settled.items()}
     for owner, kind, channel in missing:
         days = _first_and_last_day(campaign, owner, spans)
-        found = [
-            _unmade_on(states, day, told).get(request_key(owner, kind, channel)) for day in days
-        ]
+        found = [_unmade_on(states, day, told).get(f"{owner} {kind} {channel}") for day in days]
         if days and None not in found:
             reasons = dict.fromkeys(reason for told in found for reason in told or ())
             reason = "; ".join(filter(None, reasons)) if reasons else _NEVER_TOGETHER

@@ -20,7 +20,7 @@ from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import path_of_product
 from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene, UnusedFile
-from lidarops.run.options import request_key, requested_products
+from lidarops.run.options import requested_products
 from lidarops.scene import dependence
 from lidarops.scene.case import REQUEST
 from lidarops.scene.channels import READ_STEP
@@ -77,37 +77,29 @@ def scenes_without_product(planned: Sequence[Planned], campaign: Campaign) -> di
 
 
 def unmade_products(campaign: Campaign, planned: Iterable[Planned]) -> dict[str, list[str]]:
-    """Return the requested products that no scene gives, by `request_key`, with the reasons.
+    """Return the requested products that no scene gives, by ``OWNER KIND CHANNEL``, and why.
 
     There is no reason where an instrument or network has no scene.
     """
     plans = defaultdict[str, list[Plan]](list)
     for scene, plan in planned:
         plans[scene.instrument].append(plan)
-    return {
-        request_key(owner, kind, channel): reasons
-        for owner in (*campaign.instruments, *campaign.networks)
-        for kind, channel in requested_products(campaign, owner)
-        for reasons in [_why_not(plans[owner], kind, channel)]
-        if reasons is not None
-    }
-
-
-def _why_not(plans: Sequence[Plan], kind: str, channel: str) -> list[str] | None:
-    """Return why no plan gives a product; None if one does."""
-    reasons: dict[str, None] = {}
-    for plan in plans:
-        planned = dependence.planned_products(plan)
-        if any(made == kind and channel in ("", name) for made, name in planned):
-            return None
-        reasons |= dict.fromkeys(
-            left.reason
-            for left in plan.left_out
-            if left.name in (kind, READ_STEP)
-            and channel in ("", left.channel)
-            and left.rule != REQUEST
-        )
-    return list(reasons) or ([""] if plans else [])
+    unmade = {}
+    for owner in (*campaign.instruments, *campaign.networks):
+        made = {product for plan in plans[owner] for product in dependence.planned_products(plan)}
+        for kind, channel in requested_products(campaign, owner):
+            if any(kind == name and channel in ("", other) for name, other in made):
+                continue
+            reasons = dict.fromkeys(
+                left.reason
+                for plan in plans[owner]
+                for left in plan.left_out
+                if left.name in (kind, READ_STEP)
+                and channel in ("", left.channel)
+                and left.rule != REQUEST
+            )
+            unmade[f"{owner} {kind} {channel}"] = list(reasons) or [""] * bool(plans[owner])
+    return unmade
 
 
 def _networks_of_member(scene: Scene, campaign: Campaign) -> list[str]:

@@ -259,11 +259,6 @@ def requested_products(campaign: Campaign, owner: str) -> Iterator[tuple[str, st
             yield kind, channel
 
 
-def request_key(owner: str, kind: str, channel: str) -> str:
-    """Return the key by which a verdict names a requested product."""
-    return f"{owner} {kind} {channel}"
-
-
 def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
     """Return whether a selection is limited and contains no scene of the catalog.
 

@@ -168,7 +168,11 @@ class Pass:
             taken = partial(self._take, note=used_client is None)
             if first is not None:
                 others = chain([first], jobs)
-                memory = _bytes(options.memory)
+                memory = None
+                if options.memory is not None:
+                    from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
+
+                    memory = int(parse_bytes(options.memory))
                 ended = process_jobs(
                     others, client=used_client, stop=stop, taken=taken, memory=memory
                 )
@@ -362,14 +366,6 @@ class Pass:
             frozen=self.frozen,
             lost_worker=self.lost_worker,
         )
-
-
-def _bytes(size: str | None) -> int | None:
-    if size is None:
-        return None
-    from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
-
-    return int(parse_bytes(size))
 
 
 def _signed(

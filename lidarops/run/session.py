@@ -212,6 +212,7 @@ class Session:
 
     def _record(self, refused: tuple[Granule, ...], findings: Findings) -> RunRecord:
         """Return the record of the run without its scenes."""
+        truth = self._campaign.truth_path
         return RunRecord(
             id=self.id,
             campaign=self._campaign.name,
@@ -223,7 +224,7 @@ class Session:
             products=str(self._campaign.products_root),
             scenes=(),
             refused=refused,
-            truth=_truth(self._campaign),
+            truth=str(truth) if self._campaign.simulation and truth.exists() else "",
             findings=findings,
         )
 
@@ -323,9 +324,3 @@ def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:
         for used in outcome.inputs
         if used.path in known and used.sha256 != known[used.path]
     }
-
-
-def _truth(campaign: Campaign) -> str:
-    if campaign.simulation is None or not campaign.truth_path.exists():
-        return ""
-    return str(campaign.truth_path)
