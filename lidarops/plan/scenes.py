@@ -139,14 +139,16 @@ def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
 
 
 def _grids_key(members: Sequence[Scene]) -> str:
-    text = " ".join(_layout_key(member.layout) for member in members)
+    text = " ".join(_layout_key(member.granules[0].layout) for member in members)
     return hashlib.sha256(text.encode()).hexdigest()[:6]
 
 
 def as_recorded(scene: Scene, recorded: Collection[str]) -> Scene:
     """Return a scene with its suffix if a recorded one has it, whose window held others then."""
     members = tuple(as_recorded(member, recorded) for member in scene.members)
-    whole = f"{scene.id}-{_grids_key(members) if members else _layout_key(scene.layout)}"
+    whole = (
+        f"{scene.id}-{_grids_key(members) if members else _layout_key(scene.granules[0].layout)}"
+    )
     return replace(scene, id=whole if whole in recorded else scene.id, members=members)
 
 

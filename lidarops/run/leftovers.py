@@ -86,7 +86,8 @@ def unmade_products(campaign: Campaign, planned: Iterable[Planned]) -> dict[str,
         plans[scene.instrument].append(plan)
     unmade = {}
     for owner in (*campaign.instruments, *campaign.networks):
-        made = {product for plan in plans[owner] for product in dependence.planned_products(plan)}
+        steps = [step for plan in plans[owner] for step in plan.steps]
+        made = {(step.product, step.channel) for step in steps if step.name == step.product}
         for kind, channel in requested_products(campaign, owner):
             if any(kind == name and channel in ("", other) for name, other in made):
                 continue

@@ -222,7 +222,7 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
                     f"the campaign has no {word} {name!r}",
                     remedy=f"known: {', '.join(sorted(set(names)))}",
                 )
-    requested = requested_kinds(campaign)
+    requested = requested_kinds(campaign) if selection.kinds else []
     for kind in selection.kinds:
         if kind not in requested:
             raise CampaignError(
@@ -240,8 +240,11 @@ def check_selection(campaign: Campaign, selection: Selection) -> None:
 
 def requested_kinds(campaign: Campaign) -> list[str]:
     """Return the kinds of product that a campaign requests."""
-    owners = (*campaign.instruments, *campaign.networks)
-    requested = {kind for owner in owners for kind, _ in requested_products(campaign, owner)}
+    requested: set[str] = set()
+    for instrument in campaign.instruments.values():
+        requested |= instrument.products.requested().keys()
+    for network in campaign.networks.values():
+        requested |= network.requested().keys()
     return [kind for kind in kinds() if kind in requested]
 
 
