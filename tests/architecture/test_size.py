@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 74_870,
-    "lines of code alone": 48_830,
-    "modules": 326,
-    "dataclasses": 312,
-    "lines of dataclasses": 7_720,
+    "lines": 74_570,
+    "lines of code alone": 48_660,
+    "modules": 312,
+    "dataclasses": 311,
+    "lines of dataclasses": 7_680,
     "tuning numbers": 252,
     "tuning numbers that are assumed": 86,
     "copied thresholds": 1,
@@ -29,7 +29,7 @@ MOST = {
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 82, "functions": 745, "changes": 381},
-    "elastic": {"modules": 90, "functions": 880, "changes": 401},
+    "elastic": {"modules": 84, "functions": 840, "changes": 401},
 }
 
 
