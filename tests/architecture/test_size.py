@@ -29,7 +29,7 @@ MOST = {
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 82, "functions": 745, "changes": 381},
-    "elastic": {"modules": 84, "functions": 840, "changes": 401},
+    "elastic": {"modules": 84, "functions": 861, "changes": 401},
 }
 
 
