@@ -276,13 +276,7 @@ class Simulator:
             light = lights[_offset(conditions, name)]
             if mode is DetectionMode.ANALOG and detector.analog is not None:
                 recorder = _drifted(detector.analog, conditions.hours)
-                counts: AnyCounts = (
-                    digitise(light.electrons, recorder, random=random)
-                    if light.electrons
-                    else digitise_fast(
-                        light.rate, recorder, shots=shots, bin_time=light.bin_time, random=random
-                    )
-                )
+                counts = self._digitised(light, recorder, conditions, random)
                 unit, dark_offset = recorder.gain, recorder.dark_offset
             else:
                 counter: Callable[..., AnyCounts] = (
@@ -306,6 +300,23 @@ class Simulator:
                 ),
             )
         return channels
+
+    def _digitised(
+        self,
+        light: _Light,
+        recorder: AnalogRecorder,
+        conditions: _Conditions,
+        random: np.random.Generator,
+    ) -> AnyCounts:
+        if light.electrons is not None:
+            return digitise(light.electrons, recorder, random=random)
+        return digitise_fast(
+            light.rate,
+            recorder,
+            shots=conditions.acquisition.shots,
+            bin_time=light.bin_time,
+            random=random,
+        )
 
     def _lights(
         self, conditions: _Conditions, detector: Detector, random: np.random.Generator

@@ -192,7 +192,8 @@ def test_reports_and_pages_show_it(copied: Campaign) -> None:
     shutil.rmtree(page.parent / "figures", ignore_errors=True)
     run("report", page.parent)
     text = page.read_text(encoding="utf-8")
-    assert "Integral against time: coast-lidar · photon_532o" in text
+    title = "Integral of the range-corrected signal over the window against time"
+    assert f"{title}: coast-lidar · photon_532o" in text
     run("site", copied.output)
     site = Path(copied.output) / "site"
     (day,) = site.rglob("2025-01-01.html")

@@ -18,7 +18,7 @@ from support.archives.aggregate_archive import facts_of
 from support.products import fabricated as fab
 from support.products.made_products import MAKERS
 
-from lidarops import kinds, registry
+from lidarops import kinds
 from lidarops.aggregate import means_variables
 from lidarops.aggregate.facts import groups
 from lidarops.aggregate.means import write_means
@@ -106,7 +106,7 @@ def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Regist
         def points(group: str) -> list[Any]:
             return [*entry_points(group=group), *([point] if group == kinds.GROUP else [])]
 
-        monkeypatch.setattr(registry, "entry_points", points)
+        monkeypatch.setattr(kinds, "entry_points", points)
         monkeypatch.setitem(MAKERS, "smooth", MAKERS["homogeneous"])
         forget()
 
