@@ -53,3 +53,9 @@ LIDAR_EQUATION_PAPER: Final = (
 )
 KNOWN_SHAPE_PAPERS: Final = f"{LEAST_SQUARES_PAPER}\n{LIDAR_EQUATION_PAPER}"
 """Of a background fitted with the shape of clean air, for the products in which that runs."""
+STEEPEST: Final = 80.0
+"""degree; largest zenith angle at which a beam reaches aerosol-free air."""
+FIXED: Final = 0.05
+"""degree; largest difference between the zenith angles of the files of a fixed beam."""
+LEAST_SPREAD: Final = 5.0
+"""degree; smallest span of zenith angles of a scan."""

@@ -165,11 +165,15 @@ class Quality(FlagBit):
     )
 
 
-SIGNAL_BITS: Final = (
+RAW_BITS: Final = (
     Quality.INPUT_MISSING,
     Quality.SATURATED,
     Quality.PILE_UP,
     Quality.INCOMPLETE_OVERLAP,
+)
+"""Bits of raw profiles that all kinds pass on."""
+SIGNAL_BITS: Final = (
+    *RAW_BITS,
     Quality.SINGLE_RECORD,
     Quality.OUTLIER,
     Quality.LOW_SIGNAL_TO_NOISE,

@@ -1,9 +1,8 @@
 """Registry of the kinds of product, and what else packages add by entry point: raw formats.
 
-A kind of product is one package: its ``__init__`` holds a `Kind`, and its modules ``settings``,
-``retrieval``, ``variables``, ``figures`` and ``draft`` hold everything else about it.
-Without ``figures``, its main variable is drawn; without ``draft``, no new campaign file requests
-it. A package outside lidarops adds a kind by an entry point of the group
+A kind of product is one package: its ``__init__`` holds a `Kind` and its settings, and its modules
+``retrieval``, ``variables`` and ``figures`` hold everything else about it. Without ``figures``, its
+main variable is drawn. A package outside lidarops adds a kind by an entry point of the group
 ``lidarops.product_kinds``::
 
     [project.entry-points."lidarops.product_kinds"]
@@ -12,7 +11,7 @@ it. A package outside lidarops adds a kind by an entry point of the group
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -25,7 +24,7 @@ from typing import Any, Final, Protocol, TypeVar
 
 from lidarops.errors import LidarOpsError
 from lidarops.flags import Flags
-from lidarops.settings import ChannelProduct, NetworkProduct
+from lidarops.settings import ChannelProduct, MonthProduct, NetworkProduct
 
 GROUP: Final = "lidarops.product_kinds"
 """Group of entry points of kinds of product."""
@@ -46,6 +45,8 @@ class Scope(StrEnum):
 
     CHANNEL = "channel"
     """One channel of one instrument."""
+    MONTH = "month"
+    """Products of one instrument in a calendar month, UTC."""
     NETWORK = "network"
     """One channel of several instruments, whose beams cross."""
 
@@ -92,11 +93,20 @@ class Kind:
     that fog or darkness may reject all values."""
 
     common: CommonQuantity | None = None
+    draft: Callable[[Any], tuple[str, ...]] | None = None
+    """Returns the lines of its section in a new campaign file from the headers of an instrument, or
+    of the members of a network; none where it does not suit them. None: it is never drafted."""
+    reads: tuple[str, ...] = ()
+    """Kinds of product that it is made of, of smaller rank, so that they are made before; of the
+    same scene or, with a `MonthProduct` as settings, of a month. Empty for kinds made of raw files.
+    """
 
     @property
     def scope(self) -> Scope:
         """Data that one product is made of."""
-        return Scope.NETWORK if issubclass(self.settings, NetworkProduct) else Scope.CHANNEL
+        if issubclass(self.settings, NetworkProduct):
+            return Scope.NETWORK
+        return Scope.MONTH if issubclass(self.settings, MonthProduct) else Scope.CHANNEL
 
     def part(self, module: str, name: str) -> Any:
         """Return an object of one of the modules of the kind, such as ``variables``.
@@ -129,11 +139,23 @@ def kinds() -> Mapping[str, Kind]:
     Raises
     ------
     LidarOpsError
-        If an entry point cannot be loaded, or two have one name.
+        If an entry point cannot be loaded, two have one name, or a kind reads none that is made
+        before it.
     """
     unordered = registered(GROUP, Kind, "kind of product")
     order = sorted(unordered.values(), key=lambda kind: (kind.rank, kind.name))
-    return MappingProxyType({kind.name: kind for kind in order})
+    before: dict[str, Kind] = {}
+    for kind in order:
+        for name in kind.reads:
+            if name not in before or before[name].scope is not Scope.CHANNEL:
+                raise LidarOpsError(
+                    f"kind of product {kind.name!r} reads {name!r}, which is no kind of one channel"
+                    f" with a smaller rank than {kind.rank}",
+                    remedy=f"correct reads or rank of {kind.package}, or install the package that"
+                    f" adds {name!r}",
+                )
+        before[kind.name] = kind
+    return MappingProxyType(before)
 
 
 def kind_of(name: str) -> Kind:
@@ -166,9 +188,23 @@ def flags_of(name: str) -> Flags:
     return flags
 
 
-def kinds_of(scope: Scope) -> tuple[Kind, ...]:
-    """Return the kinds of product of a scope, in the order of their rank."""
-    return tuple(kind for kind in kinds().values() if kind.scope is scope)
+def kinds_of(*scopes: Scope) -> tuple[Kind, ...]:
+    """Return the kinds of product of some scopes, in the order of their rank."""
+    return tuple(kind for kind in kinds().values() if kind.scope in scopes)
+
+
+def reads_of(name: str) -> tuple[str, ...]:
+    """Return the kinds that a kind of product is made of; none if it is not known."""
+    known = kinds().get(name)
+    return known.reads if known else ()
+
+
+def with_read(names: Iterable[str]) -> set[str]:
+    """Return the names of some kinds of product, and of all kinds that these are made of."""
+    found: set[str] = set()
+    for name in names:
+        found |= {name} | with_read(reads_of(name))
+    return found
 
 
 def rank_of(name: str) -> float:

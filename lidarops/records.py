@@ -25,6 +25,11 @@ def day_of(moment: datetime) -> int:
     return moment.astimezone(UTC).toordinal() - _EPOCH
 
 
+def first_of_month(day: int) -> int:
+    """Return the first day of the month of a day, both in days since 1970-01-01."""
+    return date.fromordinal(day + _EPOCH).replace(day=1).toordinal() - _EPOCH
+
+
 class DetectionMode(StrEnum):
     """How a channel detects light."""
 
@@ -49,6 +54,8 @@ class Role(StrEnum):
     MOLECULAR = "molecular"
     OVERLAP = "overlap"
     LIDAR_RATIO = "lidar_ratio"
+    PRODUCT = "product"
+    """Of a product that another one is made of; its path is below the folder of products."""
     UNUSED = "unused"
     """Of a raw file that a product states as unused; only in the ledger."""
 
@@ -199,7 +206,7 @@ class Scene:
     """Start of the window, not of the first granule."""
     stop: datetime
     granules: tuple[Granule, ...]
-    """Good signal granules, by start time then path."""
+    """Good signal granules, by start time then path; none of a month."""
     dark: tuple[Granule, ...] = ()
     """Good dark granules for this scene, by start time then path."""
     members: tuple[Scene, ...] = ()
@@ -209,11 +216,13 @@ class Scene:
     """Notes and contradictions of its signal granules, each with the number of granules."""
     unused: tuple[UnusedFile, ...] = ()
     """Files of its time that are refused, by path."""
+    products: tuple[InputRecord, ...] = ()
+    """Products of a month, of which its products are made; empty for a scene of raw files."""
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:
-        """Channels that every granule of the scene has."""
-        return self.granules[0].layout
+        """Channels that every granule of the scene has; none of a month."""
+        return self.granules[0].layout if self.granules else ()
 
 
 @dataclass(frozen=True, slots=True)

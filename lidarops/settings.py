@@ -289,6 +289,10 @@ class ChannelProduct(SettingsModel):
         return (of_files and self.channels == "all") or channel in self.named
 
 
+class MonthProduct(ChannelProduct):
+    """Base of the settings of a kind of product that is made of other products of a month."""
+
+
 class NetworkProduct(SettingsModel):
     """Base of the settings of a kind of product that is made of a network of instruments."""
 

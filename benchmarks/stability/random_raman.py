@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
-from lidarops.products.raman.settings import RamanReferenceSettings
+from lidarops.products.raman import RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman

@@ -174,6 +174,6 @@ def _pair(
         means[raman],
         molecules=MolecularProfile.us_standard(),
         station_altitude=100.0,
-        assumptions=labeled.Assumptions(settings, 60.0, 15_000.0, known_shape=True),
+        settings=settings,
         water=water,
     )

@@ -254,11 +254,11 @@ class InstrumentFacts(SettingsModel):
         return self
 
 
-def _fields(scope: Scope) -> dict[str, Any]:
-    """Return the definition of one optional field for every kind of product of a scope."""
+def _fields(*scopes: Scope) -> dict[str, Any]:
+    """Return the definition of one optional field for every kind of product of some scopes."""
     return {
         kind.name: (kind.settings | None, Field(default=None, description=kind.title))
-        for kind in kinds_of(scope)
+        for kind in kinds_of(*scopes)
     }
 
 
@@ -281,7 +281,7 @@ else:
         "Products",
         __base__=ChannelProducts,
         __doc__="The requested products of an instrument.",
-        **_fields(Scope.CHANNEL),
+        **_fields(Scope.CHANNEL, Scope.MONTH),
     )
 
 

@@ -234,10 +234,12 @@ def _is_written(store: Store) -> bool:
 
 def _check_inputs(campaign: Campaign, store: Store) -> Iterator[CheckedFile]:
     raw, ancillary = Source.of(campaign.archive).digest, _digests_below(campaign.folder)
+    products = _digests_below(campaign.products_root)
+    by_role = {Role.SIGNAL: raw, Role.DARK: raw, Role.PRODUCT: products}
     suspects: list[tuple[CheckedFile, str]] = []
     with store.all_inputs() as rows:
         for role, path, sha256 in rows:
-            read = raw if role in (Role.SIGNAL, Role.DARK) else ancillary
+            read = by_role.get(Role(role), ancillary)
             checked = CheckedFile(role, path, _problem(read, path, sha256))
             if checked.problem:
                 suspects.append((checked, sha256))

@@ -214,7 +214,7 @@ def _needs(plan: Plan) -> Iterator[str]:
 
 
 def _effect(step: PlannedStep, plan: Plan) -> str:
-    from lidarops.scene.windows import idle_window
+    from lidarops.scene.choices import idle_window
 
     idle = idle_window(step, plan.steps)
     return f"no effect: {idle}" if idle else ", ".join(_settings(step))
@@ -261,7 +261,7 @@ def _show_kept(judged: Judgement) -> None:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
-    from lidarops.scene.windows import idle_window
+    from lidarops.scene.choices import idle_window
 
     stale, frozen, kept = (
         [
@@ -324,8 +324,7 @@ def _show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
 
 
 def _say_steps(plan: Plan) -> None:
-    from lidarops.scene.case import REQUEST
-    from lidarops.scene.channels import READ_STEP
+    from lidarops.scene.case import READ_STEP, REQUEST
 
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
@@ -353,8 +352,7 @@ def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
 
     Without those of which a product is shown as left out.
     """
-    from lidarops.scene.case import REQUEST
-    from lidarops.scene.channels import READ_STEP
+    from lidarops.scene.case import READ_STEP, REQUEST
 
     unread = (
         left

@@ -60,7 +60,7 @@ class Context:
     """Notes on its raw files."""
     provenance: Provenance
     raw_format: str
-    """Raw format of its files, in words."""
+    """Raw format of its files, in words; empty where it is made of other products."""
     unused: tuple[UnusedFile, ...] = ()
     """Raw files of its scene from which it is not made."""
     stamp: Stamp = field(default_factory=Stamp)
@@ -132,6 +132,12 @@ def path_of_product(names: tuple[str, str, str, str], scene: str, start: datetim
     return f"{folder}/{'_'.join(parts)}.nc"
 
 
+def product_of_path(path: str) -> tuple[str, str]:
+    """Return kind and channel of a product from a path by `path_of_product`."""
+    *names, _, file = path.split("/")
+    return names[2], file.removeprefix(f"{'_'.join(names)}_").rpartition("_")[0]
+
+
 @dataclass(frozen=True, slots=True)
 class Extents:
     """Extents of a product in time and space, computed from its coordinates."""
@@ -180,6 +186,7 @@ _DETECTION: Final = {
 def _description(context: Context, layout: Layout) -> dict[str, Any]:
     metadata = context.metadata
     station = context.station.name
+    files = f"{context.raw_format} raw files" if context.raw_format else "products"
     known = math.isfinite(context.wavelength)
     wavelength = f"{context.wavelength * 1e9:.6g} nm" if known else "wavelength unknown"
     summary = (
@@ -194,8 +201,7 @@ def _description(context: Context, layout: Layout) -> dict[str, Any]:
         "keywords_vocabulary": "GCMD Science Keywords",
         "id": product_id(context.provenance),
         "naming_authority": metadata.naming_authority,
-        "source": f"surface observation: {context.raw_format} raw files of the lidar"
-        f" {context.instrument_name}",
+        "source": f"surface observation: {files} of the lidar {context.instrument_name}",
         "processing_level": layout.processing_level,
         # As the templates of NCEI name time series of profiles at stations.
         "cdm_data_type": "Station",

@@ -15,7 +15,7 @@ from typing import Any, Final
 from uuid import NAMESPACE_URL, uuid5
 
 from lidarops.errors import ProductError
-from lidarops.records import LeftOut, Provenance
+from lidarops.records import InputRecord, LeftOut, Provenance, Role
 
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
@@ -49,7 +49,7 @@ def prov_json(provenance: Provenance) -> str:
             },
             "lidarops:plan": _plan(provenance),
             **{
-                f"sha256:{digest}": _input(digest, [record.path for record in records])
+                f"sha256:{digest}": _input(list(records))
                 for digest, records in groupby(inputs, key=attrgetter("sha256"))
             },
         },
@@ -136,11 +136,13 @@ def _rule(omission: LeftOut) -> str:
     return f" [{omission.rule}{number}]" if omission.rule else ""
 
 
-def _input(digest: str, paths: list[str]) -> dict[str, Any]:
+def _input(records: list[InputRecord]) -> dict[str, Any]:
+    paths = [record.path for record in records]
+    sort = "Product" if records[0].role is Role.PRODUCT else "RawFile"
     return {
-        "prov:type": prov_type("lidarops:RawFile"),
+        "prov:type": prov_type(f"lidarops:{sort}"),
         "lidarops:path": paths[0] if len(paths) == 1 else paths,
-        "lidarops:sha256": digest,
+        "lidarops:sha256": records[0].sha256,
     }
 
 

@@ -27,7 +27,7 @@ from lidarops.records import (
     Unmet,
     is_glued,
 )
-from lidarops.scene.channels import (
+from lidarops.scene.case import (
     ABSENT,
     LAG_STEP,
     UNMATCHED,

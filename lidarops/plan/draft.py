@@ -19,13 +19,13 @@ from lidarops.catalog.folder import (
     instruments_of,
     lone_beams,
 )
+from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
 from lidarops.records import ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.scene.channels import file_channels
-from lidarops.scene.pointing import LEAST_SPREAD
+from lidarops.scene.case import file_channels
 
 _NEAR: Final = 0.2
 """degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""
@@ -271,8 +271,8 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
 def _products(headers: InstrumentHeaders) -> Iterator[str]:
     yield "    products:"
     for kind in kinds_of(Scope.CHANNEL):
-        section = kind.optional_part("draft", "DRAFT")
-        yield from (f"      {line}" for line in (section(headers) if section else ()))
+        if kind.draft:
+            yield from (f"      {line}" for line in kind.draft(headers))
 
 
 def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[str]:
@@ -289,8 +289,8 @@ def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[
         sections = [
             line
             for kind in kinds_of(Scope.NETWORK)
-            if len(members) > 1 and (section := kind.optional_part("draft", "DRAFT"))
-            for line in section([known[key][0] for key in members])
+            if len(members) > 1 and kind.draft
+            for line in kind.draft([known[key][0] for key in members])
         ]
         if sections:
             yield "# ? Do their beams cross? Then give exact positions, and azimuths in the facts:"

@@ -5,6 +5,8 @@ it); those of a scan cycle that crosses the end of a window belong to the window
 A scene is split where the facts about the instrument change, because a scene has one plan, and
 where the channels or the range grid of the files change, because a product has one grid.
 
+A month of products is a scene, too, without granules.
+
 A scene of a network holds one member scene for each instrument, in the same window. It is split
 where the facts about any member change.
 
@@ -17,20 +19,34 @@ import hashlib
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from operator import attrgetter
 from typing import Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
+from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import RetrievalInputError, SceneError
-from lidarops.records import ChannelLayout, FileNote, Granule, Role, Scene, Status
+from lidarops.kinds import Scope, kinds_of
+from lidarops.records import (
+    ChannelLayout,
+    FileNote,
+    Granule,
+    InputRecord,
+    Role,
+    Scene,
+    Status,
+    day_of,
+)
 
 DARK_REACH: Final = timedelta(hours=24)
 """Longest time between a scene and the dark files that it uses."""
 STAMP: Final = "%Y%m%dT%H%M%S"
 """Format of the start time in the id of a scene."""
+MONTH: Final = "-month"
+"""End of the id of the scene of a month of products."""
 Window = tuple[datetime, datetime]
 """Start and end of a window."""
 MOST_NOTES = 20
@@ -86,6 +102,41 @@ def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     for key in sorted(campaign.networks):
         scenes += _of_network(campaign, key, signal, dark)
     return Cut(tuple(scenes), tuple(twins))
+
+
+def months_of_products(
+    campaign: Campaign, days: Collection[int], products: Mapping[InputRecord, str]
+) -> Iterator[Scene]:
+    """Yield the months that begin on some days, of instruments with products of months.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    days : collection of int
+        In days since 1970-01-01.
+    products : mapping of InputRecord to str
+        Products that are there or are to be made -> their scenes.
+    """
+    held: defaultdict[tuple[str, Window], list[InputRecord]] = defaultdict(list)
+    for product, scene in products.items():
+        instrument, start = parse_scene_id(scene)
+        window = month_of(start)
+        if day_of(window[0]) in days and not scene.endswith(MONTH):
+            held[instrument, window].append(product)
+    for (name, (start, stop)), own in sorted(held.items()):
+        owner = campaign.instruments.get(name)
+        requested = owner.products.requested() if owner else ()
+        if owner and any(kind.name in requested for kind in kinds_of(Scope.MONTH)):
+            yield Scene(
+                id=f"{name}_{start:{STAMP}}{MONTH}",
+                campaign=campaign.name,
+                station=owner.station,
+                instrument=name,
+                start=start,
+                stop=stop,
+                granules=(),
+                products=tuple(sorted(own, key=attrgetter("path"))),
+            )
 
 
 def _of_network(
@@ -211,7 +262,6 @@ def _cycles(granules: Sequence[Granule]) -> list[int]:
     known = [angle for angle in angles if angle is not None]
     # A run with nothing to do needs no numerics.
     from lidarops.retrieve.multiangle import scan_cycles  # noqa: PLC0415
-    from lidarops.scene.pointing import LEAST_SPREAD  # noqa: PLC0415
 
     if len(known) < len(angles) or max(known) - min(known) < LEAST_SPREAD:
         return list(range(len(granules)))
@@ -289,8 +339,16 @@ def parse_scene_id(scene: str) -> tuple[str, datetime]:
 def scene_stop(scene: str, campaign: Campaign) -> datetime:
     """Return when a scene with this id would end with the present campaign file."""
     key, start = parse_scene_id(scene)
+    if scene.endswith(MONTH):
+        return month_of(start)[1]
     members = campaign.networks[key].instruments if key in campaign.networks else [key]
     return window_at(campaign, [name for name in members if name in campaign.instruments], start)[1]
+
+
+def month_of(moment: datetime) -> Window:
+    """Return the calendar month that holds a moment, UTC."""
+    first = moment.astimezone(UTC).replace(day=1, hour=0, minute=0, second=0, microsecond=0)
+    return first, (first + timedelta(days=31)).replace(day=1)
 
 
 def window_at(campaign: Campaign, instruments: Sequence[str], start: datetime) -> Window:

@@ -31,7 +31,7 @@ from lidarops.records import (
     Verdicts,
 )
 from lidarops.reports.findings import disagreement_rows, finding_rows, scene_note_rows, unmade_words
-from lidarops.scene.windows import idle_window
+from lidarops.scene.choices import idle_window
 
 _MOST_NAMES: Final = 8
 """Most names listed in one cell."""

@@ -158,9 +158,15 @@ def assess(
     with Store(campaign.catalog_url, campaign.name) as store:
         judge = Judge(campaign, store, selection=selection)
         days = _days_to_judge(judge, judge.signatures(), store.verdicts(), everything=everything)
-        for batch in judge.batches(days):
-            for judged in judge.days(batch).judgements:
-                if everything or judged.due or judged.held or judged.frozen or judged.kept:
+        months = set(judge.months(days)).intersection(days)
+        # Months last: by then it is known which of their products are to be made.
+        for part in (days, sorted(months)):
+            scenes = (
+                judged for batch in judge.batches(part) for judged in judge.days(batch).judgements
+            )
+            for judged in scenes:
+                asked = everything or judged.due or judged.held or judged.frozen or judged.kept
+                if asked and bool(judged.scene.granules) == (part is days):
                     yield judge.explained(judged)
 
 
@@ -235,11 +241,12 @@ def _days_to_judge(
     *,
     everything: bool,
 ) -> list[int]:
-    return states.selection.days(
+    changed = [
         day
         for day, now in signatures.items()
         if everything or not states.is_settled(now, verdicts.get(day))
-    )
+    ]
+    return states.selection.days(sorted({*changed, *states.months(changed)}))
 
 
 def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None) -> Result:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from functools import cached_property
 from math import ceil
 from typing import Any, Final, NamedTuple
@@ -16,11 +16,12 @@ from typing import Any, Final, NamedTuple
 from lidarops.campaign.model import OPERATION, Campaign, as_settings
 from lidarops.catalog.store import RecordedProduct, Store, Verdict
 from lidarops.errors import AncillaryError
+from lidarops.kinds import Scope, kinds_of
 from lidarops.plan.channels import ChannelNames
 from lidarops.plan.outlying_headers import NEAR_DAYS
 from lidarops.plan.scenes import DARK_REACH
 from lidarops.plan.unused_files import Refused, dated
-from lidarops.records import Role, UnusedFile, day_of, digest
+from lidarops.records import Role, UnusedFile, day_of, digest, first_of_month
 from lidarops.run.options import Selection, requested_kinds
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
@@ -86,12 +87,18 @@ class DayStates:
             _add_to_days(files, day_of(file.time), unused.role, unused)
         root, base = str(self.campaign.products_root), self.base
         products: dict[int, Any] = defaultdict(hashlib.sha256)
+        months: dict[int, Any] = defaultdict(hashlib.sha256)
         broken: set[int] = set()
         with self.store.all_products() as rows:
             for made in rows:
                 products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
+                if made.kind in self._read_by_months:
+                    month = first_of_month(made.day)
+                    months[month].update(f"{made.path}\0{made.sha256}\0".encode())
                 if not _looks_right(root, made):
                     broken.add(made.day)
+        for day, state in months.items():
+            files[day].append(("month", state.hexdigest()))
         signatures = {}
         for day in sorted(files.keys() | products.keys()):
             if days is None or day in days:
@@ -113,6 +120,17 @@ class DayStates:
                 sorted({(h.instrument, c.name, c.recorder) for h in held for c in h.layout}),
             ]
         )
+
+    @cached_property
+    def _read_by_months(self) -> frozenset[str]:
+        """Kinds of which requested products of months are made."""
+        requested = requested_kinds(self.campaign)
+        months = (kind for kind in kinds_of(Scope.MONTH) if kind.name in requested)
+        return frozenset(name for kind in months for name in kind.reads)
+
+    def months(self, days: Iterable[int]) -> list[int]:
+        """Return the first days of the months of some days; none where no product reads a month."""
+        return sorted(set(map(first_of_month, days))) if self._read_by_months else []
 
     def is_settled(self, signature: Signature, verdict: Verdict | None) -> bool:
         """Return whether nothing has changed on a day since its verdict."""

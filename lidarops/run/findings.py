@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.catalog.store import Verdict
+from lidarops.kinds import Scope, kind_of
 from lidarops.plan import channels
 from lidarops.records import FactsNote, Findings, Holding, IdlePattern, Role, Unmade, UnusableFile
 from lidarops.run.day_states import DayStates
@@ -169,6 +170,8 @@ def _unmade(
     told = {} if limited else {day: verdict.unmade for day, verdict in settled.items()}
     for owner, kind, channel in missing:
         days = _first_and_last_day(campaign, owner, spans)
+        if kind_of(kind).scope is Scope.MONTH:
+            days = states.months(days)
         found = [_unmade_on(states, day, told).get(f"{owner} {kind} {channel}") for day in days]
         if days and None not in found:
             reasons = dict.fromkeys(reason for told in found for reason in told or ())

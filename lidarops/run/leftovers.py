@@ -22,8 +22,7 @@ from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene, UnusedFile
 from lidarops.run.options import requested_products
 from lidarops.scene import dependence
-from lidarops.scene.case import REQUEST
-from lidarops.scene.channels import READ_STEP
+from lidarops.scene.case import NO_PRODUCT, READ_STEP, REQUEST
 from lidarops.scene.dependence import ProductKey
 from lidarops.scene.job import nothing_to_do
 
@@ -182,8 +181,9 @@ class Leftovers:
             if left.channel == product.channel and left.name in (product.kind, "read")
         ]
         reason = "; ".join(dict.fromkeys(left.reason for left in omissions))
-        # The file may be mended, and the product is right.
-        unusable = any(left.rule == dependence.UNUSABLE_FILE for left in omissions)
+        # The file may be mended, or the product come that is missing, and this one is right.
+        mending = (dependence.UNUSABLE_FILE, NO_PRODUCT)
+        unusable = any(left.rule in mending for left in omissions)
         kept = unusable or set(self._signals(product).values()) != {
             self._content(granule) for granule in scene.granules
         }

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -89,6 +90,8 @@ class Pass:
     session: Session | None = None
     lost_worker: bool = False
     """Whether a worker died, or was abandoned at a stop."""
+    months: bool = False
+    """Whether months are processed now, or all other scenes, of whose products they are made."""
     reduced: set[int] = field(default_factory=set)
     """Days whose products may use a file that the processing has refused."""
     failing: int = 0
@@ -115,6 +118,7 @@ class Pass:
             with StopRequest() as stop:
                 self._process(days, client, stop)
                 self._process_reduced(signatures.keys(), client, stop)
+                self._process_months(client, stop)
                 caught = stop.signal
                 if stop:
                     status = RunStatus.INTERRUPTED if caught else RunStatus.STOPPED
@@ -198,6 +202,15 @@ class Pass:
             self._process(days, client, stop)
         self.file_notes = notes
 
+    def _process_months(self, client: Client | None, stop: StopRequest) -> None:
+        """Process the months of the days that were judged, whose products are as they stay."""
+        days = self.selection.days(self.judge.months({*self.days, *self.open}))
+        if days and not stop:
+            notes = list(self.file_notes)
+            self.judge, self.months, self.suspects = self._new_judge(), True, []
+            self._process(days, client, stop)
+            self.file_notes = notes
+
     def _reached(
         self,
         start: Callable[[], AbstractContextManager[Client]],
@@ -247,10 +260,12 @@ class Pass:
         """Yield the jobs of stale scenes, the largest of each group of days first."""
         for judged in self._judged(days, client):
             self._note(judged)
-            due = [scene for scene in judged.judgements if scene.due]
-            for scene in due:
-                self.judgements[scene.scene.id] = scene
+            due = []
+            for scene in filter(attrgetter("due"), judged.judgements):
                 self.open[scene.day].add(scene.scene.id)
+                if bool(scene.scene.granules) != self.months:
+                    self.judgements[scene.scene.id] = scene
+                    due.append(scene)
             if self.options.expect:
                 self.options.expect(sum(len(scene.scene.granules) for scene in due))
             unplanned = [
@@ -325,8 +340,10 @@ class Pass:
             other = {
                 day
                 for day, now in after.items()
-                # Files may have come or gone after its scenes ended.
-                if now.sources != signatures[day].sources or not self.open[day] <= done
+                # Files, or products of its month, may have come or gone after its scenes ended.
+                if day not in signatures
+                or now.sources != signatures[day].sources
+                or not self.open[day] <= done
             }
             settled |= _signed(after, self.verdicts, other)
             for batch in () if stopped else judge.batches(other):

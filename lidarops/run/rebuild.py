@@ -23,7 +23,7 @@ from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.plan.scenes import parse_scene_id
+from lidarops.plan.scenes import MONTH, parse_scene_id
 from lidarops.records import ProductRecord, Role, SceneOutcome, day_of
 from lidarops.run.recipe import Recipe
 from lidarops.run.session import new_run
@@ -82,15 +82,20 @@ def rebuild_ledger(
         files = product_paths(campaign.products_root)
         rebuilt = Rebuilt(known=len(known.intersection(files)))
         progress(rebuilt.known)
-        days: dict[int | None, list[str]] = defaultdict(list)
+        # Months last: they exist by the products of their days.
+        parts: tuple[dict[int, list[str]], ...] = (defaultdict(list), defaultdict(list))
+        unnamed = []
         for path in files:
-            if path not in known:
-                days[_day_in(path)].append(path)
+            day = None if path in known else _day_in(path)
+            if day is not None:
+                parts[PurePosixPath(path).stem.endswith(MONTH)][day].append(path)
+            elif path not in known:
+                unnamed.append(path)
         read = partial(_read_products, campaign, rebuilt, progress)
         # Says which name each of them should have.
-        read(days.pop(None, []))
+        read(unnamed)
         judge, run = Judge(campaign, store), None
-        for batch in judge.batches(day for day in days if day is not None):
+        for days, batch in [(part, batch) for part in parts for batch in judge.batches(part)]:
             present = {judged.scene.id for judged in judge.days(batch).judgements}
             scenes = ((day, *group) for day in batch for group in groupby(read(days[day]), _scene))
             for day, scene, products in scenes:
@@ -191,7 +196,14 @@ def _entry(day: int, products: tuple[_ProductFile, ...]) -> SceneEntry:
         station=keys["station"],
         instrument=keys["instrument"],
         start=parse_scene_id(scene)[1],
-        granules=len({used.path for used in recipe.inputs if used.role is Role.SIGNAL}),
+        granules=len(
+            {
+                used.path
+                for product in products
+                for used in product.recipe.inputs
+                if used.role is Role.SIGNAL
+            }
+        ),
         plan=None,
         products=tuple(product.record for product in products),
     )

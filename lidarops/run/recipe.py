@@ -172,6 +172,7 @@ class Recipe:
             unused=self.unused,
             granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
             dark=tuple(granule for granule in granules if granule.role is Role.DARK),
+            products=tuple(record for record in self.inputs if record.role is Role.PRODUCT),
         )
 
     @property

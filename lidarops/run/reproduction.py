@@ -20,7 +20,7 @@ from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.provenance import package_versions
 from lidarops.netcdf.read import opened_product
-from lidarops.records import InputRecord
+from lidarops.records import InputRecord, Role
 from lidarops.run.recipe import RAW, Recipe, stays_inside
 from lidarops.scene.job import Job, Place
 from lidarops.scene.processing import process_scene
@@ -104,22 +104,35 @@ def reproduce_product(
             raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
     recipe = Recipe.of(Path(product))
     raw = [record for record in recipe.inputs if record.role in RAW]
-    others = [record for record in recipe.inputs if record.role not in RAW]
-    place = archive or _folder(recipe, raw, "--archive", catalog)
+    read = [record for record in recipe.inputs if record.role is Role.PRODUCT]
+    others = [record for record in recipe.inputs if record not in (*raw, *read)]
+    place = archive or (_folder(recipe, raw, "--archive", catalog) if raw else recipe.file.parent)
+    products = _products_root(recipe.file)
     with _staged(recipe, raw, str(place), catalog) as (root, wrong):
         ancillaries = root
         if others:
             ancillaries = Path(ancillary or _folder(recipe, others, "--ancillary", catalog))
         changed = [*wrong, *_changed(ancillaries, others, str(ancillaries))]
+        changed += _changed(products, read, str(products))
         if changed:
             return Reproduction(str(product), identical=False, differences=tuple(changed))
         software = tuple(_software(recipe))
         with tempfile.TemporaryDirectory(prefix="lidarops-") as out:
+            for record in read:
+                place = Path(out, "products", record.path)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                place.symlink_to(products / record.path)
             differences = tuple(_made_again(recipe, root, ancillaries, Path(out)))
     # Other software is a difference only if the bytes differ.
     if differences:
         differences = (*differences, *software)
     return Reproduction(str(product), identical=not differences, differences=differences)
+
+
+def _products_root(product: Path) -> Path:
+    """Return the folder below which a product has its path."""
+    # Station, instrument, kind and year.
+    return product.resolve().parents[:5][-1]
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from lidarops.errors import ProductError, RawFormatError
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.outlying_headers import NEAR_DAYS, new_notes, without_outlying
-from lidarops.plan.scenes import Cut, as_recorded, cut_scenes
+from lidarops.plan.scenes import Cut, as_recorded, cut_scenes, months_of_products
 from lidarops.plan.unused_files import Refused, name_unused
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
@@ -36,6 +36,7 @@ from lidarops.records import (
     Stamp,
     day_of,
     digest,
+    first_of_month,
 )
 from lidarops.run.day_states import DARK_DAYS, DayStates
 from lidarops.run.leftovers import (
@@ -49,10 +50,9 @@ from lidarops.run.leftovers import (
 )
 from lidarops.run.options import Selection
 from lidarops.scene import dependence
-from lidarops.scene.context import recorded_settings
 from lidarops.scene.dependence import ProductKey, ancillary_files
 from lidarops.scene.guard import Failure, guarded
-from lidarops.scene.job import Job, Place
+from lidarops.scene.job import Job, Place, recorded_settings
 from lidarops.scene.plan import plan_scene
 from lidarops.system.code_version import code_version, joint_code_version, source_version
 from lidarops.system.files import sha256_of
@@ -104,6 +104,8 @@ class Judgement:
     ancillaries: tuple[InputRecord, ...]
     """Present ancillary files that the steps of the plan read."""
     stale: tuple[Stale, ...]
+    products: tuple[InputRecord, ...] = ()
+    """Products of which those of the scene are made."""
     fresh: int = 0
     frozen: tuple[Stale, ...] = ()
     """Products of a frozen period that would be replaced."""
@@ -198,6 +200,8 @@ class Judge(DayStates):
         self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
         self._touched: dict[str, int] = {}
+        self._to_be_made: dict[str, str] = {}
+        """Stale products of scenes that were judged, by path -> scene."""
         self._whole: Plan | None = None
         self._parts: dict[ProductKey, tuple[Plan, Mapping[str, Any]]] = {}
         """Parts of the plan `_whole`, of the scene that was judged last."""
@@ -351,10 +355,24 @@ class Judge(DayStates):
         }
         return replace(
             cut,
-            scenes=name_unused(known, unused, lost),
+            scenes=(*name_unused(known, unused, lost), *self._months(days)),
             set_aside=(*cut.set_aside, *aside),
             file_notes=tuple(new_notes(granules, kept, days)),
         )
+
+    def _months(self, days: set[int]) -> Iterator[Scene]:
+        """Yield the months that begin on some days, of which products are made."""
+        for first in days.intersection(self.months(days)):
+            held = self.store.products_of_days(first, first_of_month(first + 31) - 1)
+            made = {product.path: product for product in held}
+            scenes = {path: product.scene for path, product in made.items()} | self._to_be_made
+            records = {self._read(path, made): scene for path, scene in scenes.items()}
+            yield from months_of_products(self.campaign, {first}, records)
+
+    def _read(self, path: str, made: Mapping[str, RecordedProduct]) -> InputRecord:
+        """Return a product of which another is made, with its content if that is known."""
+        known = None if path in self._to_be_made else made.get(path)
+        return InputRecord(path, Role.PRODUCT, known.sha256 if known else f"to be made: {path}")
 
     def _header(self, granule: Granule) -> RawHeader | None:
         """Return the header of a file; None where this file cannot be read now."""
@@ -387,6 +405,8 @@ class Judge(DayStates):
         key = self.key(judged, internal=True) if last.internal else judged.key
         if last.key != key:
             return judged
+        for one in judged.stale:
+            self._to_be_made.pop(product_file(scene, one.product), None)
         failure = Failure(last.error, last.internal)
         return replace(judged, stale=(), failure=failure, held=True)
 
@@ -405,7 +425,10 @@ class Judge(DayStates):
         requested = dependence.plan_of_kinds(whole, self.selection.kinds)
         products = dependence.planned_products(requested)
         for kind, channel in products:
-            known = made.get(product_file(scene, (kind, channel)))
+            path = product_file(scene, (kind, channel))
+            known = made.get(path)
+            read = self._products_read(judged, (kind, channel), made)
+            judged = replace(judged, products=tuple(dict.fromkeys((*judged.products, *read))))
             reason, restored = self._reason(judged, (kind, channel), known)
             if reason:
                 one = Stale(kind, channel, reason, known, restored)
@@ -415,6 +438,8 @@ class Judge(DayStates):
                     frozen.append(self._with_remedy(one))
                 else:
                     stale.append(one)
+                    if not restored:
+                        self._to_be_made[path] = scene.id
         return replace(
             judged,
             requested=requested,
@@ -423,6 +448,18 @@ class Judge(DayStates):
             kept=tuple(kept),
             fresh=len(products) - len(stale) - len(frozen) - len(kept),
         )
+
+    def _products_read(
+        self, judged: Judgement, product: ProductKey, made: Mapping[str, RecordedProduct]
+    ) -> tuple[InputRecord, ...]:
+        """Return the products that are there or to be made, and of which a product is made."""
+        scene, (closure, _) = (
+            judged.scene,
+            self.plan_and_settings(judged.scene, judged.plan, product),
+        )
+        keys = [key for step in closure.steps for key in dependence.read_products(step)]
+        of_scene = (self._read(product_file(scene, key), made) for key in keys)
+        return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)
 
     def _stays_frozen(self, scene: Scene, stale: Stale) -> bool:
         """Return whether a product would be replaced, and its period forbids it."""
@@ -477,7 +514,7 @@ class Judge(DayStates):
                     [granule.path, granule.size, granule.mtime_ns]
                     for granule in (*scene.granules, *scene.dark)
                 ],
-                [[used.path, used.sha256] for used in judged.ancillaries],
+                [[used.path, used.sha256] for used in (*judged.ancillaries, *judged.products)],
             ]
         )
 
@@ -571,7 +608,9 @@ class Judge(DayStates):
         raw = [InputRecord(path, granule.role, "") for path, granule in granules.items()]
         used = [
             replace(file, sha256=self._content(granules[file.path])) if not file.sha256 else file
-            for file in dependence.product_inputs(closure, [*raw, *judged.ancillaries])
+            for file in dependence.product_inputs(
+                closure, [*raw, *judged.ancillaries, *judged.products]
+            )
         ]
         if recorded.inputs_hash != dependence.inputs_digest(used):
             return _difference(self.store.inputs_of(known.path), used)

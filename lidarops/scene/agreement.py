@@ -32,7 +32,7 @@ class Retrieved:
     context: Context
     frame: xr.Dataset
     batches: tuple[xr.Dataset, ...]
-    """All its rows; see `lidarops.scene.data.WholeProduct.results`."""
+    """All its rows; see `lidarops.scene.profiles.ProductStream`."""
 
 
 def compare_channels(

@@ -5,12 +5,26 @@ A decision is an entry of the plan: something runs, or is left out, with the rea
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Generic, TypeVar
 
-from lidarops.campaign.model import ChannelFacts, InstrumentFacts
-from lidarops.records import ChannelLayout, LeftOut, PlannedStep, Scene
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.campaign.model import ChannelFacts, Instrument, InstrumentFacts, channel_facts
+from lidarops.kinds import reads_of
+from lidarops.raw.header import label_of
+from lidarops.records import (
+    GLUED,
+    ChannelLayout,
+    DetectionMode,
+    LeftOut,
+    PlannedStep,
+    Scene,
+    is_glued,
+)
 from lidarops.settings import ChannelProduct, SettingsModel
 
 R = TypeVar("R")
@@ -19,6 +33,8 @@ R_co = TypeVar("R_co", covariant=True)
 ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"
 REQUESTED: Final = "requested by the campaign"
 NOT_REQUESTED: Final = "not requested by the campaign"
+NO_PRODUCT: Final = "products_read"
+"""Name of the rule that leaves out what is made of products that are missing."""
 REQUEST: Final = "request"
 """Name of the rule that leaves out what the campaign does not request."""
 
@@ -116,3 +132,206 @@ class ProductCase(ChannelCase, Generic[R_co]):
 
     request: R_co
     """Settings of the kind in the campaign file."""
+
+
+READ_STEP: Final = "read"
+LAG_STEP: Final = "lag"
+"""Names of steps, for commands that need no plan and should not load the steps."""
+ABSENT: Final = "channel_present"
+UNMATCHED: Final = "facts_fit"
+"""Rules that leave out what the files lack."""
+
+
+def glued_parts(glued: str) -> tuple[str, str]:
+    """Return the names of the analog and the photon-counting channel of a glued channel."""
+    label = glued.removeprefix(GLUED)
+    return f"analog_{label}", f"photon_{label}"
+
+
+def file_channels(channel: str) -> tuple[str, ...]:
+    """Return the channels of the files that a channel is made from."""
+    return glued_parts(channel) if is_glued(channel) else (channel,)
+
+
+def sources(step: PlannedStep) -> tuple[str, ...]:
+    """Return the other channels whose profiles a step takes.
+
+    Not those with which it is compared, or whose products it reads.
+    """
+    parts = [need.rpartition("/") for need in step.needs if "/" in need]
+    products = (step.product, *reads_of(step.product)) if parts else ()
+    return tuple(channel for channel, _, name in parts if name not in products)
+
+
+def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
+    """Return the channels from which the products of a channel take data, each after its parts.
+
+    The last one is the channel itself.
+    """
+    needed: dict[str, list[str]] = {}
+    for step in steps:
+        needed.setdefault(step.channel, []).extend(sources(step))
+    order: dict[str, None] = {}
+
+    def visit(name: str) -> None:
+        for other in (*file_channels(name), *needed.get(name, ())):
+            if other not in order and other != name:
+                visit(other)
+        order[name] = None
+
+    visit(channel)
+    return tuple(order)
+
+
+def counted_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
+    """Return the channels of the files from which the products of a channel are made."""
+    return tuple(name for name in prepared_channels(steps, channel) if not is_glued(name))
+
+
+def product_channel(
+    name: str, mode: DetectionMode = DetectionMode.PHOTON, wavelength: float = math.nan
+) -> ChannelLayout:
+    """Return a channel without bins: of a network, or of products made of other products."""
+    return ChannelLayout(name, mode, wavelength, bins=0, bin_width=math.nan, adc_bits=0)
+
+
+def range_channel(channel: str) -> str:
+    """Return the channel that defines the ranges: for a glued one, the photon-counting one."""
+    return file_channels(channel)[-1]
+
+
+def estimated_against(
+    channel: ChannelLayout, facts: InstrumentFacts, layout: Iterable[ChannelLayout]
+) -> str:
+    """Return the analog channel against which the dead time of a channel is to be estimated.
+
+    Empty where none is requested, or the files hold none with the same bin width.
+    """
+    if channel.mode is not DetectionMode.PHOTON or is_glued(channel.name):
+        return ""
+    if channel_facts(facts, channel.name).dead_time != "estimate":
+        return ""
+    analog = channel.name.replace("photon_", "analog_", 1)
+    same = (other for other in layout if other.name == analog)
+    return next((other.name for other in same if other.bin_width == channel.bin_width), "")
+
+
+def lag_is_unknown(facts: InstrumentFacts, analog: str, photon: str) -> bool:
+    """Return whether the lag of an analog channel is to be estimated.
+
+    The campaign states it as a lag, or by range offsets that differ between both channels.
+    """
+    of_analog, of_photon = (channel_facts(facts, name) for name in (analog, photon))
+    if of_analog.lag is not None:
+        return of_analog.lag == "estimate"
+    return (of_analog.range_offset or 0.0) == (of_photon.range_offset or 0.0)
+
+
+def joined_layout(
+    layout: Iterable[ChannelLayout], names: Iterable[str]
+) -> tuple[ChannelLayout, ...]:
+    """Return the glued channels whose two parts are in the files with one bin width.
+
+    They are in photon-counting units. Names of other channels are skipped.
+    """
+    present = {channel.name: channel for channel in layout}
+    glued = []
+    for name in sorted({name for name in names if is_glued(name)}):
+        analog, photon = (present.get(part) for part in glued_parts(name))
+        if analog and photon and analog.bin_width == photon.bin_width:
+            glued.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
+    return tuple(glued)
+
+
+def wavelength(channel: ChannelLayout, facts: ChannelFacts) -> float:
+    """Return the wavelength in m from the campaign or else the header; may be NaN."""
+    return channel.wavelength if facts.wavelength is None else facts.wavelength
+
+
+def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
+    """Return the shift of the ranges of a channel, m: the given offset minus the given lag."""
+    of_channel = channel_facts(facts, channel.name)
+    late = of_channel.lag * channel.bin_width if isinstance(of_channel.lag, float) else 0.0
+    return (of_channel.range_offset or 0.0) - late
+
+
+def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
+    """Return a channel of the files, or one glued from two of them."""
+    layout = tuple(layout)
+    known = (*layout, *joined_layout(layout, [name]))
+    return next(channel for channel in known if channel.name == name)
+
+
+def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:
+    """Return the ranges of the bin centres of a channel, m."""
+    ranged = replace(channel, name=range_channel(channel.name))
+    middles = (np.arange(channel.bins) + 0.5) * channel.bin_width
+    return np.asarray(middles + range_offset(ranged, facts))
+
+
+def named_channels(instrument: Instrument) -> list[str]:
+    """Return the channels that the products of an instrument request by name, or are made of."""
+    requested = instrument.products.requested().values()
+    return list(
+        dict.fromkeys(
+            name
+            for settings in requested
+            for channel in settings.named
+            for name in (channel, *settings.companions(channel))
+        )
+    )
+
+
+def missing_channels(
+    layout: tuple[ChannelLayout, ...], instrument: Instrument, facts: InstrumentFacts
+) -> Iterator[LeftOut]:
+    """Yield the channels that a campaign requests or gives facts of, and that files lack.
+
+    Parameters
+    ----------
+    layout : tuple of ChannelLayout
+        Channels of the files.
+    instrument : Instrument
+    facts : InstrumentFacts
+        The facts about it at the time of the files.
+    """
+    present = {channel.name: channel for channel in layout}
+    glued = [channel.name for channel in joined_layout(layout, named_channels(instrument))]
+    for kind, settings in instrument.products.requested().items():
+        for name in settings.named:
+            if name not in present and name not in glued:
+                reason = _why_absent(name, present, channel_facts(facts, name).recorder)
+                yield LeftOut(kind, name, reason, rule=ABSENT, product=kind)
+    for name, facts_of_channel in facts.channels.items():
+        if name not in present:
+            reason = f"the facts name a channel that the files lack; {_instead(name, present)}"
+            yield LeftOut(READ_STEP, name, reason, rule=UNMATCHED)
+        elif facts_of_channel.lag is not None and not name.startswith("analog_"):
+            reason = "a lag belongs to the facts of the analog channel"
+            yield LeftOut(LAG_STEP, name, reason, rule=UNMATCHED)
+
+
+def _instead(name: str, present: Mapping[str, ChannelLayout]) -> str:
+    if is_glued(name) and set(glued_parts(name)) <= set(present):
+        analog, photon = glued_parts(name)
+        return f"give the lag to {analog}, and dead time and lidar ratio to {photon}"
+    return f"they hold {_held(name, present)}"
+
+
+def _held(missing: str, present: Mapping[str, ChannelLayout]) -> str:
+    """Return the channels of files, with the recorders of those that are like a missing one."""
+    labels = {label_of(name) for name in file_channels(missing)}
+    recorders = {n: c.recorder for n, c in present.items() if label_of(n) in labels and c.recorder}
+    return ", ".join(f"{n} (recorder {recorders[n]})" if n in recorders else n for n in present)
+
+
+def _why_absent(name: str, present: Mapping[str, ChannelLayout], recorder: str | None) -> str:
+    if is_glued(name):
+        parts = glued_parts(name)
+        if set(parts) <= set(present):
+            widths = [f"{present[part].bin_width:g} m" for part in parts]
+            return f"its analog and photon-counting channels have bins of {' and '.join(widths)}"
+        missing = [part for part in parts if part not in present]
+        return f"the files hold no {' and no '.join(missing)} to glue"
+    stated = f" of the recorder {recorder} that the facts state" if recorder else ""
+    return f"the files hold no such channel{stated}, only {_held(name, present)}"

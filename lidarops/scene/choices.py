@@ -1,22 +1,29 @@
-"""What several kinds of product decide alike: background, average, and the words for them."""
+"""What several kinds of product decide alike: background, average, pointing, bins that are read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Iterable, Sequence
 from datetime import timedelta
 from typing import Final, Literal
 
 import numpy as np
 import xarray as xr
 
+from lidarops.constants import FIXED, LEAST_SPREAD, STEEPEST
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import BACKGROUND_METHOD, MOLECULAR_SOURCE, whole_error
+from lidarops.raw.header import Stretches
+from lidarops.records import PlannedStep
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.background.thresholds import THRESHOLDS
-from lidarops.scene.case import ChannelCase, Entry
+from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
+from lidarops.retrieve.common.arrays import widest_azimuth_gap
+from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
+from lidarops.scene.case import ChannelCase, Entry, prepared_channels, range_offset
 from lidarops.settings import SettingsModel, quantity
 
-FEWEST_BINS: Final = THRESHOLDS.fewest_bins
+FEWEST_BINS: Final = BACKGROUND.fewest_bins
 """Fewest bins of a section, and of the range of a background."""
 
 
@@ -36,7 +43,10 @@ def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, 
 
     By default the last tenth of the bins.
     """
-    start, stop = limits or ((1.0 - THRESHOLDS.tail_share) * case.last, case.last)
+    start, stop = limits or (
+        (1.0 - BACKGROUND.tail_share) * case.last,
+        case.last,
+    )
     return start, min(stop, case.last)
 
 
@@ -113,3 +123,165 @@ def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: floa
         low |= np.abs(value) < least * whole_error(rows, name).transpose(*dims).to_numpy()
     bit = low * np.int32(Quality.LOW_SIGNAL_TO_NOISE)
     return rows.assign(quality_flag=rows["quality_flag"].copy(data=flags | bit))
+
+
+def _zenith_angles(case: ChannelCase) -> list[float | None]:
+    """Return the zenith angle of each file of a scene, degree; one if the campaign states it."""
+    if case.facts.zenith_angle is not None:
+        return [case.facts.zenith_angle]
+    return [granule.zenith_angle for granule in case.scene.granules]
+
+
+def no_scan(case: ChannelCase) -> str:
+    """Return why the files of a scene are not a scan; empty where they are."""
+    if case.facts.zenith_angle is not None:
+        angle = case.facts.zenith_angle
+        return f"the campaign states a fixed beam at a zenith angle of {angle:g} degree"
+    stated = _zenith_angles(case)
+    angles = [angle for angle in stated if angle is not None]
+    if len(angles) < len(stated):
+        return "headers lack zenith angles"
+    spread, sector = max(angles) - min(angles), _azimuth_sector(case)
+    if spread < LEAST_SPREAD <= sector:
+        elevation = 90.0 - 0.5 * (max(angles) + min(angles))
+        return (
+            f"a plan-position scan (PPI) at {elevation:.3g} degree above the horizon, over an"
+            f" azimuth sector of {sector:.3g} degree: its slant paths do not differ"
+        )
+    if spread < LEAST_SPREAD:
+        return f"zenith angles span only {spread:g} degree: the beam does not scan"
+    return ""
+
+
+def moves(case: ChannelCase) -> bool:
+    """Return whether the files of a scene point to several directions, of any pattern."""
+    if case.facts.zenith_angle is not None:
+        return False
+    angles = [angle for angle in _zenith_angles(case) if angle is not None]
+    return bool(angles and max(angles) - min(angles) > FIXED) or _azimuth_sector(case) > FIXED
+
+
+def _azimuth_sector(case: ChannelCase) -> float:
+    """Return the narrowest azimuth sector that holds all beams, degree."""
+    if case.facts.azimuth is not None:
+        return 0.0
+    granules = case.scene.granules
+    azimuth = [granule.azimuth for granule in granules if granule.azimuth is not None]
+    # The sector of all beams may hold north.
+    return 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
+
+
+def fixed_zenith(case: ChannelCase) -> tuple[float, str]:
+    """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
+    stated = _zenith_angles(case)
+    angles = [angle for angle in stated if angle is not None]
+    if len(angles) < len(stated):
+        return math.nan, "neither headers nor campaign give the zenith angle"
+    if max(angles) - min(angles) > FIXED:
+        reason = f"the zenith angle of the beam changes from {min(angles):g} to {max(angles):g}"
+        return math.nan, f"{reason} degree"
+    if max(angles) > STEEPEST:
+        reason = f"at a zenith angle of {max(angles):g} degree the beam does not reach"
+        return math.nan, f"{reason} aerosol-free air"
+    return max(angles), ""
+
+
+ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its bins"
+WINDOW: Final = "range_window"
+"""Name of the entry of a plan by which a product states the bins that it needs."""
+
+
+class WindowSettings(SettingsModel):
+    """The bins that a product needs of a channel; `read_windows` joins those of all products."""
+
+    bins: tuple[tuple[int, int], ...]
+    """First bin and the one past the last, of each stretch that is read."""
+
+
+def read_windows(steps: Collection[PlannedStep]) -> dict[str, Stretches]:
+    """Return the channels of which only some bins are needed, with these bins."""
+    windows: dict[str, list[tuple[int, int]]] = {}
+    for step in steps:
+        if step.name == WINDOW and not idle_window(step, steps):
+            settings = WindowSettings.model_validate(step.settings)
+            windows.setdefault(step.channel, []).extend(settings.bins)
+    return {channel: tuple(merged(stretches)) for channel, stretches in windows.items()}
+
+
+def merged(stretches: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return stretches of bins, ascending, with touching ones merged and empty ones left out."""
+    kept: list[tuple[int, int]] = []
+    for first, past in sorted(stretches):
+        if kept and first <= kept[-1][1]:
+            kept[-1] = (kept[-1][0], max(kept[-1][1], past))
+        elif first < past:
+            kept.append((first, past))
+    return kept
+
+
+def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
+    """Return why a range window has no effect; empty where it has one, or for other steps.
+
+    Such a window stays in the plan, because the plan stated in a product must not depend on the
+    other products of the scene.
+
+    Parameters
+    ----------
+    step : PlannedStep
+    steps : collection of PlannedStep
+        All steps of the scene.
+    """
+    if step.name != WINDOW:
+        return ""
+    estimates = [s for s in steps if s.name == "dead_time" and "analog" in s.settings]
+    if any(step.channel in (s.channel, s.settings["analog"]) for s in estimates):
+        return "the estimate of a dead time needs all bins"
+    windowed = {
+        (other.channel, other.product)
+        for other in steps
+        if other.name == WINDOW and other.instrument == step.instrument
+    }
+    needing = list(
+        dict.fromkeys(
+            other.product if other.channel == step.channel else other.channel
+            for other in steps
+            if other.instrument in ("", step.instrument)
+            and other.product
+            and step.channel in prepared_channels(steps, other.channel)
+            and (other.channel, other.product) not in windowed
+        )
+    )
+    if not needing:
+        return ""
+    return f"{' and '.join(needing)} need{'s' if len(needing) == 1 else ''} all bins"
+
+
+def bins_with_noise(nearest: float, farthest: float, case: ChannelCase) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, with those that their noise needs.
+
+    The variance of a count is that of the mean over a share of the range on either side.
+
+    Returns
+    -------
+    (int, int)
+        The first bin, and the one past the last, which may lie beyond the channel.
+    """
+    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+
+    def margin(distance: float) -> int:
+        # Two for rounding.
+        return max(math.ceil(THRESHOLDS.noise_window * distance / width), MIN_NOISE_BINS) + 2
+
+    first = math.floor((nearest - offset) / width) - margin(nearest)
+    return max(first, 0), math.ceil((farthest - offset) / width) + margin(farthest)
+
+
+def bins_within(nearest: float, farthest: float, case: ChannelCase) -> tuple[int, int]:
+    """Return the bins of counts between ranges in m, without a margin for their noise.
+
+    For bins that are averaged: the noise at the ends then comes from fewer bins.
+    """
+    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+    # Two for rounding.
+    first = math.floor((nearest - offset) / width) - 2
+    return max(first, 0), max(math.ceil((farthest - offset) / width) + 2, 0)

@@ -13,7 +13,8 @@ from dataclasses import replace
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
-from lidarops.kinds import Scope, kinds_of
+from lidarops.kinds import reads_of, with_read
+from lidarops.netcdf.context import product_of_path
 from lidarops.records import (
     InputRecord,
     LeftOut,
@@ -23,8 +24,8 @@ from lidarops.records import (
     Scene,
     UnusedFile,
 )
-from lidarops.scene.channels import READ_STEP, sources
-from lidarops.scene.conditioning import lacks_dark, required_by
+from lidarops.scene.case import READ_STEP, sources
+from lidarops.scene.pipe import lacks_dark, required_by
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
@@ -47,6 +48,13 @@ _FILES: Final = {
 def is_product(entry: PlannedStep | LeftOut) -> bool:
     """Return whether an entry of a plan is about the step that makes a product."""
     return bool(entry.product) and entry.name == entry.product
+
+
+def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
+    """Return kind and channel of the products that a step reads."""
+    reads = reads_of(step.product) if is_product(step) else ()
+    parts = (need.rpartition("/") for need in step.needs) if reads else ()
+    return tuple((name, channel or step.channel) for channel, _, name in parts if name in reads)
 
 
 def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
@@ -92,6 +100,8 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
 def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
     """Return a plan without the products that need an ancillary file that cannot be used.
 
+    Nor those that are made of such a product.
+
     Parameters
     ----------
     plan : Plan
@@ -99,11 +109,17 @@ def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
         Path of a file -> why it cannot be used.
     """
     kept, left_out = [], []
+    without: dict[ProductKey, str] = {}
     for kind, channel in planned_products(plan):
-        files = ancillary_files(plan_closure(plan, [(kind, channel)]).steps)
-        reasons = [f"{name}: {problems[name]}" for name in files if name in problems]
+        steps = plan_closure(plan, [(kind, channel)]).steps
+        reasons = [
+            f"{name}: {problems[name]}" for name in ancillary_files(steps) if name in problems
+        ]
+        reasons += [
+            without[read] for step in steps for read in read_products(step) if read in without
+        ]
         if reasons:
-            reason = "; ".join(reasons)
+            reason = without[kind, channel] = "; ".join(dict.fromkeys(reasons))
             left_out.append(LeftOut(kind, channel, reason, rule=UNUSABLE_FILE, product=kind))
         else:
             kept.append((kind, channel))
@@ -155,7 +171,7 @@ def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> Planned
 
 
 def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
-    """Return the part of a plan that concerns some kinds of product: their steps and omissions.
+    """Return the part of a plan that concerns some kinds of product, and those they are made of.
 
     Parameters
     ----------
@@ -165,9 +181,10 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
     """
     if not selected:
         return plan
-    products = [product for product in planned_products(plan) if product[0] in selected]
+    kinds = with_read(selected)
+    products = [product for product in planned_products(plan) if product[0] in kinds]
     closure = plan_closure(plan, products)
-    names = {*selected, READ_STEP}
+    names = {*kinds, READ_STEP}
     left_out = tuple(
         omission
         for omission in plan.left_out
@@ -187,6 +204,8 @@ def product_notes(scene: Scene, plan: Plan, channel: str) -> tuple[str, ...]:
     channel : str
         Channel of the product.
     """
+    if not reads_files(plan):
+        return ()
     others = {held.name for member in scene.members or (scene,) for held in member.layout}
     others -= {step.channel for step in plan.steps} | {channel}
     return tuple(note for note in scene.notes if others.isdisjoint(note.split(": ")))
@@ -203,6 +222,8 @@ def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     plan : Plan
         Plan of the product, from `plan_closure`.
     """
+    if not reads_files(plan):
+        return ()
     dark = _reads_dark(plan) or any(map(lacks_dark, plan.left_out))
     return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
 
@@ -211,15 +232,6 @@ def unused_inputs(unused: Iterable[UnusedFile]) -> tuple[InputRecord, ...]:
     """Return the unused files of a product as the ledger knows them, by whose loss it is kept."""
     # Of a name that is stated with escapes, the file is not found.
     return tuple(InputRecord(f.path, Role.UNUSED, "") for f in unused if "\\" not in f.path)
-
-
-def unused_settings(scene: Scene, plan: Plan) -> dict[str, Any]:
-    """Return the unused files of a product as plain JSON types; no key where there are none.
-
-    Parameters as `product_unused`.
-    """
-    unused = [file._asdict() for file in product_unused(scene, plan)]
-    return {UNUSED: unused} if unused else {}
 
 
 def scene_facts(campaign: Campaign, scene: Scene) -> InstrumentFacts:
@@ -259,19 +271,6 @@ def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str
     }
 
 
-def single_channel_settings(
-    products: Mapping[str, Any] | None, channel: str
-) -> dict[str, Any] | None:
-    """Return the settings of a kind of product as if only one channel were requested."""
-    return None if products is None else {**products, "channels": [channel]}
-
-
-def single_kind_settings(network: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Return the settings of a network as if only one kind of product were requested."""
-    others = {other.name for other in kinds_of(Scope.NETWORK)} - {kind}
-    return {key: value for key, value in network.items() if key not in others}
-
-
 def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
     """Return the ancillary files that steps read, by path, with their roles."""
     return {
@@ -283,22 +282,30 @@ def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
 
 
 def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecord, ...]:
-    """Return the files of a scene that a part of its plan reads.
+    """Return the files of a scene, and the products, that a part of its plan reads.
 
     Parameters
     ----------
     plan : Plan
         Plan of the product, from `plan_closure`.
     files : iterable of InputRecord
-        Files of the scene.
+        Files and products of the scene.
     """
-    dark = _reads_dark(plan)
+    raw = {Role.SIGNAL: reads_files(plan), Role.DARK: _reads_dark(plan)}
     named = ancillary_files(plan.steps)
-    return tuple(
-        file
-        for file in files
-        if file.role is Role.SIGNAL or (file.role is Role.DARK and dark) or file.path in named
-    )
+    products = {product for step in plan.steps for product in read_products(step)}
+
+    def is_read(file: InputRecord) -> bool:
+        if file.role is Role.PRODUCT:
+            return product_of_path(file.path) in products
+        return raw.get(file.role, False) or file.path in named
+
+    return tuple(filter(is_read, files))
+
+
+def reads_files(plan: Plan) -> bool:
+    """Return whether a part of a plan reads raw files; without, it reads other products."""
+    return any(step.name == READ_STEP for step in plan.steps)
 
 
 def _reads_dark(plan: Plan) -> bool:

@@ -13,10 +13,8 @@ import xarray as xr
 from lidarops.campaign.model import channel_facts
 from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_groups
-from lidarops.scene.case import ChannelCase, Entry
-from lidarops.scene.channels import LAG_STEP, glued_parts, lag_is_unknown
-from lidarops.scene.data import ChannelSignal
-from lidarops.scene.profiles import FileProfiles, GluedProfiles
+from lidarops.scene.case import LAG_STEP, ChannelCase, Entry, glued_parts, lag_is_unknown
+from lidarops.scene.profiles import ChannelSignal, FileProfiles, GluedProfiles
 from lidarops.settings import SettingsModel, quantity
 
 _Power = npt.NDArray[np.float64]

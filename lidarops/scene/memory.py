@@ -9,10 +9,10 @@ from typing import Final
 from lidarops.kinds import kind_of
 from lidarops.records import Plan, PlannedStep, Scene
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE
-from lidarops.scene.channels import counted_channels, prepared_channels
+from lidarops.scene.case import counted_channels, prepared_channels
 from lidarops.scene.dependence import is_product
 from lidarops.scene.profiles import CHUNK_BYTES
-from lidarops.scene.retrieval import Workload, making, product_settings
+from lidarops.scene.retrieval import Making, Workload, making, product_settings
 
 PROCESS: Final = 420_000_000
 """Bytes of a process with the code of all kinds loaded; above what ``benchmarks throughput --case
@@ -81,7 +81,7 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
     for step in plan.steps:
         work = Workload(members.get(step.instrument, scene), step.channel)
         if is_product(step):
-            known = making(step.product)
+            known = making(step.product, Making)
             settings = product_settings(plan.steps, step.product, step.channel)
             held[step.channel] += known.held(settings, work)
             together = max(together, known.together(settings, work))

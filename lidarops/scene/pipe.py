@@ -1,57 +1,415 @@
-"""The pipe from raw counts to the profiles of a channel: its stages, in their order."""
+"""The pipe from raw counts to the profiles of a channel, and the air: its stages, in their order.
+
+Of each stage there is a function ``plan_...``, which decides on the headers and the campaign
+whether it runs, and one that carries it out. Those of glued channels: `lidarops.scene.gluing`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from datetime import datetime
 from types import MappingProxyType
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Literal, NamedTuple
 
-from lidarops.records import LeftOut, PlannedStep, is_glued
-from lidarops.scene import conditioning, gluing
-from lidarops.scene.case import ChannelCase, Entry
-from lidarops.scene.channels import prepared_channels
-from lidarops.scene.data import ChannelSignal, Source
-from lidarops.settings import SettingsModel
+import numpy as np
+import numpy.typing as npt
 
-S = TypeVar("S", bound=SettingsModel)
+from lidarops.campaign.model import channel_facts
+from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
+from lidarops.records import DetectionMode, Granule, LeftOut, PlannedStep, Role, is_glued
+from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.signal import labeled, labeled_gluing
+from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
+from lidarops.retrieve.signal.lag import enough_bins, profile_groups
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
+from lidarops.scene import gluing
+from lidarops.scene.case import (
+    READ_STEP,
+    REQUEST,
+    ChannelCase,
+    Entry,
+    estimated_against,
+    lag_is_unknown,
+    prepared_channels,
+    range_channel,
+    range_offset,
+    wavelength,
+)
+from lidarops.scene.profiles import ChannelSignal, FileProfiles, Source, bin_ranges
+from lidarops.settings import SettingsModel, quantity
+
+Array = npt.NDArray[np.float64]
+
+NO_WAVELENGTH: Final = "the wavelength in the header is implausible, and no facts give one"
 
 
-# No slots: typing sets an attribute of generic instances, where it can.
-@dataclass(frozen=True)
-class Stage(Generic[S]):
+class ReadSettings(SettingsModel):
+    """Settings of the stage ``read``."""
+
+    wavelength: float = quantity(unit="m")
+    recorder: str = ""
+
+
+def plan_read(case: ChannelCase) -> Entry:
+    """Read a channel that a product needs, at a known wavelength."""
+    requesters = [*case.requests, *case.requesters]
+    if not requesters and case.networks:
+        word = "networks" if len(case.networks) > 1 else "network"
+        reason = f"used only by {word} {' and '.join(case.networks)}"
+        return case.leave(READ_STEP, reason, rule="channel")
+    if not requesters:
+        reason = "no product of the campaign uses this channel"
+        return case.leave(READ_STEP, reason, rule=REQUEST)
+    metres = wavelength(case.channel, channel_facts(case.facts, range_channel(case.channel.name)))
+    if math.isnan(metres):
+        return case.leave(READ_STEP, NO_WAVELENGTH, rule="channel")
+    settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder)
+    return case.run(READ_STEP, required_by(requesters), settings, rule="channel")
+
+
+def required_by(requesters: Iterable[str]) -> str:
+    """Return the reason why a channel is read: the products and glued channels that need it."""
+    return f"required by {' and '.join(requesters)}"
+
+
+def read(settings: ReadSettings, signal: ChannelSignal) -> None:
+    """Give the wavelength."""
+    signal.wavelength = settings.wavelength
+
+
+class OverlapSettings(SettingsModel):
+    """Settings of the stage ``overlap``."""
+
+    full_overlap_range: float = quantity(unit="m")
+    overlap_profile: str | None = None
+    """Ancillary file of the overlap function."""
+
+
+def plan_overlap(case: ChannelCase) -> Entry:
+    """Flag bins before full overlap, and give the overlap function, where they are stated."""
+    full, profile = case.facts.full_overlap_range, case.facts.overlap_profile
+    if not profile and full <= 0:
+        return case.leave(
+            "overlap",
+            "the campaign gives no full_overlap_range: near bins are used as they are, and"
+            " those whose signal shows no full overlap are rejected or to be used with care",
+        )
+    reason = "bins nearer than full overlap are flagged and excluded"
+    if profile:
+        reason = f"overlap_profile given by the campaign; {reason}"
+    settings = OverlapSettings(full_overlap_range=full, overlap_profile=profile)
+    return case.run("overlap", reason, settings, number=full)
+
+
+def overlap(settings: OverlapSettings, signal: ChannelSignal) -> None:
+    """Give the range of full overlap, and the overlap function where it is known."""
+    signal.full_overlap_range = settings.full_overlap_range
+    if settings.overlap_profile is not None:
+        signal.overlap = signal.source.ancillaries.overlaps[settings.overlap_profile].at
+
+
+class RangeOffsetSettings(SettingsModel):
+    """Settings of the stage ``range_offset``."""
+
+    range_offset: float = quantity(unit="m")
+
+
+def plan_range_offset(case: ChannelCase) -> Entry:
+    """Shift the ranges of the bins where the campaign gives an offset or a lag."""
+    offset, lag = range_offset(case.channel, case.facts), case.facts_of_channel.lag
+    if offset:
+        reason = "given by the campaign"
+        if isinstance(lag, float):
+            reason += f", including a lag of {lag:g} bins"
+        settings = RangeOffsetSettings(range_offset=offset)
+        return case.run("range_offset", reason, settings, number=offset)
+    if lag == "estimate":
+        return case.leave("range_offset", "an estimated lag shifts glued channels only")
+    return case.leave("range_offset", "the campaign gives no range_offset")
+
+
+def shift_ranges(settings: RangeOffsetSettings, signal: ChannelSignal) -> None:
+    """Give the offset."""
+    signal.range_offset = settings.range_offset
+
+
+class DarkSettings(SettingsModel):
+    """Settings of the stage ``dark``."""
+
+    files: int
+    method: Literal["interpolated", "nearest"]
+
+
+def plan_dark(case: ChannelCase) -> Entry:
+    """Subtract the signal of dark files near the scene from an analog channel."""
+    if case.channel.mode is DetectionMode.PHOTON:
+        return case.leave("dark", "dark counts are part of the photon-counting background")
+    count = len(case.scene.dark)
+    if not count:
+        refused = any(file.role is Role.DARK for file in case.scene.unused)
+        which = "dark files that can be used" if refused else "dark files"
+        return case.leave("dark", f"no {which} within 24 h of the scene", number=0.0)
+    times = sorted(granule.start for granule in case.scene.dark if granule.start)
+    profiles = [granule.start for granule in case.scene.granules if granule.start]
+    around = times[0] < max(profiles) and min(profiles) < times[-1]
+    sessions = _sessions(case.scene.dark)
+    method: Literal["interpolated", "nearest"]
+    # Interpolation needs two sessions.
+    if around and sessions > 1:
+        use, method = "interpolated in time", "interpolated"
+    elif sessions > 1:
+        use, method = "the nearest in time is used", "nearest"
+    else:
+        use, method = "one session, used for all profiles", "nearest"
+    order = _times_around(times, min(profiles), max(profiles))
+    files = "1 dark file" if count == 1 else f"{count} dark files"
+    reason = f"{files} within 24 h of the scene, {order}: {use}"
+    settings = DarkSettings(files=count, method=method)
+    return case.run("dark", reason, settings, needs=("read",), number=float(count))
+
+
+def subtract_dark(settings: DarkSettings, signal: ChannelSignal) -> None:
+    """Give the dark signals."""
+    dark = signal.source.dark
+    if dark is not None:
+        signal.dark = labeled.read_dark(dark, signal.channel, method=settings.method)
+
+
+def lacks_dark(entry: LeftOut) -> bool:
+    """Return whether an entry of a plan says that dark files are wanting."""
+    return entry.name == "dark" and entry.number == 0.0
+
+
+def _sessions(dark: Iterable[Granule]) -> int:
+    """Return the number of dark sessions, separated as in the retrieval."""
+    middles = sorted(
+        granule.start + ((granule.stop or granule.start) - granule.start) / 2
+        for granule in dark
+        if granule.start
+    )
+    gaps = ((later - time).total_seconds() for time, later in itertools.pairwise(middles))
+    return 1 + sum(gap > THRESHOLDS.session_gap for gap in gaps)
+
+
+def _times_around(times: Sequence[datetime], first: datetime, last: datetime) -> str:
+    """Return in words how many times lie before, among and after the profiles of a scene."""
+    counts = {
+        "before": sum(time < first for time in times),
+        "among": sum(first <= time <= last for time in times),
+        "after": sum(time > last for time in times),
+    }
+    *firsts, last_count = [f"{number} {place}" for place, number in counts.items() if number]
+    words = f"{', '.join(firsts)} and {last_count}" if firsts else last_count
+    return f"{words} its profiles"
+
+
+class DeadTimeSettings(SettingsModel):
+    """Settings of the stage ``dead_time``."""
+
+    dead_time: float | None = quantity(None, unit="s", description="None if it is estimated")
+    dead_time_uncertainty: float | None = None
+    """Relative standard error; None if it is estimated."""
+    analog: str | None = None
+    """Channel against which it is estimated."""
+    lag: Literal["estimate", "given"] | None = None
+    """Whether the lag of that channel is estimated too, or given by the ranges of the campaign."""
+
+
+def plan_dead_time(case: ChannelCase) -> Entry:
+    """Correct photon counts for a known dead time, or one that can be estimated."""
+    dead_time = case.facts_of_channel.dead_time
+    if case.channel.mode is not DetectionMode.PHOTON:
+        return case.leave("dead_time", "analog detection has no dead time")
+    if dead_time is None:
+        reason = "the campaign gives no dead_time; pile-up is flagged for an assumed 4 ns"
+        return case.leave("dead_time", reason)
+    if dead_time == "estimate":
+        return _plan_estimate(case)
+    reason, error = "given by the campaign", case.facts_of_channel.dead_time_uncertainty
+    if error is None:
+        reason += f"; its uncertainty is not, and {DEAD_TIME_UNCERTAINTY:.0%} is assumed"
+        error = DEAD_TIME_UNCERTAINTY
+    settings = DeadTimeSettings(dead_time=dead_time, dead_time_uncertainty=error)
+    return case.run("dead_time", reason, settings, number=dead_time)
+
+
+def _plan_estimate(case: ChannelCase) -> Entry:
+    """Estimate the dead time against the analog channel of the detector."""
+    analog = estimated_against(case.channel, case.facts, case.scene.layout)
+    if case.member:
+        reason = "dead times are not estimated for a network; pile-up is flagged"
+    elif not enough_bins(case.channel.bins):
+        reason = f"the {case.channel.bins} bins are too few for an estimate"
+    elif not analog:
+        reason = "the files hold no analog channel of the same detector and bins"
+    else:
+        unknown = lag_is_unknown(case.facts, analog, case.channel.name)
+        settings = DeadTimeSettings(analog=analog, lag="estimate" if unknown else "given")
+        words = f"the campaign requests an estimate, against {analog}"
+        return case.run("dead_time", words, settings, needs=(f"{analog}/noise",))
+    return case.leave("dead_time", reason)
+
+
+def correct_dead_time(settings: DeadTimeSettings, signal: ChannelSignal) -> None:
+    """Give the dead time, and its relative standard error."""
+    if settings.analog is not None:
+        estimate = _estimated_dead_time(signal, signal.channels[settings.analog], settings)
+        words = f"dead_time: no estimate of {signal.channel} against {settings.analog}"
+        if estimate is None:
+            signal.notes.append(
+                f"dead_time: estimate of {signal.channel}: the data give none against"
+                f" {settings.analog}, so that pile-up is not corrected, and flagged for an"
+                " assumed 4 ns; give dead_time in s, as the data sheet of the counter states it"
+            )
+        else:
+            signal.dead_time = estimate.dead_time
+            signal.dead_time_uncertainty = min(estimate.standard_error / estimate.dead_time, 1.0)
+            words = (
+                f"dead_time: {1e9 * estimate.dead_time:.3f} ns of {signal.channel}, estimated"
+                f" against {settings.analog}, standard error"
+                f" {1e9 * estimate.standard_error:.3f} ns"
+            )
+        signal.statements.append(words)
+    elif settings.dead_time is not None and settings.dead_time_uncertainty is not None:
+        signal.dead_time = settings.dead_time
+        signal.dead_time_uncertainty = settings.dead_time_uncertainty
+
+
+def _estimated_dead_time(
+    photon: ChannelSignal, analog: ChannelSignal, settings: DeadTimeSettings
+) -> DeadTimeEstimate | None:
+    """Return the dead time from the first profiles of a scene."""
+    archive, profiles = photon.source.archive, analog.profiles
+    channel = photon.channel
+    width = archive[channel].attrs["bin_width"]
+    groups: list[tuple[Array, ...]] = []
+
+    def records() -> Iterator[tuple[Array, Array]]:
+        """Yield the records for an estimate of the lag, and keep their sums."""
+        for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
+            raw = archive.isel(time=rows)
+            counts = raw[channel].to_numpy().astype(np.float64)
+            shots = raw[f"{channel}_shots"].to_numpy()
+            exposure = shots * (width / LICEL_RANGE_PER_MICROSECOND)
+            part = profiles.of(raw)
+            power, variance, length = (
+                part[name].to_numpy() for name in ("power", "variance", CORRELATION_LENGTH)
+            )
+            share = (exposure / max(exposure.sum(), 1e-300))[:, np.newaxis]
+            of_mean = (variance * length[:, np.newaxis] * share**2).sum(axis=0)
+            groups.append(
+                (counts.sum(axis=0), exposure.sum(), (power * share).sum(axis=0), of_mean)
+            )
+            yield power, counts / np.maximum(exposure, 1e-300)[:, np.newaxis]
+
+    distance = bin_ranges(archive, channel, photon.range_offset)
+    lag = labeled_gluing.range_lag(profiles.range, distance)
+    if settings.lag == "estimate":
+        lag = labeled_gluing.estimate_lag(records(), known=lag).bins
+    else:
+        for _ in records():
+            pass
+    kept = [group for group in groups if group[1] > 0.0]
+    if not kept:
+        return None
+    counts, exposure, power, variance = (np.stack(parts) for parts in zip(*kept, strict=True))
+    return estimate_dead_time(counts, exposure, power, variance, lag)
+
+
+class NoiseSettings(SettingsModel):
+    """Settings of the stage ``noise``."""
+
+    method: Literal["poisson", "given", "differences"]
+    noise_variance: float | None = quantity(
+        None, unit="mV2", description="with the method ``given``"
+    )
+    baseline_uncertainty: float | None = quantity(
+        None, unit="mV", description="of an analog channel, where the campaign gives it"
+    )
+
+
+def plan_noise(case: ChannelCase) -> Entry:
+    """Turn counts into power, with a noise that is Poisson, given, or estimated."""
+    variance = case.facts_of_channel.noise_variance
+    if case.channel.mode is DetectionMode.PHOTON:
+        reason, settings = "photon counts are Poisson distributed", NoiseSettings(method="poisson")
+    else:
+        reason = (
+            "the campaign gives no noise_variance; estimated from third differences over range"
+            if variance is None
+            else "given by the campaign"
+        )
+        settings = NoiseSettings(
+            method="differences" if variance is None else "given",
+            noise_variance=variance,
+            baseline_uncertainty=case.facts_of_channel.baseline_uncertainty,
+        )
+    needs = ("read", "overlap", "range_offset", "dark", "dead_time")
+    return case.run("noise", reason, settings, needs=needs, number=settings.noise_variance)
+
+
+def weigh(settings: NoiseSettings, signal: ChannelSignal) -> None:
+    """Give the profiles of the channel."""
+    signal.relative_variance = settings.method == "differences"
+    signal.profiles = FileProfiles(
+        signal.source.archive,
+        signal.channel,
+        {
+            "dead_time": signal.dead_time,
+            "dead_time_uncertainty": signal.dead_time_uncertainty,
+            "noise_variance": settings.noise_variance,
+            "baseline_uncertainty": settings.baseline_uncertainty,
+            "dark": signal.dark,
+            "range_offset": signal.range_offset,
+            "full_overlap_range": signal.full_overlap_range or 0.0,
+        },
+    )
+
+
+class MolecularSettings(SettingsModel):
+    """Settings of the stage ``molecular``."""
+
+    molecular_profile: str | None = None
+    """Ancillary file of pressure and temperature; None for the US Standard Atmosphere 1976."""
+
+
+def plan_molecular(case: ChannelCase) -> Entry:
+    """Give the density of the air, of a file or of the standard atmosphere."""
+    source = case.facts.molecular_profile
+    reason = "given by the campaign"
+    if not source:
+        reason = "the campaign gives no molecular_profile; US Standard Atmosphere 1976 is used"
+    return case.run("molecular", reason, MolecularSettings(molecular_profile=source or None))
+
+
+def give_air(settings: MolecularSettings, signal: ChannelSignal) -> None:
+    """Give the profile of the file, or of the standard atmosphere."""
+    source, known = settings.molecular_profile, signal.source.ancillaries.profiles
+    signal.molecules = MolecularProfile.us_standard() if source is None else known[source]
+
+
+class Stage(NamedTuple):
     """One stage: the settings that a plan states, the decision, and its execution."""
 
-    settings: type[S]
+    settings: type[SettingsModel]
     decide: Callable[[ChannelCase], Entry]
-    carry_out: Callable[[S, ChannelSignal], None]
+    carry_out: Callable[[Any, ChannelSignal], None]
 
 
-PIPE: Final[Mapping[str, Stage[Any]]] = MappingProxyType(
+PIPE: Final[Mapping[str, Stage]] = MappingProxyType(
     {
-        "read": Stage(conditioning.ReadSettings, conditioning.plan_read, conditioning.read),
-        "overlap": Stage(
-            conditioning.OverlapSettings, conditioning.plan_overlap, conditioning.overlap
-        ),
-        "range_offset": Stage(
-            conditioning.RangeOffsetSettings,
-            conditioning.plan_range_offset,
-            conditioning.shift_ranges,
-        ),
-        "dark": Stage(
-            conditioning.DarkSettings, conditioning.plan_dark, conditioning.subtract_dark
-        ),
-        "dead_time": Stage(
-            conditioning.DeadTimeSettings,
-            conditioning.plan_dead_time,
-            conditioning.correct_dead_time,
-        ),
-        "noise": Stage(conditioning.NoiseSettings, conditioning.plan_noise, conditioning.weigh),
+        "read": Stage(ReadSettings, plan_read, read),
+        "overlap": Stage(OverlapSettings, plan_overlap, overlap),
+        "range_offset": Stage(RangeOffsetSettings, plan_range_offset, shift_ranges),
+        "dark": Stage(DarkSettings, plan_dark, subtract_dark),
+        "dead_time": Stage(DeadTimeSettings, plan_dead_time, correct_dead_time),
+        "noise": Stage(NoiseSettings, plan_noise, weigh),
         "lag": Stage(gluing.LagSettings, gluing.plan_lag, gluing.give_lag),
         "glue": Stage(gluing.GlueSettings, gluing.plan_glue, gluing.glue),
-        "molecular": Stage(
-            conditioning.MolecularSettings, conditioning.plan_molecular, conditioning.give_air
-        ),
+        "molecular": Stage(MolecularSettings, plan_molecular, give_air),
     }
 )
 """The stages by name, in the order in which they run."""

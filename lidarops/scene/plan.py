@@ -7,25 +7,38 @@ is a sentence that a user can check against the campaign file.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from lidarops.campaign.model import Campaign, channel_facts
-from lidarops.kinds import Scope, kind_of, kinds_of
-from lidarops.records import LeftOut, Plan, PlannedStep, Scene
-from lidarops.scene.case import NOT_REQUESTED, REQUEST, ChannelCase, Entries, Entry
-from lidarops.scene.channels import (
+from lidarops.campaign.model import (
+    Campaign,
+    ChannelFacts,
+    InstrumentFacts,
+    channel_facts,
+)
+from lidarops.kinds import Scope, kind_of, kinds_of, reads_of
+from lidarops.netcdf.context import product_of_path
+from lidarops.records import LeftOut, Plan, PlannedStep, Scene, is_glued
+from lidarops.scene.case import (
+    NO_PRODUCT,
+    NOT_REQUESTED,
     READ_STEP,
+    REQUEST,
+    ChannelCase,
+    Entries,
+    Entry,
+    ProductCase,
     estimated_against,
     file_channels,
     joined_layout,
     missing_channels,
     named_channels,
     prepared_channels,
+    product_channel,
 )
-from lidarops.scene.dependence import is_product
+from lidarops.scene.dependence import ProductKey, is_product, read_products, scene_facts
 from lidarops.scene.pipe import AIR, PIPE, plan_stages
-from lidarops.scene.retrieval import NetworkCase, making
+from lidarops.scene.retrieval import Derivation, NetworkCase, NetworkRetrieval, Retrieval, making
 from lidarops.settings import ChannelProduct
 
 
@@ -43,31 +56,39 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
         Steps by channel in the order in which they run. It may have no steps; `left_out` then
         states why.
     """
-    entries = _network_entries(scene, campaign) if scene.members else _entries(scene, campaign)
+    if scene.members:
+        entries = _network_entries(scene, campaign)
+    elif scene.granules:
+        entries = _entries(scene, campaign)
+    else:
+        entries = _month_entries(scene, campaign)
     linked = list(_linked(list(entries)))
     plan = Plan(
         scene.id,
         tuple(entry for entry in linked if isinstance(entry, PlannedStep)),
         tuple(entry for entry in linked if isinstance(entry, LeftOut)),
     )
-    return plan if scene.members else _drop_unused_channels(plan)
+    return _drop_unused_channels(plan) if scene.layout and not scene.members else plan
 
 
 def _network_entries(scene: Scene, campaign: Campaign) -> Entries:
     for kind, request in campaign.networks[scene.instrument].requested().items():
-        yield from making(kind).needs(NetworkCase(scene, campaign, request))
+        yield from making(kind, NetworkRetrieval).needs(NetworkCase(scene, campaign, request))
 
 
 def _entries(scene: Scene, campaign: Campaign) -> Entries:
     instrument = campaign.instruments[scene.instrument]
     # A scene never spans an edge of a validity period, so the facts of its first granule hold.
-    facts = instrument.facts_at(scene.granules[0].start or scene.start)
+    facts = scene_facts(campaign, scene)
     layout = scene.layout
     yield from missing_channels(layout, instrument, facts)
     glued = joined_layout(layout, named_channels(instrument))
-    requested = instrument.products.requested()
+    wanted = instrument.products.requested()
+    requested = {kind: one for kind, one in wanted.items() if not reads_of(kind)}
     networks = _channels_of_networks(scene, campaign)
     estimated = {other.name: estimated_against(other, facts, layout) for other in layout}
+    entries: list[Entry] = []
+    cases: dict[str, ChannelCase] = {}
     for channel in (*layout, *glued):
         name = channel.name
         requesters = [
@@ -79,22 +100,75 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
             *_companions_of(name, requested.values()),
             *(other for other, analog in estimated.items() if name == analog),
         ]
-        yield from _channel_entries(
-            ChannelCase(
-                scene,
-                channel,
-                facts,
-                channel_facts(facts, name),
-                all_steps=campaign.all_steps,
-                requests={
-                    kind: settings
-                    for kind, settings in requested.items()
-                    if settings.covers(name, of_files=channel in layout)
-                },
-                requesters=tuple(dict.fromkeys(requesters)),
-                networks=tuple(used for used, names in networks.items() if name in names),
-            )
+        case = cases[name] = ChannelCase(
+            scene,
+            channel,
+            facts,
+            channel_facts(facts, name),
+            all_steps=campaign.all_steps,
+            requests={
+                kind: settings
+                for kind, settings in requested.items()
+                if settings.covers(name, of_files=channel in layout)
+            },
+            requesters=tuple(dict.fromkeys(requesters)),
+            networks=tuple(used for used, names in networks.items() if name in names),
         )
+        entries += _channel_entries(case)
+    yield from entries
+    # Those of all channels are decided by now.
+    made = dict.fromkeys(_made(entries))
+    read = {entry.channel for entry in entries if isinstance(entry, PlannedStep)}
+    for kind in kinds_of(Scope.CHANNEL):
+        settings = wanted.get(kind.name)
+        for name, case in cases.items() if kind.reads else ():
+            if settings and settings.covers(name, of_files=case.channel in layout):
+                derived = list(_derived_entries(case.of_product(kind.name, settings), made))
+                made |= dict.fromkeys(_made(derived))
+                yield from derived
+            elif name in read:
+                yield replace(case, product=kind.name).leave(kind.name, NOT_REQUESTED, rule=REQUEST)
+
+
+def _made(entries: Iterable[Entry]) -> Iterator[ProductKey]:
+    """Yield kind and channel of the products that run."""
+    for entry in entries:
+        if isinstance(entry, PlannedStep) and is_product(entry):
+            yield entry.name, entry.channel
+
+
+def _month_entries(scene: Scene, campaign: Campaign) -> Entries:
+    """Yield the entries of a month, of the channels that are requested or have products."""
+    requested = campaign.instruments[scene.instrument].products.requested()
+    held = dict.fromkeys(product_of_path(product.path) for product in scene.products)
+    for kind in kinds_of(Scope.MONTH):
+        if settings := requested.get(kind.name):
+            own = [channel for read, channel in held if read in kind.reads]
+            present = [name for name in own if settings.covers(name, of_files=not is_glued(name))]
+            for name in dict.fromkeys([*settings.named, *present]):
+                case = ChannelCase(scene, product_channel(name), InstrumentFacts(), ChannelFacts())
+                yield from _derived_entries(case.of_product(kind.name, settings), held)
+
+
+def _derived_entries(
+    case: ProductCase[ChannelProduct], made: Collection[ProductKey]
+) -> Iterator[Entry]:
+    """Yield the entries of a product that is made of others, of which some are there."""
+    kind, own = kind_of(case.product), case.channel.name
+    channels = (own, *case.request.companions(own))
+    read = [(name, channel) for channel in channels for name in kind.reads]
+    missing = [f"{name} of {channel}" for name, channel in read if (name, channel) not in made]
+    if missing:
+        where = "the scene" if case.scene.granules else "the month"
+        reason = f"made of products that {where} lacks: {', '.join(missing)}"
+        yield case.leave(kind.name, reason, rule=NO_PRODUCT, number=float(len(missing)))
+        return
+    needs = (name if channel == own else f"{channel}/{name}" for name, channel in read)
+    for entry in making(kind.name, Derivation).needs(case):
+        if isinstance(entry, PlannedStep) and is_product(entry):
+            yield replace(entry, needs=(*entry.needs, *needs))
+        else:
+            yield entry
 
 
 def _channels_of_networks(scene: Scene, campaign: Campaign) -> dict[str, tuple[str, ...]]:
@@ -123,7 +197,10 @@ def _channel_entries(case: ChannelCase) -> list[Entry]:
     if isinstance(stages[0], LeftOut):
         return stages
     products = [
-        entry for kind in kinds_of(Scope.CHANNEL) for entry in _product_entries(case, kind.name)
+        entry
+        for kind in kinds_of(Scope.CHANNEL)
+        if not kind.reads
+        for entry in _product_entries(case, kind.name)
     ]
     needed = any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep))
     return [*stages, *([PIPE[AIR].decide(case)] if needed else []), *products]
@@ -134,7 +211,7 @@ def _product_entries(case: ChannelCase, kind: str) -> list[Entry]:
     request = case.requests.get(kind)
     if request is None:
         return [replace(case, product=kind).leave(kind, NOT_REQUESTED, rule=REQUEST)]
-    return list(making(kind).needs(case.of_product(kind, request)))
+    return list(making(kind, Retrieval).needs(case.of_product(kind, request)))
 
 
 def _linked(entries: Sequence[Entry]) -> Iterator[Entry]:
@@ -149,6 +226,8 @@ def _linked(entries: Sequence[Entry]) -> Iterator[Entry]:
 
     def is_held(need: str, step: PlannedStep) -> bool:
         channel, _, name = need.rpartition("/")
+        if (name, channel or step.channel) in read_products(step):
+            return True
         return any(
             (channel or step.channel, step.instrument, product, name) in places
             for product in ("", step.product)
@@ -167,7 +246,7 @@ def _compared(steps: Iterable[PlannedStep]) -> dict[tuple[str, str], list[str]]:
     wavelengths = {s.channel: s.settings["wavelength"] for s in steps if s.name == READ_STEP}
     alike: defaultdict[tuple[str, float], list[str]] = defaultdict(list)
     for step in steps:
-        if is_product(step) and kind_of(step.product).common:
+        if is_product(step) and kind_of(step.product).common and not read_products(step):
             alike[step.product, wavelengths[step.channel]].append(step.channel)
     return {
         (kind, channel): [f"{other}/{kind}" for other in channels if other != channel]

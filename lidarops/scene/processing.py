@@ -19,13 +19,15 @@ import dask.local
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
-from lidarops.errors import RawFormatError
+from lidarops.errors import ProductError, RawFormatError
 from lidarops.kinds import kind_of
-from lidarops.netcdf.context import Context, product_path
+from lidarops.netcdf.context import Context, path_of_product, product_of_path, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
+from lidarops.netcdf.read import opened_product
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
+    DetectionMode,
     Disagreement,
     Grade,
     Granule,
@@ -33,33 +35,52 @@ from lidarops.records import (
     Plan,
     PlannedStep,
     ProductRecord,
+    Role,
     Scene,
     SceneOutcome,
+    is_glued,
 )
-from lidarops.scene import data
 from lidarops.scene.agreement import Retrieved, compare_channels
-from lidarops.scene.channels import (
+from lidarops.scene.case import (
     READ_STEP,
     channel_ranges,
     counted_channels,
     file_channels,
     member_channel,
+    product_channel,
 )
-from lidarops.scene.context import product_context
-from lidarops.scene.data import ChannelSignal, ProductStream, Source, WholeProduct, in_one_batch
+from lidarops.scene.choices import read_windows
 from lidarops.scene.dependence import (
     ancillary_files,
     is_product,
     plan_closure,
+    planned_products,
+    read_products,
     scene_facts,
 )
 from lidarops.scene.guard import Failure, guarded
 from lidarops.scene.input_files import check_files, local_files, open_granules
-from lidarops.scene.job import Job, nothing_to_do
+from lidarops.scene.job import Job, nothing_to_do, product_context
 from lidarops.scene.pipe import channel_signal
-from lidarops.scene.profiles import Chunk
-from lidarops.scene.retrieval import Member, network_retrieval, product_settings, streams_of
-from lidarops.scene.windows import read_windows
+from lidarops.scene.profiles import (
+    READ_TOGETHER,
+    ChannelSignal,
+    Source,
+    chunk_profiles,
+    chunks,
+    in_one_batch,
+    profiles_together,
+)
+from lidarops.scene.retrieval import (
+    Derivation,
+    InputProduct,
+    Member,
+    NetworkRetrieval,
+    making,
+    product_settings,
+    streams_of,
+)
+from lidarops.system.files import sha256_of
 
 
 def process_scene(job: Job) -> SceneOutcome:
@@ -118,7 +139,8 @@ def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutc
     with dask.config.set(scheduler=dask.local.get_sync), count_bytes_read() as tally:
         process = _Network if usable.members else _Instrument
         work = process(job, usable, inputs, root, clock)
-        products = guarded(work.all_products)
+        failed = guarded(work.all_products)
+    order = planned_products(work.job.plan)
     outcome = replace(
         failure,
         plan=work.job.plan,
@@ -128,13 +150,13 @@ def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutc
         notes=tuple(work.notes),
         disagreements=work.disagreements,
         bytes_read=read + tally.bytes,
+        # Also those before a failure: they are on the disk, so that the ledger must know them.
+        products=tuple(sorted(work.made, key=lambda made: order.index((made.kind, made.channel)))),
     )
-    if isinstance(products, Failure):
-        # Those before the failure are on the disk, so that the ledger must know them.
-        error = "" if work.refused else products.error
-        failed = replace(outcome, error=error, internal=products.internal)
-        return replace(failed, products=tuple(work.made)), products.final
-    return replace(outcome, products=products), True
+    if failed is None:
+        return outcome, True
+    error = "" if work.refused else failed.error
+    return replace(outcome, error=error, internal=failed.internal), failed.final
 
 
 class _Clock:
@@ -171,18 +193,18 @@ class _Work(ABC):
         self.refused: tuple[Granule, ...] = ()
         """Files of the scene that cannot be used, of which one turned out when steps read it."""
 
-    def all_products(self) -> tuple[ProductRecord, ...]:
-        """Make all products, and return their records."""
+    def all_products(self) -> None:
+        """Make all products."""
         try:
-            return tuple(self.products())
+            self.products()
         except RawFormatError:
             # A file of known content was not checked, and differs from it or cannot be read now.
             self.refused = check_files(self.job.scene, self._root, read_all=True)[2]
             raise
 
     @abstractmethod
-    def products(self) -> Iterator[ProductRecord]:
-        """Make the products, and yield their records."""
+    def products(self) -> None:
+        """Make the products."""
 
     def _source(
         self,
@@ -198,7 +220,7 @@ class _Work(ABC):
         read = {step.channel for step in steps if step.name == READ_STEP}
         subtracted = [step.channel for step in steps if step.name == "dark"]
         bins = {channel.name: channel.bins for channel in scene.layout if channel.name in read}
-        profiles = data.chunk_profiles(max(bins.values()), job.profiles_per_chunk)
+        profiles = chunk_profiles(max(bins.values()), job.profiles_per_chunk)
         open_files = (job.campaign, scene)
         source = Source(
             archive=open_granules(
@@ -206,7 +228,7 @@ class _Work(ABC):
                 scene.granules,
                 self._root,
                 list(bins),
-                profiles_per_chunk=max(1, profiles // data.READ_TOGETHER),
+                profiles_per_chunk=max(1, profiles // READ_TOGETHER),
                 stretches=stretches,
             ),
             dark=(
@@ -220,58 +242,48 @@ class _Work(ABC):
         self.inputs += tuple(file for file in source.ancillaries.inputs if file not in self.inputs)
         return source
 
-    def _chunk_profiles(self, source: Source, channels: Sequence[str]) -> int:
-        """Return the number of profiles of channels of the files that are processed together."""
-        counts = [source.archive[name] for name in channels]
-        requested = self.job.profiles_per_chunk
-        if requested is None and sum(array.nbytes for array in counts) <= data.IN_MEMORY:
-            return int(source.archive.sizes["time"])
-        bins = sum(int(array.shape[1]) for array in counts)
-        return data.chunk_profiles(bins, requested)
-
     @contextmanager
     def _writer(self, frame: xr.Dataset, context: Context) -> Iterator[ProductWriter]:
         """Yield a writer of a product, which is complete at the end."""
         target = self.job.campaign.products_root / product_path(context)
-        former = self.job.place(context.kind, context.channel).sha256
-        with create_product(frame, context, target, former) as writer:
+        place = self.job.place(context.kind, context.channel)
+        with create_product(frame, context, target, place.sha256) as writer:
             yield writer
-        self.made.append(self._record(context, writer))
+        written = writer.written
+        stays = written.change is not None and written.change.grade is Grade.NONE
+        self.made.append(
+            ProductRecord(
+                product_path(context),
+                context.kind,
+                context.channel,
+                **{item.name: getattr(written, item.name) for item in fields(written)},
+                stamp=place.former if stays else context.stamp,
+            )
+        )
         self._clock.lap("write")
 
-    def _written(self, context: Context, results: Iterator[xr.Dataset]) -> ProductRecord:
+    def _write(self, context: Context, results: Iterator[xr.Dataset]) -> None:
         """Write a product from its frame and the rows that follow."""
         with self._writer(next(results), context) as writer:
             for rows in results:
                 self._clock.lap("retrieve")
                 writer.add(rows)
                 self._clock.lap("write")
-        return self._record(context, writer)
-
-    def _record(self, context: Context, writer: ProductWriter) -> ProductRecord:
-        written = writer.written
-        stays = written.change is not None and written.change.grade is Grade.NONE
-        former = self.job.place(context.kind, context.channel).former
-        return ProductRecord(
-            product_path(context),
-            context.kind,
-            context.channel,
-            **{item.name: getattr(written, item.name) for item in fields(written)},
-            stamp=former if stays else context.stamp,
-        )
 
 
 class _Instrument(_Work):
     """The processing of a scene of one instrument."""
 
-    def products(self) -> Iterator[ProductRecord]:
-        """Make the products of all channels, and yield their records."""
+    def products(self) -> None:
+        """Make the products of all channels."""
         steps = self.job.plan.steps
-        channels = dict.fromkeys(step.channel for step in steps if is_product(step))
-        source = self._source(self._scene, steps, read_windows(steps))
+        products = [step for step in steps if is_product(step)]
+        channels = dict.fromkeys(s.channel for s in products if not read_products(s))
         compared: list[Retrieved] = []
-        for channel in channels:
-            yield from self._channel_products(source, channel, compared)
+        if channels:
+            source = self._source(self._scene, steps, read_windows(steps))
+            for channel in channels:
+                self._make_products(source, channel, compared)
         judged, pairs = compare_channels(compared) if compared else ([], ())
         self._clock.lap("retrieve")
         # Pairs of two products that stand were reported when these were made.
@@ -282,11 +294,51 @@ class _Instrument(_Work):
         )
         for product in judged:
             if self.job.writes(product.context.kind, product.context.channel):
-                yield self._written(product.context, iter([product.frame, *product.batches]))
+                self._write(product.context, iter([product.frame, *product.batches]))
+        # Last, and in the order of the plan: of products that are on the disk.
+        for step in products:
+            if read_products(step):
+                self._derive(step)
 
-    def _channel_products(
-        self, source: Source, channel: str, compared: list[Retrieved]
-    ) -> Iterator[ProductRecord]:
+    def _derive(self, step: PlannedStep) -> None:
+        """Write a product that is made of others."""
+        job, kind = self.job, step.product
+        read = [self._read(path) for path in self._paths_read(step)]
+        first = next(product.file for product in read if product.channel == step.channel)
+        with opened_product(first, in_parts=True, decode_cf=False) as product:
+            wavelength = float(product["wavelength"]) * 1e-9
+            stated = product.attrs["lidarops_detection_mode"]
+        mode = DetectionMode.PHOTON if is_glued(step.channel) else DetectionMode(stated)
+        channel = product_channel(step.channel, mode, wavelength)
+        context = product_context(job, self._scene, kind, channel, wavelength, self.inputs)
+        settings = product_settings(job.plan.steps, kind, step.channel)
+        self._write(context, making(kind, Derivation).derive(settings, read))
+
+    def _paths_read(self, step: PlannedStep) -> list[str]:
+        """Return the paths of the products that a step reads, of its scene or its month."""
+        scene, keys = self._scene, read_products(step)
+        if scene.granules:
+            owner = (scene.station, scene.instrument)
+            return sorted(path_of_product((*owner, *key), scene.id, scene.start) for key in keys)
+        paths = (product.path for product in scene.products)
+        return sorted(path for path in paths if product_of_path(path) in keys)
+
+    def _read(self, path: str) -> InputProduct:
+        """Return a product that is read, and state its content as an input."""
+        file = self.job.campaign.products_root / path
+        try:
+            record = InputRecord(path, Role.PRODUCT, sha256_of(file))
+        except OSError as error:
+            raise ProductError(
+                f"cannot be read: {error.strerror or error}",
+                file=file,
+                remedy="run lidarops reprocess again, which makes it",
+            ) from error
+        if record not in self.inputs:
+            self.inputs += (record,)
+        return InputProduct(*product_of_path(path), file)
+
+    def _make_products(self, source: Source, channel: str, compared: list[Retrieved]) -> None:
         """Write the products of a channel, but for those to be compared with other channels."""
         steps = self.job.plan.steps
         signal = channel_signal(source, steps, channel)
@@ -305,9 +357,9 @@ class _Instrument(_Work):
         with ExitStack() as until_written:
             writers: dict[str, ProductWriter] = {}
             channels = counted_channels(steps, channel)
-            profiles = self._chunk_profiles(source, channels)
-            for chunk in data.chunks(source, channels, streams.values(), profiles):
-                for kind, rows in _taken(chunk, streams):
+            profiles = profiles_together(source, channels, self.job.profiles_per_chunk)
+            for chunk in chunks(source, channels, streams.values(), profiles):
+                for kind, rows in ((k, rows) for k, s in streams.items() for rows in s.add(chunk)):
                     self._clock.lap("retrieve")
                     if kind in writers:
                         writers[kind].add(rows)
@@ -315,18 +367,16 @@ class _Instrument(_Work):
                     else:
                         writer = self._writer(_with_words(rows, words[kind]), contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
-        yield from (self._record(contexts[kind], writer) for kind, writer in writers.items())
-        for kind, stream in streams.items():
-            if isinstance(stream, WholeProduct):
-                results = stream.results()
-                frame = _with_words(next(results), words[kind])
-                common = kind_of(kind).common
-                if self.job.writes(kind, channel):
-                    self.notes.update(dict.fromkeys(stream.notes))
-                if common:
-                    compared.append(Retrieved(common, contexts[kind], frame, tuple(results)))
-                else:
-                    yield self._written(contexts[kind], itertools.chain([frame], results))
+        for kind in [kind for kind in streams if kind not in writers]:
+            results = streams[kind].results()
+            frame = _with_words(next(results), words[kind])
+            common = kind_of(kind).common
+            if self.job.writes(kind, channel):
+                self.notes.update(dict.fromkeys(streams[kind].notes))
+            if common:
+                compared.append(Retrieved(common, contexts[kind], frame, tuple(results)))
+            else:
+                self._write(contexts[kind], itertools.chain([frame], results))
 
 
 def _words(plan: Plan, product: str, signal: ChannelSignal) -> list[str]:
@@ -342,31 +392,23 @@ def _with_words(frame: xr.Dataset, words: Sequence[str]) -> xr.Dataset:
     return frame.assign_attrs(steps="; ".join([*words, *stated])) if words else frame
 
 
-def _taken(chunk: Chunk, streams: Mapping[str, ProductStream]) -> Iterator[tuple[str, xr.Dataset]]:
-    """Give a chunk to all products, and yield the rows that are complete, with their kinds."""
-    for kind, stream in streams.items():
-        if isinstance(stream, WholeProduct):
-            stream.add(chunk)
-        else:
-            yield from ((kind, rows) for rows in stream.rows(chunk))
-
-
 class _Network(_Work):
     """The processing of a scene of a network."""
 
-    def products(self) -> Iterator[ProductRecord]:
-        """Make the products of the network, and yield their records."""
+    def products(self) -> None:
+        """Make the products of the network."""
         plan = self.job.plan
         for step in [step for step in plan.steps if is_product(step)]:
             members = list(self._members(step))
             settings = product_settings(plan.steps, step.product, step.channel)
-            stream = network_retrieval(step.product).stream(settings, members)
+            stream = making(step.product, NetworkRetrieval).stream(settings, members)
             for member in members:
                 if member.signal is not None:
                     source = member.signal.source
                     channels = file_channels(step.channel)
-                    profiles = self._chunk_profiles(source, channels)
-                    for chunk in data.chunks(source, channels, (), profiles):
+                    requested = self.job.profiles_per_chunk
+                    profiles = profiles_together(source, channels, requested)
+                    for chunk in chunks(source, channels, (), profiles):
                         stream.add(member, chunk)
             made = stream.result()
             self._clock.lap("retrieve")
@@ -379,7 +421,7 @@ class _Network(_Work):
                 stream.wavelength,
                 self.inputs,
             )
-            yield self._written(context, in_one_batch(made))
+            self._write(context, in_one_batch(made))
 
     def _members(self, product: PlannedStep) -> Iterator[Member[Any]]:
         """Yield the instruments that take part, with the data of the channel of a product."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, Generic, TypeVar, get_args
 
@@ -16,18 +18,18 @@ from pydantic import BaseModel
 
 from lidarops.campaign.model import Campaign, Station
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import Scope, kind_of
+from lidarops.kinds import kind_of
+from lidarops.netcdf.read import open_product
 from lidarops.records import PlannedStep, Scene
-from lidarops.scene.case import Entries
-from lidarops.scene.channels import file_channels
-from lidarops.scene.data import ChannelSignal, ProductStream
-from lidarops.scene.dependence import is_product
+from lidarops.scene.case import Entries, file_channels
+from lidarops.scene.dependence import is_product, read_products
 from lidarops.scene.pipe import PIPE
-from lidarops.scene.profiles import Chunk
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream
 from lidarops.settings import SettingsModel
 
 R = TypeVar("R")
 S = TypeVar("S", bound=SettingsModel)
+M = TypeVar("M", bound="Making[Any]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +62,6 @@ class Workload:
         return len({math.floor(start.timestamp() / seconds) for start in starts if start})
 
 
-def nothing_held(settings: Any, work: Workload) -> float:  # noqa: ARG001
-    """Return that nothing is held for the whole scene, bytes."""
-    return 0.0
-
-
-def any_profiles(settings: Any, work: Workload) -> int:  # noqa: ARG001
-    """Return that a chunk may end after each profile."""
-    return 1
-
-
 # No slots: typing sets an attribute of generic instances, where it can.
 @dataclass(frozen=True, kw_only=True)
 class Making(Generic[S]):
@@ -80,9 +72,9 @@ class Making(Generic[S]):
     entry is left out."""
     needs: Callable[[Any], Entries]
     """Yields the entries of a case: what runs, and what is left out."""
-    held: Callable[[S, Workload], float] = nothing_held
+    held: Callable[[S, Workload], float] = lambda _settings, _work: 0.0
     """Returns the estimated number of bytes that are held for the whole scene."""
-    together: Callable[[S, Workload], int] = any_profiles
+    together: Callable[[S, Workload], int] = lambda _settings, _work: 1
     """Returns the largest number of profiles that a chunk must not part."""
 
 
@@ -92,6 +84,32 @@ class Retrieval(Making[S]):
 
     stream: Callable[[S, ChannelSignal], ProductStream]
     """Returns the product in the making, which takes the profiles of the scene in chunks."""
+
+
+@dataclass(frozen=True, slots=True)
+class InputProduct:
+    """A product of which another one is made."""
+
+    kind: str
+    channel: str
+    file: Path
+
+    def open(self, names: Iterable[str]) -> AbstractContextManager[xr.Dataset]:
+        """Open it for some of its variables, as `lidarops.netcdf.read.open_product`."""
+        return open_product(self.file, names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derivation(Making[S]):
+    """How the products of a kind come about, each from others: `needs` of a `ProductCase`.
+
+    It is asked only where all products are there that the kind reads, of the channel and of its
+    `companions`. The case of a month has no facts, and a channel without bins.
+    """
+
+    derive: Callable[[S, Sequence[InputProduct]], Iterator[xr.Dataset]]
+    """Yields the frame of the product, then its rows in batches, from products by path, so that
+    those of a kind and channel are in order of time; as of a `ProductStream`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,35 +161,27 @@ class NetworkRetrieval(Making[S]):
     """Returns the product in the making, which takes the profiles of all instruments."""
 
 
-def making(kind: str) -> Making[Any]:
+def making(kind: str, sort: type[M]) -> M:
     """Return how the products of a kind come about.
+
+    Parameters
+    ----------
+    kind : str
+    sort : type
+        `Making`, or the one of its kinds that suits the settings of the kind of product.
 
     Raises
     ------
     LidarOpsError
-        If there is no such kind, its package is incomplete, or another scope than its settings.
+        If there is no such kind, its package is incomplete, or it is of another sort.
     """
     known = kind_of(kind)
-    found: Making[Any] = known.part("retrieval", "RETRIEVAL")
-    expected = NetworkRetrieval if known.scope is Scope.NETWORK else Retrieval
-    if not isinstance(found, expected) or kind not in found.settings.model_fields:
+    found: M = known.part("retrieval", "RETRIEVAL")
+    if not isinstance(found, sort) or kind not in found.settings.model_fields:
         raise LidarOpsError(
-            f"kind of product {kind!r}: RETRIEVAL is no {expected.__name__} with settings of"
-            f" {kind}",
+            f"kind of product {kind!r}: RETRIEVAL is no {sort.__name__} with settings of {kind}",
             remedy=f"correct {known.package}.retrieval",
         )
-    return found
-
-
-def retrieval(kind: str) -> Retrieval[Any]:
-    """Return how the products of a kind of one channel come about, as `making`."""
-    found: Retrieval[Any] = kind_of(kind).part("retrieval", "RETRIEVAL")
-    return found
-
-
-def network_retrieval(kind: str) -> NetworkRetrieval[Any]:
-    """Return how the products of a kind of networks come about, as `making`."""
-    found: NetworkRetrieval[Any] = kind_of(kind).part("retrieval", "RETRIEVAL")
     return found
 
 
@@ -179,7 +189,7 @@ def product_settings(
     steps: Iterable[PlannedStep], kind: str, channel: str, member: str = ""
 ) -> SettingsModel:
     """Return what a plan states of a product, or of one instrument of its network."""
-    model = network_retrieval(kind).member if member else making(kind).settings
+    model = making(kind, NetworkRetrieval).member if member else making(kind, Making).settings
     return model.model_validate(
         {
             step.name: dict(step.settings)
@@ -193,11 +203,11 @@ def streams_of(steps: Sequence[PlannedStep], signal: ChannelSignal) -> dict[str,
     """Return the products of a channel in the making, by kind."""
     channel = signal.channel
     return {
-        step.product: retrieval(step.product).stream(
+        step.product: making(step.product, Retrieval).stream(
             product_settings(steps, step.product, channel), signal
         )
         for step in steps
-        if step.channel == channel and is_product(step)
+        if step.channel == channel and is_product(step) and not read_products(step)
     }
 
 
@@ -205,7 +215,7 @@ def settings_model(step: PlannedStep) -> type[BaseModel]:
     """Return the model of the settings of an entry of a plan."""
     if not step.product:
         return PIPE[step.name].settings
-    known = making(step.product)
+    known = making(step.product, Making)
     fields = known.settings.model_fields | (
         known.member.model_fields if isinstance(known, NetworkRetrieval) else {}
     )

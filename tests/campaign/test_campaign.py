@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CampaignError, CatalogError
-from lidarops.products.elastic.settings import ElasticSettings
-from lidarops.products.homogeneous.settings import HomogeneousSettings
-from lidarops.products.multiangle.settings import MultiAngleSettings
-from lidarops.products.visibility.settings import VisibilityProductSettings
+from lidarops.products.elastic import ElasticSettings
+from lidarops.products.homogeneous import HomogeneousSettings
+from lidarops.products.multiangle import MultiAngleSettings
+from lidarops.products.visibility import VisibilityProductSettings
 
 MINIMAL = """\
 name: small

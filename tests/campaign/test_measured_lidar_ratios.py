@@ -8,12 +8,12 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import lidar_ratio_profile
 from lidarops.flags import Quality, rejecting
-from lidarops.products.raman.settings import RamanReferenceSettings
+from lidarops.products.raman import RamanReferenceSettings
 from lidarops.products.raman.variables import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic.labeled import invert_elastic
-from lidarops.retrieve.raman.labeled import Assumptions, retrieve
+from lidarops.retrieve.raman.labeled import retrieve
 from lidarops.retrieve.raman.signals import RamanSettings
 from lidarops.retrieve.signal.counts_to_signal import photon_signal
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
@@ -73,7 +73,7 @@ def test_elastic_values_with_measured_lidar_ratios_are_right_within_their_errors
         nitrogen,
         molecules=air,
         station_altitude=0.0,
-        assumptions=Assumptions(settings, 60.0, 15_000.0, known_shape=True),
+        settings=settings,
         overlap=np.where(r < 345.0, np.nan, 1.0),
     )
     rejected = (product["quality_flag"] & np.int32(rejecting(FLAGS))) != 0

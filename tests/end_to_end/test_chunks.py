@@ -14,7 +14,6 @@ from support.archives import mixed_campaign
 from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import load_campaign
-from lidarops.scene import data
 from lidarops.scene.job import Job
 from lidarops.scene.processing import process_scene
 from lidarops.simulate.campaign import simulate_campaign
@@ -73,7 +72,7 @@ def test_any_number_of_profiles_together_gives_the_same_bits(
     for kind in ("signal", "homogeneous", "elastic", "multiangle", "visibility"):
         assert any(kind in path for path in whole), kind
     # Small scenes are one chunk otherwise.
-    monkeypatch.setattr(data, "IN_MEMORY", 0)
+    monkeypatch.setattr("lidarops.scene.profiles.IN_MEMORY", 0)
     for profiles in (1, 5, PROFILES):
         assert digests([replace(job, profiles_per_chunk=profiles) for job in jobs]) == whole
 

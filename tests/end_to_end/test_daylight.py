@@ -14,7 +14,6 @@ from support.archives.scene_jobs import scene_jobs
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
-from lidarops.scene import data
 from lidarops.scene.job import Job
 from lidarops.scene.processing import process_scene
 from lidarops.simulate.campaign import simulate_campaign
@@ -139,6 +138,6 @@ def test_cycles_of_night_and_day_are_not_mixed_in_scale(products) -> None:
 def test_chunks_do_not_change_what_is_glued(
     jobs: list[Job], written: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(data, "IN_MEMORY", 0)
+    monkeypatch.setattr("lidarops.scene.profiles.IN_MEMORY", 0)
     for profiles in (1, 5):
         assert digests([replace(job, profiles_per_chunk=profiles) for job in jobs]) == written

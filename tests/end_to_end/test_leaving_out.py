@@ -22,11 +22,11 @@ from lidarops.raw.file import RawFile
 from lidarops.records import Plan, PlannedStep, ProductRecord, Role, RunRecord
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
-from lidarops.scene import data, dependence
+from lidarops.scene import dependence
+from lidarops.scene.choices import idle_window, read_windows
 from lidarops.scene.job import Job
 from lidarops.scene.plan import plan_scene
 from lidarops.scene.processing import process_scene
-from lidarops.scene.windows import idle_window, read_windows
 from lidarops.simulate.campaign import simulate_campaign
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}
@@ -426,7 +426,7 @@ def test_products_are_the_same_bits_read_at_once_and_in_chunks(
     scene = catalogued_scenes(campaign)[0]
     job = Job(campaign, scene, plan_scene(scene, campaign))
     usual = [product.sha256 for product in process_scene(job).products]
-    monkeypatch.setattr(data, "IN_MEMORY", bytes_at_once)
+    monkeypatch.setattr("lidarops.scene.profiles.IN_MEMORY", bytes_at_once)
     assert [product.sha256 for product in process_scene(job).products] == usual
 
 

@@ -248,7 +248,7 @@ def test_any_number_of_profiles_at_a_time_gives_the_same_bytes(copied: Campaign)
     before = {path: path.read_bytes() for path in products(copied)}
     # Larger than memory decides: every profile is a chunk of its own.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidarops.scene.data.IN_MEMORY", 0)
+        patch.setattr("lidarops.scene.profiles.IN_MEMORY", 0)
         run("reprocess", file_of(copied), "--force", "--profiles-per-chunk", "1")
     assert {path: path.read_bytes() for path in products(copied)} == before
 

@@ -219,7 +219,7 @@ def test_one_changed_byte_of_an_input_changes_the_id(moved: Campaign, tmp_path: 
 def test_other_software_is_reported_where_bytes_differ(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ):
-    for module in ("lidarops.run.reproduction", "lidarops.scene.context"):
+    for module in ("lidarops.run.reproduction", "lidarops.scene.job"):
         monkeypatch.setattr(f"{module}.code_version", lambda _kind: "0" * 16)
     for module in ("lidarops.run.reproduction", "lidarops.netcdf.provenance"):
         monkeypatch.setattr(f"{module}.package_versions", lambda: {"numpy": "0.1"})

@@ -18,7 +18,7 @@ from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_product
-from lidarops.products.elastic.figure_data import CAUSES, clearest_profile
+from lidarops.products.elastic.figures import CAUSES, clearest_profile
 from lidarops.records import RunRecord
 from lidarops.reports import gallery
 from lidarops.retrieve.elastic.flags import ElasticQuality

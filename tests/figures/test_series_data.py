@@ -21,7 +21,7 @@ from lidarops.figures.series_data import (
     thin,
 )
 from lidarops.flags import Quality
-from lidarops.products.homogeneous.figure_data import read_sections
+from lidarops.products.homogeneous.figures import read_sections
 
 
 def sections_of(product, truth=None, **options):

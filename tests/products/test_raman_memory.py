@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import pytest
 
@@ -29,9 +30,7 @@ def peak(means: int, bins: int, cell: float) -> tuple[float, int]:
         raman,
         molecules=MolecularProfile.us_standard(),
         station_altitude=100.0,
-        assumptions=labeled.Assumptions(
-            SETTINGS, cell, float(counts["range"][-1]), known_shape=True
-        ),
+        settings=replace(SETTINGS, cell=cell, farthest=float(counts["range"][-1])),
     )
     highest = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -21,11 +21,10 @@ from lidarops.netcdf.context import Context
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
-from lidarops.scene import data, dependence, pipe
-from lidarops.scene.channels import counted_channels
-from lidarops.scene.data import ChannelSignal, RowProduct, Source, WholeProduct
+from lidarops.scene import dependence, pipe
+from lidarops.scene.case import counted_channels
 from lidarops.scene.plan import plan_scene
-from lidarops.scene.profiles import Chunk
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, Source, chunks
 from lidarops.scene.retrieval import streams_of
 
 AIR = MolecularProfile.us_standard()
@@ -146,17 +145,12 @@ def carry_out(
     source = Source(raw, dark, files, STATION)
     signal = pipe.channel_signal(source, plan.steps, channel)
     streams = streams_of(plan.steps, signal)
-    rows = {kind: [] for kind, stream in streams.items() if isinstance(stream, RowProduct)}
+    rows = {kind: [] for kind in streams}
     counted = counted_channels(plan.steps, channel)
-    for chunk in data.chunks(source, counted, streams.values(), profiles):
+    for chunk in chunks(source, counted, streams.values(), profiles):
         for kind, stream in streams.items():
-            if isinstance(stream, RowProduct):
-                rows[kind] += stream.rows(chunk)
-            else:
-                stream.add(chunk)
-    return {
-        kind: product_of(rows.get(kind) or [*stream.results()]) for kind, stream in streams.items()
-    }
+            rows[kind] += stream.add(chunk)
+    return {kind: product_of([*rows[kind], *stream.results()]) for kind, stream in streams.items()}
 
 
 def product_of(batches):
@@ -620,15 +614,15 @@ def test_the_background_follows_the_method_of_the_campaign() -> None:
 def test_a_chunk_holds_the_channel_that_is_processed_and_leaves_the_source_lazy() -> None:
     lazy = archive(profiles=3)
     source = Source(lazy, None, NONE, STATION)
-    (chunk,) = data.chunks(source, ["photon_532o"], (), 7)
+    (chunk,) = chunks(source, ["photon_532o"], (), 7)
     assert isinstance(chunk.counts["photon_532o"].data, np.ndarray)
     assert "analog_532o" not in chunk.counts
     assert isinstance(lazy["photon_532o"].data, da.Array)
-    (glued,) = data.chunks(source, ["analog_532o", "photon_532o"], (), 7)
+    (glued,) = chunks(source, ["analog_532o", "photon_532o"], (), 7)
     assert {"photon_532o", "analog_532o"} <= set(glued.counts)
 
 
-class _Ends(WholeProduct):
+class _Ends(ProductStream):
     """A product that allows a chunk to end before some rows only."""
 
     def __init__(self, *rows: int) -> None:
@@ -637,11 +631,9 @@ class _Ends(WholeProduct):
     def ends(self) -> np.ndarray:
         return self._rows
 
-    def add(self, chunk: Chunk) -> None:
+    def add(self, chunk: Chunk) -> tuple[()]:
         """Take nothing."""
-
-    def results(self) -> xr.Dataset:
-        return xr.Dataset()
+        return ()
 
 
 @pytest.mark.parametrize(
@@ -656,9 +648,9 @@ class _Ends(WholeProduct):
     ],
 )
 def test_chunks_end_where_all_products_allow_it(
-    streams: tuple[WholeProduct, ...], profiles: int, edges: list[int]
+    streams: tuple[ProductStream, ...], profiles: int, edges: list[int]
 ) -> None:
     source = Source(archive(), None, NONE, STATION)
-    made = list(data.chunks(source, ["photon_532o"], streams, profiles))
+    made = list(chunks(source, ["photon_532o"], streams, profiles))
     assert [chunk.rows.stop for chunk in made] == edges
     assert [chunk.rows.start for chunk in made] == [0, *edges[:-1]]

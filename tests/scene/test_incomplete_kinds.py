@@ -11,9 +11,9 @@ import pytest
 from lidarops import kinds as all_kinds
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import Kind
-from lidarops.products.signal.settings import SignalSettings
+from lidarops.products.signal import SignalSettings
 from lidarops.scene.pipe import PIPE
-from lidarops.scene.retrieval import making
+from lidarops.scene.retrieval import Making, Retrieval, making
 
 
 @pytest.fixture
@@ -33,32 +33,40 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_a_kind_without_steps_is_incomplete(package: Path) -> None:
     with pytest.raises(LidarOpsError, match=r"incomplete: odd_kind\.retrieval has no RETRIEVAL"):
-        making("odd")
+        making("odd", Retrieval)
     (package / "retrieval.py").write_text("OTHER = 1\n")
     with pytest.raises(LidarOpsError, match="incomplete"):
-        making("odd")
+        making("odd", Retrieval)
 
 
 def test_an_error_in_a_module_of_a_kind_is_not_hidden(package: Path) -> None:
     (package / "retrieval.py").write_text("import no_such_package\n")
     with pytest.raises(ModuleNotFoundError, match="no_such_package"):
-        making("odd")
+        making("odd", Retrieval)
 
 
 def test_the_settings_of_a_kind_have_its_name(package: Path) -> None:
     words = "from lidarops.products.signal.retrieval import RETRIEVAL\n"
     (package / "retrieval.py").write_text(words)
     with pytest.raises(LidarOpsError, match="'odd'"):
-        making("odd")
+        making("odd", Retrieval)
 
 
 def test_a_kind_of_channels_is_no_kind_of_networks(package: Path) -> None:
     words = "from lidarops.products.visibility.retrieval import RETRIEVAL\n"
     (package / "retrieval.py").write_text(words)
     with pytest.raises(LidarOpsError, match="is no Retrieval"):
-        making("odd")
+        making("odd", Retrieval)
 
 
 @pytest.mark.parametrize("kind", all_kinds.kinds())
 def test_entries_of_a_kind_have_names_of_their_own(kind: str) -> None:
-    assert not set(making(kind).settings.model_fields) & set(PIPE)
+    assert not set(making(kind, Making).settings.model_fields) & set(PIPE)
+
+
+def test_a_kind_reads_only_kinds_that_are_made_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    odd = Kind("odd", "Odd", "odd_kind", SignalSettings, rank=1, reads=("signal",))
+    known = {**all_kinds.kinds(), "odd": odd}
+    monkeypatch.setattr(all_kinds, "registered", lambda *_: known)
+    with pytest.raises(LidarOpsError, match="'odd' reads 'signal', which is no"):
+        all_kinds.kinds.__wrapped__()

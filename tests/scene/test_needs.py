@@ -15,8 +15,7 @@ from support.archives.network_plans import granules as network_granules
 from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, PlannedStep, Role
 from lidarops.scene import dependence
-from lidarops.scene.context import recorded_settings
-from lidarops.scene.job import Job
+from lidarops.scene.job import Job, recorded_settings
 from lidarops.scene.plan import plan_scene
 from lidarops.scene.retrieval import settings_model
 

@@ -2,10 +2,61 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
+from pydantic import Field
+
+from lidarops.constants import FIXED, STEEPEST
 from lidarops.kinds import Kind
-from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.settings import (
+    ChannelProduct,
+    PartOfDay,
+    ReferenceSettings,
+    average_interval,
+    background_method,
+    quantity,
+    signal_to_noise_limit,
+)
+
+if TYPE_CHECKING:
+    from lidarops.catalog.folder import InstrumentHeaders
+
+
+class ElasticSettings(ChannelProduct):
+    """The ``elastic`` product: backscatter and extinction of aerosol, from a lidar ratio."""
+
+    channels: list[str] = Field(
+        min_length=1,
+        description="glued_532o is glued from analog_532o and photon_532o of the files",
+    )
+    lidar_ratio: Annotated[float, Field(ge=1, le=200)] = quantity(
+        50.0, unit="sr", description="of particles, extinction over backscatter, at all heights"
+    )
+    lidar_ratio_standard_error: float = quantity(
+        10.0, unit="sr", ge=0, le=100, description="of lidar_ratio"
+    )
+    average: PartOfDay = average_interval()
+    background: Literal["known_shape", "tail_mean"] = background_method()
+    reference: ReferenceSettings = ReferenceSettings()
+    molecular_relative_error: float = quantity(
+        0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
+    )
+    least_signal_to_noise: float = signal_to_noise_limit()
+
+
+def _section(headers: InstrumentHeaders) -> tuple[str, ...]:
+    """Return the lines of the section; empty where no fixed beam reaches clean air."""
+    channels = ", ".join(headers.joined_channels)
+    if not channels or headers.zenith_span > FIXED or headers.zenith_angle > STEEPEST:
+        return ()
+    return (
+        "elastic:",
+        f"  channels: [{channels}]",
+        "  lidar_ratio: 50  # ? sr, of the particles: about 25 (sea salt) to 75 (smoke)",
+        "  lidar_ratio_standard_error: 15  # ? sr",
+        "  average: 30min",
+    )
+
 
 KIND: Final = Kind(
     name="elastic",
@@ -13,4 +64,5 @@ KIND: Final = Kind(
     package=__name__,
     settings=ElasticSettings,
     rank=40,
+    draft=_section,
 )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, ProductSource, View, image_view
@@ -24,11 +26,14 @@ from lidarops.figures.panels import (
     span_in_words,
 )
 from lidarops.figures.raster import raster_variables, read_raster
+from lidarops.figures.series_data import require
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import utc
-from lidarops.products.elastic.figure_data import PROFILE_VARIABLES, Profile, clearest_profile
+from lidarops.kinds import flags_of
 
-_CAUSES: Final = {
+Floats = NDArray[np.float64]
+
+CAUSES: Final = {
     "noise": "noise",
     "background": "background",
     "reference": "reference",
@@ -37,6 +42,104 @@ _CAUSES: Final = {
     "dead_time": "dead time",
     "baseline": "baseline",
 }
+"""Causes of backscatter errors, as in the names of variables, in words."""
+
+_ALONG_TIME: Final = ("time", "reference_bottom", "reference_top")
+_ALONG_BOTH: Final = (
+    "aerosol_backscatter",
+    "aerosol_backscatter_standard_error",
+    "quality_flag",
+    *(f"aerosol_backscatter_error_{cause}" for cause in CAUSES),
+)
+PROFILE_VARIABLES: Final = (
+    *_ALONG_TIME,
+    "range",
+    "molecular_backscatter",
+    "lidar_ratio",
+    *_ALONG_BOTH,
+)
+"""Variables that `clearest_profile` needs."""
+_REJECTED: Final = flags_of("elastic").rejecting
+_WITH_CARE: Final = flags_of("elastic").caring
+_BEYOND: Final = 1.15
+"""A profile is shown to this many times the top of its reference window."""
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """A mean backscatter profile with its error budget, to just beyond the reference."""
+
+    time: np.datetime64
+    """UTC."""
+    range: Floats
+    """m."""
+    backscatter: Floats
+    """m-1 sr-1; NaN where rejected."""
+    standard_error: Floats
+    budget: dict[str, Floats]
+    """Absolute error from each of `CAUSES`, m-1 sr-1."""
+    molecular: Floats
+    """m-1 sr-1."""
+    with_care: NDArray[np.bool_]
+    reference: tuple[float, float]
+    """m."""
+    lidar_ratio: tuple[float, float]
+    """sr, least and largest."""
+
+
+def clearest_profile(product: xr.Dataset) -> Profile | None:
+    """Return the profile with the most unflagged bins below its reference.
+
+    Parameters
+    ----------
+    product : Dataset
+        Kind ``elastic``.
+
+    Returns
+    -------
+    Profile or None
+        The first among equals; None if no profile has a reference and an unflagged bin.
+
+    Raises
+    ------
+    ProductError
+        If a variable is missing or has other dimensions.
+    """
+    require(
+        product,
+        dict.fromkeys(_ALONG_TIME, ("time",))
+        | dict.fromkeys(("range", "molecular_backscatter", "lidar_ratio"), ("range",))
+        | dict.fromkeys(_ALONG_BOTH, ("time", "range")),
+    )
+    r = product["range"].values.astype(np.float64)
+    top = product["reference_top"].values.astype(np.float64)
+    flag = product["quality_flag"].values.astype(np.int64)
+    below = r[np.newaxis, :] <= np.nan_to_num(top)[:, np.newaxis]
+    clear = ((flag == 0) & below).sum(axis=1)
+    if not np.any(np.isfinite(top)) or clear.max() == 0:
+        return None
+    index = int(np.argmax(clear))
+    shown = r <= _BEYOND * top[index]
+    profile = product.isel(time=index, range=shown)
+    bits = flag[index, shown]
+    rejected = (bits & _REJECTED) != 0
+
+    def values(name: str) -> Floats:
+        return np.where(rejected, np.nan, profile[name].values.astype(np.float64))
+
+    return Profile(
+        time=product["time"].values.astype("datetime64[ns]")[index],
+        range=r[shown],
+        backscatter=values("aerosol_backscatter"),
+        standard_error=values("aerosol_backscatter_standard_error"),
+        budget={cause: np.abs(values(f"aerosol_backscatter_error_{cause}")) for cause in CAUSES},
+        molecular=profile["molecular_backscatter"].values.astype(np.float64),
+        with_care=(bits & _WITH_CARE) != 0,
+        reference=(float(profile["reference_bottom"]), float(top[index])),
+        lidar_ratio=(float(profile["lidar_ratio"].min()), float(profile["lidar_ratio"].max())),
+    )
+
+
 _UNIT: Final = "Mm⁻¹ sr⁻¹"
 _MEGA: Final = 1e6
 _HEIGHT: Final = 366
@@ -103,7 +206,7 @@ def _error_budget(profile: Profile, y: Axis) -> Panel:
     causes = {name: _MEGA * values for name, values in profile.budget.items()}
     x = decade_axis(f"error of backscatter ({_UNIT})", [*causes.values(), error])
     lines = [
-        Curve(values, profile.range / 1e3, f"c{number} d{number}", label=_CAUSES[name])
+        Curve(values, profile.range / 1e3, f"c{number} d{number}", label=CAUSES[name])
         for number, (name, values) in enumerate(causes.items())
     ]
     total = Curve(error, profile.range / 1e3, "ink thick", label="total")

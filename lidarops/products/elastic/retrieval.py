@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -12,58 +12,40 @@ import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
-from lidarops.products.elastic.settings import ElasticSettings
+from lidarops.products.elastic import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
-from lidarops.scene.case import REQUESTED, Entries, Entry, NoSettings, ProductCase
-from lidarops.scene.channels import range_channel, range_offset
-from lidarops.scene.choices import AverageSettings, average, with_low_signal_to_noise, with_methods
-from lidarops.scene.data import ChannelSignal, RowProduct, Source
-from lidarops.scene.pointing import fixed_zenith
-from lidarops.scene.profiles import Chunk, ScreenedAverages, gluing
+from lidarops.scene.case import (
+    REQUESTED,
+    Entries,
+    Entry,
+    NoSettings,
+    ProductCase,
+    range_channel,
+    range_offset,
+)
+from lidarops.scene.choices import (
+    AverageSettings,
+    average,
+    fixed_zenith,
+    with_low_signal_to_noise,
+    with_methods,
+)
+from lidarops.scene.profiles import (
+    ChannelSignal,
+    Chunk,
+    ProductStream,
+    ScreenedAverages,
+    Source,
+    gluing,
+)
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
 Case = ProductCase[ElasticSettings]
-
-
-@dataclass(frozen=True, slots=True)
-class _ReferenceLimits:
-    """Limits within which the reference window may lie, m along the beam."""
-
-    bottom: float
-    top: float
-    width: float
-    reason: str
-    """Why there can be no reference window; empty where there can."""
-
-
-def _reference_limits(case: Case) -> _ReferenceLimits:
-    zenith, reason = fixed_zenith(case)
-    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
-    window = case.request.reference
-    # A window is a set of bin centres.
-    ranged = replace(case.channel, name=range_channel(case.channel.name))
-    reach = case.last - 0.5 * case.channel.bin_width + range_offset(ranged, case.facts)
-    bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
-    if not reason and top - bottom < window.width * stretch * (1.0 - 1e-9):
-        reason = (
-            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
-            f" above {window.lowest:g} m"
-        )
-    return _ReferenceLimits(bottom, top, window.width * stretch, reason)
-
-
-def _known_shape(case: Case) -> Entry:
-    """Fit the background with the shape of the signal of aerosol-free air, where requested."""
-    if case.request.background == "known_shape":
-        return case.run("known_shape", "the far range is assumed to be aerosol-free, and tested")
-    return case.leave(
-        "known_shape", "the campaign requests tail_mean; signal in the far range biases it"
-    )
 
 
 class ReferenceWindowSettings(SettingsModel):
@@ -76,14 +58,40 @@ class ReferenceWindowSettings(SettingsModel):
     relative_error: float
 
 
-def _reference(case: Case, limits: _ReferenceLimits) -> Entry:
-    """State where the reference window may lie."""
+def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
+    """Return where the reference window may lie, along the beam; or why there can be none."""
+    zenith, reason = fixed_zenith(case)
+    if reason:
+        return reason
+    stretch = 1.0 / math.cos(math.radians(zenith))
     window = case.request.reference
-    settings = ReferenceWindowSettings.taken_from(
-        window, lowest=limits.bottom, highest=limits.top, width=limits.width
+    # A window is a set of bin centres.
+    ranged = replace(case.channel, name=range_channel(case.channel.name))
+    reach = case.last - 0.5 * case.channel.bin_width + range_offset(ranged, case.facts)
+    bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
+    if top - bottom < window.width * stretch * (1.0 - 1e-9):
+        return (
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    return ReferenceWindowSettings.taken_from(
+        window, lowest=bottom, highest=top, width=window.width * stretch
     )
+
+
+def _known_shape(case: Case) -> Entry:
+    """Fit the background with the shape of the signal of aerosol-free air, where requested."""
+    if case.request.background == "known_shape":
+        return case.run("known_shape", "the far range is assumed to be aerosol-free, and tested")
+    return case.leave(
+        "known_shape", "the campaign requests tail_mean; signal in the far range biases it"
+    )
+
+
+def _reference(case: Case, limits: ReferenceWindowSettings) -> Entry:
+    """State where the reference window may lie."""
     reason = "windows within the campaign's limits are tested against the molecular profile"
-    return case.run("reference", reason, settings, number=limits.top - limits.bottom)
+    return case.run("reference", reason, limits, number=limits.highest - limits.lowest)
 
 
 def _lidar_ratio(case: Case) -> dict[str, Any]:
@@ -122,8 +130,8 @@ class ElasticPlan(SettingsModel):
 def _needs(case: Case) -> Entries:
     """Invert the averaged elastic signals, where a fixed beam reaches aerosol-free air."""
     limits, request = _reference_limits(case), case.request
-    if limits.reason:
-        yield case.leave("elastic", limits.reason)
+    if isinstance(limits, str):
+        yield case.leave("elastic", limits)
         return
     reason = "the noise of a single profile is too large for the inversion"
     yield average(case, request.average, reason)
@@ -149,7 +157,7 @@ _BYTES_OF_A_BIN: Final = 240.0
 memory``."""
 
 
-class _Inversion(RowProduct):
+class _Inversion(ProductStream):
     """Averages of the profiles of a scene, and their inversion."""
 
     def __init__(self, settings: ElasticPlan, signal: ChannelSignal) -> None:
@@ -166,7 +174,7 @@ class _Inversion(RowProduct):
         self._begun = False
         self._lidar_ratio = _ratio_at(settings.elastic, signal.source)
 
-    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+    def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Add the next profiles to their averages, and yield those that are complete, inverted."""
         self._averages.add(chunk)
         for (averages,) in self._averages.completed():

@@ -2,10 +2,126 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
+from pydantic import Field, model_validator
+
+from lidarops.constants import FIXED
 from lidarops.kinds import Kind
-from lidarops.products.homogeneous.settings import HomogeneousSettings
+from lidarops.settings import (
+    NO_UNIT,
+    BackgroundRange,
+    ChannelProduct,
+    Metres,
+    VisibilitySettings,
+    located_error,
+    quantity,
+)
+
+if TYPE_CHECKING:
+    from lidarops.catalog.folder import InstrumentHeaders
+
+NonNegative = Annotated[float, Field(ge=0)]
+Method = Literal["auto", "direct", "cubic", "known_background", "linearized", "known_extinction"]
+_GIVEN_EXTINCTION: Final = ("linearized", "known_extinction")
+"""Methods that start from a given extinction."""
+
+
+class HomogeneousSettings(ChannelProduct):
+    """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
+
+    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
+    sections: list[tuple[Metres, Metres]] = quantity(
+        unit="m",
+        min_length=1,
+        description="near and far end of each section whose air is homogeneous",
+    )
+    method: Method = Field(
+        default="auto",
+        description="known_background takes the background from the far range, for paths that end"
+        " there, or from background; auto does the former where the beam moves and the sections end"
+        " before the last tenth of the bins, and is direct elsewhere; the other methods retrieve it"
+        " from the section. linearized takes one step from extinction, known_extinction takes it"
+        " as exact",
+    )
+    extinction: float | None = quantity(
+        None,
+        unit="m-1",
+        ge=0,
+        le=0.1,
+        description="of molecules and particles, for linearized (known to some percent) and"
+        " known_extinction",
+    )
+    background_range: BackgroundRange | None = quantity(
+        None,
+        unit="m",
+        description="far range of known_background; the last tenth of the bins by default",
+    )
+    background: dict[str, tuple[float, NonNegative]] | None = quantity(
+        None,
+        unit="MHz or mV",
+        description="of known_background, in place of the far range: the background of each"
+        " channel, measured separately, and its standard error; MHz for photon counting, mV for"
+        " analog, with dead time and dark signal corrected",
+    )
+    lag: int | None = quantity(
+        None,
+        unit=NO_UNIT,
+        ge=1,
+        description="bins between those of a triple of the method cubic; by default 0.4 of the bins"
+        " of the section, at 1 the published cubic",
+    )
+    visibility: VisibilitySettings | None = Field(
+        default=None, description="if given, adds visibility along the sections"
+    )
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if len(set(self.sections)) < len(self.sections):
+            raise ValueError("sections lists a section twice")
+        for near, far in self.sections:
+            if far <= near:
+                raise ValueError(f"section [{near}, {far}] must end farther than it starts")
+        if self.background_range is not None and self.method != "known_background":
+            raise located_error("is used by the method known_background only", "background_range")
+        if (self.extinction is not None) != (self.method in _GIVEN_EXTINCTION):
+            raise located_error(
+                f"is required by {' and '.join(_GIVEN_EXTINCTION)}, and used by no other method",
+                "extinction",
+            )
+        if self.lag is not None and self.method != "cubic":
+            raise located_error("is used by the method cubic only", "lag")
+        self._check_background()
+        return self
+
+    def _check_background(self) -> None:
+        """Refuse a given background that no channel, or not every channel, uses."""
+        if self.background is None:
+            return
+        if self.method != "known_background":
+            raise located_error("is used by the method known_background only", "background")
+        if self.background_range is not None:
+            raise located_error("is given together with background; give one", "background_range")
+        if self.background.keys() != set(self.channels):
+            named = ", ".join(self.channels)
+            raise located_error(f"must state each of the channels: {named}", "background")
+
+
+_LEVEL: Final = 1.9
+"""degree above or below the horizon, at which 3 km of path climb 100 m."""
+
+
+def _section(headers: InstrumentHeaders) -> tuple[str, ...]:
+    """Return the lines of the section; empty where no fixed beam is level."""
+    channels = ", ".join(headers.elastic_channels)
+    if not channels or headers.zenith_span > FIXED or abs(headers.zenith_angle - 90.0) > _LEVEL:
+        return ()
+    return (
+        "homogeneous:",
+        f"  channels: [{channels}]",
+        "  sections: [[1000, 4000]]  # ? m, where the air is homogeneous and the signal strong",
+    )
+
 
 KIND: Final = Kind(
     name="homogeneous",
@@ -14,4 +130,5 @@ KIND: Final = Kind(
     settings=HomogeneousSettings,
     rank=20,
     expects_usable=False,
+    draft=_section,
 )

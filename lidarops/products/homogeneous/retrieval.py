@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Final
 
@@ -13,7 +13,7 @@ import xarray as xr
 
 from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.flags import Quality
-from lidarops.products.homogeneous.settings import HomogeneousSettings, Method
+from lidarops.products.homogeneous import HomogeneousSettings, Method
 from lidarops.products.homogeneous.variables import LAYOUT
 from lidarops.records import DetectionMode, is_glued
 from lidarops.retrieve.air import labeled as labeled_visibility
@@ -26,12 +26,17 @@ from lidarops.retrieve.signal.labeled import (
     counts_per_power,
 )
 from lidarops.scene.case import ALL_STEPS, REQUESTED, Entries, Entry, NoSettings, ProductCase
-from lidarops.scene.choices import FEWEST_BINS, tail
-from lidarops.scene.data import ChannelSignal, WholeProduct, in_one_batch
-from lidarops.scene.pointing import moves
-from lidarops.scene.profiles import Chunk
+from lidarops.scene.choices import (
+    ANALOG_NOISE,
+    FEWEST_BINS,
+    WINDOW,
+    WindowSettings,
+    bins_with_noise,
+    moves,
+    tail,
+)
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, in_one_batch
 from lidarops.scene.retrieval import Retrieval, Workload
-from lidarops.scene.windows import ANALOG_NOISE, WINDOW, WindowSettings, bins_with_noise
 from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
 
 Case = ProductCase[HomogeneousSettings]
@@ -275,14 +280,14 @@ def _partly_slanted(case: Case, near: float, far: float) -> Entry:
     return case.leave("homogeneous", reason, number=float(steep), rule="beam_level")
 
 
-class _Sections(WholeProduct):
+class _Sections(ProductStream):
     """Values of the sections of each profile."""
 
     def __init__(self, settings: HomogeneousPlan, signal: ChannelSignal) -> None:
         self._settings, self._signal = settings.homogeneous, signal
         self._parts: list[xr.Dataset] = []
 
-    def add(self, chunk: Chunk) -> None:
+    def add(self, chunk: Chunk) -> Iterable[xr.Dataset]:
         """Retrieve the sections of the next profiles."""
         profiles = self._signal.profiles
         shots = profiles.shots(chunk.counts)
@@ -292,6 +297,7 @@ class _Sections(WholeProduct):
         self._parts.append(sections.assign_coords(chunk.geometry.variables))
         if len(self._parts) == _PARTS:
             self._parts = [self._joined()]
+        return ()
 
     def _retrieved(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.Dataset:
         settings, quality = self._settings, conditioned["quality"]

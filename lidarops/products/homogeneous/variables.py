@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, get_args
 
-from lidarops.flags import Flags, Quality
+from lidarops.flags import RAW_BITS, Flags, Quality
 from lidarops.netcdf.quantities import total_extinction, visibility
 from lidarops.netcdf.variables import (
     MEASURED_SHARES,
@@ -19,17 +19,14 @@ from lidarops.netcdf.variables import (
     retrieval_method,
     shots,
 )
-from lidarops.products.homogeneous.settings import Method
+from lidarops.products.homogeneous import Method
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
 FLAGS: Final = Flags(
     kind="homogeneous",
     version=2,
     bits=(
-        Quality.INPUT_MISSING,
-        Quality.SATURATED,
-        Quality.PILE_UP,
-        Quality.INCOMPLETE_OVERLAP,
+        *RAW_BITS,
         Quality.TOO_FEW_BINS,
         Quality.NO_SIGNAL,
         Quality.LOW_SIGNAL,

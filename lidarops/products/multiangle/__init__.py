@@ -2,10 +2,89 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final, Literal, Self
 
+from pydantic import Field, model_validator
+
+from lidarops.constants import LEAST_SPREAD
 from lidarops.kinds import CommonQuantity, Kind
-from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.settings import (
+    ChannelProduct,
+    Metres,
+    background_method,
+    located_error,
+    quantity,
+    signal_to_noise_limit,
+)
+
+if TYPE_CHECKING:
+    from lidarops.catalog.folder import InstrumentHeaders
+
+Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"]
+
+
+class MultiAngleSettings(ChannelProduct):
+    """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
+
+    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
+    highest: Metres = quantity(6000.0, unit="m", description="highest altitude above the station")
+    step: float = quantity(60.0, unit="m", ge=5, le=1000, description="distance of altitudes")
+    method: Method = Field(
+        default="auto",
+        description="two_angle uses the shortest and the longest path; kano_hamilton a regression"
+        " at each altitude; joint then one smooth profile through all altitudes; mld a regularised"
+        " derivative along the path; mld_prior the same on the difference from the altitude below."
+        " auto is two_angle for two beams, joint for more, kano_hamilton where the errors of joint"
+        " would be too small",
+    )
+    regularisation: float | None = quantity(
+        None,
+        unit="1",
+        ge=0,
+        le=1e6,
+        description="strength of the penalty of mld and mld_prior; by default the largest with"
+        " residuals not larger than the noise, at each altitude",
+    )
+    background: Literal["known_shape", "tail_mean"] = background_method()
+    layers: list[tuple[float, float]] = quantity(
+        [],
+        unit="m",
+        description="above the station: bottom and top of layers whose optical depth is written",
+    )
+    largest_gradient: float = quantity(
+        5e-5,
+        unit="m-1",
+        ge=0,
+        le=1e-2,
+        description="largest horizontal gradient of ln(backscatter) included in the error",
+    )
+
+    least_signal_to_noise: float = signal_to_noise_limit()
+
+    @model_validator(mode="after")
+    def _holds_altitudes(self) -> Self:
+        if self.highest < 10 * self.step:
+            raise ValueError("highest must be at least 10 times step")
+        if self.regularisation is not None and not self.method.startswith("mld"):
+            raise located_error("is used by the methods mld and mld_prior only", "regularisation")
+        for low, high in self.layers:
+            if not 0 <= low <= high - self.step or high > self.highest:
+                raise ValueError("layers must be at least one step deep, between 0 and highest")
+        return self
+
+
+def _section(headers: InstrumentHeaders) -> tuple[str, ...]:
+    """Return the lines of the section; empty where the beam does not scan."""
+    channels = ", ".join(headers.scanned_channels)
+    if not channels or headers.zenith_span < LEAST_SPREAD:
+        return ()
+    return (
+        "multiangle:",
+        "  # all elastic channels, which test each other; leave out what has no usable detector",
+        f"  channels: [{channels}]",
+        "  highest: 3000  # ? m above the station, where signals end",
+    )
+
 
 KIND: Final = Kind(
     name="multiangle",
@@ -22,4 +101,5 @@ KIND: Final = Kind(
         ),
         errors_of_air=("vertical_optical_depth_gradient_error",),
     ),
+    draft=_section,
 )

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.products.multiangle.settings import MultiAngleSettings
+from lidarops.products.multiangle import MultiAngleSettings
 from lidarops.records import DetectionMode
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS

@@ -20,6 +20,7 @@ import xarray as xr
 from lidarops.constants import KNOWN_SHAPE_PAPERS, MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
 from lidarops.netcdf.variables import BACKGROUND_METHOD
+from lidarops.products.multiangle import Method, MultiAngleSettings
 from lidarops.products.multiangle.baseline import (
     add_low_beams,
     blocked_in_words,
@@ -27,7 +28,6 @@ from lidarops.products.multiangle.baseline import (
     plan_baseline,
     with_baseline,
 )
-from lidarops.products.multiangle.settings import Method, MultiAngleSettings
 from lidarops.products.multiangle.variables import LAYOUT
 from lidarops.records import Granule
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
@@ -36,10 +36,8 @@ from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, Blocked
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.scene.case import REQUESTED, Entries, Entry, NoSettings, ProductCase
-from lidarops.scene.choices import BackgroundSettings, background, with_low_signal_to_noise
-from lidarops.scene.data import ChannelSignal, WholeProduct, in_one_batch
-from lidarops.scene.pointing import no_scan
-from lidarops.scene.profiles import Chunk, Indices
+from lidarops.scene.choices import BackgroundSettings, background, no_scan, with_low_signal_to_noise
+from lidarops.scene.profiles import ChannelSignal, Chunk, Indices, ProductStream, in_one_batch
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
@@ -376,7 +374,7 @@ _BYTES_OF_AN_ALTITUDE: Final = 430.0
 throughput --case memory`` measures."""
 
 
-class _Scans(WholeProduct):
+class _Scans(ProductStream):
     """Scan cycles in altitude cells, and their optical depth."""
 
     def __init__(self, settings: MultiAnglePlan, signal: ChannelSignal) -> None:
@@ -411,11 +409,12 @@ class _Scans(WholeProduct):
         """Return the rows before which a chunk may end: those that begin a cycle."""
         return self._cycles.ends()
 
-    def add(self, chunk: Chunk) -> None:
+    def add(self, chunk: Chunk) -> Iterable[xr.Dataset]:
         """Average the cycles of the next profiles over altitude cells."""
         profiles = self._signal.profiles
         add_low_beams(self._blocked, chunk, profiles)
         self._cycles.add(chunk.profiles(profiles), chunk.rows.start)
+        return ()
 
     def _without_baseline(self, baseline: AnalogBaseline) -> AltitudeCycles:
         """Return the cycles of all profiles, read again, from which a baseline is subtracted."""

@@ -26,7 +26,7 @@ from lidarops.netcdf.variables import (
     retrieval_method,
     shots,
 )
-from lidarops.products.multiangle.settings import Method
+from lidarops.products.multiangle import Method
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from typing import Final, cast
 
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
-from lidarops.products.raman.settings import RamanProductSettings
+from lidarops.products.raman import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
@@ -24,12 +25,30 @@ from lidarops.retrieve.raman.signals import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
-from lidarops.scene.case import REQUESTED, Entries, ProductCase
-from lidarops.scene.channels import file_channels, member_channel, range_channel, wavelength
-from lidarops.scene.choices import AverageSettings, average, with_low_signal_to_noise, with_methods
-from lidarops.scene.data import ChannelSignal, ProductStream, RowProduct, WholeProduct, in_one_batch
-from lidarops.scene.pointing import fixed_zenith
-from lidarops.scene.profiles import Averages, Chunk, ScreenedAverages
+from lidarops.scene.case import (
+    REQUESTED,
+    Entries,
+    ProductCase,
+    file_channels,
+    member_channel,
+    range_channel,
+    wavelength,
+)
+from lidarops.scene.choices import (
+    AverageSettings,
+    average,
+    fixed_zenith,
+    with_low_signal_to_noise,
+    with_methods,
+)
+from lidarops.scene.profiles import (
+    Averages,
+    ChannelSignal,
+    Chunk,
+    ProductStream,
+    ScreenedAverages,
+    in_one_batch,
+)
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
@@ -218,30 +237,17 @@ _BYTES_OF_A_SOLUTION: Final = 80.0
 """Bytes per pair of cells of the profile that is being solved."""
 
 
-def _assumptions(settings: RetrievalSettings, signal: ChannelSignal) -> labeled.Assumptions:
-    return labeled.Assumptions(
-        RamanSettings(
-            wavelength=signal.wavelength,
-            raman_wavelength=signal.channels[settings.nitrogen].wavelength,
-            angstrom_exponent=settings.angstrom_exponent,
-            angstrom_standard_error=settings.angstrom_standard_error,
-            lowest=settings.lowest,
-            highest=settings.highest,
-            width=settings.width,
-            scattering_ratio=settings.scattering_ratio,
-            reference_relative_error=settings.reference_relative_error,
-            molecular_relative_error=settings.molecular_relative_error,
-            overlap_relative_error=settings.overlap_relative_error,
-            molecular_slope_error=settings.molecular_slope_error,
-        ),
-        cell=settings.cell,
-        highest=settings.farthest,
-        known_shape=settings.known_shape,
-        filter_width=settings.filter_width,
+def _assumed(settings: RetrievalSettings, signal: ChannelSignal) -> RamanSettings:
+    """Return what the retrieval assumes: the wavelengths, and what the plan states."""
+    _, _, *stated = fields(RamanSettings)
+    return RamanSettings(
+        signal.wavelength,
+        signal.channels[settings.nitrogen].wavelength,
+        **{field.name: getattr(settings, field.name) for field in stated},
     )
 
 
-class _Retrieval(RowProduct):
+class _Retrieval(ProductStream):
     """Averages of the profiles of all channels, and their retrieval."""
 
     def __init__(self, settings: RamanPlan, signal: ChannelSignal) -> None:
@@ -256,7 +262,7 @@ class _Retrieval(RowProduct):
             Screening(cloud_contrast(signal.wavelength), settings.raman.highest),
         )
 
-    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+    def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Add the next profiles to their averages, and yield those that are complete."""
         self._averages.add(chunk)
         for means in self._averages.completed():
@@ -275,7 +281,7 @@ class _Retrieval(RowProduct):
             nitrogen,
             molecules=signal.molecules,
             station_altitude=signal.source.station_altitude,
-            assumptions=_assumptions(settings, signal),
+            settings=_assumed(settings, signal),
             water=None if water is None else self._water(water),
             overlap=signal.overlap_at(elastic["range"].to_numpy()),
             overlap_is_stated=signal.full_overlap_range is not None,
@@ -317,20 +323,18 @@ def _without_signal(settings: RetrievalSettings, signal: ChannelSignal) -> str:
     )
 
 
-class _Dark(WholeProduct):
+class _Dark(ProductStream):
     """A product without values, whose rows are the averages of a scene without Raman signal."""
+
+    reads = False
 
     def __init__(self, settings: RamanPlan, signal: ChannelSignal, reason: str) -> None:
         self._settings, self._signal, self._reason = settings, signal, reason
         self.notes = [f"raman of {signal.channel}: {reason}"]
 
-    @property
-    def reads(self) -> bool:
-        """Nothing is read."""
-        return False
-
-    def add(self, chunk: Chunk) -> None:
+    def add(self, chunk: Chunk) -> Iterable[xr.Dataset]:  # noqa: ARG002
         """Take nothing of the profiles."""
+        return ()
 
     def results(self) -> Iterator[xr.Dataset]:
         """Yield the empty product."""
@@ -343,7 +347,7 @@ class _Dark(WholeProduct):
             signal.source.pointing,
             molecules=signal.molecules,
             station_altitude=signal.source.station_altitude,
-            assumptions=_assumptions(settings.raman, signal),
+            settings=_assumed(settings.raman, signal),
         )
         product = with_methods(empty, signal.molecules, known_shape=settings.raman.known_shape)
         return in_one_batch(product.assign_attrs(steps=f"raman: {self._reason}"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from lidarops.flags import Flags, Quality
+from lidarops.flags import RAW_BITS, Flags, Quality
 from lidarops.netcdf.quantities import (
     AEROSOL_LIDAR_RATIO,
     AVERAGED,
@@ -40,10 +40,7 @@ FLAGS: Final = Flags(
     kind="raman",
     version=1,
     bits=(
-        Quality.INPUT_MISSING,
-        Quality.SATURATED,
-        Quality.PILE_UP,
-        Quality.INCOMPLETE_OVERLAP,
+        *RAW_BITS,
         Quality.SINGLE_RECORD,
         Quality.LOW_SIGNAL_TO_NOISE,
         Quality.BACKGROUND_UNCERTAIN,

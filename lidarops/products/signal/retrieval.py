@@ -12,7 +12,7 @@ import xarray as xr
 from lidarops.constants import CUBIC_PAPER
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import BACKGROUND_METHOD
-from lidarops.products.signal.settings import SignalSettings
+from lidarops.products.signal import SignalSettings
 from lidarops.products.signal.variables import LAYOUT
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, Entries, ProductCase
@@ -23,8 +23,7 @@ from lidarops.scene.choices import (
     tail,
     with_low_signal_to_noise,
 )
-from lidarops.scene.data import ChannelSignal, RowProduct
-from lidarops.scene.profiles import Chunk, gluing
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
 from lidarops.scene.retrieval import Retrieval
 from lidarops.settings import SettingsModel
 
@@ -61,7 +60,7 @@ def _needs(case: ProductCase[SignalSettings]) -> Entries:
     yield case.run("signal", REQUESTED, settings, needs=taken)
 
 
-class _Signals(RowProduct):
+class _Signals(ProductStream):
     """Range-corrected signals of each profile."""
 
     def __init__(self, settings: SignalPlan, signal: ChannelSignal) -> None:
@@ -71,7 +70,7 @@ class _Signals(RowProduct):
         self._overlap = signal.overlap_at(signal.profiles.range)
         self._geometry = signal.source.geometry
 
-    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+    def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Yield the signals of profiles."""
         if chunk.rows.start == 0:
             yield self._frame()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.flags import Flags, Quality
+from lidarops.flags import RAW_BITS, Flags, Quality
 from lidarops.netcdf.variables import (
     ALONG_BEAM,
     BACKGROUND_METHOD,
@@ -23,10 +23,7 @@ FLAGS: Final = Flags(
     kind="signal",
     version=2,
     bits=(
-        Quality.INPUT_MISSING,
-        Quality.SATURATED,
-        Quality.PILE_UP,
-        Quality.INCOMPLETE_OVERLAP,
+        *RAW_BITS,
         Quality.SINGLE_RECORD,
         Quality.NO_REAL_SOLUTION,
         Quality.LOW_SIGNAL_TO_NOISE,

@@ -8,18 +8,19 @@ from dataclasses import dataclass
 from typing import Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, Station, channel_facts
-from lidarops.products.visibility.settings import VisibilityProductSettings
+from lidarops.products.visibility import VisibilityProductSettings
 from lidarops.records import ChannelLayout, Granule, Scene
 from lidarops.retrieve.network import geometry
-from lidarops.scene.case import ChannelCase
-from lidarops.scene.channels import (
+from lidarops.scene.case import (
+    ChannelCase,
     channel_ranges,
     joined_layout,
     member_channel,
     range_channel,
     wavelength,
 )
-from lidarops.scene.conditioning import NO_WAVELENGTH
+from lidarops.scene.dependence import scene_facts
+from lidarops.scene.pipe import NO_WAVELENGTH
 from lidarops.settings import SettingsModel
 
 NAME: Final = "visibility"
@@ -54,8 +55,7 @@ class MemberCase:
     @property
     def facts(self) -> InstrumentFacts:
         """Facts about the instrument."""
-        instrument = self.campaign.instruments[self.scene.instrument]
-        return instrument.facts_at(self.scene.granules[0].start or self.scene.start)
+        return scene_facts(self.campaign, self.scene)
 
     @property
     def channel(self) -> ChannelLayout:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -13,6 +12,11 @@ import xarray as xr
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts
 from lidarops.flags import Quality
+from lidarops.products.visibility import (
+    MultiplierValue,
+    PriorName,
+    VisibilityProductSettings,
+)
 from lidarops.products.visibility.network import (
     NAME,
     SAME_POINTING,
@@ -21,39 +25,42 @@ from lidarops.products.visibility.network import (
     angle_between,
     crossings,
 )
-from lidarops.products.visibility.settings import (
-    MultiplierValue,
-    PriorName,
-    VisibilityProductSettings,
-)
 from lidarops.products.visibility.variables import LAYOUT
-from lidarops.records import ChannelLayout, DetectionMode, LeftOut, PlannedStep, is_glued
+from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
 from lidarops.retrieve.air.labeled import VisibilityDefinition
 from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BeamAverages
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled_averaging import joined
-from lidarops.scene.case import ALL_STEPS, ChannelCase, Entries, Entry, NoSettings, ProductCase
-from lidarops.scene.channels import READ_STEP, file_channels, member_channel
+from lidarops.scene.case import (
+    ALL_STEPS,
+    READ_STEP,
+    ChannelCase,
+    Entries,
+    Entry,
+    NoSettings,
+    ProductCase,
+    file_channels,
+    member_channel,
+    product_channel,
+)
 from lidarops.scene.choices import (
+    ANALOG_NOISE,
+    WINDOW,
     AverageSettings,
     BackgroundSettings,
+    WindowSettings,
     average,
     background,
+    bins_with_noise,
+    bins_within,
+    merged,
     tail,
 )
 from lidarops.scene.pipe import plan_stages
 from lidarops.scene.profiles import Averages, Chunk, Indices
 from lidarops.scene.retrieval import Member, NetworkCase, NetworkRetrieval, NetworkStream, Workload
-from lidarops.scene.windows import (
-    ANALOG_NOISE,
-    WINDOW,
-    WindowSettings,
-    bins_with_noise,
-    bins_within,
-    merged,
-)
 from lidarops.settings import SettingsModel, VisibilitySettings
 
 Case = ProductCase[VisibilityProductSettings]
@@ -234,9 +241,7 @@ class _NetworkPlan:
     @property
     def _joint_case(self) -> Case:
         """The case of the steps of the whole network."""
-        channel = ChannelLayout(
-            self._settings.channel, DetectionMode.PHOTON, math.nan, 0, math.nan, 0
-        )
+        channel = product_channel(self._settings.channel)
         return self._of_product(
             ChannelCase(self._scene, channel, InstrumentFacts(), ChannelFacts())
         )

@@ -65,21 +65,6 @@ class WaterVapour:
     constant_standard_error: float
 
 
-@dataclass(frozen=True, slots=True)
-class Assumptions:
-    """What is assumed for a retrieval; lengths are along the beam."""
-
-    settings: RamanSettings
-    cell: float
-    """m, length of a cell."""
-    highest: float
-    """m, farthest range of cells."""
-    known_shape: bool
-    """Whether the background is fitted with the shape of clean air."""
-    filter_width: float | None = None
-    """m, full width at half maximum of the filter of nitrogen; None where all lines pass."""
-
-
 _Bins = tuple[slice, float]
 """Bins of a channel for the ranges that all channels have in common, and the weight of the bin
 beyond in the value at a common range; 0 where ranges agree."""
@@ -166,7 +151,7 @@ def retrieve(
     *,
     molecules: MolecularProfile,
     station_altitude: float,
-    assumptions: Assumptions,
+    settings: RamanSettings,
     water: WaterVapour | None = None,
     overlap: Array | None = None,
     overlap_is_stated: bool = True,
@@ -183,7 +168,7 @@ def retrieve(
     molecules : MolecularProfile
     station_altitude : float
         m above mean sea level.
-    assumptions : Assumptions
+    settings : RamanSettings
     water : WaterVapour, optional
     overlap : (range,) float, optional
         Overlap function at the ranges of `elastic`, common to all channels; NaN where it is not
@@ -214,15 +199,14 @@ def retrieve(
         for averages, part in zip((elastic, *others), bins, strict=True)
     ]
     seen = np.ones(distance.size) if overlap is None else overlap[bins[0][0]]
-    settings = assumptions.settings
     heights = station_altitude + climb * distance
-    air = _air(molecules, heights, distance, settings, assumptions.filter_width, seen)
-    cells = make_cells(distance, min(assumptions.highest, float(distance[-1])), assumptions.cell)
+    air = _air(molecules, heights, distance, settings, settings.filter_width, seen)
+    cells = make_cells(distance, min(settings.farthest, float(distance[-1])), settings.cell)
     of_elastic, elastic_uncertain = channels[0].signal(
-        air.backscatter * air.elastic_shape, known_shape=assumptions.known_shape
+        air.backscatter * air.elastic_shape, known_shape=settings.known_shape
     )
     of_raman, raman_uncertain = channels[1].signal(
-        air.raman_shape, known_shape=assumptions.known_shape
+        air.raman_shape, known_shape=settings.known_shape
     )
     quality = _quality(cells, channels[:2], seen)
     uncertain = elastic_uncertain | raman_uncertain
@@ -233,7 +217,7 @@ def retrieve(
     variables = {
         **_variables(result, cells, air, of_raman, settings, stated),
         **_reference_variables(result, settings, sky),
-        **_cloud_variables(channels[0].averages, assumptions, cells, result, sky),
+        **_cloud_variables(channels[0].averages, settings, cells, result, sky),
         "background": ("time", of_elastic.background),
         "background_standard_error": ("time", of_elastic.background_standard_error),
         "profiles": elastic["profiles"],
@@ -241,9 +225,7 @@ def retrieve(
         "shots": elastic["shots"],
     }
     if water is not None:
-        of_water, doubtful = _water(
-            water, channels[2], of_raman, air, cells, result, sky, assumptions
-        )
+        of_water, doubtful = _water(water, channels[2], of_raman, air, cells, result, sky, settings)
         dims, bits = variables["quality_flag"]
         doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
         variables |= {**of_water, "quality_flag": (dims, bits | doubt)}
@@ -260,7 +242,7 @@ def without_signal(
     *,
     molecules: MolecularProfile,
     station_altitude: float,
-    assumptions: Assumptions,
+    settings: RamanSettings,
 ) -> xr.Dataset:
     """Return the product of profiles in which a look found no Raman signal.
 
@@ -274,7 +256,7 @@ def without_signal(
         m, of the elastic channel.
     pointing : mapping of str to float
         Scalar coordinates in degree, ``zenith_angle`` among them.
-    molecules, station_altitude, assumptions
+    molecules, station_altitude, settings
         As for `retrieve`.
 
     Returns
@@ -304,7 +286,7 @@ def without_signal(
         empty,
         molecules=molecules,
         station_altitude=station_altitude,
-        assumptions=replace(assumptions, known_shape=False),
+        settings=replace(settings, known_shape=False),
     )
     missing = RamanQuality.WEAK_SIGNAL | RamanQuality.NO_REFERENCE | RamanQuality.NO_LIDAR_RATIO
     unknown = xr.full_like(product["overlap"], np.nan)
@@ -448,10 +430,10 @@ def _reference_variables(result: RamanResult, settings: RamanSettings, sky: _Sky
 
 
 def _cloud_variables(
-    averages: xr.Dataset, assumptions: Assumptions, cells: Cells, result: RamanResult, sky: _Sky
+    averages: xr.Dataset, settings: RamanSettings, cells: Cells, result: RamanResult, sky: _Sky
 ) -> dict[str, Any]:
     """Return the clouds of the elastic signal, and the quality with their bits."""
-    both, settings = ("time", "range"), assumptions.settings
+    both = ("time", "range")
     distance = averages["range"].to_numpy()
     air = _clouds.air_along(sky.molecules, sky.altitude(distance), distance, settings.wavelength)
     contrast = cloud_contrast(settings.wavelength)
@@ -467,7 +449,7 @@ def _cloud_variables(
         means,
         averages,
         reference,
-        known_shape=assumptions.known_shape,
+        known_shape=settings.known_shape,
         overlap_is_stated=sky.overlap_is_stated,
     )
     state = state_of_cells(clouds.state, cells, _clouds.UNKNOWN)
@@ -541,15 +523,15 @@ def _water(
     cells: Cells,
     result: RamanResult,
     sky: _Sky,
-    assumptions: Assumptions,
+    settings: RamanSettings,
 ) -> tuple[dict[str, Any], Booleans]:
     """Return the mixing ratio of water vapour with its errors, and the cells that are doubtful."""
-    settings, heights = assumptions.settings, sky.altitude(air.range)
+    heights = sky.altitude(air.range)
     density = sky.molecules.number_density(heights)
     depth = _depth(sky.molecules, heights, air.range, water.wavelength)
     # The share of the lines of nitrogen that the filter passes is not that of water vapour.
     shape = replace(air, raman_depth=depth, density=density)
-    vapour, uncertain = channel.signal(shape.raman_shape, known_shape=assumptions.known_shape)
+    vapour, uncertain = channel.signal(shape.raman_shape, known_shape=settings.known_shape)
     share = air.density / density
     errors = (
         water.constant_standard_error / water.constant,

@@ -250,7 +250,7 @@ def touched(mask: Booleans, resolution: Array, step: float) -> Booleans:
 
 @dataclass(frozen=True, slots=True)
 class RamanSettings:
-    """What is assumed, with standard errors."""
+    """What is assumed, with standard errors; lengths are along the beam."""
 
     wavelength: float
     """m, of the laser."""
@@ -273,7 +273,15 @@ class RamanSettings:
     overlap_relative_error: float = 0.0
     """Of one minus the overlap."""
     molecular_slope_error: float = 0.0
-    """m-1 along the beam, of the derivative of the logarithm of the density of air."""
+    """m-1, of the derivative of the logarithm of the density of air."""
+    cell: float = 60.0
+    """m, length of a cell."""
+    farthest: float = 15_000.0
+    """m, of cells."""
+    known_shape: bool = True
+    """Whether the background is fitted with the shape of clean air."""
+    filter_width: float | None = None
+    """m, full width at half maximum of the filter of nitrogen; None where all lines pass."""
 
     @property
     def ratio(self) -> float:

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.products.elastic.settings import ReferenceSettings
+from lidarops.products.elastic import ReferenceSettings
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled

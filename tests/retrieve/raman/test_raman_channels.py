@@ -14,7 +14,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.labeled import Assumptions, WaterVapour, retrieve
+from lidarops.retrieve.raman.labeled import WaterVapour, retrieve
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
     WATER_SHIFT,
@@ -84,7 +84,7 @@ def retrieved(nitrogen=None, water=None, filter_width=None, seen=1.0, **argument
         nitrogen,
         molecules=AIR,
         station_altitude=0.0,
-        assumptions=Assumptions(SETTINGS, 60.0, 12_000.0, True, filter_width),
+        settings=replace(SETTINGS, farthest=12_000.0, filter_width=filter_width),
         water=None if water is None else WaterVapour(water, WATER, 1.0, 0.03),
         **arguments,
     )

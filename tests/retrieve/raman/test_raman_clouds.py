@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -9,7 +11,7 @@ from support.raman_signals import LASER, make_sky, mean_over
 
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.labeled import Assumptions, retrieve
+from lidarops.retrieve.raman.labeled import retrieve
 from lidarops.retrieve.raman.signals import largest_of_cells, make_cells, state_of_cells, touched
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import (
@@ -87,7 +89,7 @@ def product_of(cloudy, cirrus=CIRRUS):
         raman,
         molecules=MolecularProfile.us_standard(),
         station_altitude=0.0,
-        assumptions=Assumptions(clear.settings, 60.0, 10_000.0, known_shape=True),
+        settings=replace(clear.settings, farthest=10_000.0),
         overlap=clear.air.overlap,
     )
 

@@ -17,7 +17,7 @@ import xarray as xr
 from support.raman_signals import along, mean_over, sliding_line
 
 from lidarops.flags import Quality
-from lidarops.products.raman.settings import RamanProductSettings, RamanReferenceSettings
+from lidarops.products.raman import RamanProductSettings, RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.signals import (

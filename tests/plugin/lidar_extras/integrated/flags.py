@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.flags import FlagBit, Flags, Quality, Severity
+from lidarops.flags import RAW_BITS, FlagBit, Flags, Quality, Severity
 
 
 class IntegratedQuality(FlagBit):
@@ -21,10 +21,7 @@ FLAGS: Final = Flags(
     kind="integrated",
     version=1,
     bits=(
-        Quality.INPUT_MISSING,
-        Quality.SATURATED,
-        Quality.PILE_UP,
-        Quality.INCOMPLETE_OVERLAP,
+        *RAW_BITS,
         Quality.BACKGROUND_UNCERTAIN,
         Quality.NO_GLUING,
         *IntegratedQuality,

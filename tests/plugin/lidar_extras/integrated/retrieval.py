@@ -11,11 +11,9 @@ import xarray as xr
 from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
-from lidarops.scene.case import REQUESTED, Entries, ProductCase
-from lidarops.scene.channels import channel_ranges
+from lidarops.scene.case import REQUESTED, Entries, ProductCase, channel_ranges
 from lidarops.scene.choices import FEWEST_BINS, BackgroundSettings, background, tail
-from lidarops.scene.data import ChannelSignal, RowProduct
-from lidarops.scene.profiles import Chunk, gluing
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
 from lidarops.scene.retrieval import Retrieval
 from lidarops.settings import SettingsModel
 
@@ -61,7 +59,7 @@ def needs(case: ProductCase[IntegratedSettings]) -> Entries:
         yield case.run("integrated", REQUESTED, settings, needs=taken, number=number)
 
 
-class _Integrals(RowProduct):
+class _Integrals(ProductStream):
     """Integrals of each profile."""
 
     def __init__(self, settings: IntegratedPlan, signal: ChannelSignal) -> None:
@@ -89,7 +87,7 @@ class _Integrals(RowProduct):
         words = background_words(method, background_range)
         return frame.assign(bins=("window", bins)).assign_attrs(steps=words)
 
-    def rows(self, chunk: Chunk) -> Iterator[xr.Dataset]:
+    def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Yield the integrals of profiles."""
         if chunk.rows.start == 0:
             yield self._frame()
