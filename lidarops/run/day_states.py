@@ -124,9 +124,9 @@ class DayStates:
     @cached_property
     def _read_by_months(self) -> frozenset[str]:
         """Kinds of which requested products of months are made."""
-        requested = requested_kinds(self.campaign)
-        months = (kind for kind in kinds_of(Scope.MONTH) if kind.name in requested)
-        return frozenset(name for kind in months for name in kind.reads)
+        months = kinds_of(Scope.MONTH)
+        requested = requested_kinds(self.campaign) if months else ()
+        return frozenset(n for kind in months if kind.name in requested for n in kind.reads)
 
     def months(self, days: Iterable[int]) -> list[int]:
         """Return the first days of the months of some days; none where no product reads a month."""

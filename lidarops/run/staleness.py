@@ -19,6 +19,7 @@ from lidarops.catalog.headers import HEADER_BYTES
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Dependence, LastTry, RecordedProduct, Store, Verdict
 from lidarops.errors import ProductError, RawFormatError
+from lidarops.kinds import reads_of
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
 from lidarops.plan.outlying_headers import NEAR_DAYS, new_notes, without_outlying
@@ -453,10 +454,10 @@ class Judge(DayStates):
         self, judged: Judgement, product: ProductKey, made: Mapping[str, RecordedProduct]
     ) -> tuple[InputRecord, ...]:
         """Return the products that are there or to be made, and of which a product is made."""
-        scene, (closure, _) = (
-            judged.scene,
-            self.plan_and_settings(judged.scene, judged.plan, product),
-        )
+        scene = judged.scene
+        if not reads_of(product[0]):
+            return ()
+        closure, _ = self.plan_and_settings(scene, judged.plan, product)
         keys = [key for step in closure.steps for key in dependence.read_products(step)]
         of_scene = (self._read(product_file(scene, key), made) for key in keys)
         return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)

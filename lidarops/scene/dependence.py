@@ -294,13 +294,13 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     raw = {Role.SIGNAL: reads_files(plan), Role.DARK: _reads_dark(plan)}
     named = ancillary_files(plan.steps)
     products = {product for step in plan.steps for product in read_products(step)}
-
-    def is_read(file: InputRecord) -> bool:
-        if file.role is Role.PRODUCT:
-            return product_of_path(file.path) in products
-        return raw.get(file.role, False) or file.path in named
-
-    return tuple(filter(is_read, files))
+    return tuple(
+        file
+        for file in files
+        if raw.get(file.role)
+        or file.path in named
+        or (file.role is Role.PRODUCT and product_of_path(file.path) in products)
+    )
 
 
 def reads_files(plan: Plan) -> bool:

@@ -36,7 +36,7 @@ from lidarops.scene.case import (
     prepared_channels,
     product_channel,
 )
-from lidarops.scene.dependence import ProductKey, is_product, read_products, scene_facts
+from lidarops.scene.dependence import ProductKey, is_product, scene_facts
 from lidarops.scene.pipe import AIR, PIPE, plan_stages
 from lidarops.scene.retrieval import Derivation, NetworkCase, NetworkRetrieval, Retrieval, making
 from lidarops.settings import ChannelProduct
@@ -226,8 +226,6 @@ def _linked(entries: Sequence[Entry]) -> Iterator[Entry]:
 
     def is_held(need: str, step: PlannedStep) -> bool:
         channel, _, name = need.rpartition("/")
-        if (name, channel or step.channel) in read_products(step):
-            return True
         return any(
             (channel or step.channel, step.instrument, product, name) in places
             for product in ("", step.product)
@@ -235,7 +233,9 @@ def _linked(entries: Sequence[Entry]) -> Iterator[Entry]:
 
     for entry in entries:
         if isinstance(entry, PlannedStep):
-            held = [need for need in entry.needs if is_held(need, entry)]
+            # Products that are read are there, of the scene or of the month.
+            read = reads_of(entry.product) if is_product(entry) else ()
+            held = [n for n in entry.needs if n.rpartition("/")[2] in read or is_held(n, entry)]
             yield replace(entry, needs=(*held, *compared.get((entry.name, entry.channel), ())))
         else:
             yield entry
@@ -246,7 +246,7 @@ def _compared(steps: Iterable[PlannedStep]) -> dict[tuple[str, str], list[str]]:
     wavelengths = {s.channel: s.settings["wavelength"] for s in steps if s.name == READ_STEP}
     alike: defaultdict[tuple[str, float], list[str]] = defaultdict(list)
     for step in steps:
-        if is_product(step) and kind_of(step.product).common and not read_products(step):
+        if is_product(step) and kind_of(step.product).common and not reads_of(step.product):
             alike[step.product, wavelengths[step.channel]].append(step.channel)
     return {
         (kind, channel): [f"{other}/{kind}" for other in channels if other != channel]

@@ -278,7 +278,8 @@ class _Instrument(_Work):
         """Make the products of all channels."""
         steps = self.job.plan.steps
         products = [step for step in steps if is_product(step)]
-        channels = dict.fromkeys(s.channel for s in products if not read_products(s))
+        derived = [step for step in products if read_products(step)]
+        channels = dict.fromkeys(step.channel for step in products if step not in derived)
         compared: list[Retrieved] = []
         if channels:
             source = self._source(self._scene, steps, read_windows(steps))
@@ -296,9 +297,8 @@ class _Instrument(_Work):
             if self.job.writes(product.context.kind, product.context.channel):
                 self._write(product.context, iter([product.frame, *product.batches]))
         # Last, and in the order of the plan: of products that are on the disk.
-        for step in products:
-            if read_products(step):
-                self._derive(step)
+        for step in derived:
+            self._derive(step)
 
     def _derive(self, step: PlannedStep) -> None:
         """Write a product that is made of others."""

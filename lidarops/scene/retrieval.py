@@ -18,11 +18,11 @@ from pydantic import BaseModel
 
 from lidarops.campaign.model import Campaign, Station
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import kind_of
+from lidarops.kinds import kind_of, reads_of
 from lidarops.netcdf.read import open_product
 from lidarops.records import PlannedStep, Scene
 from lidarops.scene.case import Entries, file_channels
-from lidarops.scene.dependence import is_product, read_products
+from lidarops.scene.dependence import is_product
 from lidarops.scene.pipe import PIPE
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream
 from lidarops.settings import SettingsModel
@@ -207,7 +207,7 @@ def streams_of(steps: Sequence[PlannedStep], signal: ChannelSignal) -> dict[str,
             product_settings(steps, step.product, channel), signal
         )
         for step in steps
-        if step.channel == channel and is_product(step) and not read_products(step)
+        if step.channel == channel and is_product(step) and not reads_of(step.product)
     }
 
 
