@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 74_570,
-    "lines of code alone": 48_660,
-    "modules": 312,
-    "dataclasses": 311,
-    "lines of dataclasses": 7_680,
+    "lines": 74_810,
+    "lines of code alone": 48_900,
+    "modules": 292,
+    "dataclasses": 310,
+    "lines of dataclasses": 7_710,
     "tuning numbers": 252,
     "tuning numbers that are assumed": 86,
-    "copied thresholds": 1,
+    "copied thresholds": 0,
     "most parameters": 24,
-    "lines of the largest package": 6_390,
+    "lines of the largest package": 6_310,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 82, "functions": 745, "changes": 381},
-    "elastic": {"modules": 84, "functions": 861, "changes": 401},
+    "homogeneous": {"modules": 70, "functions": 729, "changes": 390},
+    "elastic": {"modules": 78, "functions": 867, "changes": 410},
 }
 
 
