@@ -89,7 +89,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
         (
             "station: coast",
             "products: {elastik: {}}",
-            r"elastik: .* keys here are elastic, homogeneous",
+            r"elastik: .* keys here are elastic, (averaged, )?homogeneous",
         ),
         ("lidar:", "my_lidar:", r"line 8: instruments\.my_lidar: .*letters, digits and hyphens"),
         ("station: coast", "station: x y", r"line 9: .*letters, digits and hyphens.*not 'x y'"),

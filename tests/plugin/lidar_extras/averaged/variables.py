@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops.flags import Flags
+from lidarops.kinds import flags_of
 from lidarops.netcdf.variables import ALONG_BEAM, Layout, Row, quality
-from lidarops.products.signal.variables import FLAGS
 
 BINS: Final = ("time", "range")
 
@@ -31,7 +31,7 @@ def layout_of_means(kind: str, title: str) -> Layout:
                 comment="Not calibrated.",
                 ancillaries=("quality_flag",),
             ),
-            quality(BINS, Flags(kind=kind, version=1, bits=tuple(FLAGS))),
+            quality(BINS, Flags(kind=kind, version=1, bits=tuple(flags_of("signal")))),
         ),
     )
 
