@@ -222,6 +222,11 @@ class Database:
         if version == _UPGRADED:
             for table in REMADE:
                 connection.execute(sa.text(f"DROP TABLE IF EXISTS {table}"))
+            if connection.dialect.name == "postgresql":
+                # It held 10 characters: no file of lidar ratios.
+                connection.execute(
+                    sa.text("ALTER TABLE product_input ALTER COLUMN role TYPE VARCHAR(16)")
+                )
             METADATA.create_all(connection)
             connection.execute(sa.update(SCHEMA).values(version=SCHEMA_VERSION))
             return

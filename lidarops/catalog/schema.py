@@ -128,7 +128,7 @@ PRODUCT_INPUT = sa.Table(
     METADATA,
     sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("product", _PATH, primary_key=True),
-    sa.Column("role", sa.String(10), primary_key=True),
+    sa.Column("role", sa.String(16), primary_key=True),
     # The products of a scene share their files, so each set of files is stored once.
     sa.Column("file_set", sa.String(32), nullable=False),
     sa.Index("product_input_by_set", "file_set"),

@@ -13,9 +13,10 @@ import sqlalchemy as sa
 
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.schema import LOCK, SCHEMA_VERSION
+from lidarops.catalog.schema import LOCK, PRODUCT_INPUT, SCHEMA_VERSION
 from lidarops.catalog.store import Run, RunStatus, Store
 from lidarops.errors import CatalogError
+from lidarops.records import Role
 
 
 @pytest.fixture
@@ -124,6 +125,14 @@ def test_a_catalog_of_the_version_before_is_upgraded(url: str, tmp_path: Path) -
         assert [known.id for known in store.runs()] == [run.id]
     with Store(url, "test") as again:
         assert again.verdicts() == {}
+
+
+def test_every_role_fits_into_its_column() -> None:
+    # SQLite does not mind; PostgreSQL refused a product with a file of lidar ratios.
+    longest = PRODUCT_INPUT.c.role.type
+    assert isinstance(longest, sa.String)
+    assert longest.length is not None
+    assert max(map(len, Role)) <= longest.length
 
 
 def test_a_catalog_is_not_made_where_it_is_only_read(tmp_path: Path) -> None:
