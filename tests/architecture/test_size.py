@@ -28,8 +28,8 @@ MOST = {
     "lines of the largest package": 6_310,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 70, "functions": 729, "changes": 390},
-    "elastic": {"modules": 78, "functions": 867, "changes": 410},
+    "homogeneous": {"modules": 70, "functions": 729, "changes": 395},
+    "elastic": {"modules": 78, "functions": 867, "changes": 415},
 }
 
 
