@@ -167,29 +167,32 @@ def _unmade(
     spans = store.days_of_instruments(*selection.day_limits)
     # Within an interval, some scenes of a day may not be selected.
     limited = selection.since or selection.until
-    told = {} if limited else {day: verdict.unmade for day, verdict in settled.items()}
+    known = {} if limited else {day: verdict.unmade for day, verdict in settled.items()}
     for owner, kind, channel in missing:
         days = _first_and_last_day(campaign, owner, spans)
         if kind_of(kind).scope is Scope.MONTH:
             days = states.months(days)
-        found = [_unmade_on(states, day, told).get(f"{owner} {kind} {channel}") for day in days]
+        found = [_unmade_on(states, day, known).get(f"{owner} {kind} {channel}") for day in days]
         if days and None not in found:
-            reasons = dict.fromkeys(reason for told in found for reason in told or ())
+            reasons = dict.fromkeys(reason for of_day in found for reason in of_day or ())
             reason = "; ".join(filter(None, reasons)) if reasons else _NEVER_TOGETHER
             if reason:
                 yield Unmade(owner, kind, channel, reason)
 
 
 def _unmade_on(
-    states: DayStates, day: int, told: dict[int, dict[str, list[str]]]
+    states: DayStates, day: int, known: dict[int, dict[str, list[str]]]
 ) -> dict[str, list[str]]:
-    """Return what no selected scene of a day gives; the day is judged unless it is told."""
-    if day not in told:
+    """Return the requested products that no selected scene of a day gives, with the reasons.
+
+    A day that is not among the known ones is judged, and added to them.
+    """
+    if day not in known:
         from lidarops.run.staleness import Judge  # noqa: PLC0415 - loads the numerics
 
         judge = Judge(states.campaign, states.store, selection=states.selection)
-        told[day] = judge.days([day]).unmade[day]
-    return told[day]
+        known[day] = judge.days([day]).unmade[day]
+    return known[day]
 
 
 def _first_and_last_day(

@@ -1,4 +1,4 @@
-"""What a run is asked for: a selection and options; and its result."""
+"""Selection and options of a run, and its result."""
 
 from __future__ import annotations
 
