@@ -164,6 +164,14 @@ def site(
     reports_at: Annotated[
         str, typer.Option(help="The same for the folder of the reports of runs.")
     ] = "",
+    below: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="Height above the station, m, below which a profile with a usable value counts in"
+            " the calendar.",
+        ),
+    ] = 5000.0,
     as_json: JsonOption = False,
 ) -> None:
     """Make a static site of all products: calendar, figures, flags, provenance, downloads.
@@ -186,6 +194,7 @@ def site(
             copies=copies,
             stac_at=stac_at,
             reports_at=reports_at,
+            below=below,
             progress=bar.advance,
         )
     if as_json:

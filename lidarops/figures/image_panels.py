@@ -54,6 +54,8 @@ class ImageQuantity:
     images can be compared; None for those of the data, where a scale has no absolute meaning."""
     background: bool = True
     """Whether the background is drawn below."""
+    farthest: float = np.inf
+    """Farthest range that is shown, m, so that the lowest kilometres can be told apart."""
 
 
 def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str) -> Figure:
@@ -69,13 +71,14 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     Returns
     -------
     Figure
-        Block means on a logarithmic colour scale, up to the range where noise dominates. Means at
+        Block means on a logarithmic colour scale, up to the range where noise dominates; against
+        altitude, with range at the right, where the beam is not nearly horizontal. Means at
         or below zero are grey, rejected bins striped, times without measurement empty; triangles
         mark the lowest cloud bases.
     """
     axis = _time_axis(rasters)
     x = time_panel_axis(axis)
-    full = max(float(raster.edges[-1]) for raster in rasters)
+    full = min(max(float(raster.edges[-1]) for raster in rasters), quantity.farthest)
     reach = max(raster.reach for raster in rasters)
     # Of a quantity that noise hides, such as particles of clean air, all usable bins are shown.
     last = reach or max(raster.usable_to for raster in rasters)
@@ -88,20 +91,24 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     image = np.full((_HEIGHT, COLUMNS), pixels.BLANK, dtype=np.uint8)
     for raster in shown:
         _fill(image, raster, axis, (near, far), quantity.factor, ends)
-    y = Axis(f"{along} (km)", near / 1e3, far / 1e3)
+    line = _altitude(rasters)
+    y, right = Axis(f"{along} (km)", near / 1e3, far / 1e3), None
+    if line is not None:
+        y, right = Axis("altitude (km)", *_kilometres(line, np.array([near, far])).tolist()), y
     label = f"{quantity.name} ({quantity.units or units(rasters[0].units)})"
     main = Panel(
         x,
         y,
-        (Image(pixels.striped(image)), *_clouds(rasters, axis)),
+        (Image(pixels.striped(image)), *_clouds(rasters, axis, line or (0.0, 1.0))),
         height=_HEIGHT,
-        right=_altitude(rasters, y),
+        right=right,
         bar=Axis(label, *ends, log=True) if ends else None,
         note="" if (values > 0).any() else "no usable value above zero",
     )
     lower = _background(rasters, x, axis) if quantity.background else ()
     below = ", with the background below" if lower else ""
-    caption = f"{quantity.name[:1].upper()}{quantity.name[1:]} against time and {along}{below}"
+    name = f"{quantity.name[:1].upper()}{quantity.name[1:]}"
+    caption = f"{name} against time and {along if line is None else 'altitude'}{below}"
     words = _in_words(rasters, shown, reach, ends, along)
     return Figure(caption, words, (main, *lower))
 
@@ -156,8 +163,13 @@ def _columns(raster: Raster, axis: TimeAxis, width: int) -> NDArray[np.intp]:
     return column
 
 
-def _clouds(rasters: Sequence[Raster], axis: TimeAxis) -> list[Curve]:
-    base = np.concatenate([raster.clouds for raster in rasters]) / 1e3
+def _kilometres(line: tuple[float, float], ranges: Floats) -> Floats:
+    """Return altitude, km, at ranges, m, by the altitude at range 0 and its change per range."""
+    return np.asarray((line[0] + line[1] * ranges) / 1e3)
+
+
+def _clouds(rasters: Sequence[Raster], axis: TimeAxis, line: tuple[float, float]) -> list[Curve]:
+    base = _kilometres(line, np.concatenate([raster.clouds for raster in rasters]))
     time = np.concatenate([raster.time for raster in rasters])
     if not np.isfinite(base).any():
         return []
@@ -165,13 +177,11 @@ def _clouds(rasters: Sequence[Raster], axis: TimeAxis) -> list[Curve]:
     return [Curve(axis.x(time), base, "cloud", Mark.DOWN, joined=False, label=label)]
 
 
-def _altitude(rasters: Sequence[Raster], y: Axis) -> Axis | None:
+def _altitude(rasters: Sequence[Raster]) -> tuple[float, float] | None:
+    """Return altitude at range 0 and its change with range, if all rasters have the same."""
     lines = {raster.altitude for raster in rasters}
     line = lines.pop() if len(lines) == 1 else None
-    if line is None or abs(line[1]) < _UPRIGHT:
-        return None
-    low, high = (line[0] / 1e3 + line[1] * end for end in (y.low, y.high))
-    return Axis("altitude (km)", low, high)
+    return None if line is None or abs(line[1]) < _UPRIGHT else line
 
 
 def _background(rasters: Sequence[Raster], x: Axis, axis: TimeAxis) -> tuple[Panel, ...]:

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 BLANK: Final = 0
 """Pixel without data, transparent."""
 REJECTED: Final = 1
-"""Dark stripes over rejected blocks; light stripes are the next value."""
+"""Stripes over rejected blocks, of two light greys; the second is the next value."""
 NEGATIVE: Final = 3
 """A usable block at or below zero, which a logarithmic scale cannot show: grey."""
 _FIRST: Final = 4
@@ -27,9 +27,9 @@ _COLOURS: Final = 252
 _STRIPE: Final = 5
 """Width of a stripe, pixels."""
 _ANCHORS: Final = {
-    # viridis without its dark end, because stripes are black.
-    Palette.SIGNAL: "463480 404588 3a538b 33628d 2e6f8e 287c8e 23898e 1f958b 1fa287 28ae80 3bbb75"
-    " 56c667 73d056 95d840 b8de29 dde318 fde725",
+    # viridis.
+    Palette.SIGNAL: "440154 481567 482677 453781 404788 39568c 33638d 2d708e 287d8e 238a8d 1f968b"
+    " 20a387 29af7f 3cbb75 55c667 73d055 95d840 b8de29 dce319 fde725",
     # cividis: its middle is grey, and it can be read with colour vision deficiency and in grey.
     Palette.SIGNED: "00224e 123570 3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
 }
@@ -100,5 +100,7 @@ def _colours(palette: Palette) -> bytes:
     anchors = np.array([list(bytes.fromhex(word)) for word in _ANCHORS[palette].split()], float)
     places = np.linspace(0.0, len(anchors) - 1.0, _COLOURS)
     scale = [np.interp(places, np.arange(len(anchors)), anchors[:, c]) for c in range(3)]
-    special = np.array([[0, 0, 0], [20, 20, 20], [170, 174, 180], [128, 128, 128]], dtype=np.uint8)
+    special = np.array(
+        [[0, 0, 0], [206, 209, 213], [228, 230, 233], [128, 128, 128]], dtype=np.uint8
+    )
     return np.concatenate([special, np.rint(np.stack(scale, -1)).astype(np.uint8)]).tobytes()

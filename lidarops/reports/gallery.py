@@ -9,6 +9,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,10 +20,12 @@ from lidarops.figures import svg
 from lidarops.figures.any_kind import views_of
 from lidarops.figures.kind_figures import View
 from lidarops.figures.panels import Figure
+from lidarops.figures.product_names import attribute, light_in_words
 from lidarops.figures.wording import counted
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.netcdf.read import UNREADABLE, opened_product
+from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
 from lidarops.reports.reading import Compared, Group, Problem, Readers, Sources, reason
 from lidarops.system.files import write_atomically
@@ -42,6 +45,8 @@ class Picture:
     """File name in the report folder, and in its folder `NARROW`."""
     instrument: str
     caption: str
+    lacking: str
+    """Why its products have no usable value; empty if they have."""
     words: str
     """Description, with channel and number of scenes."""
     alt: str
@@ -111,7 +116,20 @@ def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterato
 def _picture(file: str, drawn: Figure, group: Group) -> Picture:
     scenes = counted(len(group.members), "scene")
     words = f"{scenes}. {drawn.words}."
-    return Picture(file, group.instrument, f"{drawn.caption}: {group.label}", words, drawn.text)
+    caption = f"{drawn.caption}: {_title(group)}"
+    return Picture(file, group.instrument, caption, group.lacking, words, drawn.text)
+
+
+def _title(group: Group) -> str:
+    """Return channel and instrument as people call them, by the first product that can be read."""
+    for _, product in group.members:
+        try:
+            with opened_product(group.root / product.path) as opened:
+                name = attribute(opened, "instrument", group.instrument)
+                return f"{light_in_words(opened) or group.channel}, {name}"
+        except ProductError:
+            continue
+    return group.label
 
 
 def missing_products(record: RunRecord) -> frozenset[str]:
@@ -126,20 +144,30 @@ def missing_products(record: RunRecord) -> frozenset[str]:
 
 
 def _groups(record: RunRecord) -> list[Group]:
-    """Return the groups by kind; within a kind, the first channel of every instrument first."""
+    """Return the groups in the order in which an operator looks at them.
+
+    First one quicklook of each instrument, then what is retrieved, by kind and with the first
+    channel of every instrument first, then the other signals, and last what has no usable value.
+    """
     members: dict[tuple[str, str, str], list[tuple[SceneOutcome, ProductRecord]]]
     members = defaultdict(list)
     for scene in record.scenes:
         for product in scene.products:
             members[product.kind, scene.instrument, product.channel].append((scene, product))
+    groups = [Group(*key, tuple(rows), Path(record.products)) for key, rows in members.items()]
+    groups.sort(key=lambda group: (group.instrument, -group.good, group.channel))
+    signals = [group for group in groups if not is_retrieved(group.kind)]
+    quicklooks = [next(first) for _, first in groupby(signals, lambda group: group.instrument)]
     turns: Counter[tuple[str, str]] = Counter()
-    ordered = []
-    for (kind, instrument, channel), products in sorted(members.items()):
-        turn = turns[kind, instrument]
-        turns[kind, instrument] += 1
-        group = Group(kind, instrument, channel, tuple(products), Path(record.products))
-        ordered.append((rank_of(kind), kind, turn, instrument, channel, group))
-    return [group for *_, group in sorted(ordered, key=lambda row: row[:5])]
+
+    def place(group: Group) -> tuple[Any, ...]:
+        stage = 1 if is_retrieved(group.kind) else 0 if group in quicklooks else 2
+        turns[group.kind, group.instrument] += 1
+        turn = turns[group.kind, group.instrument]
+        kind = rank_of(group.kind), group.kind
+        return bool(group.lacking), stage, kind, turn, group.instrument
+
+    return sorted(sorted(groups, key=lambda group: group.channel), key=place)
 
 
 def _shares(record: RunRecord) -> Mapping[str, Mapping[str, float]]:

@@ -6,6 +6,7 @@ cannot be read, the result is a `ReadFailure` with the reason.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,9 @@ from lidarops.errors import ProductError
 from lidarops.figures.kind_figures import ProductSource, View
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.series_data import Comparison
+from lidarops.figures.wording import percent
+from lidarops.flags import Severity
+from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.read import open_product, profiles_in
 from lidarops.records import ProductRecord, SceneOutcome
 from lidarops.system.processes import Processes
@@ -35,6 +39,8 @@ _UNREADABLE: Final = (
 _AT_A_TIME: Final = 8
 """Products sent to a process together, so that it waits less."""
 _LENGTHS_AT_A_TIME: Final = 32
+CAUSES: Final = 2
+"""Most causes named for products without a usable value."""
 
 Content = TypeVar("Content")
 _Content_co = TypeVar("_Content_co", covariant=True)
@@ -136,6 +142,30 @@ class Group:
     def label(self) -> str:
         """Instrument and channel, for titles."""
         return f"{self.instrument} \N{MIDDLE DOT} {self.channel}"
+
+    @property
+    def good(self) -> float:
+        """Share of values without a quality bit."""
+        values = sum(product.values for _, product in self.members)
+        return sum(product.unflagged for _, product in self.members) / values if values else 0.0
+
+    @property
+    def lacking(self) -> str:
+        """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
+        products = [product for _, product in self.members]
+        values = sum(product.values for product in products)
+        if self.kind not in kinds() or any(product.usable != 0 for product in products):
+            return ""
+        flags = flags_of(self.kind)
+        counts: Counter[str] = Counter()
+        for product in products:
+            counts.update(product.flagged)
+        worst = [
+            f"{bit.description} ({percent(count / values)})"
+            for name, count in counts.most_common()
+            if (bit := flags.named(name)) is not None and bit.severity is Severity.REJECT
+        ]
+        return "; ".join(worst[:CAUSES])
 
 
 @dataclass(frozen=True, slots=True)

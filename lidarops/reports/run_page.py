@@ -143,7 +143,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
     problems = {problem.path: problem.reason for problem in filled.problems}
     problems = dict.fromkeys(sorted(missing), "the file is missing") | problems
     stages = run_tables.stages(record)
-    pictures = _by_instrument(filled.pictures)
+    pictures = _by_instrument([one for one in filled.pictures if not one.lacking])
     return _environment().get_template("run.html").render(
         record=record,
         summary=run_tables.summary(record),
@@ -176,6 +176,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         compared=filled.compared,
         compared_words=_compared_words(filled.compared),
         pictures=pictures,
+        lacking=[picture for picture in filled.pictures if picture.lacking],
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
         flag_shares=filled.flags,
         flag_names=next(iter(filled.flags.values()), {}),

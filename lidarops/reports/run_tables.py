@@ -206,17 +206,14 @@ def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def verdict(record: RunRecord) -> str:
-    """Return the outcome of the run in one sentence, and what to look at in others."""
-    problems = list(_problems(record))
+    """Return the outcome of the run in words: problems, what to look at, and what went well."""
+    *first, last = [*_problems(record)] or [""]
+    sentences = [f"{', '.join(first)} and {last}" if first else last, *_cautions(record)]
     if not record.scenes:
-        sentence = ", ".join(("There was no scene to process", *problems))
-    elif not problems:
-        sentence = "Every scene was processed and no granule was refused"
-    else:
-        *first, last = problems
-        words = f"{', '.join(first)} and {last}" if first else last
-        sentence = f"{words[0].upper()}{words[1:]}"
-    return " ".join(f"{part}." for part in (sentence, *_cautions(record)))
+        sentences.append("There was no scene to process")
+    elif not last:
+        sentences.append("All files were read")
+    return " ".join(f"{words[0].upper()}{words[1:]}." for words in sentences if words)
 
 
 def outcome_class(record: RunRecord) -> str:
@@ -256,11 +253,11 @@ def _problems(record: RunRecord) -> Iterator[str]:
 
 def _cautions(record: RunRecord) -> Iterator[str]:
     """Yield what fails no run, but needs a look."""
-    empty = sum(
-        p.usable == 0 for scene in record.scenes if not scene.unusable for p in scene.products
-    )
+    products = [product for scene in record.scenes for product in scene.products]
+    empty = sum(product.usable == 0 for product in products)
     if empty:
-        yield f"{counted(empty, 'product')} without a usable value"
+        have = "has" if empty == 1 else "have"
+        yield f"{empty:,} of {counted(len(products), 'product')} {have} no usable value"
     disagreeing = sorted({row.subject for row in disagreement_rows(record.scenes)})
     if disagreeing:
         yield f"Channels that measure the same disagree: {listed(disagreeing)}"

@@ -23,6 +23,7 @@ from lidarops.errors import CatalogError, ProductError
 from lidarops.figures import any_kind, svg
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
+from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.quality_panel import quality_figure, read_quality
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import with_current_flags
@@ -78,6 +79,7 @@ class _Task:
     products: Path
     site: Path
     known: Entry | None
+    below: float
 
 
 _Outcome = tuple[Entry | Problem, bool]
@@ -92,6 +94,7 @@ def build_site(
     copies: bool = False,
     stac_at: str = "",
     reports_at: str = "",
+    below: float = product_contents.LOW,
     progress: Callable[[int], None] | None = None,
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
@@ -114,6 +117,9 @@ def build_site(
     stac_at, reports_at : str, optional
         Where the links to the STAC catalog and to the report of the last run lead, where the site
         is not used in the output: an address, or a place relative to the site.
+    below : float, optional
+        Height above the station, m, below which a profile with a usable value counts in the
+        calendar.
     progress : callable, optional
         Called with the number of products done since the last call.
 
@@ -132,14 +138,16 @@ def build_site(
     output = Path(output).resolve()
     links = Links(output, COPIES if copies else products_at, stac_at, reports_at)
     products, site = product_folder(output), output / SITE
-    before = _manifest(site, links)
-    tasks = [_Task(path, products, site, before.get(path)) for path in product_paths(products)]
+    before = _manifest(site, links, below)
+    tasks = [
+        _Task(path, products, site, before.get(path), below) for path in product_paths(products)
+    ]
     entries, problems, made = _collect(tasks, workers, progress)
     entries = list(_linked(site, entries, links))
-    expected = _write_calendar(site, entries, problems, links)
+    expected = _write_calendar(site, entries, problems, links, below)
     if copies:
         expected |= _copy(products, site, entries)
-    _write_manifest(site, entries, problems, links)
+    _write_manifest(site, entries, problems, links, below)
     _sweep(site, expected)
     return Site(site / pages.INDEX, len(entries), made, tuple(problems))
 
@@ -229,10 +237,10 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
 
 def _make(task: _Task, file: Path, sha256: str) -> Entry:
     with opened_product(file, decode_timedelta=False) as opened:
-        quality = product_contents.count_quality(opened)
+        quality = product_contents.count_quality(opened, task.below)
         origin = product_contents.origin(opened)
         span = product_contents.span(opened)
-        kind = product_contents.attribute(opened, "lidarops_kind")
+        kind = attribute(opened, "lidarops_kind")
         figures, problem = _draw(opened, kind)
         page = product_page(task.path)
         values, no_values = _guarded(
@@ -241,8 +249,8 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         over_time, no_quality = _guarded(
             lambda: _quality_figures(opened, figures), "its quality over time cannot be drawn"
         )
-        station = product_contents.attribute(opened, "lidarops_station")
-        instrument = product_contents.attribute(opened, "lidarops_instrument")
+        station = attribute(opened, "lidarops_station")
+        instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
             path=task.path,
             sha256=sha256,
@@ -252,21 +260,24 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             digests=(),
             campaign=product_contents.campaign(opened),
             station=station,
-            place=product_contents.attribute(opened, "platform", station),
+            place=attribute(opened, "platform", station),
             instrument=instrument,
-            name=product_contents.attribute(opened, "instrument", instrument),
+            name=attribute(opened, "instrument", instrument),
             kind=kind,
-            channel=product_contents.attribute(opened, "lidarops_channel"),
-            light=product_contents.light(opened),
+            channel=attribute(opened, "lidarops_channel"),
+            light=light_in_words(opened),
             latitude=product_contents.middle(opened, "latitude"),
             longitude=product_contents.middle(opened, "longitude"),
-            altitude=product_contents.scalar(opened, "station_altitude"),
-            license=product_contents.attribute(opened, "license", ""),
+            altitude=scalar(opened, "station_altitude"),
+            license=attribute(opened, "license", ""),
             start=span.start,
             stop=span.stop,
             values=quality.values,
             usable=quality.usable,
             unflagged=quality.unflagged,
+            profiles=quality.profiles,
+            available=quality.available,
+            lacking=quality.lacking,
             alt=figures[0].text if figures else _EMPTY.capitalize(),
             problem=_joined(problem, no_values, no_quality, origin.problem, _missing_flags(opened)),
         )
@@ -380,7 +391,7 @@ def _copy(products: Path, site: Path, entries: Sequence[Entry]) -> set[str]:
 
 
 def _write_calendar(
-    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links
+    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
 ) -> set[str]:
     """Write all calendar pages; return the files that belong in the site's folders."""
     expected = {name for entry in entries for name in entry.files}
@@ -407,7 +418,7 @@ def _write_calendar(
                 write(name, pages.day(station, day, by_day, before, after))
     campaigns = sorted({entry.campaign for entry in entries})
     _write(site, "site.css", pages.style().encode())
-    _write(site, pages.INDEX, pages.index(entries, problems, campaigns, links))
+    _write(site, pages.INDEX, pages.index(entries, problems, campaigns, links, below))
     return expected
 
 
@@ -431,11 +442,12 @@ def _version() -> str:
 
 
 def _write_manifest(
-    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links
+    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
 ) -> None:
     document = {
         "format": _FORMAT,
         "products_at": links.products,
+        "below": below,
         "version": _version(),
         "products": [asdict(entry) for entry in entries],
         "problems": [asdict(problem) for problem in problems],
@@ -444,7 +456,7 @@ def _write_manifest(
     _write(site, MANIFEST, text.encode("ascii") + b"\n")
 
 
-def _manifest(site: Path, links: Links) -> dict[str, Entry]:
+def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
     """Return the entries of the existing site by path; empty if they are unknown or outdated."""
     file = site / MANIFEST
     if not file.is_file():
@@ -455,11 +467,15 @@ def _manifest(site: Path, links: Links) -> dict[str, Entry]:
                 remedy="move it away, so that its content is not lost",
             )
         # Written first, so that an interrupted build is recognised as a site.
-        _write_manifest(site, [], [], links)
+        _write_manifest(site, [], [], links, below)
         return {}
     try:
         document = json.loads(file.read_bytes())
-        if document["format"] != _FORMAT or document["version"] != _version():
+        if (document["format"], document["version"], document["below"]) != (
+            _FORMAT,
+            _version(),
+            below,
+        ):
             return {}
         return {item["path"]: _entry(item) for item in document["products"]}
     except (ValueError, KeyError, TypeError):

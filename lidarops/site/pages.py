@@ -16,6 +16,7 @@ import xarray as xr
 from lidarops import __version__
 from lidarops.figures import svg
 from lidarops.figures.panels import Figure
+from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment, page_style
 from lidarops.figures.wording import counted, percent, size, verdicts_in_words
 from lidarops.kinds import kinds, rank_of
@@ -24,7 +25,7 @@ from lidarops.site.links import Links
 from lidarops.site.neighbours import Neighbours
 from lidarops.site.paths import day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import Origin, QualityCounts, citation, contact, variables
-from lidarops.site.product_entry import UNKNOWN, Entry, Problem, ShareGrade, Shares, mean_shares
+from lidarops.site.product_entry import Entry, Problem, ShareGrade, mean_availability
 from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import Values
 
@@ -86,6 +87,7 @@ def product(
         trail=[*_trail(entry, page), (entry.day, href(day_page(entry.station, entry.day), page))],
         sha256=entry.sha256,
         problem=entry.problem,
+        lacking=entry.lacking,
         summary=summary,
         figures=[(svg.inline(figure), figure.text) for figure in figures],
         quality=quality,
@@ -173,7 +175,7 @@ def _trail(entry: Entry, page: str) -> list[tuple[str, str]]:
 
 
 def _quality(entry: Entry) -> str:
-    if entry.shares is None:
+    if not entry.values:
         return "no quality flags"
     return f"{verdicts_in_words(entry.verdicts)} of {entry.values:,} values"
 
@@ -189,30 +191,25 @@ def _card(entry: Entry, page: str, *, place: bool) -> dict[str, Any]:
         "light": entry.light or entry.channel,
         "where": where,
         "grade": entry.grade,
-        "quality": "" if entry.shares is None else verdicts_in_words(entry.verdicts),
+        "quality": verdicts_in_words(entry.verdicts) if entry.values else "",
+        "lacking": entry.lacking,
         "problem": entry.problem,
     }
 
 
 def _order(entry: Entry) -> tuple[Any, ...]:
-    rank = rank_of(entry.kind)
-    return entry.instrument, rank, entry.kind, entry.channel, entry.start, entry.path
+    """Return the place of a product on the page of a day: signals, then what is retrieved."""
+    kind = is_retrieved(entry.kind), rank_of(entry.kind), entry.kind
+    return entry.instrument, *kind, entry.channel, entry.start, entry.path
 
 
-def _cell(shares: Shares | None) -> dict[str, Any]:
-    """Return what a day or month shows: its share of good values, and a bar of all shares."""
-    if shares is None:
-        return {"share": "", "of": "", "bar": [], "grade": ShareGrade.UNKNOWN}
+def _cell(share: float | None) -> dict[str, Any]:
+    """Return what a day or month shows: the share of usable profiles, and its grade."""
+    words = "" if share is None else _short(share)
     return {
-        "share": _short(shares.good),
-        "of": f" good, {_short(shares.care)} care, {_short(shares.reject)} reject",
-        "bar": [
-            (word, f"{100 * before:.4g}", f"{100 * share:.4g}")
-            for word, before, share in zip(
-                Shares._fields, (0.0, shares.good, shares.good + shares.care), shares, strict=True
-            )
-        ],
-        "grade": ShareGrade.of(shares.good),
+        "share": words,
+        "of": " of profiles usable" * bool(words),
+        "grade": ShareGrade.of(share),
     }
 
 
@@ -262,13 +259,14 @@ def index(
     problems: Sequence[Problem],
     campaigns: Sequence[str],
     links: Links,
+    below: float,
 ) -> bytes:
-    """Return the first page."""
+    """Return the first page. `below` is the height of the calendar above the station, m."""
     by_station = stations(entries)
     rows = sum(len(years(group)) for group in by_station.values())
     title = f"Lidar archive: {'; '.join(campaigns[:3])}" if campaigns else "Lidar archive"
     newest = sorted(entries, key=lambda entry: (entry.start, entry.path), reverse=True)
-    retrieved = [entry for entry in newest if is_retrieved(entry.kind)] or newest
+    retrieved = [e for e in newest if is_retrieved(e.kind) and not e.lacking] or newest
     return _render(
         "index.html",
         INDEX,
@@ -276,6 +274,7 @@ def index(
         lead=_index_lead(entries, by_station),
         trail=[],
         grades=list(ShareGrade),
+        below=f"{below / 1e3:g} km",
         map=station_map(_places(by_station)),
         stac=links.catalog(INDEX),
         report=links.report(INDEX),
@@ -343,7 +342,7 @@ def _months(entries: Sequence[Entry]) -> list[dict[str, Any] | None]:
             "name": calendar.month_abbr[number],
             "label": f"{calendar.month_name[number]} {group[0].day[:4]}",
             "days": len({entry.day for entry in group}),
-            **_cell(mean_shares(group)),
+            **_cell(mean_availability(group)),
         }
     return cells
 
@@ -415,7 +414,7 @@ def _day(key: str, date_: date, month: int, by_day: ByDay, page: str) -> dict[st
         "href": href(day_page(key, date_.isoformat()), page),
         "number": date_.day,
         "words": f", {counted(len(entries), 'product')}",
-        **_cell(mean_shares(entries)),
+        **_cell(mean_availability(entries)),
     }
 
 
@@ -425,11 +424,8 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
     entries = by_day[day_]
     shown_kinds = tabs(entries)[1:]
     ordered = sorted(entries, key=_order)
-    shares = mean_shares(entries)
-    words = [
-        f"{percent(share)} {word}" for word, share in (shares._asdict() if shares else {}).items()
-    ]
-    mean = f"; on average {', '.join(words)}" if words else ""
+    share = mean_availability(entries)
+    mean = "" if share is None else f"; {percent(share)} of profiles usable"
 
     def beside(other: str | None) -> tuple[str, str] | None:
         return None if other is None else (other, href(day_page(key, other), page))
@@ -455,16 +451,23 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
     )
 
 
-def _instrument(
-    entries: Sequence[Entry], shown_kinds: Sequence[str], page: str
-) -> tuple[str, list[tuple[int, str, list[dict[str, Any]]]]]:
-    """Return the name of an instrument, and its products of a day by kind."""
-    kinds_ = [
-        (
-            shown_kinds.index(kind),
-            _about(kind, "Kind"),
-            [_card(entry, page, place=False) for entry in rows],
-        )
-        for kind, rows in groupby(entries, key=lambda entry: entry.kind)
-    ]
-    return _named(entries[0].name, entries[0].instrument), kinds_
+def _instrument(entries: Sequence[Entry], shown_kinds: Sequence[str], page: str) -> dict[str, Any]:
+    """Return an instrument: its products of a day by kind, and those without usable value."""
+    return {
+        "name": _named(entries[0].name, entries[0].instrument),
+        "kinds": [
+            (
+                shown_kinds.index(kind),
+                _about(kind, "Kind"),
+                [_card(entry, page, place=False) for entry in rows],
+            )
+            for kind, rows in groupby(
+                (entry for entry in entries if not entry.lacking), key=lambda entry: entry.kind
+            )
+        ],
+        "lacking": [
+            (shown_kinds.index(entry.kind), _card(entry, page, place=False))
+            for entry in entries
+            if entry.lacking
+        ],
+    }

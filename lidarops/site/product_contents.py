@@ -10,16 +10,20 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
+from lidarops.figures.product_names import attribute, scalar
 from lidarops.figures.quality_panel import READ_VALUES
 from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.records import GLUED
-from lidarops.site.product_entry import UNKNOWN
 
 PROVENANCE: Final = "provenance"
+LOW: Final = 5000.0
+"""Height above the station, m, below which a profile with a usable value counts in the calendar."""
+_CAUSES: Final = 2
+"""Most causes named for a product without usable value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,18 @@ class QualityCounts:
     values: int
     usable: int
     unflagged: int
+    profiles: int
+    available: int
+    """Number of profiles with a usable value below a height above the station."""
     rows: tuple[FlagRow, ...]
+
+    @property
+    def lacking(self) -> str:
+        """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
+        if self.usable or not self.values:
+            return ""
+        worst = sorted((row for row in self.rows if row.css == "bad"), key=lambda row: -row.count)
+        return "; ".join(f"{row.meaning} ({row.share})" for row in worst[:_CAUSES])
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,28 +117,45 @@ class Span:
     stop: str
 
 
-def count_quality(product: xr.Dataset) -> QualityCounts:
-    """Count the values of a product by quality bit.
+def count_quality(product: xr.Dataset, below: float = LOW) -> QualityCounts:
+    """Count the values of a product by quality bit, and the profiles with a usable value.
 
     Parameters
     ----------
     product : Dataset
         May be lazy; flags are read in blocks of bounded memory.
+    below : float, optional
+        Height above the station, m, below which a profile must have a usable value to count.
     """
     if QUALITY_FLAG not in product:
-        return QualityCounts(0, 0, 0, ())
+        return QualityCounts(0, 0, 0, 0, 0, ())
     bits = stored_bits(product[QUALITY_FLAG].attrs, product.attrs.get("lidarops_kind"))
     counts: Counter[StoredBit] = Counter()
-    values = usable = unflagged = 0
+    values = usable = unflagged = profiles = available = 0
     rejecting = np.int64(rejecting_mask(bits))
+    low = _low(product, below)
     for block in blocks(product[QUALITY_FLAG], READ_VALUES):
         flags = np.atleast_1d(quality_bits(block))
+        accepted = (flags & rejecting) == 0
         values += flags.size
-        usable += int(np.count_nonzero((flags & rejecting) == 0))
+        usable += int(np.count_nonzero(accepted))
         unflagged += flags.size - int(np.count_nonzero(flags))
+        profiles += len(flags)
+        seen = accepted[:, low].reshape(len(flags), -1) if accepted.ndim > 1 else accepted[:, None]
+        available += int(np.count_nonzero(seen.any(axis=1)))
         counts.update(count_bits(flags, bits))
     rows = [_flag_row(bit, counts[bit], values) for bit in bits if counts[bit]]
-    return QualityCounts(values, usable, unflagged, tuple(rows))
+    return QualityCounts(values, usable, unflagged, profiles, available, tuple(rows))
+
+
+def _low(product: xr.Dataset, below: float) -> NDArray[np.bool_] | slice:
+    """Return which places of a profile are below a height above the station; all if unknown."""
+    ground = {"altitude": scalar(product, "station_altitude"), "range": 0.0}
+    for name, start in ground.items():
+        along = product.variables.get(name)
+        if start is not None and along is not None and along.dims == product[QUALITY_FLAG].dims[1:]:
+            return np.asarray(along.values.astype(np.float64) - start <= below)
+    return slice(None)
 
 
 def _flag_row(bit: StoredBit, count: int, values: int) -> FlagRow:
@@ -180,39 +212,10 @@ def variables(product: xr.Dataset) -> list[VariableRow]:
     ]
 
 
-def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
-    """Return a global attribute as text."""
-    return str(product.attrs.get(name, "")).strip() or default
-
-
 def campaign(product: xr.Dataset) -> str:
     """Return the title of the campaign, with which that of a product begins; its key without."""
     title, _, _ = attribute(product, "title", "").rpartition(": ")
     return title or attribute(product, "lidarops_campaign")
-
-
-def light(product: xr.Dataset) -> str:
-    """Return wavelength and detection of the channel in words; empty if unknown."""
-    wavelength = scalar(product, "wavelength")
-    words = "" if wavelength is None else f"{wavelength:g} {product['wavelength'].attrs['units']}"
-    glued = attribute(product, "lidarops_channel").startswith(GLUED)
-    mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
-    return ", ".join(filter(None, (words, mode)))
-
-
-_DETECTION: Final = {
-    "photon": "photon counting",
-    "analog": "analog",
-    GLUED: "analog glued to photon counting",
-}
-
-
-def scalar(product: xr.Dataset, name: str) -> float | None:
-    """Return a variable that is one finite number; None without it."""
-    if name not in product.variables or product[name].ndim or "units" not in product[name].attrs:
-        return None
-    value = product[name].values.astype(np.float64).item()
-    return float(value) if np.isfinite(value) else None
 
 
 def middle(product: xr.Dataset, name: str) -> float | None:

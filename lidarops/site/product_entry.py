@@ -1,4 +1,4 @@
-"""The entry of a product in the calendar, and grades for the share of good values."""
+"""The entry of a product in the calendar, and grades of the share of usable profiles."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from statistics import fmean
-from typing import Final, NamedTuple
+from typing import Final
 
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import Verdicts
 
-UNKNOWN: Final = "unknown"
-
 
 class ShareGrade(StrEnum):
-    """Grade of a share of good values."""
+    """Grade of a share of profiles with a usable value."""
 
     MOST = "most"
     SOME = "some"
@@ -35,7 +33,7 @@ class ShareGrade(StrEnum):
 
     @classmethod
     def of(cls, share: float | None) -> ShareGrade:
-        """Return the grade of a share of good values (0 to 1; None without quality flags)."""
+        """Return the grade of a share of usable profiles (0 to 1; None without quality flags)."""
         if share is None:
             return cls.UNKNOWN
         if share <= 0.0:
@@ -48,20 +46,12 @@ class ShareGrade(StrEnum):
 _SOME: Final = 0.25
 _MOST: Final = 0.75
 _MEANING: Final = {
-    ShareGrade.MOST: "75 % or more of the values good",
-    ShareGrade.SOME: "25 to 75 % good",
-    ShareGrade.FEW: "less than 25 % good",
-    ShareGrade.NONE: "no value good",
+    ShareGrade.MOST: "75 % or more of the profiles usable",
+    ShareGrade.SOME: "25 to 75 % usable",
+    ShareGrade.FEW: "less than 25 % usable",
+    ShareGrade.NONE: "no profile usable",
     ShareGrade.UNKNOWN: "no quality flags",
 }
-
-
-class Shares(NamedTuple):
-    """Shares of values by the worst severity of their quality bits, 0 to 1."""
-
-    good: float
-    care: float
-    reject: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +93,12 @@ class Entry:
     usable: int
     """Number of values that no bit rejects."""
     unflagged: int
+    profiles: int
+    """Number of profiles with quality flags."""
+    available: int
+    """Number of profiles with a usable value below the height that matters."""
+    lacking: str
+    """Why no value is usable; empty if one is."""
     alt: str
     """Description of the thumbnail."""
     problem: str
@@ -125,21 +121,19 @@ class Entry:
         return self.start[:10]
 
     @property
-    def shares(self) -> Shares | None:
-        """Shares of good, care and rejected values; None without quality flags."""
-        if not self.values:
-            return None
-        return Shares(*(count / self.values for count in self.verdicts))
-
-    @property
     def verdicts(self) -> Verdicts:
         """Numbers of good values, of those to be used with care, and of rejected ones."""
         return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
 
     @property
     def grade(self) -> ShareGrade:
-        """Grade of the share of good values."""
-        return ShareGrade.of(self.shares and self.shares.good)
+        """Grade of the share of usable profiles."""
+        return ShareGrade.of(self.availability)
+
+    @property
+    def availability(self) -> float | None:
+        """Share of usable profiles, 0 to 1; None without quality flags."""
+        return self.available / self.profiles if self.profiles else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,14 +144,13 @@ class Problem:
     reason: str
 
 
-def mean_shares(entries: Iterable[Entry]) -> Shares | None:
-    """Return the means over products of the shares of good, care and rejected values.
+def mean_availability(entries: Iterable[Entry]) -> float | None:
+    """Return the mean over products of the share of usable profiles; None without quality flags.
 
-    Only retrievals count if there are any, because signals are always flagged at far range. The
-    mean is over products, not values, so that a product of many bins does not dominate one of few
-    sections. None without quality flags.
+    Only retrievals count if there are any. The mean is over products, so that one of many
+    profiles does not dominate one of few.
     """
-    known = [(entry.kind, entry.shares) for entry in entries if entry.shares is not None]
-    retrieved = [shares for kind, shares in known if is_retrieved(kind)]
-    shares = retrieved or [shares for _, shares in known]
-    return Shares(*map(fmean, zip(*shares, strict=True))) if shares else None
+    known = [(entry.kind, share) for entry in entries if (share := entry.availability) is not None]
+    retrieved = [share for kind, share in known if is_retrieved(kind)]
+    shares = retrieved or [share for _, share in known]
+    return fmean(shares) if shares else None

@@ -188,7 +188,7 @@ class TestGallery:
         for picture in drawn.pictures:
             for place in (folder, folder / gallery.NARROW):
                 assert (place / picture.file).read_bytes().startswith(b"<svg")
-            assert CHANNEL in picture.caption
+            assert picture.caption.endswith(": 532 nm, photon counting, Lidar One")
             assert picture.alt
         assert drawn.flags
 

@@ -39,10 +39,10 @@ def test_colours_are_the_signal_and_flags_are_striped():
     panel, below = figure.panels
     pixels = image(panel)
     height, width = pixels.shape
-    far = panel.y.high * 1e3
+    far = panel.right.high * 1e3
     column = ((np.arange(width) + 0.5) / width * 48).astype(int)
     ranges = product["range"].values
-    along = far - (np.arange(height) + 0.5) / height * (far - 1e3 * panel.y.low)
+    along = far - (np.arange(height) + 0.5) / height * (far - 1e3 * panel.right.low)
     row = np.abs(ranges[None, :] - along[:, None]).argmin(axis=1)
     flag = product["quality_flag"].values
     rejected = ((flag & flags_of("signal").rejecting) != 0)[np.ix_(column, row)].T
@@ -100,11 +100,24 @@ def test_an_empty_panel_has_a_note(value):
     assert panel.bar is None
 
 
-def test_altitude_stands_beside_range():
+def test_range_stands_beside_altitude():
     panel = drawn(signal(times(START, 5, 60.0), bins=40)).panels[0]
-    assert panel.right.label == "altitude (km)"
-    ends = np.array([panel.y.low, panel.y.high])
-    np.testing.assert_allclose([panel.right.low, panel.right.high], 0.12 + 0.94 * ends)
+    assert (panel.y.label, panel.right.label) == ("altitude (km)", "range (km)")
+    ends = np.array([panel.right.low, panel.right.high])
+    np.testing.assert_allclose([panel.y.low, panel.y.high], 0.12 + 0.94 * ends)
+
+
+def test_a_beam_that_is_nearly_horizontal_is_drawn_against_range():
+    product = signal(times(START, 5, 60.0), bins=40)
+    product["altitude"] = ("range", 120.0 + 0.01 * product["range"].values)
+    panel = drawn(product).panels[0]
+    assert (panel.y.label, panel.right) == ("range (km)", None)
+
+
+def test_a_quicklook_shows_the_lowest_15_km():
+    product = signal(times(START, 5, 60.0), bins=4000, bin_width=15.0)
+    product["signal_standard_error"].values[:] = 1e-3 * np.abs(product["signal"].values)
+    assert drawn(product).panels[0].right.high == pytest.approx(15.0, rel=0.02)
 
 
 def test_share_with_care_is_that_of_the_product():
@@ -126,7 +139,7 @@ def test_a_quantity_that_noise_hides_is_shown_as_far_as_it_is_usable():
     product["signal"].values[:] = 0.0
     product["quality_flag"].values[:] = 0
     product["quality_flag"].values[:, 400:] = flags_of("signal").rejecting
-    assert drawn(product).panels[0].y.high == pytest.approx(7.2, rel=0.02)
+    assert drawn(product).panels[0].right.high == pytest.approx(7.2, rel=0.02)
 
 
 def test_triangles_mark_the_lowest_cloud_bases():
@@ -135,7 +148,8 @@ def test_triangles_mark_the_lowest_cloud_bases():
     product["cloud_base_range"] = ("time", [90.0, np.nan, 40.0, 60.0, *[np.nan] * 4])
     figure = drawn(product)
     (marks,) = labelled(figure.panels[0], "base of the lowest cloud")
-    np.testing.assert_array_equal(marks.y[:4], [0.09, np.nan, 0.04, 0.06])
+    base = np.array([0.09, np.nan, 0.04, 0.06])
+    np.testing.assert_allclose(marks.y[:4], 0.12 + 0.94 * base)
     assert "cloud base in 3 of 8 columns (triangles)" in figure.words
 
 

@@ -86,9 +86,9 @@ class TestFigures:
         alone, together = filled
         assert files(tmp_path / "one") == files(tmp_path / "two")
         assert together == alone
-        assert [problem.path for problem in alone.problems] == ["e2.nc", "s3.nc", "s4.nc"]
-        assert alone.problems[0].reason == "the file is missing"
-        assert alone.problems[2].reason == "background: is missing from the product"
+        assert [problem.path for problem in alone.problems] == ["s3.nc", "s4.nc", "e2.nc"]
+        assert alone.problems[2].reason == "the file is missing"
+        assert alone.problems[1].reason == "background: is missing from the product"
         assert alone.compared
 
     def test_no_product_is_read_twice(self, many, tmp_path, monkeypatch):

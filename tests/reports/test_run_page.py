@@ -333,14 +333,16 @@ class TestDegenerateRuns:
         idle = replace(bad, path="z.nc", kind="homogeneous")
         scenes = [outcome("cloudy", products=(bad,)), outcome("clear", products=(good, idle))]
         run = run_record(tmp_path, scenes)
-        verdict = "1 scene without a usable value: cloudy. 1 product without a usable value."
+        verdict = "1 scene without a usable value: cloudy. 2 of 3 products have no usable value."
         assert verdict in built(run, tmp_path / "report").text
         assert run_tables.outcome_word(scenes[0]) == "no usable value"
         assert run_tables.outcome_word(scenes[1]) == "done"
         refused = replace(run, refused=(fab.granule("raw/0", "cause"),))
         assert run_tables.verdict(refused).startswith("1 granule refused and 1 scene without a")
         only_idle = replace(run, scenes=scenes[1:])
-        assert run_tables.verdict(only_idle).startswith("Every scene was processed")
+        verdict = "1 of 2 products has no usable value. All files were read."
+        assert run_tables.verdict(only_idle) == verdict
+        assert run_tables.outcome_class(only_idle) == "care"
 
     def test_unknown_bits_are_shown(self, tmp_path):
         odd = ProductRecord("x.nc", "signal", "c", "", 0, 10, {"cosmic": 4}, 6)
@@ -490,6 +492,36 @@ class TestManyScenes:
         scenes = [outcome(name, instrument=name, products=(product,)) for name in names]
         page = built(run_record(archive.root, scenes), tmp_path / "report")
         assert {f"#figures-{number}" for number in range(1, 11)} <= set(page.links)
+
+    def test_a_quicklook_comes_first_and_what_is_not_usable_is_folded(self, archive, tmp_path):
+        time = fab.times(START, 12, 900.0)
+        made = {
+            ("signal", "a"): {"unflagged": 10},
+            ("signal", "b"): {"unflagged": 20},
+            ("homogeneous", "a"): {"usable": 5},
+            ("homogeneous", "b"): {"usable": 0, "flagged": {"poor_fit": 12}, "values": 12},
+        }
+        products = tuple(
+            replace(
+                archive.write(f"{kind}_{channel}.nc", getattr(fab, kind)(time), kind),
+                channel=channel,
+                **changes,
+            )
+            for (kind, channel), changes in made.items()
+        )
+        run = run_record(archive.root, [outcome("s", products=products)])
+        run_page.build_report(run, tmp_path / "report")
+        text = (tmp_path / "report/index.html").read_text("utf-8")
+        shown, folded = text.split("figures of products without usable values")
+        found = re.findall(r'href="(\w+)_horizontal_(\w)[_\d]*\.svg', shown)
+        assert list(dict.fromkeys(found)) == [
+            ("signal", "b"),
+            ("homogeneous", "a"),
+            ("signal", "a"),
+        ]
+        assert "homogeneous_horizontal_b" in folded
+        reason = flags_of("homogeneous").named("poor_fit").description
+        assert f"{reason} (100 %)" in folded
 
     def test_more_sections_than_a_panel_holds(self, archive, tmp_path):
         sections = tuple((1000.0 * k, 1000.0 * k + 900.0) for k in range(1, 8))

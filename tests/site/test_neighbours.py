@@ -13,7 +13,7 @@ ENTRY = Entry(
     path="", sha256="", size=1, page="", thumbnail="", digests=(), campaign="c", station="s",
     place="S", instrument="i", name="I", kind="signal", channel="a", light="", latitude=None,
     longitude=None, altitude=None, license="", start="", stop="", values=0, usable=0,
-    unflagged=0, alt="", problem="",
+    unflagged=0, profiles=1, available=1, lacking="", alt="", problem="",
 )  # fmt: skip
 
 

@@ -115,7 +115,7 @@ def test_calendar_to_download_by_mouse(site: Path, watched: Watched) -> None:
     page = watched.page
     watched.open(site / "index.html")
     page.get_by_role("link", name="March 2026").click()
-    page.get_by_role("link", name="reject, 6 products").first.click()
+    page.get_by_role("link", name="usable, 6 products").first.click()
     assert "2026-03-01" in page.get_by_role("heading", level=1).inner_text()
     page.get_by_role("link", name=ELASTIC).click()
     assert "Backscatter" in page.get_by_role("heading", level=1).inner_text()
@@ -160,7 +160,7 @@ def test_calendar_to_download_by_keyboard(site: Path, watched: Watched) -> None:
     assert page.evaluate("document.activeElement.getBoundingClientRect().left") > 0
     page.keyboard.press("Enter")
     assert page.evaluate("document.activeElement.id") == "main"
-    for words in ("March 2026", "reject, 6 products", ELASTIC):
+    for words in ("March 2026", "usable, 6 products", ELASTIC):
         _tab_to(page, words)
         with page.expect_navigation():
             page.keyboard.press("Enter")
@@ -270,7 +270,7 @@ class Visitor:
 
     def product(self, title: str) -> Visitor:
         """Go to a product of 1 March 2026."""
-        return self.click("March 2026").click("reject, 6 products").click(title)
+        return self.click("March 2026").click("usable, 6 products").click(title)
 
 
 @pytest.fixture
@@ -339,7 +339,7 @@ def test_find_where_the_station_is_and_its_data(visitor: Visitor) -> None:
 
 
 def test_see_one_kind_only(visitor: Visitor) -> None:
-    visitor.click("March 2026").click("reject, 6 products").click("Choose kinds", "summary")
+    visitor.click("March 2026").click("usable, 6 products").click("Choose kinds", "summary")
     signals = visitor.page.get_by_role("heading", name="Range-corrected signals").first
     assert signals.is_visible()
     visitor.click("Range-corrected signals", "checkbox")
@@ -366,7 +366,7 @@ def test_quality_is_chosen_of_days_in_a_year_and_of_products_in_a_day(visitor: V
 
 
 def test_choose_another_date(visitor: Visitor) -> None:
-    visitor.click("March 2026").click("reject, 6 products").click("Choose another day", "summary")
+    visitor.click("March 2026").click("usable, 6 products").click("Choose another day", "summary")
     visitor.page.locator("table.days a:not([aria-current])").first.click()
     assert visitor.page.url.endswith("2026-03-02.html")
 

@@ -218,7 +218,7 @@ def test_values_reach_as_far_as_the_figure() -> None:
     (figure,) = figures("signal", "signal", [product])
     stated = float(read_values(product, "signal").note.partition("up to ")[2].removesuffix(" km"))
     # The note has three digits.
-    assert stated == pytest.approx(figure.panels[0].y.high, abs=0.05)
+    assert stated == pytest.approx(figure.panels[0].right.high, abs=0.05)
 
 
 def test_a_product_leads_to_the_previous_the_next_and_its_siblings(output: Path) -> None:

@@ -13,7 +13,10 @@ _READ: Final = partial(read_raster, quantity="signal", kind="signal")
 FIGURES: Final = KindFigures(
     (
         image_view(
-            "signal", raster_variables("signal"), _READ, ImageQuantity("range-corrected signal")
+            "signal",
+            raster_variables("signal"),
+            _READ,
+            ImageQuantity("range-corrected signal", farthest=15e3),
         ),
     ),
     preferred="signal",
