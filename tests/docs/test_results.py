@@ -185,13 +185,14 @@ def _rows_before():
     return [row for group in groups for row in group["rows"]]
 
 
-@pytest.mark.parametrize("row", _rows_before(), ids=lambda row: row["figure"])
-def test_a_figure_that_does_not_meet_its_target_says_why(row) -> None:
+def test_a_figure_that_does_not_meet_its_target_says_why() -> None:
     """Every figure of the independent study is measured today."""
-    assert before_after.measured(row["now"]).value >= 0.0
-    judged = before_after.judgement(row)
-    if judged and not judged.met:
-        assert before_after.why(row)
+    rows = _rows_before()
+    assert len(rows) > 100
+    for row in rows:
+        assert before_after.measured(row["now"]).value >= 0.0, row["figure"]
+        judged = before_after.judgement(row)
+        assert not judged or judged.met or before_after.why(row), row["figure"]
 
 
 def test_the_page_shows_before_and_now_with_errors() -> None:

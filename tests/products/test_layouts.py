@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
+from collections.abc import Iterator
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,17 +23,13 @@ from lidarops.netcdf.variables import (
 from lidarops.records import DetectionMode
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 
-ROWS = [
-    pytest.param(kind, row, id=f"{kind}-{row.name}")
-    for kind in kinds()
-    for layout in [layout_of(kind)]
-    for row in (*layout.coordinates, *layout.variables, station(profiles=True), PROVENANCE)
-]
-NAMED = [
-    pytest.param(value.values[1], id=str(value.id))
-    for value in ROWS
-    if value.values[1].standard_name
-]
+
+def rows() -> Iterator[tuple[str, Row]]:
+    """Yield the rows of all kinds, each with its name for a message."""
+    for kind in kinds():
+        layout = layout_of(kind)
+        for row in (*layout.coordinates, *layout.variables, station(profiles=True), PROVENANCE):
+            yield f"{kind}: {row.name}", row
 
 
 @pytest.fixture(scope="module")
@@ -45,31 +42,31 @@ def standard_names() -> dict[str, str | None]:
     return {entry.attrib["id"]: entry.findtext("canonical_units") for entry in table.iter("entry")}
 
 
-@pytest.mark.parametrize("row", NAMED)
-def test_standard_names_exist_and_their_units_convert(
-    row: Row, standard_names: dict[str, str | None]
-):
-    name, _, modifier = str(row.standard_name).partition(" ")
-    assert modifier in ("", "standard_error")
-    assert name in standard_names
-    canonical = standard_names[name]
-    if canonical:
-        # The canonical unit of time is s; a time coordinate counts from an epoch.
-        unit = attributes(row, mode=DetectionMode.ANALOG)["units"].split(" since ")[0]
-        assert Unit(unit).is_convertible(Unit(canonical))
-    else:
-        assert row.units is None
+def test_standard_names_exist_and_their_units_convert(standard_names: dict[str, str | None]):
+    named = [(place, row) for place, row in rows() if row.standard_name]
+    assert len(named) > 100
+    for place, row in named:
+        name, _, modifier = str(row.standard_name).partition(" ")
+        assert modifier in ("", "standard_error"), place
+        assert name in standard_names, place
+        canonical = standard_names[name]
+        if canonical:
+            # The canonical unit of time is s; a time coordinate counts from an epoch.
+            unit = attributes(row, mode=DetectionMode.ANALOG)["units"].split(" since ")[0]
+            assert Unit(unit).is_convertible(Unit(canonical)), place
+        else:
+            assert row.units is None, place
 
 
-@pytest.mark.parametrize(("kind", "row"), ROWS)
 @pytest.mark.parametrize("mode", list(DetectionMode))
-def test_every_unit_is_valid_and_no_placeholder_is_left(kind: str, row: Row, mode: DetectionMode):
-    found = attributes(row, mode=mode)
-    assert found["long_name"]
-    assert found["coverage_content_type"] in set(Coverage)
-    assert "{" not in "".join(str(value) for value in found.values())
-    if row.dtype != "S1":
-        Unit(found["units"].split(" since ")[0])
+def test_every_unit_is_valid_and_no_placeholder_is_left(mode: DetectionMode):
+    for place, row in rows():
+        found = attributes(row, mode=mode)
+        assert found["long_name"], place
+        assert found["coverage_content_type"] in set(Coverage), place
+        assert "{" not in "".join(str(value) for value in found.values()), place
+        if row.dtype != "S1":
+            Unit(found["units"].split(" since ")[0])
 
 
 _CAUSES = ("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline")
