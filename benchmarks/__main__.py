@@ -11,7 +11,7 @@ import typer
 # First of all, it sets the number of threads.
 from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_rows
 
-from benchmarks.harness.benchmark import Effort  # isort: skip
+from benchmarks.harness.results import Effort  # isort: skip
 from benchmarks.registry import run_benchmark  # isort: skip
 
 app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
@@ -68,9 +68,10 @@ def main(
     if as_json:
         typer.echo(study.json())
     else:
-        for results in (shown for chapter in study.chapters for shown in chapter.results):
+        for results in study.results:
             if not results.folded:
-                show_rows(results.title, results.table.columns, results.table.rows)
+                table = results.table
+                show_rows(results.title, table.columns, table.itertuples(index=False, name=None))
         if page is not None:
             typer.echo(f"report: {page}")
     for target in study.missed:

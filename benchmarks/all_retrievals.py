@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from benchmarks.accuracy import elastic, homogeneous, multiangle, network
-from benchmarks.harness.benchmark import Effort
-from benchmarks.harness.charts import error_against_time
-from benchmarks.harness.drawing import Chart
-from benchmarks.harness.figure import Figure, cpu_time, share
-from benchmarks.harness.rows import CPU_TIME, Row, Score, Scores, rows_of, rows_of_scores
-from benchmarks.harness.study import Chapter, Results, Study, Work
-from benchmarks.harness.timing import least_times
+from benchmarks.harness.figure import Figure, share
+from benchmarks.harness.plots import Chart
+from benchmarks.harness.results import Chapter, Effort, Results, Study, Work, frame
+from benchmarks.harness.timing import CPU_TIME
+from benchmarks.harness.verdicts import Score, Scores
 
-_PROFILES: Final = 500
-_BINS: Final = 4096
-_CHANNELS: Final = 12
-_ROUNDS: Final = 9
 _RMSE: Final = "RMSE"
 STRONGEST: Final = "Ours beside the strongest peer"
 _SHOWN: Final = frozenset({"background of 100000 counts", "3 x 2 beams, plume, noise 5 %"})
 """Settings shown for a retrieval, if not its first."""
+Works = Mapping[str, Sequence[Work]]
+"""Works by retrieval."""
 
 
 def measure_all(effort: Effort, *, data: Path | None = None) -> Study:
@@ -75,21 +68,7 @@ def _prefixed(chapter: Chapter, name: str) -> Chapter:
     )
 
 
-def _minimal_operations() -> Scores:
-    profiles = np.random.default_rng(0).random((_PROFILES, _BINS), np.float32)
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        file = Path(folder) / "counts"
-        file.write_bytes(np.zeros((_CHANNELS, _BINS), np.int32).tobytes())
-        times = least_times({"memory": lambda: np.max(profiles), "file": file.read_bytes}, _ROUNDS)
-    memory = f"read a profile of {_BINS} float32 in memory (np.max)"
-    files = f"read a file of {_CHANNELS} channels of {_BINS} bins from the page cache"
-    return {
-        ("", memory): {CPU_TIME: cpu_time(1e9 * times["memory"] / _PROFILES)},
-        ("", files): {CPU_TIME: cpu_time(1e9 * times["file"])},
-    }
-
-
-def _overview(works: Mapping[str, Sequence[Work]]) -> Chapter:
+def _overview(works: Works) -> Chapter:
     return Chapter(
         "Error against run time, all retrievals",
         "All methods of all retrievals, with common baselines and iterative peers, on "
@@ -113,19 +92,11 @@ def _overview(works: Mapping[str, Sequence[Work]]) -> Chapter:
                 case="error of",
                 method="ours",
             ),
-            Results(
-                "Minimal operations, measured in the same run",
-                rows_of_scores(_minimal_operations()),
-                method="operation",
-            ),
             *(
                 Results(
                     f"{retrieval.capitalize()}: all methods",
-                    [
-                        row
-                        for work in group
-                        for row in _rows(work, f"{work.quantity}; {work.setting}")
-                    ],
+                    {(f"{work.quantity}; {work.setting}", _named(work)): _score(work)
+                     for work in group},
                     case="error of",
                     folded=True,
                 )
@@ -133,25 +104,28 @@ def _overview(works: Mapping[str, Sequence[Work]]) -> Chapter:
             ),
         ],
         [_chart(retrieval, group) for retrieval, group in works.items()],
-    )
+    )  # fmt: skip
 
 
-def _rows(work: Work, case: str) -> list[Row]:
-    method = work.method if work.ours else f"peer: {work.method}"
+def _named(work: Work) -> str:
+    return work.method if work.ours else f"peer: {work.method}"
+
+
+def _score(work: Work) -> Score:
     coverage = None if work.coverage is None else share(work.coverage)
-    return rows_of(case, method, {_RMSE: work.error, "95 %": coverage, CPU_TIME: work.time})
+    return {_RMSE: work.error, "95 %": coverage, CPU_TIME: work.time}
 
 
 def _shown(settings: Sequence[str]) -> str:
     return next((setting for setting in settings if setting in _SHOWN), settings[0])
 
 
-def best_methods(works: Mapping[str, Sequence[Work]]) -> list[Row]:
+def best_methods(works: Works) -> Scores:
     """Return the best of our methods and of the peers for each retrieval and quantity.
 
     Of methods whose errors differ by less than 2 Monte Carlo errors, the best is the fastest.
     """
-    rows: list[Row] = []
+    scores: Scores = {}
     for retrieval, every in works.items():
         for quantity in dict.fromkeys(work.quantity for work in every):
             group = [w for w in every if w.quantity == quantity and not w.informed]
@@ -159,28 +133,26 @@ def best_methods(works: Mapping[str, Sequence[Work]]) -> list[Row]:
             for ours in (True, False):
                 rivals = [work for work in group if work.ours is ours and work.setting == setting]
                 if rivals:
-                    rows += _rows(_best(rivals), f"{retrieval}, {setting}: {quantity}")
-    return rows
+                    best = _best(rivals)
+                    scores[f"{retrieval}, {setting}: {quantity}", _named(best)] = _score(best)
+    return scores
 
 
-def against_peers(works: Mapping[str, Sequence[Work]]) -> list[Row]:
+def against_peers(works: Works) -> Scores:
     """Return the most accurate of our methods beside that of the peers, in every setting."""
-    rows: list[Row] = []
+    scores: Scores = {}
     for retrieval, every in works.items():
-        settings = dict.fromkeys((work.quantity, work.setting) for work in every)
-        for quantity, setting in settings:
+        for quantity, setting in dict.fromkeys((work.quantity, work.setting) for work in every):
             group = [
-                work
-                for work in every
+                work for work in every
                 if (work.quantity, work.setting) == (quantity, setting) and not work.informed
-            ]
+            ]  # fmt: skip
             ours, peers = ([work for work in group if work.ours is of] for of in (True, False))
             if ours and peers:
-                best, peer = _best(ours), _best(peers)
-                rows += rows_of(
-                    f"{retrieval}, {setting}: {quantity}", best.method, _beside(best, peer)
-                )
-    return rows
+                best = _best(ours)
+                key = (f"{retrieval}, {setting}: {quantity}", best.method)
+                scores[key] = _beside(best, _best(peers))
+    return scores
 
 
 def _beside(ours: Work, peer: Work) -> Score:
@@ -212,19 +184,18 @@ def _best(works: Sequence[Work]) -> Work:
 def _chart(retrieval: str, works: Sequence[Work]) -> Chart:
     quantity = works[0].quantity
     drawn = [work for work in works if work.quantity == quantity]
-    settings = list(dict.fromkeys(work.setting for work in drawn))
+    settings = list(dict.fromkeys(work.setting for work in drawn if not work.ours))
     last = _shown(settings)
     chosen = {settings[0], last if last != settings[0] else settings[-1]}
-    chart = error_against_time(
+    scores = {(work.setting, work.method): _score(work) for work in drawn if work.setting in chosen}
+    return Chart(
         "all-" + retrieval.replace(" ", "-"),
-        [
-            row
-            for work in drawn
-            if work.setting in chosen
-            for row in rows_of(work.setting, work.method, {_RMSE: work.error, CPU_TIME: work.time})
-        ],
+        f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time",
+        "Bars of 2 Monte Carlo standard errors. Hollow: peers, and methods that know more than the "
+        "profile or solve only a part. The steps join the methods that no other beats in both "
+        "error and time.",
+        frame(scores),
         _RMSE,
-        hollow={work.method for work in drawn if not work.ours or work.informed},
+        {work.method for work in drawn if not work.ours or work.informed},
         gain=1.0,
     )
-    return replace(chart, title=f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time")

@@ -11,8 +11,7 @@ from typing import TypeVar
 
 from benchmarks import all_retrievals
 from benchmarks.accuracy import elastic, homogeneous, multiangle, network
-from benchmarks.harness.benchmark import BenchmarkKind, Effort
-from benchmarks.harness.study import Study
+from benchmarks.harness.results import BenchmarkKind, Effort, Study
 from benchmarks.harness.timing import cpu_seconds
 from benchmarks.stability import study
 from benchmarks.throughput import (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -13,15 +13,12 @@ import numpy.typing as npt
 
 from benchmarks.accuracy import elastic_cases
 from benchmarks.accuracy.elastic_cases import BackgroundEstimates, SimulatedSky
-from benchmarks.harness.benchmark import Effort
-from benchmarks.harness.charts import chart, panel
-from benchmarks.harness.costs import batch_label, cost_chapter, time_methods
-from benchmarks.harness.drawing import Chart
+from benchmarks.accuracy.elastic_peers import LINEAR, klett_numpy, linear_backgrounds
 from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share
-from benchmarks.harness.rows import CPU_TIME, Row, Score, Scores, rows_of_scores
+from benchmarks.harness.results import Chapter, Effort, Results, Study, Work
 from benchmarks.harness.statistics import SIGMAS, mean, root, share_inside
-from benchmarks.harness.study import Chapter, Results, Study, Work
-from benchmarks.harness.timing import READ, affordable
+from benchmarks.harness.timing import CPU_TIME, READ, affordable, time_methods
+from benchmarks.harness.verdicts import Score, Scores
 from lidarops.retrieve.elastic.inversion import ElasticResult
 
 DRAWS: Final = 5000
@@ -30,18 +27,20 @@ SLOW_SHARE: Final = 5
 """One in this many profiles is processed by `homogeneous`, which is slow."""
 BLOCK: Final = 200
 """Profiles simulated and solved together."""
-CLOSED_LEVELS: Final = (1.0, 1e4, 1e8)
 ALL_STEPS: Final = "all steps"
 TIMED_LEVEL: Final = 1e4
 """Background of the timed profiles, counts per shot."""
 _BATCH: Final = 400
-_REPEATS: Final = 5
-_QUICK_REPEATS: Final = 3
 _COMPARED: Final = (1e2, 1e5)
 """Backgrounds shown on the page of all retrievals, counts per shot."""
 _CARRIED: Final = "chosen, error carried"
 """Chain of all steps."""
 _WITHIN: Final = ("within 1", "within 1.96")
+
+
+def background_methods() -> dict[str, elastic_cases.BackgroundMethod]:
+    """Return the methods of the background and their peer by name."""
+    return {**elastic_cases.background_methods(), LINEAR: linear_backgrounds}
 
 
 def measure_elastic_accuracy(
@@ -69,37 +68,60 @@ def measure_elastic_accuracy(
     inversions: Scores = {}
     for seed, level in enumerate(elastic_cases.LEVELS):
         of_background, of_inversion = _level(sky, level, count, seed)
-        backgrounds |= of_background
-        inversions |= of_inversion
+        backgrounds |= {(_decade(level), name): score for name, score in of_background.items()}
+        inversions |= {(_decade(level), name): score for name, score in of_inversion.items()}
         effort.progress(1)
-    repeats = _QUICK_REPEATS if effort.quick else _REPEATS
-    costs = elastic_costs(min(count, _BATCH), repeats)
-    closed = {
-        ("none" if b is None else _decade(b), ""): _closed(sky, b) for b in (None, *CLOSED_LEVELS)
-    }
+    costs = elastic_costs("", min(count, _BATCH), 3 if effort.quick else 5)
+    times = {name: score[CPU_TIME] for (_, name), score in costs.items()}
     return Study(
         "Elastic inversion: error against the level of the background",
         effort.date,
         [
-            _backgrounds(backgrounds, count),
-            _inversions(inversions),
-            _without_noise(closed),
+            Chapter(
+                "Simulated profiles",
+                "Simulated like the EARLINET elastic intercomparison: 532 nm, aerosol below 6 km "
+                "(optical depth 1.4), 1005 bins of 15 m, means of 1000 shots with Poisson noise; "
+                f"{count:,} profiles per level, one in {SLOW_SHARE} of them for homogeneous. "
+                "known_shape selects its window, or knows that the air is clean above 6 km; "
+                "tail_mean averages the last tenth of the bins. homogeneous and cubic assume a "
+                "homogeneous path, and get the range above 6 km. The reference window of the "
+                "inversion is given, 7 to 8 km, or chosen; error carried: what noise may hide in "
+                "it is stated as error of the reference.",
+                [
+                    Results(
+                        "Background, counts per shot",
+                        backgrounds,
+                        "Mean and root mean square of the error over the stated one, and share of "
+                        "profiles within 1 and 1.96 stated errors. Bound: Cramér-Rao, above 6 km. "
+                        "Rejected profiles are excluded.",
+                        case="background",
+                    ),
+                    Results(
+                        "Backscatter from 0.5 to 6 km, percent of its mean",
+                        inversions,
+                        "Solved: share of bins with a value. Mean error and scatter of a profile; "
+                        "RMSE and stated standard error of a bin.",
+                        case="background",
+                    ),
+                ],
+            ),
             *published,
-            elastic_cost_chapter(costs),
         ],
-        _works(backgrounds, inversions, costs),
+        list(_works(backgrounds, inversions, times)),
     )
 
 
-def _level(sky: SimulatedSky, level: float, draws: int, seed: int) -> tuple[Scores, Scores]:
-    """Return the scores of the backgrounds and of the inversions at one level."""
+def _level(
+    sky: SimulatedSky, level: float, draws: int, seed: int
+) -> tuple[dict[str, Score], dict[str, Score]]:
+    """Return the scores of the backgrounds and of the inversions at one level, by method."""
     estimates: dict[str, list[BackgroundEstimates]] = {}
     errors: dict[str, list[Array]] = {}
     for k, first in enumerate(range(0, draws, BLOCK)):
         counts = sky.counts(level, min(BLOCK, draws - first), seed, k)
         solved = {
             name: method(counts, sky)
-            for name, method in elastic_cases.background_methods().items()
+            for name, method in background_methods().items()
             if first < draws / SLOW_SHARE or name != elastic_cases.HOMOGENEOUS
         }
         for name, estimate in solved.items():
@@ -107,21 +129,21 @@ def _level(sky: SimulatedSky, level: float, draws: int, seed: int) -> tuple[Scor
         for name, chain in elastic_cases.chains().items():
             inverted = elastic_cases.invert(counts, sky, solved[chain.method], chain)
             errors.setdefault(name, []).append(_errors(inverted, sky))
-    backgrounds: Scores = {}
-    inversions: Scores = {}
+    backgrounds: dict[str, Score] = {}
     for name, blocks in estimates.items():
         error, stated, rejected = (
             np.concatenate([getattr(block, field) for block in blocks])
             for field in ("background", "standard_error", "rejected")
         )
-        backgrounds[_decade(level), name] = {
+        backgrounds[name] = {
             **background_score(error - level, stated, rejected),
             "bound": elastic_cases.least_error(sky, level),
             "rejected": share(float(rejected.mean())),
         }
-    for name, chunks in errors.items():
-        error, stated = np.concatenate(chunks, axis=1)
-        inversions[_decade(level), name] = inversion_score(error, stated, _scale(sky))
+    inversions = {
+        name: inversion_score(np.concatenate(chunks, axis=1), _scale(sky))
+        for name, chunks in errors.items()
+    }
     return backgrounds, inversions
 
 
@@ -162,17 +184,18 @@ def background_score(error: Array, stated: Array, rejected: Mask) -> Score:
     return dict(zip(names, values, strict=True))
 
 
-def inversion_score(error: Array, stated: Array, scale: float) -> Score:
+def inversion_score(errors: Array, scale: float) -> Score:
     """Return the errors of backscatter; None where fewer than two of many profiles have a value.
 
     Parameters
     ----------
-    error, stated : (profile, compared bin) float
+    errors : (error or standard error, profile, compared bin) float
         m-1 sr-1; NaN where withheld.
     scale : float
         Mean of the truth, m-1 sr-1.
     """
     names = ("solved", "mean error", "scatter", "RMSE", "stated", *_WITHIN)
+    error, stated = errors
     valid = np.isfinite(error) & np.isfinite(stated)
     kept = np.any(valid, axis=1)
     if kept.sum() < min(2, kept.size) or not np.any(kept):
@@ -195,191 +218,47 @@ def inversion_score(error: Array, stated: Array, scale: float) -> Score:
     return dict(zip(names, map(share, values), strict=True))
 
 
-def _works(backgrounds: Scores, inversions: Scores, costs: Sequence[Row]) -> list[Work]:
-    times = {row.method: row.value for row in costs if row.quantity == CPU_TIME}
-    works = []
+def _works(backgrounds: Scores, inversions: Scores, times: dict[str, Any]) -> Iterator[Work]:
     for level in _COMPARED:
-        scores = {
-            name: score for (case, name), score in backgrounds.items() if case == _decade(level)
-        }
+        scores = {name: score for (case, name), score in backgrounds.items()
+                  if case == _decade(level)}  # fmt: skip
         scores |= {ALL_STEPS: inversions[_decade(level), _CARRIED]}
+        whole, background = "backscatter 0.5 to 6 km, relative", "background, counts"
         for method, score in scores.items():
             error, coverage, spent = score["RMSE"], score[_WITHIN[1]], times.get(method)
-            if not isinstance(error, Figure) or not isinstance(coverage, Figure):
-                continue
-            if isinstance(spent, float):
-                works.append(
-                    Work(
-                        f"background of {level:.0f} counts",
-                        "backscatter 0.5 to 6 km, relative"
-                        if method == ALL_STEPS
-                        else "background, counts",
-                        method,
-                        Figure(error.value, error.error),
-                        coverage,
-                        cpu_time(spent),
-                        ours=method not in {elastic_cases.TAIL_MEAN, elastic_cases.LINEAR},
-                        informed=method == elastic_cases.KNOWN_CLEAN_RANGE,
-                    )
+            if isinstance(error, Figure) and isinstance(coverage, Figure) and spent:
+                yield Work(
+                    f"background of {level:.0f} counts",
+                    whole if method == ALL_STEPS else background,
+                    method,
+                    Figure(error.value, error.error),
+                    coverage,
+                    cpu_time(spent.value),
+                    ours=method not in {elastic_cases.TAIL_MEAN, LINEAR},
+                    informed=method == elastic_cases.KNOWN_CLEAN_RANGE,
                 )
-    return works
-
-
-# Chapters -------------------------------------------------------------------------------------
-
-_LEVEL: Final = "background (counts per shot)"
-_DRAWN: Final = (
-    elastic_cases.KNOWN_SHAPE,
-    elastic_cases.KNOWN_CLEAN_RANGE,
-    elastic_cases.TAIL_MEAN,
-)
 
 
 def _decade(level: float) -> str:
     return f"1e{round(math.log10(level))}"
 
 
-def _by_method(scores: Scores) -> dict[str, list[Row]]:
-    groups: dict[str, list[Row]] = {}
-    for row in rows_of_scores(scores):
-        groups.setdefault(row.method, []).append(row)
-    return groups
-
-
-def _backgrounds(scores: Scores, profiles: int) -> Chapter:
-    groups = _by_method(scores)
-    return Chapter(
-        "Background",
-        "Simulated like the EARLINET elastic intercomparison: 532 nm, aerosol below 6 km "
-        "(optical depth 1.4), 1005 bins of 15 m, means of 1000 shots with Poisson noise; "
-        f"{profiles:,} profiles per level, one in {SLOW_SHARE} of them for "
-        "homogeneous. known_shape selects its window, or knows that the air is clean above 6 km. "
-        "tail_mean averages the last tenth of the bins, including the signal there. The methods "
-        "homogeneous and cubic are not in the figure, because they assume a homogeneous path. "
-        "Above 6 km the decreasing air density looks like extinction, which biases their "
-        "background by about one count for any noise, and the additional unknown increases its "
-        "scatter (folded tables, above 6 km).",
-        [
-            Results(
-                f"Background by {name}, counts per shot",
-                group,
-                "In brackets: Monte Carlo standard error of the last digits. Stated: median "
-                "standard error. Mean and root mean square of the error over the stated one, and "
-                "share of profiles within 1 and 1.96 stated errors: 68.3 and 95 % if errors are as "
-                "stated. Bound: Cramér-Rao, above 6 km. Rejected profiles are excluded.",
-                case="background",
-                folded=name not in _DRAWN,
-            )
-            for name, group in groups.items()
-        ],
-        [
-            _level_chart(
-                "background",
-                "Error of the background against its level (counts per shot)",
-                {name: groups[name] for name in _DRAWN},
-            )
-        ],
-    )
-
-
-def _inversions(scores: Scores) -> Chapter:
-    groups = _by_method(scores)
-    return Chapter(
-        "Backscatter",
-        "Backscatter of particles from 0.5 to 6 km, in percent of its mean there, with the "
-        "true lidar ratio. The reference window is given, 7 to 8 km, or chosen from windows of "
-        "1 km between 4 and 12 km, some of which hold a tenuous layer of up to 0.4 per Mm and sr. "
-        "Error carried: what noise may hide in the window is stated as error of the reference, "
-        "for particles hidden by noise. Bins without value are excluded: where few bins are "
-        "solved, noise has selected them.",
-        [
-            Results(
-                f"Backscatter by {name}, percent of its mean",
-                group,
-                "Solved: share of bins with a value. Mean error and scatter of a profile; RMSE and "
-                "stated standard error of a bin. Share of bins within 1 and 1.96 stated standard "
-                "errors.",
-                case="background",
-            )
-            for name, group in groups.items()
-        ],
-        [_level_chart("backscatter", "Error of backscatter, 0.5 to 6 km, by background", groups)],
-    )
-
-
-def _level_chart(name: str, title: str, groups: dict[str, list[Row]]) -> Chart:
-    return chart(
-        name,
-        title,
-        "Root mean square error, with bars of 2 Monte Carlo standard errors, and stated standard "
-        "error (hollow). Where they agree, errors are as stated.",
-        [
-            panel(method, group, ("RMSE", "stated"), x=_LEVEL, joined=True, hollow={"stated"})
-            for method, group in groups.items()
-        ],
-    )
-
-
-# Without noise, and published files -----------------------------------------------------------
-
-
-def _closed(sky: SimulatedSky, level: float | None) -> Score:
-    counts = (sky.signal + (level or 0.0))[np.newaxis]
-    no_background = BackgroundEstimates(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.bool_))
-    # With a known clean range only numerical errors remain, none of the choice of a window.
-    estimates = (
-        no_background
-        if level is None
-        else elastic_cases.background_methods()[elastic_cases.KNOWN_CLEAN_RANGE](counts, sky)
-    )
-    solved = elastic_cases.invert_particles(
-        elastic_cases.subtract_background(counts, sky, estimates), sky, elastic_cases.GIVEN_WINDOW
-    )
-    near = sky.compared
-    error = (solved.backscatter[0] - sky.backscatter)[near] / _scale(sky)
-    return {
-        "its error (counts)": float(estimates.background[0]) - (level or 0.0),
-        "mean error": share(float(error.mean())),
-        "largest error": share(float(np.abs(error).max())),
-    }
-
-
-def _without_noise(scores: Scores) -> Chapter:
-    return Chapter(
-        "Without noise",
-        "Errors of the method itself: the signal is summed over ninths of a bin, the "
-        "inversion and the molecular shape by trapezoids over bins of 15 m.",
-        [
-            Results(
-                "Closed loop without noise",
-                rows_of_scores(scores),
-                "Of backscatter from 0.5 to 6 km, over its mean there.",
-                case="background",
-            )
-        ],
-    )
-
-
-def _files(sky: SimulatedSky, files: Sequence[elastic_cases.Published]) -> Chapter:
+def _files(sky: SimulatedSky, files: list[elastic_cases.Published]) -> Chapter:
     backgrounds: Scores = {}
     inversions: Scores = {}
     for file in files:
-        estimates = {
-            name: method(file.counts, sky)
-            for name, method in elastic_cases.background_methods().items()
-        }
+        case = _decade(file.level)
+        estimates = {name: find(file.counts, sky) for name, find in background_methods().items()}
         for name, estimate in estimates.items():
             error = float(estimate.background[0]) - file.background
-            backgrounds[_decade(file.level), name] = {
+            backgrounds[case, name] = {
                 "error": error,
                 "error / stated": error / float(estimate.standard_error[0]),
                 "error of the truth": file.background_error,
             }
         for name, chain in elastic_cases.chains().items():
             inverted = elastic_cases.invert(file.counts, sky, estimates[chain.method], chain)
-            errors = _errors(inverted, sky)
-            score = inversion_score(errors[0], errors[1], _scale(sky))
-            inversions[_decade(file.level), name] = score
+            inversions[case, name] = inversion_score(_errors(inverted, sky), _scale(sky))
     return Chapter(
         "Files of the intercomparison",
         "The published files at 532 nm, one per level, lidar ratio 39 sr. The true background "
@@ -389,13 +268,11 @@ def _files(sky: SimulatedSky, files: Sequence[elastic_cases.Published]) -> Chapt
         "there is biased by that amount.",
         [
             Results(
-                "Background of published files, counts per shot",
-                rows_of_scores(backgrounds),
-                case="background",
+                "Background of published files, counts per shot", backgrounds, case="background"
             ),
             Results(
                 "Backscatter of published files, percent of its mean",
-                rows_of_scores(inversions),
+                inversions,
                 "From 0.5 to 6 km, one profile per row, so without scatter.",
                 case="background",
             ),
@@ -406,11 +283,12 @@ def _files(sky: SimulatedSky, files: Sequence[elastic_cases.Published]) -> Chapt
 # CPU time -------------------------------------------------------------------------------------
 
 
-def elastic_costs(batch: int, repeats: int) -> list[Row]:
+def elastic_costs(case: str, batch: int, repeats: int) -> Scores:
     """Return the CPU time of each step and peer, the read first.
 
     Parameters
     ----------
+    case : str
     batch : int
         Profiles per call; slow peers get fewer.
     repeats : int
@@ -422,7 +300,7 @@ def elastic_costs(batch: int, repeats: int) -> list[Row]:
     for name, step in (ours | peers).items():
         size = batch if name == READ else affordable(step, batch)
         calls[name] = (partial(step, size), size)
-    return time_methods(batch_label(batch), calls, repeats, peers=peers)
+    return time_methods(case, calls, repeats, peers=peers)
 
 
 _Step = Callable[[int], object]
@@ -432,7 +310,7 @@ _Step = Callable[[int], object]
 def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
     """Return the steps of lidarops with the read, and the peers."""
     sky = elastic_cases.simulated_sky()
-    methods = elastic_cases.background_methods()
+    methods = background_methods()
     estimate = methods[elastic_cases.KNOWN_SHAPE](counts, sky)
     power = elastic_cases.subtract_background(counts, sky, estimate)
     noise = elastic_cases.count_variance(counts)
@@ -456,36 +334,21 @@ def _steps(counts: Any) -> tuple[dict[str, _Step], dict[str, _Step]]:
         first = counts[:few]
         return elastic_cases.invert(first, sky, methods[chain.method](first, sky), chain)
 
+    names = (
+        elastic_cases.TAIL_MEAN,
+        elastic_cases.KNOWN_SHAPE,
+        elastic_cases.KNOWN_CLEAN_RANGE,
+    )
     ours: dict[str, _Step] = {
         READ: lambda few: np.max(counts[:few]),
-        **{
-            name: background(name)
-            for name in (
-                elastic_cases.TAIL_MEAN,
-                elastic_cases.KNOWN_SHAPE,
-                elastic_cases.KNOWN_CLEAN_RANGE,
-            )
-        },
+        **{name: background(name) for name in names},
         "layers.screen": lambda few: elastic_cases.find_clouds(power[:few], noise[:few], sky),
         "reference.choose": lambda few: elastic_cases.choose_window(power[:few], noise[:few], sky),
         "elastic.solve": solve_particles,
         ALL_STEPS: everything,
     }
     peers: dict[str, _Step] = {
-        elastic_cases.LINEAR: background(elastic_cases.LINEAR),
-        "Klett, numpy": lambda few: elastic_cases.klett_numpy(whole[:few], sky),
+        LINEAR: background(LINEAR),
+        "Klett, numpy": lambda few: klett_numpy(whole[:few], sky),
     }
     return ours, peers
-
-
-def elastic_cost_chapter(costs: Sequence[Row]) -> Chapter:
-    """Return the chapter on the CPU time of the steps, beside plain peers."""
-    return cost_chapter(
-        "elastic-time",
-        f"Profiles of {elastic_cases.RANGE.size} bins, float64, one thread, least CPU time of "
-        "interleaved repeats. Steps of lidarops compute all errors and flags; all steps: "
-        "background, clouds, reference window and inversion with its error budget. The peer "
-        f"{elastic_cases.LINEAR} gives values and errors without flags, the Klett inversion in "
-        "numpy for each profile values alone.",
-        costs,
-    )

@@ -188,8 +188,6 @@ KNOWN_SHAPE: Final = "known_shape"
 KNOWN_CLEAN_RANGE: Final = "known_shape, from 6 km"
 TAIL_MEAN: Final = "tail_mean"
 HOMOGENEOUS: Final = "homogeneous"
-LINEAR: Final = "least squares {1, shape}"
-"""The peer: the range from 6 km is given, and the weights are those of the mean profile."""
 
 
 def background_methods() -> dict[str, BackgroundMethod]:
@@ -202,7 +200,6 @@ def background_methods() -> dict[str, BackgroundMethod]:
         KNOWN_SHAPE: _known_shape,
         KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
         TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
-        LINEAR: linear_backgrounds,
         HOMOGENEOUS: _homogeneous,
         "cubic": _cubic,
     }
@@ -257,6 +254,11 @@ def least_error(sky: SimulatedSky, level: float) -> float:
     slopes = np.stack([np.ones_like(shape), shape], axis=1)
     fisher = slopes.T @ (slopes * (SHOTS / (sky.signal[far] + level))[:, np.newaxis])
     return float(np.sqrt(np.linalg.inv(fisher)[0, 0]))
+
+
+def count_weight(counts: Array) -> Array:
+    """Return inverse variances of mean counts, (range,), from the mean of the profiles."""
+    return np.asarray(SHOTS / np.maximum(counts.mean(axis=0), 1.0 / SHOTS))
 
 
 # Inversion ------------------------------------------------------------------------------------
@@ -373,50 +375,6 @@ def invert(
         background_error=estimates.standard_error,
         reference_error=hidden,
     )
-
-
-# Peers ----------------------------------------------------------------------------------------
-
-
-def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    """Return backgrounds by linear least squares with a constant and the shape of air."""
-    first = int(np.searchsorted(sky.range, CLEAN_FROM))
-    shape = sky.shape[first:] / sky.shape[first]
-    slopes = np.stack([np.ones_like(shape), shape], axis=1)
-    weighted = slopes * count_weight(counts[:, first:])[:, np.newaxis]
-    covariance = np.linalg.inv(weighted.T @ slopes)
-    background = counts[:, first:] @ (weighted @ covariance[:, 0])
-    error = np.full(len(counts), np.sqrt(covariance[0, 0]))
-    return BackgroundEstimates(background, error, np.zeros(len(counts), dtype=np.bool_))
-
-
-def count_weight(counts: Array) -> Array:
-    """Return inverse variances of mean counts, (range,), from the mean of the profiles."""
-    return np.asarray(SHOTS / np.maximum(counts.mean(axis=0), 1.0 / SHOTS))
-
-
-def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
-    """Return the backscatter of particles profile by profile, without errors.
-
-    fernald1984, backward and forward from the middle of `GIVEN_WINDOW`, by trapezoids.
-    """
-    inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
-    start = inside[inside.size // 2]
-    excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter
-    backscatter = np.empty(power.shape)
-    for row, profile in enumerate(power):
-        depth = _cumulated(excess, sky.range)
-        corrected = profile * sky.range**2 * np.exp(2.0 * (depth - depth[start]))
-        integral = _cumulated(LIDAR_RATIO * corrected, sky.range)
-        ratio = np.mean(corrected[inside] / sky.molecular_backscatter[inside])
-        total = corrected / (ratio - 2.0 * (integral - integral[start]))
-        backscatter[row] = total - sky.molecular_backscatter
-    return backscatter
-
-
-def _cumulated(values: Array, distance: Array) -> Array:
-    slices = 0.5 * (values[1:] + values[:-1]) * np.diff(distance)
-    return np.concatenate([[0.0], np.cumsum(slices)])
 
 
 # Published files ------------------------------------------------------------------------------

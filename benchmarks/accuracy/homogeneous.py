@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,22 +12,20 @@ from benchmarks.accuracy.homogeneous_cases import (
     BACKGROUND,
     QUANTITIES,
     TAIL_MEAN,
-    Estimates,
     PathSolver,
     Scenario,
     background_bias,
-    difficulty,
     least_errors,
     methods,
     scenarios,
 )
-from benchmarks.accuracy.peers import SLOW, iterative_peers
-from benchmarks.harness.benchmark import Effort
-from benchmarks.harness.charts import chart, error_against_time, panel
+from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
 from benchmarks.harness.figure import Figure, cpu_time, share
-from benchmarks.harness.rows import CPU_TIME, Score, Scores, rows_of_scores
+from benchmarks.harness.plots import Chart
+from benchmarks.harness.results import Chapter, Effort, Results, Study, Work, frame
 from benchmarks.harness.statistics import TWO_SIDED, mean, root, share_inside
-from benchmarks.harness.study import Chapter, Results, Study, Work
+from benchmarks.harness.timing import CPU_TIME
+from benchmarks.harness.verdicts import Score, Scores
 from lidarops.retrieve.background.cubic_and_tail import cubic
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
@@ -37,18 +35,9 @@ _SLOW_SHARE: Final = 20
 _WARM: Final = 64
 _ROUNDS: Final = 3
 """Timed calls, of which the least counts: others share the processor."""
-_INFORMED: Final = frozenset(
-    {
-        HomogeneousMethod.LINEARIZED,
-        HomogeneousMethod.KNOWN_BACKGROUND,
-        HomogeneousMethod.KNOWN_EXTINCTION,
-    }
-)
+_INFORMED: Final = frozenset({"linearized", "known_background", "known_extinction"})
 """Methods that are given more than the profile."""
-
 _RMSE: Final = "RMSE over bound"
-_DISTANCE: Final = "distance over bound"
-_DIFFICULTY: Final = "difficulty"
 
 
 def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study:
@@ -62,222 +51,136 @@ def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study
     """
     count = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
     solvers = {**methods(), **iterative_peers()}
-    scores: Scores = {}
+    scores: dict[str, list[Score]] = {name: [] for name in solvers}
     for seed, scenario in enumerate(scenarios(quick=effort.quick)):
-        scores |= _scores(scenario, solvers, scenario.powers(count, seed))
+        power = scenario.powers(count, seed)
+        for name, solver in solvers.items():
+            few = max(count // _SLOW_SHARE, 16) if name in SLOW else count
+            rounds = 1 if name in SLOW else _ROUNDS
+            scores[name].append(score_path(solver, scenario, power[:few], rounds))
         effort.progress(1)
-    offsets = published_offsets(count)
+    summary = _summary(scores)
+    peers = {*iterative_peers(), TAIL_MEAN}
     return Study(
         "Homogeneous path: error against the Cramér-Rao bound",
         effort.date,
-        [_overview(scores), _offsets(offsets)],
-        list(_works(scores)),
+        [
+            Chapter(
+                "Error against time",
+                "Paths of 225 bins through white noise, from 2.5 or 10.5 km over 1.7 or 8 km, "
+                "extinction 0.01 to 5 per km, signal 15 to 100 000 times the noise. The bound is "
+                "the inverse Fisher matrix of background, amplitude and extinction. Profiles that "
+                "a method rejects do not count for its error. The iterative peers start from the "
+                "fit of the mean of 64 profiles, and test no residuals.",
+                [
+                    Results(
+                        "All paths",
+                        summary,
+                        "Median over the paths of the RMSE over the bound; RMSE and bias of the "
+                        "worst path; least and largest coverage of the 95 percent interval; mean "
+                        "shares of flagged and rejected profiles. In brackets the Monte Carlo "
+                        "standard error in the last digits.",
+                        case="error of",
+                    )
+                ],
+                [
+                    Chart(
+                        "work-precision",
+                        "RMSE over bound against CPU time",
+                        "Hollow: peers, and methods that know more than the profile.",
+                        frame(summary),
+                        _RMSE,
+                        peers | _INFORMED,
+                        level=1.0,
+                    )
+                ],
+            ),
+            _offsets_chapter(published_offsets(count)),
+        ],
+        list(_works(scores, peers)),
     )
 
 
-def _scores(scenario: Scenario, solvers: Mapping[str, PathSolver], power: Any) -> Scores:
-    converged = solvers[HomogeneousMethod.DIRECT](power, scenario)
-    hardness: Score = {_DIFFICULTY: difficulty(scenario)}
-    return {
-        (scenario.label, name): hardness | score_path(name, solver, scenario, power, converged)
-        for name, solver in solvers.items()
-    }
-
-
-def score_path(
-    name: str, solver: PathSolver, scenario: Scenario, power: Any, converged: Estimates
-) -> Score:
+def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int = 1) -> Score:
     """Return errors over the Cramér-Rao bound, flags and time of one solver on one path.
 
     Parameters
     ----------
-    name : str
     solver : PathSolver
     scenario : Scenario
     power : (profile, bin) float
-    converged : Estimates
-        Solution of the direct method.
+    rounds : int
+        Timed calls.
     """
-    if name in SLOW:
-        power = power[: max(len(power) // _SLOW_SHARE, 16)]
     solver(power[:_WARM], scenario)
     seconds = []
-    for _ in range(1 if name in SLOW else _ROUNDS):
+    for _ in range(rounds):
         begin = time.process_time()
         solution = solver(power, scenario)
         seconds.append(time.process_time() - begin)
     least = least_errors(scenario)
-    score: Score = {}
-    for quantity in QUANTITIES:
-        errors = _errors(solution, quantity, scenario.truth[quantity], least[quantity])
-        if errors["RMSE"] is not None:
-            errors["distance"] = _distance(solution, converged, quantity) / least[quantity]
-        score |= {f"{quantity.replace('_', ' ')}: {key}": value for key, value in errors.items()}
-    return score | {
+    score: Score = {
         "profiles": len(power),
         "flagged": share(float(solution.flagged.mean())),
         "rejected": share(float(solution.rejected.mean())),
         CPU_TIME: cpu_time(1e9 * min(seconds) / len(power)),
     }
+    for name in QUANTITIES:
+        error = (solution.values[name] - scenario.truth[name]) / least[name]
+        stated = solution.standard_errors[name] / least[name]
+        kept = np.isfinite(error) & ~solution.rejected
+        # A value that is given has no score.
+        if kept.sum() >= 2 and np.any(stated[kept] > 0):
+            error, stated = error[kept], stated[kept]
+            score[f"{name}: RMSE"] = root(mean(error**2))
+            score[f"{name}: bias"] = mean(error)
+            score[f"{name}: 95 %"] = share_inside(np.abs(error) <= TWO_SIDED * stated)
+    return score
 
 
-def _errors(solution: Estimates, quantity: str, truth: float, least: float) -> Score:
-    """Return errors over the profiles that are not rejected; None for a value that is given."""
-    error = (solution.values[quantity] - truth) / least
-    stated = solution.standard_errors[quantity] / least
-    kept = np.isfinite(error) & ~solution.rejected
-    if kept.sum() < 2 or not np.any(stated[kept] > 0):
-        return dict.fromkeys(("RMSE", "bias", "95 %", "distance"))
-    error, stated = error[kept], stated[kept]
-    return {
-        "RMSE": root(mean(error**2)),
-        "bias": mean(error),
-        "95 %": share_inside(np.abs(error) <= TWO_SIDED * stated),
-    }
+def _ranked(paths: Sequence[Score], quantity: str) -> list[Figure]:
+    """Return the figures of a quantity on all paths that have one, the smallest first."""
+    figures = [score[quantity] for score in paths if quantity in score]
+    return sorted((f for f in figures if isinstance(f, Figure)), key=lambda figure: figure.value)
 
 
-def _distance(solution: Estimates, converged: Estimates, quantity: str) -> float:
-    """Return the largest difference from the direct method where neither rejects."""
-    count = len(solution.rejected)
-    kept = ~solution.rejected & ~converged.rejected[:count]
-    distance = np.abs(solution.values[quantity] - converged.values[quantity][:count])[kept]
-    return float(np.nanmax(distance, initial=0.0))
+def _median(figures: Sequence[Figure]) -> float:
+    return float(np.median([figure.value for figure in figures]))
 
 
-# Chapters -------------------------------------------------------------------------------------
-
-
-def _columns(scores: Scores, method: str) -> dict[str, list[Figure]]:
-    """Return the figures of a method on all paths by quantity, without those that it lacks."""
-    columns: dict[str, list[Figure]] = {}
-    for (_, name), score in scores.items():
-        for quantity, value in score.items() if name == method else ():
-            if isinstance(value, Figure | float):
-                figure = value if isinstance(value, Figure) else Figure(value)
-                columns.setdefault(quantity, []).append(figure)
-    return columns
-
-
-def _ranked(figures: list[Figure]) -> list[Figure]:
-    return sorted(figures, key=lambda figure: figure.value)
-
-
-def _summary(scores: Scores) -> Scores:
+def _summary(scores: dict[str, list[Score]]) -> Scores:
     """Return the scores of all paths together, by unknown and method."""
-    paths = len(dict.fromkeys(path for path, _ in scores))
     summary: Scores = {}
-    for case in (quantity.replace("_", " ") for quantity in QUANTITIES):
-        for method in dict.fromkeys(method for _, method in scores):
-            columns = _columns(scores, method)
-            errors = _ranked(columns.get(f"{case}: RMSE", []))
-            solved = "all" if len(errors) == paths else f"{len(errors):,}"
-            line: Score = {"solved": solved}
+    for quantity in QUANTITIES:
+        for method, paths in scores.items():
+            errors = _ranked(paths, f"{quantity}: RMSE")
+            line: Score = {"solved": "all" if len(errors) == len(paths) else f"{len(errors):,}"}
             if errors:
-                coverage = _ranked(columns[f"{case}: 95 %"])
-                bias = max(columns[f"{case}: bias"], key=lambda figure: abs(figure.value))
+                coverage = _ranked(paths, f"{quantity}: 95 %")
+                bias = max(_ranked(paths, f"{quantity}: bias"), key=lambda each: abs(each.value))
                 line |= {_RMSE: errors[len(errors) // 2], "worst": errors[-1], "bias": bias}
                 line |= {"95 %": coverage[0], "to": coverage[-1]}
-            distances = [f.value for f in columns.get(f"{case}: distance", []) if f.value]
-            if distances:
-                line[_DISTANCE] = float(np.median(distances))
             for name in ("flagged", "rejected"):
-                line[name] = share(float(np.mean([f.value for f in columns[name]])))
-            line[CPU_TIME] = cpu_time(float(np.median([f.value for f in columns[CPU_TIME]])))
-            summary[case, method] = line
+                line[name] = share(float(np.mean([each.value for each in _ranked(paths, name)])))
+            line[CPU_TIME] = cpu_time(_median(_ranked(paths, CPU_TIME)))
+            summary[quantity.replace("_", " "), method] = line
     return summary
 
 
-def _solves_all(scores: Scores, method: str) -> bool:
-    """Return whether a method has an error of any unknown on all paths."""
-    own = [score for (_, name), score in scores.items() if name == method]
-    names = (f"{quantity.replace('_', ' ')}: RMSE" for quantity in QUANTITIES)
-    return any(all(score[name] is not None for score in own) for name in names)
-
-
-def _works(scores: Scores) -> list[Work]:
-    peers = {*iterative_peers(), TAIL_MEAN}
-    works = []
-    for method in dict.fromkeys(method for _, method in scores):
-        columns = _columns(scores, method)
-        errors = _ranked(columns.get("extinction: RMSE", []))
+def _works(scores: dict[str, list[Score]], peers: set[str]) -> Iterator[Work]:
+    for method, paths in scores.items():
+        errors = _ranked(paths, "extinction: RMSE")
         if errors:
-            paths = len(columns[CPU_TIME])
-            works.append(
-                Work(
-                    f"median of {paths} paths",
-                    "extinction, RMSE over the Cramér-Rao bound",
-                    method,
-                    errors[len(errors) // 2],
-                    _ranked(columns["extinction: 95 %"])[len(errors) // 2],
-                    cpu_time(float(np.median([f.value for f in columns[CPU_TIME]]))),
-                    ours=method not in peers,
-                    informed=method in _INFORMED,
-                )
+            yield Work(
+                f"median of {len(paths)} paths",
+                "extinction, RMSE over the Cramér-Rao bound",
+                method,
+                errors[len(errors) // 2],
+                _ranked(paths, "extinction: 95 %")[len(errors) // 2],
+                cpu_time(_median(_ranked(paths, CPU_TIME))),
+                ours=method not in peers,
+                informed=method in _INFORMED,
             )
-    return works
-
-
-def _overview(scores: Scores) -> Chapter:
-    summary, paths = rows_of_scores(_summary(scores)), rows_of_scores(scores)
-    methods_of = list(dict.fromkeys(method for _, method in scores))
-    hollow = {method for method in methods_of if not _solves_all(scores, method)} | _INFORMED
-    drawn = [row for row in paths if row.method in {"direct", "cubic"}]
-    profiles = next(row.value for row in paths if row.quantity == "profiles")
-    return Chapter(
-        "Error against time",
-        f"{len({row.case for row in paths})} paths of 225 bins through white noise, from 2.5 or "
-        "10.5 km over 1.7 or 8 km, extinction 0.01 to 5 per km, signal 15 to 100 000 times the "
-        f"noise, background 370; {profiles:,} profiles each, fewer for scipy. The bound is the "
-        "inverse Fisher matrix of background, amplitude and extinction. The amplitude is the "
-        "signal extrapolated to range zero; its logarithm is compared. Profiles that a method "
-        "rejects do not count for its error. The iterative peers start from the fit of the mean of "
-        "64 profiles, and test no residuals. Variable projection stops at steps of 0.05 standard "
-        "errors. Distance: largest difference from the "
-        "solution of the direct method. Difficulty: least standard error of extinction over "
-        "extinction + 1 / mean range.",
-        [
-            Results(
-                "All paths",
-                summary,
-                "Median over the paths of RMSE and of the distance, over the bound; RMSE and bias "
-                "of the worst path; least and largest coverage of the 95 percent interval; mean "
-                "shares of flagged and rejected profiles. In brackets the Monte Carlo standard "
-                "error in the last digits; the worst of many paths exceeds the typical one by two "
-                "or three of these errors.",
-                case="error of",
-            ),
-            *(
-                Results(
-                    f"{method}, path by path",
-                    [row for row in paths if row.method == method],
-                    "RMSE, bias and distance over the bound.",
-                    case="path",
-                    folded=True,
-                )
-                for method in methods_of
-            ),
-        ],
-        [
-            error_against_time("work-precision", summary, _RMSE, hollow=hollow, level=1.0),
-            error_against_time("convergence", summary, _DISTANCE, hollow=hollow, gain=1.0),
-            chart(
-                "difficulty",
-                "Error against difficulty",
-                "RMSE over the Cramér-Rao bound of each path, with bars of 2 Monte Carlo standard "
-                "errors.",
-                [
-                    panel(
-                        quantity.replace("_", " "),
-                        drawn,
-                        f"{quantity.replace('_', ' ')}: RMSE",
-                        x=_DIFFICULTY,
-                        level=1.0,
-                    )
-                    for quantity in QUANTITIES
-                ],
-            ),
-        ],
-    )
 
 
 # Background of the published cubic ------------------------------------------------------------
@@ -289,7 +192,6 @@ _PAPER_EXTINCTION: Final = 3e-5
 _AVERAGED: Final = 100
 _PUBLISHED: Final = {1e3: 10.6, 4e3: 6.5, 6e3: 1.5, 8e3: 1.2}
 """bobrovsky2024, table 1, less an assumed truth of 37.00, over an assumed noise of 0.1."""
-_LENGTH: Final = "length of the section (km)"
 
 
 def published_offsets(count: int) -> Scores:
@@ -301,95 +203,58 @@ def published_offsets(count: int) -> Scores:
     fade = np.exp(-2 * _PAPER_EXTINCTION * (10500.0 - 2500.0)) * (2500.0 / 10500.0) ** 2
     signals = {2500.0: _PAPER_SIGNAL, 10500.0: float(_PAPER_SIGNAL * fade)}
     sections = [(start, length) for start, lengths in _PAPER_LENGTHS for length in lengths]
-    return {
-        (_section(start, length), f"{averaged}"): _offset(
-            start, length, signals[start], averaged, (count, seed)
-        )
-        for averaged in (1, _AVERAGED)
-        for seed, (start, length) in enumerate(sections)
-    }
+    scores: Scores = {}
+    for averaged in (1, _AVERAGED):
+        # The mean of white noise is white noise: powers in units of its standard deviation.
+        scale = float(np.sqrt(averaged))
+        for seed, (start, length) in enumerate(sections):
+            path = Scenario(
+                start,
+                length,
+                _PAPER_EXTINCTION,
+                signals[start] * scale,
+                background=BACKGROUND * scale,
+                bins=round(length / _PAPER_STEP) + 1,
+            )
+            score = _offset(path, path.powers(count, seed), scale)
+            if start < 5e3:
+                score["published"] = _PUBLISHED.get(length)
+            scores[f"{start / 1e3:g} + {length / 1e3:g} km", f"{averaged}"] = score
+    return scores
 
 
-def _section(start: float, length: float) -> str:
-    return f"{start / 1e3:g} + {length / 1e3:g} km"
-
-
-def _offset(
-    start: float, length: float, signal: float, averaged: int, draw: tuple[int, int]
-) -> Score:
-    # The mean of white noise is white noise: powers in units of its standard deviation.
-    scale = float(np.sqrt(averaged))
-    path = Scenario(
-        start,
-        length,
-        _PAPER_EXTINCTION,
-        signal * scale,
-        background=BACKGROUND * scale,
-        bins=round(length / _PAPER_STEP) + 1,
-    )
-    power = path.powers(*draw)
+def _offset(path: Scenario, power: Any, scale: float) -> Score:
     # A variance of 0 means no noise, so that its bias is not subtracted, as published.
     published = cubic(power, path.range, lag=1, variance=0.0).background
     solution = methods()[HomogeneousMethod.DIRECT](power, path)
     background = solution.values["background"]
-    score: Score = {
-        _LENGTH: length / 1e3,
+    return {
+        "length of the section (km)": path.length / 1e3,
         "lag 1": mean((published - path.background) / scale),
         "direct": mean((background - path.background) / scale),
         "scatter": float(np.nanstd(background)) / scale,
         "expected": background_bias(path) / scale,
         "flagged": share(float(solution.flagged.mean())),
     }
-    return score | {"published": _PUBLISHED.get(length)} if start < 5e3 else score
 
 
-def _offsets(scores: Scores) -> Chapter:
-    rows = rows_of_scores(scores)
-    start, lengths = _PAPER_LENGTHS[0]
-    sections = {_section(start, length) for length in lengths}
-    near = [row for row in rows if row.case in sections]
+def _offsets_chapter(scores: Scores) -> Chapter:
     return Chapter(
         "Background of the published cubic",
         "Tables 1 and 2 of bobrovsky2024 give a background that decreases with the length of "
         "the section. This is due to noise: with a lag of one bin and no correction for the "
         "noise, the cubic counts part of the signal as background, however many profiles are "
-        "averaged. The tables do not state the signal; 17 times the noise at 2.5 km, 15 m bins "
-        "and 0.03 per km are assumed. The remaining error of the direct fit is the bias "
-        "of all least-squares solutions to second order in the noise; averaging removes it.",
+        "averaged. The remaining error of the direct fit is the bias of all least-squares "
+        "solutions to second order in the noise; averaging removes it.",
         [
             Results(
                 "Mean error of the background, in units of the noise of one profile",
-                rows,
+                scores,
                 "Mean error and, in brackets, its standard error: of the cubic with a lag of one "
                 "bin, and of the direct fit with its scatter. Expected: second-order bias "
                 "of least squares, not meaningful where it exceeds the scatter.",
                 case="section",
                 method="mean of",
-            ),
-        ],
-        [
-            chart(
-                "offsets",
-                "Mean error of the background, sections from 2.5 km",
-                "In units of the noise of a profile, of all profiles, flagged or not. Published: "
-                "table 1 less an assumed truth of 37.00, over an assumed noise of 0.10; its entry "
-                "at 4 km is not reproduced.",
-                [
-                    panel(
-                        title,
-                        [row for row in near if row.method == f"{averaged}"],
-                        ("lag 1", "direct", "published"),
-                        x=_LENGTH,
-                        joined=True,
-                        hollow={"published"},
-                        logarithmic=(False, False),
-                        level=0.0,
-                    )
-                    for title, averaged in (
-                        ("single profiles", 1),
-                        ("means of profiles", _AVERAGED),
-                    )
-                ],
             ),
         ],
     )

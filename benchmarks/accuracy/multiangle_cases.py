@@ -8,8 +8,6 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.optimize import lsq_linear
 
 from benchmarks.harness.figure import Array
 from lidarops.retrieve.multiangle.optical_depth import (
@@ -29,15 +27,6 @@ _LAYER: Final = 50.0
 """m, thickness of the layers of a cloud."""
 _OUTLIERS: Final = (0.3, 1.0)
 """Smallest and largest deviation of an outlier in the logarithm."""
-_STRENGTHS: Final = np.logspace(-6.0, 4.0, 25)
-_SPLINE_STRENGTHS: Final = np.geomspace(1e-4, 1e9, 60)
-"""In the weights of the data, for altitudes one apart."""
-_LEAST_SNR: Final = 3.0
-_FEWEST_BEAMS: Final = 3
-_FEWEST_KNOTS: Final = 5
-_RUN: Final = 9
-"""Altitudes of the running mean by which the spline peer selects samples."""
-_LEAST_SCATTER: Final = 1e-20
 
 AUTO: Final = "auto"
 TWO_ANGLE: Final = "two_angle"
@@ -45,10 +34,6 @@ KANO_HAMILTON: Final = "kano_hamilton"
 JOINT: Final = "joint"
 MLD: Final = "mld"
 MLD_PRIOR: Final = "mld_prior"
-LINES: Final = "straight lines, numpy"
-SPLINE: Final = "straight lines, GCV spline"
-TIKHONOV: Final = "Tikhonov, L-curve"
-BOUNDED: Final = "scipy lsq_linear"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,18 +82,8 @@ class Scene:
         """
         rng = np.random.default_rng(seed)
         shape = (profiles, self.path.size, self.altitude.size)
+        # Added to the logarithm of backscatter.
         air = self.inhomogeneity * correlated(rng, shape, self.correlation)
-        return self.observe(air, rng)
-
-    def observe(self, air: Array, rng: np.random.Generator) -> Scan:
-        """Simulate scans of air with a given scatter.
-
-        Parameters
-        ----------
-        air : (profile, angle, altitude) float
-            Added to the logarithm of backscatter.
-        rng : numpy.random.Generator
-        """
         x = self.path[:, np.newaxis]
         depth = np.atleast_2d(self.optical_depth)[:, np.newaxis, :]
         mean = np.log(np.atleast_2d(self.backscatter))[:, np.newaxis, :] - 2.0 * x * depth
@@ -158,12 +133,6 @@ class ScanEstimates:
     optical_depth: Array
     standard_error: Array | None = None
     """None if the method states none."""
-    extinction: Array | None = None
-    """m-1, as published by the method; None if it gives optical depth only."""
-    extinction_standard_error: Array | None = None
-    data_share: Array | None = None
-    freedom: Array | None = None
-    """(profile,)"""
 
 
 ScanSolver = Callable[[Scan], ScanEstimates]
@@ -236,51 +205,6 @@ def scan_scenes() -> tuple[Scene, ...]:
     return (clear(3000.0), clear(300.0), cloud(), cloud(0.8))
 
 
-def published_cloud(largest: float, beams: int, scatter: float) -> Scene:
-    """Return the cloud of the published experiment, with altitudes at the centres of its 8 layers.
-
-    Parameters
-    ----------
-    largest : float
-        degree; angles are evenly spaced from 0.
-    beams : int
-    scatter : float
-        Standard deviation of the logarithm of backscatter.
-    """
-    height = _LAYER * (0.5 + np.arange(len(LAYERS), dtype=np.float64))
-    layers = np.array(LAYERS)
-    depth = _LAYER * (np.cumsum(layers) - 0.5 * layers)
-    extinction = np.diff(depth, prepend=0.0) / np.diff(height, prepend=0.0)
-    label = f"{largest:g}°, {beams} beams"
-    angles = np.linspace(0.0, largest, beams)
-    return Scene(label, angles, height, extinction, np.ones(height.size), NOISELESS, scatter)
-
-
-def uniform_scatter(share: float, profiles: int, scene: Scene, *seed: int) -> Scan:
-    """Return scans with uniformly distributed errors of backscatter, as published.
-
-    Parameters
-    ----------
-    share : float
-        Largest relative error; 0.25 for errors from -25 to 25 %.
-    profiles : int
-    scene : Scene
-    *seed : int
-    """
-    rng = np.random.default_rng(seed)
-    shape = (profiles, scene.path.size, scene.altitude.size)
-    return scene.observe(np.log1p(rng.uniform(-share, share, shape)), rng)
-
-
-def uniform_deviation(share: float) -> float:
-    """Return the standard deviation of ln(1 + U(-share, share))."""
-    low, high = 1.0 - share, 1.0 + share
-    first, second = (u * np.log(u) - u for u in (low, high))
-    mean = (second - first) / (2.0 * share)
-    squares = (u * (np.log(u) ** 2 - 2.0 * np.log(u) + 2.0) for u in (high, low))
-    return float(np.sqrt((next(squares) - next(squares)) / (2.0 * share) - mean**2))
-
-
 def random_scene(seed: int, profiles: int, *, calm: bool = False) -> Scene:
     """Return a scene that violates the assumptions, with another truth for each profile.
 
@@ -351,160 +275,4 @@ def estimate(scan: Scan, method: str, **options: Any) -> ScanEstimates:
     return ScanEstimates(
         optical_depth=result.optical_depth,
         standard_error=result.optical_depth_standard_error,
-        extinction=result.extinction,
-        extinction_standard_error=result.extinction_standard_error,
-        data_share=result.data_share,
-        freedom=result.effective_degrees_of_freedom,
     )
-
-
-def with_prior(scan: Scan, prior: Array) -> Array:
-    """Return optical depth by "mld" from the difference of the scan from a prior (altitude,)."""
-    known = np.exp(2.0 * scan.scene.path[:, np.newaxis] * prior)
-    rest = replace(scan, signal=scan.signal * known, variance=scan.variance * known**2)
-    return estimate(rest, MLD).optical_depth + prior
-
-
-# Peers ----------------------------------------------------------------------------------------
-
-
-def scan_peers() -> Mapping[str, ScanSolver]:
-    """Return methods written directly with numpy and scipy.
-
-    They know the true scatter, and use samples of more than 3 times their noise, the spline those
-    of which a running mean is. All but the spline solve each altitude on its own.
-    """
-    return {LINES: lines, SPLINE: spline, TIKHONOV: tikhonov, BOUNDED: bounded}
-
-
-SLOW: Final = frozenset({TIKHONOV, BOUNDED})
-"""Peers that loop over altitudes."""
-_Line = tuple[Array, Array, Array]
-"""Slant path, logarithm and weight (the reciprocal standard error) of each beam."""
-
-
-def lines(scan: Scan) -> ScanEstimates:
-    """Fit straight lines to all altitudes at once: Kano-Hamilton in closed form."""
-    return _fit_lines(scan, scan.signal)
-
-
-def _fit_lines(scan: Scan, level: Array) -> ScanEstimates:
-    """Fit straight lines to logarithms at a level of the signal, which also selects samples."""
-    x = scan.scene.path[:, np.newaxis]
-    used = level > _LEAST_SNR * np.sqrt(scan.variance)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scatter = scan.variance / level**2 + scan.scene.inhomogeneity**2
-        # Without scatter and noise, all beams have the same weight.
-        weight = np.where(used, 1.0 / np.maximum(scatter, _LEAST_SCATTER), 0.0)
-        positive = np.where(used, level, 1.0)
-        y = np.where(used, np.log(positive) + (scan.signal - level) / positive, 0.0)
-        total = weight.sum(axis=1, keepdims=True)
-        away = x - (weight * x).sum(axis=1, keepdims=True) / total
-        information = (weight * away**2).sum(axis=1)
-        depth = -0.5 * (weight * away * y).sum(axis=1) / information
-        error = 0.5 / np.sqrt(information)
-    solvable = used.sum(axis=1) >= _FEWEST_BEAMS
-    return ScanEstimates(np.where(solvable, depth, np.nan), np.where(solvable, error, np.nan))
-
-
-def spline(scan: Scan) -> ScanEstimates:
-    """Smooth optical depths by a discrete spline, its strength by generalised cross validation.
-
-    All profiles share one singular value decomposition and one strength, for the altitudes that all
-    of them reach and the medians of their errors. A running mean of the signal selects samples, so
-    that noise does not: bright samples alone would bias the lines.
-    """
-    level = uniform_filter1d(scan.signal, _RUN, axis=-1, mode="nearest")
-    unsmoothed = _fit_lines(scan, level)
-    smooth = np.full(unsmoothed.optical_depth.shape, np.nan)
-    known = np.isfinite(unsmoothed.optical_depth).all(axis=0)
-    if known.sum() >= _FEWEST_KNOTS:
-        error = np.median(np.asarray(unsmoothed.standard_error)[:, known], axis=0)
-        smooth[:, known] = _cross_validated(unsmoothed.optical_depth[:, known], error)
-    return ScanEstimates(smooth)
-
-
-def _cross_validated(depth: Array, error: Array) -> Array:
-    """Return profiles at even altitudes, smoothed by second differences weighted by the errors."""
-    count = error.size
-    error = error / error.mean()
-    roughness = np.diff(np.eye(count), 2, axis=0) * error
-    _, singular, modes = np.linalg.svd(roughness, full_matrices=True)
-    penalty = np.append(singular**2, np.zeros(count - singular.size))
-    kept = 1.0 / (1.0 + _SPLINE_STRENGTHS[:, np.newaxis] * penalty)
-    data = (depth / error) @ modes.T
-    misfit = (1.0 - kept) ** 2 @ np.sum(data**2, axis=0)
-    best = np.argmin(misfit / (count - kept.sum(axis=1)) ** 2)
-    return np.asarray((data * kept[best]) @ modes * error)
-
-
-def bounded(scan: Scan) -> ScanEstimates:
-    """Fit straight lines with the optical depth constrained to be non-negative."""
-
-    def fit(x: Array, y: Array, root: Array) -> float:
-        design = np.stack([root, -2.0 * x * root], axis=1)
-        least = ([-np.inf, 0.0], [np.inf, np.inf])
-        return float(lsq_linear(design, y * root, bounds=least).x[1])
-
-    return _solve_lines(scan, fit)
-
-
-def tikhonov(scan: Scan, strengths: Array = _STRENGTHS) -> ScanEstimates:
-    """Differentiate along the slant path, with the strength at the corner of the L-curve.
-
-    Parameters
-    ----------
-    scan : Scan
-    strengths : (strength,) float
-        Ascending; one strength is taken as it is.
-    """
-
-    def fit(x: Array, y: Array, root: Array) -> float:
-        order = np.argsort(x)
-        x, y, root = x[order], y[order], root[order]
-        width = np.diff(x) / (x[-1] - x[0])
-        matrix = np.where(np.arange(width.size) < np.arange(x.size)[:, np.newaxis], width, 0.0)
-        square = root**2 / np.sum(root**2)
-        matrix = root[:, np.newaxis] * (matrix - square @ matrix) / np.sqrt(width)
-        left, values, right = np.linalg.svd(matrix, full_matrices=False)
-        data = left.T @ (root * (y - square @ y))
-        kept = values**2 / (values**2 + strengths[:, np.newaxis])
-        size = np.sqrt(np.sum((kept * data / values) ** 2, axis=1))
-        misfit = np.sqrt(np.sum(((1.0 - kept) * data) ** 2, axis=1))
-        slope = right.T @ (kept[_corner(misfit, size)] * data / values)
-        return float(-0.5 * np.sum(np.sqrt(width) * slope) / (x[-1] - x[0]))
-
-    return _solve_lines(scan, fit)
-
-
-def _corner(misfit: Array, size: Array) -> int:
-    """Return the index of the largest curvature of the L-curve."""
-    if misfit.size == 1:
-        return 0
-    tiny = np.finfo(np.float64).tiny
-    x, y = np.log(np.maximum(misfit, tiny)), np.log(np.maximum(size, tiny))
-    dx, dy = np.gradient(x), np.gradient(y)
-    speed = np.maximum(np.hypot(dx, dy), tiny)
-    bend = (dx * np.gradient(dy) - dy * np.gradient(dx)) / speed**3
-    return int(np.argmax(np.where(np.isfinite(bend), bend, -np.inf)))
-
-
-def _solve_lines(scan: Scan, fit: Callable[[Array, Array, Array], float]) -> ScanEstimates:
-    profiles, _, bins = scan.signal.shape
-    depth = np.full((profiles, bins), np.nan)
-    for t in range(profiles):
-        for k in range(bins):
-            line = _line(scan, t, k)
-            if line[0].size >= _FEWEST_BEAMS:
-                depth[t, k] = fit(*line)
-    return ScanEstimates(depth)
-
-
-def _line(scan: Scan, t: int, k: int) -> _Line:
-    signal, variance = scan.signal[t, :, k], scan.variance[t, :, k]
-    used = signal > _LEAST_SNR * np.sqrt(variance)
-    signal, variance = signal[used], variance[used]
-    scatter = variance / signal**2 + scan.scene.inhomogeneity**2
-    # Without scatter and noise, all beams have the same weight.
-    root = 1.0 / np.sqrt(scatter) if np.all(scatter > 0.0) else np.ones(signal.size)
-    return scan.scene.path[used], np.log(signal), root

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.extinction_field import (
@@ -16,8 +15,6 @@ from lidarops.retrieve.network.extinction_field import (
     NetworkResult,
     retrieve_network,
 )
-from lidarops.retrieve.network.thresholds import THRESHOLDS
-from lidarops.retrieve.network.triangles import systematic_error
 from lidarops.simulate.signal import backscatter_signal
 
 Array = npt.NDArray[np.float64]
@@ -38,8 +35,6 @@ _FIRST_BIN: Final = 100.3
 """m, range of the first bin."""
 _BEYOND: Final = 60.0
 """m, length of a signal after the last crossing."""
-_LEAST_SLOPE: Final = 1e-6
-"""m-1, smallest extinction at the start of a fit."""
 _CELLS: Final = 5
 """Cells of a bin, over which the optical depth is summed."""
 
@@ -129,8 +124,6 @@ AIRS: Final = (
 )
 """The gradient is 2 per km at 600 m with a scale height of 1 km. The plume has 3.5 per km in air
 of 1.5 per km, and drifts by 300 m in a block."""
-VISIBILITY_AIR: Final = AIRS[3]
-"""Air of the errors of visibility."""
 
 
 # Signals --------------------------------------------------------------------------------------
@@ -224,141 +217,6 @@ class NetworkSolver:
         )
 
 
-PAPER_MULTIPLIER: Final = 0.8
 NETWORK_WITHOUT_PRIOR: Final = NetworkSolver("network, no prior", FieldPrior.NONE)
 NETWORK: Final = NetworkSolver("network", FieldPrior.BLOCK)
 NETWORK_SOLVERS: Final = (NETWORK_WITHOUT_PRIOR, NETWORK)
-
-
-# The paper's second figure --------------------------------------------------------------------
-
-FIGURE_FIRST_LIDARS: Final = (200.0, 300.0, 400.0)
-"""m, distance of lidars 1 and 3."""
-FIGURE_ELEVATIONS: Final = tuple(float(angle) for angle in range(15, 80, 5))
-"""degree, of the second beam."""
-_FIGURE_EXTINCTION: Final = 2e-3
-"""m-1."""
-
-
-@dataclass(frozen=True, slots=True)
-class FigurePoint:
-    """Systematic error (true - estimate) / true of visibility in homogeneous air of 2 per km."""
-
-    first_lidar: float
-    """m."""
-    elevation: float
-    """degree."""
-    printed: float
-    """With unsigned lengths, the only reading that fits the axis of the figure."""
-    signed: float | None
-    """At crossing 1 with signs; None beyond the pole."""
-    near: float | None
-    """At a crossing from which the cycle leads away from the lidars."""
-
-
-def figure_point(first_lidar: float, elevation: float) -> FigurePoint:
-    """Return one point of figure 2 of drabenko2021, without signs and with correct ones."""
-    lidars = LidarLine("", (first_lidar, -500.0, 0.0), ((120.0,), (elevation,), (90.0,)))
-    net = lidars.network()
-    lengths = np.array([np.ptp(net.on_beam(beam)[1]) for beam in range(3)])
-    depths = _FIGURE_EXTINCTION * lengths * [1.0, 1.0, -1.0]
-    # Below the crossing of beams 1 and 3, a cycle in the other direction leads away.
-    leads_away = _leads_away(net)
-    near = depths if leads_away else depths[[1, 0, 2]]
-    return FigurePoint(
-        first_lidar,
-        elevation,
-        printed=float(systematic_error(depths, PAPER_MULTIPLIER)),
-        signed=_error_of(depths if leads_away else -depths),
-        near=_error_of(near),
-    )
-
-
-def _leads_away(net: geometry.Network) -> bool:
-    """Return whether beam 1 meets beam 3 before beam 2."""
-    crossings, _ = net.on_beam(0)
-    return bool(crossings[0] in net.on_beam(2)[0])
-
-
-def _error_of(depths: Array) -> float | None:
-    value = float(systematic_error(depths, PAPER_MULTIPLIER))
-    return value if np.isfinite(value) else None
-
-
-# Peers ----------------------------------------------------------------------------------------
-
-
-def network_by_scipy(power: Array, variance: Array, signals: Signals) -> Array:
-    """Return (profile, crossing) extinction by `scipy.optimize.least_squares`, without errors.
-
-    For each profile, the logarithms of extinction at the crossings and of one constant per beam
-    are fitted to point values, weighted as if these were independent.
-    """
-    return np.stack(
-        [
-            _fit_network(*_point_values(profile, noise, signals), signals)
-            for profile, noise in zip(power, variance, strict=True)
-        ]
-    )
-
-
-def network_by_scipy_of_means(power: Array, variance: Array, signals: Signals) -> Array:
-    """Return (profile, crossing) extinction of the mean of each block, for all its profiles."""
-    first = np.arange(0, len(power), BLOCK)
-    counts = np.diff(first, append=len(power))
-    number = counts[:, np.newaxis, np.newaxis]
-    mean = np.add.reduceat(power, first) / number
-    variance_of_mean = np.add.reduceat(variance, first) / number**2
-    return np.repeat(network_by_scipy(mean, variance_of_mean, signals), counts, axis=0)
-
-
-def _point_values(power: Array, variance: Array, signals: Signals) -> tuple[Array, Array, Array]:
-    """Return values, their relative errors, and integrals from the first crossing of each beam."""
-    values, errors, integrals = [], [], []
-    # A bin that is not positive has no logarithm and is replaced by half its noise.
-    power = np.maximum(power, 0.5 * np.sqrt(variance))
-    for beam in range(signals.network.beams):
-        logarithm = np.log(power[beam] * signals.range**2)
-        crossing_ranges, points = signals.network.on_beam(beam)[1], []
-        for distance in crossing_ranges:
-            middle = int(np.argmin(np.abs(signals.range - distance)))
-            bins = slice(middle - THRESHOLDS.fit_bins // 2, middle + THRESHOLDS.fit_bins // 2 + 1)
-            fit = np.polynomial.Polynomial.fit(signals.range[bins] - distance, logarithm[bins], 1)
-            points.append(float(fit(0.0)))
-            noise = np.sqrt(variance[beam, bins]) / power[beam, bins]
-            errors.append(float(noise.mean() / np.sqrt(THRESHOLDS.fit_bins)))
-        values += points
-        total = 0.0
-        for k, distance in enumerate(crossing_ranges):
-            if k:
-                inside = (signals.range > crossing_ranges[k - 1]) & (signals.range < distance)
-                x = np.concatenate([[crossing_ranges[k - 1]], signals.range[inside], [distance]])
-                y = np.concatenate([[points[k - 1]], logarithm[inside], [points[k]]])
-                total += _log_trapezoid(x, y)
-            integrals.append(total)
-    return np.array(values), np.array(errors), np.array(integrals)
-
-
-def _log_trapezoid(x: Array, logarithm: Array) -> float:
-    """Return the integral of a function that is exponential between points."""
-    rise = np.diff(logarithm)
-    constant = np.abs(rise) < 1e-6
-    mean = np.where(constant, 1.0, np.expm1(rise) / np.where(constant, 1.0, rise))
-    return float(np.sum(np.diff(x) * np.exp(logarithm[:-1]) * mean))
-
-
-def _fit_network(values: Array, errors: Array, integrals: Array, signals: Signals) -> Array:
-    net = signals.network
-    beam, crossing = net.passages.beam, net.passages.crossing
-    first = np.searchsorted(beam, np.arange(net.beams))
-    last = np.searchsorted(beam, np.arange(net.beams), side="right") - 1
-    drop = np.exp(values[first]) - np.exp(values[last])
-    slope = max(float(np.median(drop / (2.0 * integrals[last]))), _LEAST_SLOPE)
-    start = np.concatenate([np.full(net.crossings, np.log(slope)), values[first] - np.log(slope)])
-
-    def residuals(unknown: Array) -> Array:
-        extinction, constant = unknown[crossing], np.exp(unknown[net.crossings + beam])
-        remaining = np.maximum(constant - 2.0 * integrals, 1e-9 * constant)
-        return np.asarray((np.log(remaining) + extinction - values) / errors)
-
-    return np.asarray(np.exp(least_squares(residuals, start, x_scale="jac").x[: net.crossings]))

@@ -8,15 +8,21 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
+from benchmarks.harness.figure import cpu_time
+from benchmarks.harness.verdicts import Scores
 from lidarops.system.code_version import source_version
 
+CPU_TIME: Final = "CPU time"
+"""Quantity against which errors are drawn."""
+READS: Final = "reads"
+"""Quantity: CPU time as a multiple of the read."""
 READ: Final = "read (np.max)"
 """Name of the floor of all times: a vectorised read of the same array in the same run."""
 _SHORTEST: Final = 1e-9
@@ -81,6 +87,32 @@ def least_times(
             function()
             least[name] = min(least[name], max(read() - begin, _SHORTEST))
     return least
+
+
+Calls = Mapping[str, tuple[Callable[[], object], int]]
+"""Calls by method, each with its number of profiles; the read is one of them."""
+
+
+def time_methods(case: str, calls: Calls, repeats: int, *, peers: Container[str] = ()) -> Scores:
+    """Return the least CPU time per profile of each method, and as a multiple of the read."""
+    times = least_times({name: call for name, (call, _) in calls.items()}, repeats)
+    read = times[READ] / calls[READ][1]
+    return {
+        (case, name): {
+            "lidarops": name != READ and name not in peers,
+            "profiles": profiles,
+            CPU_TIME: cpu_time(1e9 * times[name] / profiles),
+            READS: times[name] / profiles / read,
+        }
+        for name, (_, profiles) in calls.items()
+    }
+
+
+def timed(call: Callable[[], _Result]) -> tuple[float, _Result]:
+    """Return the CPU time of a call in seconds, and its result."""
+    begin = time.process_time()
+    result = call()
+    return max(time.process_time() - begin, _SHORTEST), result
 
 
 def cpu_seconds() -> float:

@@ -47,6 +47,12 @@ class Judgement:
         return self.verdict is Verdict.MET
 
 
+Score = dict[str, Figure | Judgement | float | str | None]
+"""Values of one method in one case, by quantity; None where it has none."""
+Scores = dict[tuple[str, str], Score]
+"""Scores by case and method."""
+
+
 @dataclass(frozen=True, slots=True)
 class Target:
     """Limits of a figure."""

@@ -8,9 +8,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.rows import Scores
 from benchmarks.harness.statistics import clustered_share
-from benchmarks.harness.verdicts import Target
+from benchmarks.harness.verdicts import Scores, Target
 from benchmarks.stability.random_homogeneous import random_paths
 from benchmarks.stability.random_scenes import TARGET
 from lidarops.flags import Quality, rejecting

@@ -304,7 +304,7 @@ def _negative_chi_square(solved: inversion.ElasticResult, power: Array, noise: A
     return np.asarray(np.sum(deviates**2, axis=1) + np.sum(remainder**2, axis=1))
 
 
-def score_elastic(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_elastic(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield the scored values of profiles of one random sky, class by class."""
     base = elastic_cases.simulated_sky()
     for number, (failure, change) in enumerate(FAILURES):
@@ -328,7 +328,7 @@ def score_elastic(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, i
         if sky.outlying:
             # The misfit of noise-free signals does not include outlying bins.
             misfit = np.full(profiles, np.inf)
-        yield _scored(failure, sky, processed, base, misfit), profiles
+        yield _scored(failure, sky, processed, base, misfit)
 
 
 def _deviations(rng: Random, shape: tuple[int, ...], share: float) -> Array:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 from scipy import stats
 
 from benchmarks.accuracy.multiangle_cases import correlated
-from benchmarks.harness.figure import Array, Mask
+from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import COVERED, Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.simulate.signal import relative_signal
 
 Random = np.random.Generator
@@ -240,7 +241,7 @@ def visible_misfit(range_: Array, signal: Array) -> Array:
     return np.sqrt(np.maximum(fit.reduced_chi2, 0.0) * (fit.valid_bins - 3))
 
 
-def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_homogeneous(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield the scores of random paths of one geometry, for every class of violation."""
     paths, rng = random_paths(cluster, profiles)
     with np.errstate(under="ignore", over="ignore", invalid="ignore", divide="ignore"):
@@ -258,9 +259,24 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[tuple[ScoredValue
             power = _with_outliers(power, rng)
         noise = None if failure is _NOISE_NOT_STATED else 1.0
         wider = _widening(paths.range.size) if noise is None else 1.0
-        solvable: Mask = within & (wider * least <= _SOLVABLE)
+        # Missing bins lose information.
+        expected = failure.satisfied and failure is not _WITH_GAPS
+        solvable = within & (wider * least <= _SOLVABLE) if expected else None
         misfit = None if violate is _none else visible_misfit(paths.range, violated.signal)
-        yield from _solved(failure, paths, violated, power, (noise, solvable, misfit))
+        fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
+        truths = {"extinction": violated.extinction, "background": paths.background[:, 0]}
+        for quantity, truth in truths.items():
+            yield _scored(failure, quantity, truth, fit, solvable=solvable, misfit=misfit)
+
+
+def _scored(
+    failure: Failure, quantity: str, truth: Array, fit: path_fit.HomogeneousResult, **known: Any
+) -> ScoredValues:
+    return ScoredValues(
+        failure, quantity, getattr(fit, quantity) - truth,
+        getattr(fit, f"{quantity}_standard_error"), getattr(fit, f"{quantity}_model_error"),
+        np.asarray(fit.quality), HomogeneousQuality, **known,
+    )  # fmt: skip
 
 
 def _widening(bins: int) -> float:
@@ -272,32 +288,91 @@ def _widening(bins: int) -> float:
     return float(stats.t.isf(stats.norm.sf(COVERED), freedom) / COVERED)
 
 
-def _solved(
-    failure: Failure,
-    paths: Paths,
-    violated: ViolatedPaths,
-    power: Array,
-    known: tuple[float | None, Mask, Array | None],
-) -> Iterator[tuple[ScoredValues, int]]:
-    noise, solvable, misfit = known
-    fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
-    bits = np.asarray(fit.quality)
-    # Missing bins lose information.
-    expected = solvable if failure.satisfied and failure is not _WITH_GAPS else None
-    count = len(power)
-    yield (
-        ScoredValues(
-            failure, "extinction", fit.extinction - violated.extinction,
-            fit.extinction_standard_error, fit.extinction_model_error, bits,
-            HomogeneousQuality, solvable=expected, misfit=misfit,
-        ),
-        count,
+# Correlated noise, few bins, and hardly determined values -------------------------------------
+
+_CORRELATIONS: Final = (0.6, 0.9)
+"""Between neighbouring bins."""
+_RECORDED: Final = 4000
+"""Bins in the far half of a recorder's profiles, in which products measure the correlation."""
+_NEAR_THE_CUT: Final = 0.10
+"""Relative error of extinction, below the limit of 0.15 of POORLY_DETERMINED."""
+_SHORT: Final = ((8, 10), (11, 15), (16, 23), (24, 32))
+"""Least and most bins of short sections."""
+_SHORT_STEP: Final = 37.5
+"""m."""
+_FALLS: Final = (1.0, 6.0)
+"""Decades by which a signal falls from bin to bin."""
+_UNKNOWN: Final = (
+    "noise whose bins are correlated looks like less noise: without the length of the correlation,"
+    " the stated errors are too small"
+)
+
+
+def _fitted(paths: Paths, noise: Array, **options: Any) -> Any:
+    """Return the fit of paths with unit noise."""
+    with np.errstate(under="ignore"):
+        power = paths.background + paths.clean + noise
+        return path_fit.fit_homogeneous_path(power, paths.range, **{"variance": 1.0, **options})
+
+
+def score_correlated_noise(cluster: int, profiles: int) -> Iterator[ScoredValues]:
+    """Yield extinctions with noise that is correlated between bins."""
+    for correlation in _CORRELATIONS:
+        paths, rng = random_paths(cluster, profiles)
+        noise = correlated(rng, (profiles, paths.range.size), correlation)
+        recorded = correlated(rng, (profiles, _RECORDED), correlation)
+        estimated = estimate_noise_correlation(recorded, np.ones_like(recorded)).length
+        length = (1.0 + correlation) / (1.0 - correlation)
+        for words, options in (
+            ("not stated", {}),
+            ("stated", {"noise_correlation_length": length}),
+            ("estimated, as in products", {"noise_correlation_length": estimated}),
+        ):
+            failure = Failure(
+                f"AR(1) {correlation:g}, correlation {words}", satisfied=bool(options),
+                unseen="" if options else _UNKNOWN,
+            )  # fmt: skip
+            yield _scored(
+                failure, "extinction", paths.extinction[:, 0], _fitted(paths, noise, **options)
+            )
+
+
+def score_near_the_cut(cluster: int, profiles: int) -> Iterator[ScoredValues]:
+    """Yield backgrounds of paths whose extinction is nearly too uncertain to be accepted."""
+    paths, rng = random_paths(cluster, profiles)
+    fit = _fitted(paths, rng.standard_normal((profiles, paths.range.size)))
+    scale = fit.extinction + 1.0 / float(paths.range.mean())
+    with np.errstate(invalid="ignore", divide="ignore"):
+        near = fit.extinction_standard_error / scale > _NEAR_THE_CUT
+    failure = Failure("near the limit of POORLY_DETERMINED", satisfied=True)
+    values = _scored(failure, "background", paths.background[:, 0], fit)
+    yield replace(values, error=np.where(near, values.error, np.nan))
+
+
+def score_short_sections(cluster: int, profiles: int) -> Iterator[ScoredValues]:
+    """Yield extinctions and backgrounds of sections of 8 to 32 bins."""
+    for least, most in _SHORT:
+        paths, rng = random_paths(cluster, profiles)
+        bins = int(rng.integers(least, most + 1))
+        paths = replace(
+            paths, range=paths.range[0] + _SHORT_STEP * np.arange(bins, dtype=np.float64)
+        )
+        noise = rng.standard_normal((profiles, bins))
+        for words, variance in (("stated", 1.0), ("estimated", None)):
+            failure = Failure(f"{least} to {most} bins, noise {words}", satisfied=True)
+            fit = _fitted(paths, noise, variance=variance)
+            yield _scored(failure, "extinction", paths.extinction[:, 0], fit)
+            yield _scored(failure, "background", paths.background[:, 0], fit)
+
+
+def score_dying_signals(cluster: int, profiles: int) -> Iterator[ScoredValues]:
+    """Yield extinctions where the signal falls by a factor of 10 to 1e6 from bin to bin."""
+    paths, rng = random_paths(cluster, profiles)
+    decades = rng.uniform(*_FALLS, (profiles, 1))
+    paths = replace(
+        paths, range=100.0 + _SHORT_STEP * np.arange(40, dtype=np.float64),
+        extinction=np.log(10.0) * decades / (2.0 * _SHORT_STEP),
     )  # fmt: skip
-    yield (
-        ScoredValues(
-            failure, "background", fit.background - paths.background[:, 0],
-            fit.background_standard_error, fit.background_model_error, bits,
-            HomogeneousQuality, solvable=expected, misfit=misfit,
-        ),
-        count,
-    )  # fmt: skip
+    fit = _fitted(paths, rng.standard_normal((profiles, 40)))
+    failure = Failure("signal that dies within a bin", satisfied=True)
+    yield _scored(failure, "extinction", paths.extinction[:, 0], fit)

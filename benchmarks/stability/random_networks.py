@@ -166,7 +166,7 @@ _DECIDABLE: Final = (homogeneous, layered)
 
 def score_networks(
     cluster: int, profiles: int, *, of_all: float = math.inf
-) -> Iterator[tuple[ScoredValues, int]]:
+) -> Iterator[ScoredValues]:
     """Yield results of blocks of profiles of random networks, class by class.
 
     Parameters
@@ -186,18 +186,11 @@ def score_networks(
         if solved is None:
             continue
         result, truth = solved
-        bits = np.where(result.flagged, _DOUBTED, np.int32(0))
-        error = np.where(result.near_crossing, result.extinction - truth, np.nan)
-        stated = result.extinction_standard_error
+        values = scored(failure, result, truth, 0.0)
         # Values with a small standard error should not be flagged.
         with np.errstate(invalid="ignore"):
-            solvable = np.isfinite(error) & (stated < 0.1 * truth)
-        yield (
-            ScoredValues(
-                failure, "extinction", error, stated, 0.0, bits, NetworkQuality, solvable=solvable
-            ),
-            profiles,
-        )
+            small = np.asarray(values.random < 0.1 * truth[:, result.near_crossing])
+        yield replace(values, solvable=np.isfinite(values.error) & small)
 
 
 def _solve_damaged(
@@ -244,7 +237,7 @@ def _drawn(rng: Random, draw_air: DrawAir) -> tuple[Signals, float] | None:
 
 def score_short_blocks(
     cluster: int, profiles: int, *, draw_air: DrawAir, name: str, length: int
-) -> Iterator[tuple[ScoredValues, int]]:
+) -> Iterator[ScoredValues]:
     """Yield results of networks that are solved in blocks of a few profiles; a class of that name.
 
     `length` is the number of profiles of a block.
@@ -259,21 +252,23 @@ def score_short_blocks(
         power, clean.range, clean.network, variance=variance, full_overlap_range=_FULL_OVERLAP,
         blocks=np.arange(profiles) // length,
     )  # fmt: skip
-    yield _scored(Failure(name, satisfied=True), result, clean.truth(profiles), 0.0), profiles
+    yield scored(Failure(name, satisfied=True), result, clean.truth(profiles), 0.0)
 
 
-def _scored(
+def scored(
     failure: Failure, result: extinction_field.NetworkResult, truth: Array, systematic: Any
 ) -> ScoredValues:
+    """Return the values at near crossings."""
+    near = result.near_crossing
     bits = np.where(result.flagged, _DOUBTED, np.int32(0))
-    error = np.where(result.near_crossing, result.extinction - truth, np.nan)
     return ScoredValues(
-        failure, "extinction", error, result.extinction_standard_error, systematic, bits,
-        NetworkQuality,
+        failure, "extinction", (result.extinction - truth)[:, near],
+        result.extinction_standard_error[:, near],
+        np.broadcast_to(systematic, truth.shape)[:, near], bits[:, near], NetworkQuality,
     )  # fmt: skip
 
 
-def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield results of networks whose lidar ratio varies along a wave of random direction."""
     rng = np.random.default_rng((86, cluster))
     drawn = _drawn(rng, plume)
@@ -293,7 +288,7 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[tuple[ScoredValu
     of_ratio = labeled._lidar_ratio_error(solver, result, 1.0)  # noqa: SLF001 - as products state it
     for words, declared in _DECLARED:
         failure = Failure(f"lidar ratio varies by 10 %, {words}", unseen=_NOT_SHOWN)
-        yield _scored(failure, result, clean.truth(profiles), declared * of_ratio), profiles
+        yield scored(failure, result, clean.truth(profiles), declared * of_ratio)
 
 
 def _solver(clean: Signals, power: Array, variance: Array) -> Any:

@@ -125,7 +125,7 @@ def _signal(counts: Array) -> ChannelSignal:
     return ChannelSignal(counts, variance, zero, zero, np.zeros((1, bins)), np.ones(rows))
 
 
-def score_raman(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_raman(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield extinctions, backscatters and lidar ratios of profiles of one random sky."""
     air, cells = _air()
     partial = np.isnan(cells.split(air.overlap)).any(axis=-1)
@@ -153,8 +153,7 @@ def score_raman(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int
         )
         bits = np.repeat(quality[np.newaxis], profiles, axis=0)
         result = retrieve_raman(signals[0], signals[1], air, cells, settings, quality=bits)
-        for values in _scored(failure, sky, cells, cells.mean(backscatter), result):
-            yield values, profiles
+        yield from _scored(failure, sky, cells, cells.mean(backscatter), result)
 
 
 def _scored(

@@ -139,17 +139,17 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
 )
 
 
-def score_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_scans(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Solve random scans of one geometry, class by class."""
     for number, (failure, change, damage) in held_first(FAILURES):
         rng = np.random.default_rng((72, cluster, number))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = damage(scene.draw(profiles, cluster, number, 72), rng)
         result = multiangle_cases.retrieve(scan, multiangle_cases.AUTO)
-        yield from _score_quantities(failure, scene, result, profiles)
+        yield from _score_quantities(failure, scene, result)
 
 
-def score_scan_methods(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_scan_methods(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Solve random scans with all violations at once, of any air and of calm air, by two methods.
 
     Little scatter makes stated errors small.
@@ -159,15 +159,14 @@ def score_scan_methods(cluster: int, profiles: int) -> Iterator[tuple[ScoredValu
         failure = Failure(f"{'calm' if calm else 'any'} air, {method}")
         scene = multiangle_cases.random_scene(cluster, profiles, calm=calm)
         result = multiangle_cases.retrieve(scene.draw(profiles, cluster, 6), method)
-        yield from _score_quantities(failure, scene, result, profiles)
+        yield from _score_quantities(failure, scene, result)
 
 
 def _score_quantities(
     failure: Failure,
     scene: Scene,
     result: optical_depth.MultiAngleResult,
-    profiles: int,
-) -> Iterator[tuple[ScoredValues, int]]:
+) -> Iterator[ScoredValues]:
     truth: dict[str, Array] = {
         "optical depth": scene.optical_depth,
         "extinction": np.asarray(scene.extinction),
@@ -175,22 +174,17 @@ def _score_quantities(
     for quantity, true in truth.items():
         name = quantity.replace(" ", "_")
         error: Any = getattr(result, name) - true
-        yield (
-            ScoredValues(
-                failure, quantity, error, getattr(result, f"{name}_standard_error"),
-                getattr(result, f"{name}_gradient_error"), result.quality, MultiAngleQuality,
-                uncertain=result.raised(_UNCERTAIN), solvable=np.isfinite(error),
-            ),
-            profiles,
+        yield ScoredValues(
+            failure, quantity, error, getattr(result, f"{name}_standard_error"),
+            getattr(result, f"{name}_gradient_error"), result.quality, MultiAngleQuality,
+            uncertain=result.raised(_UNCERTAIN), solvable=np.isfinite(error),
         )  # fmt: skip
 
 
 # Other scans ------------------------------------------------------------------------------------
 
 
-def score_short_scans(
-    cluster: int, profiles: int, *, length: int
-) -> Iterator[tuple[ScoredValues, int]]:
+def score_short_scans(cluster: int, profiles: int, *, length: int) -> Iterator[ScoredValues]:
     """Solve random scans where the model holds, in blocks of `length` profiles."""
     for words, change in (
         ("", _level),
@@ -209,15 +203,13 @@ def score_short_scans(
             )
             block = Scan(part, scan.signal[some], scan.variance[some])
             result = multiangle_cases.retrieve(block, multiangle_cases.AUTO)
-            blocks.append(
-                [values for values, _ in _score_quantities(failure, part, result, length)]
-            )
+            blocks.append([*_score_quantities(failure, part, result)])
         # Blocks of one geometry are one cluster.
         for of_blocks in zip(*blocks, strict=True):
-            yield joined(of_blocks), profiles
+            yield joined(of_blocks)
 
 
-def score_counted_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_counted_scans(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Solve scans of photon counts, whose variance is stated in two ways."""
     rng = np.random.default_rng((84, cluster))
     angles = np.degrees(np.arccos(1.0 / np.linspace(1.0, 3.0, 9)))
@@ -238,7 +230,7 @@ def score_counted_scans(cluster: int, profiles: int) -> Iterator[tuple[ScoredVal
         result = optical_depth.retrieve_optical_depth(
             counts * distance**2, angles, altitude, variance=variance * distance**4
         )
-        yield _score_depth(Failure(name, satisfied=holds), depth, result), profiles
+        yield _score_depth(Failure(name, satisfied=holds), depth, result)
 
 
 def _score_depth(

@@ -6,17 +6,17 @@ it differs from the truth by more than 4 stated standard errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from benchmarks.harness.figure import Array, Figure, Mask
-from benchmarks.harness.rows import Score, Scores
 from benchmarks.harness.statistics import clustered_share, design_effect
-from benchmarks.harness.verdicts import Judgement, Target
+from benchmarks.harness.verdicts import Judgement, Score, Scores, Target
 from lidarops.flags import FlagBit, Quality, rejecting
 
 FALSE: Final = 4.0
@@ -39,26 +39,6 @@ HELD: Final = "all where the model holds"
 BROKEN: Final = "all violations"
 """Classes of all scenes of a retrieval."""
 POOLED: Final = frozenset({HELD, BROKEN})
-_COUNTS: Final = (
-    "values",
-    "covered",
-    "covered by one",
-    "plain covered",
-    "kept",
-    "plain",
-    "bare",
-    "false random",
-    "false",
-    "false plain",
-    "plain hidden",
-    "false hidden",
-    "false half",
-    "false bare",
-    "rejected",
-    "fine rejected",
-    "solvable",
-    "solvable rejected",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,28 +107,20 @@ def joined(blocks: Sequence[ScoredValues]) -> ScoredValues:
     return replace(blocks[0], **{name: stacked(name) for name in names})
 
 
-@dataclass(slots=True)
 class Tally:
-    """Counts by class and cluster; scenes of one cluster share their geometry."""
+    """Counts by quantity, class and cluster; scenes of one cluster share their geometry."""
 
-    counts: dict[tuple[str, str], list[dict[str, Any]]] = field(default_factory=dict)
-    scenes: dict[tuple[str, str], int] = field(default_factory=dict)
-    failures: dict[str, Failure] = field(default_factory=dict)
-    measured: set[tuple[str, str]] = field(default_factory=set)
-    """Classes and quantities for which it is known which violations are detectable."""
+    def __init__(self) -> None:
+        self._rows: list[dict[str, Any]] = []
+        self._failures = {HELD: Failure(HELD, satisfied=True), BROKEN: Failure(BROKEN)}
 
-    def add(self, values: ScoredValues, scenes: int) -> None:
-        """Count the values of a chunk."""
-        self.failures[values.failure.name] = values.failure
+    def add(self, values: ScoredValues) -> None:
+        """Count the values of a chunk; its first axis is that of scenes."""
+        self._failures[values.failure.name] = values.failure
         pooled = HELD if values.failure.satisfied else BROKEN
-        self.failures[pooled] = Failure(pooled, values.failure.satisfied)
-        counts = _count(values)
-        for name in (values.failure.name, pooled):
-            key = (name, values.quantity)
-            self.counts.setdefault(key, []).append(counts)
-            self.scenes[key] = self.scenes.get(key, 0) + scenes
-            if values.misfit is not None:
-                self.measured.add(key)
+        own = {"quantity": values.quantity, "scenes": len(values.error),
+               "measured": values.misfit is not None, **counts(values)}  # fmt: skip
+        self._rows += [own | {"class": name} for name in (values.failure.name, pooled)]
 
     def rates(self, needless: float | None, *, pooled: bool = True) -> Scores:
         """Return the shares of kept, false and flagged values by quantity and class.
@@ -160,77 +132,79 @@ class Tally:
         pooled : bool
             Whether to add all classes that satisfy the model together, and all that do not.
         """
-        names = sorted(self.counts, key=lambda key: (key[1], key[0] in POOLED))
+        table = pd.DataFrame(self._rows)
+        groups = table.groupby(["quantity", "class"], sort=False)
+        keys = table[["quantity", "class"]].drop_duplicates().itertuples(index=False, name=None)
+        # Of each quantity, what is pooled comes last.
+        names = sorted(keys, key=lambda key: (key[0], key[1] in POOLED))
         return {
-            (quantity, name): self._score(name, quantity, needless)
-            for name, quantity in names
+            (quantity, name): _score(groups.get_group((quantity, name)), self._failures[name],
+                                     None if needless is None else Target(needless, own=True))
+            for quantity, name in names
             if pooled or name not in POOLED
-        }
+        }  # fmt: skip
 
-    def _score(self, name: str, quantity: str, needless: float | None) -> Score:
-        chunks = self.counts[name, quantity]
-        column = {count: np.array([chunk[count] for chunk in chunks]) for count in _COUNTS}
-        holds = self.failures[name].satisfied
-        # Where false values are few, those beyond 1.96 errors show how values depend on each other.
-        inside, of = ("covered", "kept") if holds else ("plain covered", "plain")
-        effect = design_effect(column[of] - column[inside], column[of])
 
-        def part(events: str, trials: str) -> Figure | None:
-            some = column[trials].any()
-            return clustered_share(column[events], column[trials], effect) if some else None
+def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> Score:
+    """Return the shares of one class, given its counts by cluster."""
+    holds = failure.satisfied
+    # Where false values are few, those beyond 1.96 errors show how values depend on each other.
+    inside, of = ("covered", "kept") if holds else ("plain covered", "plain")
+    effect = design_effect((chunks[of] - chunks[inside]).to_numpy(), chunks[of].to_numpy())
 
-        covered, covered_by_one = part("covered", "kept"), part("covered by one", "kept")
-        false_random, false_plain = part("false random", "kept"), part("false plain", "plain")
-        flagged = part("solvable rejected", "solvable") if holds else None
-        measured = (name, quantity) in self.measured
-        # A class has intervals of its own; those of all classes together may hide it.
-        alone = holds and name not in POOLED
-        return {
-            "scenes": self.scenes[name, quantity],
-            "clusters": len(chunks),
-            "values": int(column["values"].sum()),
-            "not rejected": part("kept", "values"),
-            COVERED_SHARE: covered,
-            COVERED_TARGET: _judged(covered, COVERED_BY_95 if alone else None),
-            ONE_SHARE: covered_by_one,
-            ONE_TARGET: _judged(covered_by_one, COVERED_BY_68 if alone else None),
-            "stated / median error": _stated_over_median(chunks),
-            FALSE_RANDOM: false_random,
-            "false, with systematic": part("false", "kept"),
-            FALSE_PLAIN: false_plain,
-            # Where the model holds, random errors alone must cover the truth.
-            TARGET: _judged(false_random, Target(SATISFIED))
-            if holds
-            else _judged(false_plain, Target(VIOLATED)),
-            "of these undetectable": part("false hidden", "plain") if measured else None,
-            f"and below {HALF:g}": part("false half", "plain") if measured else None,
-            "share of the detectable": _detectable(column) if measured else None,
-            "without any flag": part("false bare", "bare"),
-            "rejected but accurate": part("fine rejected", "rejected"),
-            NEEDLESS: flagged,
-            NEEDLESS_TARGET: _judged(
-                flagged, None if needless is None else Target(needless, own=True)
-            ),
-            "detectable in the data": f"no: {self.failures[name].unseen}"
-            if self.failures[name].unseen
-            else "yes",
-        }
+    def part(events: str, trials: str, *, known: bool = True) -> Figure | None:
+        if not known or not chunks[trials].any():
+            return None
+        return clustered_share(chunks[events].to_numpy(), chunks[trials].to_numpy(), effect)
+
+    covered, covered_by_one = part("covered", "kept"), part("covered by one", "kept")
+    false_random, false_plain = part("false random", "kept"), part("false plain", "plain")
+    flagged = part("solvable rejected", "solvable", known=holds)
+    measured = bool(chunks["measured"].any())
+    # A class has intervals of its own; those of all classes together may hide it.
+    alone = holds and failure.name not in POOLED
+    return {
+        "scenes": int(chunks["scenes"].sum()),
+        "clusters": len(chunks),
+        "values": int(chunks["values"].sum()),
+        "not rejected": part("kept", "values"),
+        COVERED_SHARE: covered,
+        COVERED_TARGET: _judged(covered, COVERED_BY_95 if alone else None),
+        ONE_SHARE: covered_by_one,
+        ONE_TARGET: _judged(covered_by_one, COVERED_BY_68 if alone else None),
+        "stated / median error": _stated_over_median(chunks["sizes"].sum()),
+        FALSE_RANDOM: false_random,
+        "false, with systematic": part("false", "kept"),
+        FALSE_PLAIN: false_plain,
+        # Where the model holds, random errors alone must cover the truth.
+        TARGET: _judged(false_random, Target(SATISFIED))
+        if holds
+        else _judged(false_plain, Target(VIOLATED)),
+        "of these undetectable": part("false hidden", "plain", known=measured),
+        f"and below {HALF:g}": part("false half", "plain", known=measured),
+        "share of the detectable": _detectable(chunks) if measured else None,
+        "without any flag": part("false bare", "bare"),
+        "rejected but accurate": part("fine rejected", "rejected"),
+        NEEDLESS: flagged,
+        NEEDLESS_TARGET: _judged(flagged, needless),
+        "detectable in the data": f"no: {failure.unseen}" if failure.unseen else "yes",
+    }
 
 
 def _judged(figure: Figure | None, target: Target | None) -> Judgement | None:
     return None if figure is None or target is None else target.judged(figure)
 
 
-def _detectable(column: dict[str, Array]) -> Figure | None:
+def _detectable(chunks: pd.DataFrame) -> Figure | None:
     """Return the share of false values among those whose violation is detectable."""
-    seen = column["false plain"] - column["false hidden"]
-    visible = column["plain"] - column["plain hidden"]
+    seen = (chunks["false plain"] - chunks["false hidden"]).to_numpy()
+    visible = (chunks["plain"] - chunks["plain hidden"]).to_numpy()
     return clustered_share(seen, visible) if visible.any() else None
 
 
-def _stated_over_median(chunks: list[dict[str, Any]]) -> float | None:
+def _stated_over_median(sizes: Array) -> float | None:
     """Return one over the median error in stated errors, from the counts between `_EDGES`."""
-    below = np.cumsum(sum(chunk["sizes"] for chunk in chunks))
+    below = np.cumsum(sizes)
     if below[-1] == 0:
         return None
     middle = np.interp(0.5 * below[-1], below, np.log(_EDGES[1:]))
@@ -265,21 +239,23 @@ TARGETS: Final = {
 _EDGES: Final = np.concatenate([[1e-6], np.geomspace(1e-3, 1e2, 501), [1e6]])
 """Sizes of errors, in stated ones, between which values are counted."""
 
-Generator = Callable[[int], Iterator[tuple[ScoredValues, int]]]
-"""Yields the values of the scenes of a cluster, given its number, and the number of scenes."""
 
-
-def collect(generator: Generator, clusters: int, progress: Callable[[int], object]) -> Tally:
+def collect(
+    generator: Callable[[int], Iterable[ScoredValues]],
+    clusters: int,
+    progress: Callable[[int], object] = lambda _: None,
+) -> Tally:
     """Count the values of that many clusters; the same numbers give the same scenes."""
     tally = Tally()
     for cluster in range(clusters):
-        for values, scenes in generator(cluster):
-            tally.add(values, scenes)
+        for values in generator(cluster):
+            tally.add(values)
         progress(1)
     return tally
 
 
-def _count(values: ScoredValues) -> dict[str, Any]:
+def counts(values: ScoredValues) -> dict[str, Any]:
+    """Return how many values are kept, false or flagged, and the sizes of their errors."""
     shape = values.error.shape
     size = np.abs(values.error)
     valued = np.isfinite(size)
@@ -317,5 +293,5 @@ def _count(values: ScoredValues) -> dict[str, Any]:
     }
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         sizes = np.clip(size[kept] / random[kept], _EDGES[0], _EDGES[-1])
-    counts: dict[str, Any] = {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
-    return counts | {"sizes": np.histogram(sizes[~np.isnan(sizes)], _EDGES)[0]}
+    numbers: dict[str, Any] = {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
+    return numbers | {"sizes": np.histogram(sizes[~np.isnan(sizes)], _EDGES)[0]}

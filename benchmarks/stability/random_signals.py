@@ -214,20 +214,17 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Random, int], Errors]], ...]] = (
 )
 
 
-def score_signals(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_signals(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield the scored values of random counts, class by class."""
     for number, (failure, process) in held_first(FAILURES):
         rng = np.random.default_rng((75, cluster, number))
         errors = process(rng, profiles)
         clean = failure.satisfied and process is not _cubic
-        yield (
-            ScoredValues(
-                failure, errors.quantity, errors.error, errors.random, errors.systematic,
-                np.asarray(errors.bits), HomogeneousQuality,
-                solvable=np.isfinite(errors.error) if clean else None, misfit=errors.misfit,
-                uncertain=(errors.bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
-            ),
-            profiles,
+        yield ScoredValues(
+            failure, errors.quantity, errors.error, errors.random, errors.systematic,
+            np.asarray(errors.bits), HomogeneousQuality,
+            solvable=np.isfinite(errors.error) if clean else None, misfit=errors.misfit,
+            uncertain=(errors.bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
         )  # fmt: skip
 
 
@@ -235,7 +232,7 @@ _ROUNDED: Final = (0.05, 0.1, 0.2)
 """Noise in steps of the digitizer."""
 
 
-def score_digitizers(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues, int]]:
+def score_digitizers(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield single bins of a signal that falls steeply, with noise of a fraction of a step."""
     for noise in _ROUNDED:
         rng = np.random.default_rng((83, cluster))
@@ -258,10 +255,7 @@ def score_digitizers(cluster: int, profiles: int) -> Iterator[tuple[ScoredValues
         }
         for place, bins in places.items():
             failure = Failure(f"noise of {noise:g} steps, {place} bins", satisfied=True)
-            yield (
-                ScoredValues(
-                    failure, "voltage of a bin", error[:, bins], stated[:, bins], 0.0,
-                    np.asarray(signal.quality)[:, bins], HomogeneousQuality,
-                ),
-                profiles,
+            yield ScoredValues(
+                failure, "voltage of a bin", error[:, bins], stated[:, bins], 0.0,
+                np.asarray(signal.quality)[:, bins], HomogeneousQuality,
             )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.accuracy import multiangle_cases
 from benchmarks.accuracy.network_cases import signals
 from benchmarks.harness.figure import Array
-from benchmarks.harness.rows import Scores
+from benchmarks.harness.verdicts import Scores
 from benchmarks.stability import random_networks
 from lidarops.retrieve.network import extinction_field
 
@@ -57,7 +57,7 @@ def network_values(clusters: int) -> Array:
     """Return errors of extinction of networks and their stated ones, NaN where flagged."""
     values = []
     for cluster in range(clusters):
-        for scored, _ in random_networks.score_networks(cluster, _NETWORK_PROFILES):
+        for scored in random_networks.score_networks(cluster, _NETWORK_PROFILES):
             kept = np.where(scored.bits == 0, scored.error, np.nan)
             columns = (kept, np.broadcast_to(scored.random, kept.shape))
             values.append(np.stack([column.ravel() for column in columns]))

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from benchmarks.harness.benchmark import Effort
 from benchmarks.harness.figure import cpu_time, share_text
-from benchmarks.harness.rows import CPU_TIME, Scores, rows_of_scores
-from benchmarks.harness.study import Chapter, Results, Study
-from benchmarks.harness.timing import cpu_seconds
-from benchmarks.harness.verdicts import Judgement, Verdict
+from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.timing import CPU_TIME, cpu_seconds
+from benchmarks.harness.verdicts import Judgement, Scores, Verdict
 from benchmarks.stability import (
     flag_rates,
     random_elastic,
@@ -21,8 +19,8 @@ from benchmarks.stability import (
     random_networks,
     random_raman,
     random_scans,
-    random_sections,
     random_signals,
+    reproducibility,
 )
 from benchmarks.stability.random_scenes import (
     BROKEN,
@@ -40,9 +38,7 @@ from benchmarks.stability.random_scenes import (
     collect,
 )
 from benchmarks.stability.reasons import Unmet, read_reasons, why
-from benchmarks.stability.reproducibility import measure_reproducibility
 from lidarops.errors import CampaignError
-from lidarops.figures.wording import counted
 
 LONGEST: Final = 1200.0
 """s, most CPU time of the whole benchmark."""
@@ -59,7 +55,7 @@ class Draws:
     retrieval: str
     case: str
     """Name by which the command runs this part with others."""
-    score: Callable[[int, int], Iterator[tuple[ScoredValues, int]]]
+    score: Callable[[int, int], Iterator[ScoredValues]]
     """Returns the values of a cluster, given its number and the number of profiles."""
     profiles: int
     """Number per cluster and class; they share their geometry."""
@@ -72,9 +68,55 @@ class Draws:
     pooled: bool = False
     """Whether to add the classes where the model holds together, and all others."""
 
-    def score_cluster(self, cluster: int) -> Iterator[tuple[ScoredValues, int]]:
-        """Return the values of a cluster."""
-        return self.score(cluster, self.profiles)
+    def measure(self, effort: Effort) -> Scores:
+        """Return the rates of false values."""
+        clusters = self.quick if effort.quick else self.clusters
+        tally = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
+        return tally.rates(self.needless, pooled=self.pooled)
+
+    def chapter(self, scores: Scores) -> Chapter:
+        """Return the table of the part."""
+        drawn: Counter[str] = Counter()
+        for (quantity, name), score in scores.items():
+            if name not in {HELD, BROKEN}:
+                drawn[quantity] += int(str(score["scenes"]))
+        return Chapter(
+            f"False values: {self.retrieval}",
+            f"{max(drawn.values()):,} random scenes. A value is false if it differs from the truth "
+            f"by more than {FALSE:g} stated standard errors. Targets for values that no flag "
+            f"rejects: {share_text(SATISFIED)} where the model holds, by random errors alone; "
+            f"{share_text(VIOLATED)} of everything drawn elsewhere, with the stated systematic "
+            f"errors, excluding values that flags mark as uncertain. {targets(scores)}",
+            [
+                Results(
+                    results_title(self.retrieval), scores, _NOTE, case="quantity", method="class"
+                )
+            ],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Other:
+    """A part without random scenes."""
+
+    case: str
+    name: str
+    retrieval: str
+    """Title of its table."""
+    text: str
+    score: Callable[[bool], Scores]
+    """Returns the scores, given whether the run is quick."""
+    columns: tuple[str, str]
+    """Headings of the columns of cases and methods."""
+
+    def measure(self, effort: Effort) -> Scores:
+        """Return the scores."""
+        return self.score(effort.quick)
+
+    def chapter(self, scores: Scores) -> Chapter:
+        """Return the table of the part."""
+        results = Results(self.retrieval, scores, "", *self.columns)
+        return Chapter(self.retrieval, self.text, [results])
 
 
 def _blocks(
@@ -90,55 +132,50 @@ def _scans(length: int) -> Draws:
     return Draws(f"scans, blocks of {length}", "multiangle", score, 8, 400, 4)
 
 
+_paths, _scanned, _networks = random_homogeneous, random_scans, random_networks
 DRAWS: Final = (
-    Draws(
-        "homogeneous",
-        "homogeneous",
-        random_homogeneous.score_homogeneous,
-        1000,
-        400,
-        4,
-        1e-3,
-        pooled=True,
-    ),
+    Draws("homogeneous", "homogeneous", _paths.score_homogeneous, 1000, 400, 4, 1e-3, pooled=True),
     Draws("signal chain", "signal", random_signals.score_signals, 50, 500, 20, 0.05, pooled=True),
     Draws("elastic", "elastic", random_elastic.score_elastic, 20, 400, 6, 0.05, pooled=True),
-    Draws("multi-angle", "multiangle", random_scans.score_scans, 8, 400, 6, 0.13, pooled=True),
-    Draws(
-        "scans of any and of calm air",
-        "multiangle",
-        random_scans.score_scan_methods,
-        8,
-        400,
-        6,
-        pooled=True,
-    ),
-    Draws(
-        "network",
-        "network",
-        partial(random_networks.score_networks, of_all=300),
-        50,
-        700,
-        4,
-        0.05,
-        pooled=True,
-    ),
+    Draws("multi-angle", "multiangle", _scanned.score_scans, 8, 400, 6, 0.13, pooled=True),
+    Draws("scans of any and of calm air", "multiangle", _scanned.score_scan_methods, 8, 400, 6,
+          pooled=True),
+    Draws("network", "network", partial(_networks.score_networks, of_all=300), 50, 700, 4, 0.05,
+          pooled=True),
     Draws("Raman", "raman", random_raman.score_raman, 8, 500, 6, pooled=True),
-    Draws("short sections", "homogeneous", random_sections.score_short_sections, 300, 600, 6),
-    Draws("correlated noise", "homogeneous", random_sections.score_correlated_noise, 60, 400, 6),
-    Draws("near the cut", "homogeneous", random_sections.score_near_the_cut, 1000, 400, 6),
-    Draws("dying signals", "homogeneous", random_sections.score_dying_signals, 300, 2500, 6),
+    Draws("short sections", "homogeneous", _paths.score_short_sections, 300, 600, 6),
+    Draws("correlated noise", "homogeneous", _paths.score_correlated_noise, 60, 400, 6),
+    Draws("near the cut", "homogeneous", _paths.score_near_the_cut, 1000, 400, 6),
+    Draws("dying signals", "homogeneous", _paths.score_dying_signals, 300, 2500, 6),
     Draws("quiet digitizers", "signal", random_signals.score_digitizers, 5, 60, 6),
     _scans(1),
     _scans(2),
-    Draws("scans of photon counts", "multiangle", random_scans.score_counted_scans, 8, 250, 6),
-    _blocks(random_networks.plume, "plume", 1, 2000),
-    _blocks(random_networks.plume, "plume", 2, 1500),
-    _blocks(random_networks.plume, "plume", 3, 1500),
-    _blocks(random_networks.homogeneous, "homogeneous", 1, 2000, 3),
-    _blocks(random_networks.layered, "layered", 1, 2500, 3),
-    Draws(
-        "networks, varying lidar ratio", "network", random_networks.score_lidar_ratios, 6, 200, 4
+    Draws("scans of photon counts", "multiangle", _scanned.score_counted_scans, 8, 250, 6),
+    _blocks(_networks.plume, "plume", 1, 2000),
+    _blocks(_networks.plume, "plume", 2, 1500),
+    _blocks(_networks.plume, "plume", 3, 1500),
+    _blocks(_networks.homogeneous, "homogeneous", 1, 2000, 3),
+    _blocks(_networks.layered, "layered", 1, 2500, 3),
+    Draws("networks, varying lidar ratio", "network", _networks.score_lidar_ratios, 6, 200, 4),
+)  # fmt: skip
+OTHERS: Final = (
+    Other(
+        "flags",
+        "flags",
+        FLAGS,
+        "How many profiles of few photon counts are flagged although the model holds, and how"
+        " many values of homogeneous paths a single bit rejects.",
+        lambda quick: flag_rates.flag_rates(2 if quick else 60),
+        ("flag", "condition"),
+    ),
+    Other(
+        "order",
+        "order and machine",
+        REPRODUCIBLE,
+        "How far values change with the order of the profiles of a block, and with the kernel of "
+        "linear algebra.",
+        lambda quick: reproducibility.measure_reproducibility(*((2, 1) if quick else (60, 6))),
+        ("case", "figure"),
     ),
 )
 
@@ -160,41 +197,29 @@ def measure_stability(
     CampaignError
         If no part has this case or name.
     """
-    selected = [draw for draw in draws if case in {None, draw.case, draw.retrieval}]
-    others = [other for other in OTHERS if case in {None, other.case}]
-    if not selected and not others:
-        names = dict.fromkeys([draw.case for draw in draws] + [other.case for other in OTHERS])
+    parts: dict[str, Draws | Other] = {draw.retrieval: draw for draw in draws}
+    parts |= {other.name: other for other in OTHERS}
+    selected = {name: part for name, part in parts.items() if case in {None, part.case, name}}
+    if not selected:
+        names = dict.fromkeys(part.case for part in parts.values())
         raise CampaignError(
             f"no case {case!r}",
             remedy=f"choose: {' or '.join(names)}, or a part such as {draws[-1].retrieval!r}",
         )
     chapters: list[Chapter] = []
-    targets_unmet: list[Unmet] = []
+    unmet: list[Unmet] = []
     costs: dict[str, float] = {}
-    for draw in selected:
+    for name, part in selected.items():
         begin = cpu_seconds()
-        clusters = draw.quick if effort.quick else draw.clusters
-        tally = collect(draw.score_cluster, clusters, effort.progress)
-        scores = tally.rates(draw.needless, pooled=draw.pooled)
-        chapters.append(_chapter(draw.retrieval, scores))
-        targets_unmet += unmet_targets(draw.retrieval, scores)
-        costs[draw.retrieval] = cpu_seconds() - begin
-    for other in others:
-        begin = cpu_seconds()
-        scores = other.measure(effort)
-        chapters.append(other.chapter(scores))
-        targets_unmet += unmet_targets(other.title, scores)
-        costs[other.name] = cpu_seconds() - begin
+        scores = part.measure(effort)
+        chapters.append(part.chapter(scores))
+        unmet += unmet_targets(part.retrieval, scores)
+        costs[name] = cpu_seconds() - begin
     of_cost = cost_scores(costs, whole=case is None)
-    chapters.append(
-        Chapter(
-            COST,
-            "CPU time with child processes and compilation.",
-            [Results(COST, rows_of_scores(of_cost), method="part")],
-        )
-    )
-    targets_unmet += unmet_targets(COST, of_cost)
-    missed = [one for one in targets_unmet if one.judgement.verdict is Verdict.MISSED]
+    text = "CPU time with child processes and compilation."
+    chapters.append(Chapter(COST, text, [Results(COST, of_cost, method="part")]))
+    unmet += unmet_targets(COST, of_cost)
+    missed = [one for one in unmet if one.judgement.verdict is Verdict.MISSED]
     reasons = read_reasons()
     return Study(
         "Stability: false values without a flag", effort.date, chapters,
@@ -203,69 +228,16 @@ def measure_stability(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class _Other:
-    """A part without random scenes."""
-
-    case: str
-    name: str
-    title: str
-    text: str
-    measure: Callable[[Effort], Scores]
-    line: str
-    """Heading of the column of cases."""
-    method: str
-    """Heading of the column of methods."""
-
-    def chapter(self, scores: Scores) -> Chapter:
-        """Return the table of the part."""
-        rows = rows_of_scores(scores)
-        results = Results(self.title, rows, case=self.line, method=self.method)
-        return Chapter(self.title, self.text, [results])
-
-
-def _flag_scores(effort: Effort) -> Scores:
-    return flag_rates.flag_rates(2 if effort.quick else 60)
-
-
-def _order_scores(effort: Effort) -> Scores:
-    return measure_reproducibility(*((2, 1) if effort.quick else (60, 6)))
-
-
-OTHERS: Final = (
-    _Other(
-        "flags",
-        "flags",
-        FLAGS,
-        "How many profiles of few photon counts are flagged although the model holds, and how"
-        " many values of homogeneous paths a single bit rejects.",
-        _flag_scores,
-        "flag",
-        "condition",
-    ),
-    _Other(
-        "order",
-        "order and machine",
-        REPRODUCIBLE,
-        "How far values change with the order of the profiles of a block, and with the kernel of "
-        "linear algebra.",
-        _order_scores,
-        "case",
-        "figure",
-    ),
-)
-
-
-def cost_scores(costs: dict[str, float], *, whole: bool = True) -> Scores:
+def cost_scores(costs: Mapping[str, float], *, whole: bool = True) -> Scores:
     """Return the CPU times of the parts, s, and whether the sum of all parts is short enough."""
     total = sum(costs.values())
-    verdict = Verdict.MET if total <= LONGEST else Verdict.MISSED
     scores: Scores = {
         ("", name): {CPU_TIME: cpu_time(1e9 * seconds), TARGET: None}
         for name, seconds in costs.items()
     }
-    target = Judgement(f"{LONGEST / 60.0:g} min", verdict)
     if whole:
+        verdict = Verdict.MET if total <= LONGEST else Verdict.MISSED
+        target = Judgement(f"{LONGEST / 60.0:g} min", verdict)
         scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), TARGET: target}
     return scores
 
@@ -291,31 +263,6 @@ _NOTE: Final = (
 )
 
 
-def _chapter(name: str, scores: Scores) -> Chapter:
-    drawn: Counter[str] = Counter()
-    pooled = {HELD, BROKEN} & {failure for _, failure in scores}
-    for (quantity, failure), score in scores.items():
-        if failure in pooled or not pooled:
-            drawn[quantity] += int(str(score["scenes"]))
-    return Chapter(
-        f"False values: {name}",
-        f"{counted(max(drawn.values()), 'random scene')}. A value is false if it differs from the "
-        f"truth by more than {FALSE:g} stated standard errors. Targets for values that no "
-        f"flag rejects: {share_text(SATISFIED)} where the model holds, by random errors alone; "
-        f"{share_text(VIOLATED)} of everything drawn elsewhere, with the stated systematic errors, "
-        f"excluding values that flags mark as uncertain. {targets(scores)}",
-        [
-            Results(
-                results_title(name),
-                rows_of_scores(scores),
-                _NOTE,
-                case="quantity",
-                method="class",
-            )
-        ],
-    )
-
-
 def results_title(retrieval: str) -> str:
     """Return the title of the table of a retrieval."""
     return f"Values that differ by more than {FALSE:g} stated errors: {retrieval}"
@@ -323,10 +270,10 @@ def results_title(retrieval: str) -> str:
 
 def targets(scores: Scores) -> str:
     """Return which classes miss their targets, and for which that is undecided."""
-    targets_unmet = unmet_targets("", scores)
+    unmet = unmet_targets("", scores)
     sentences = []
     for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNDECIDED, "Undecided")):
-        names = [one.place for one in targets_unmet if one.judgement.verdict is verdict]
+        names = [one.place for one in unmet if one.judgement.verdict is verdict]
         if names:
             sentences.append(f"{words}: {', '.join(names)}.")
     return " ".join(sentences) or "All targets are met."

@@ -7,27 +7,28 @@ of a difference is that of pairs: a jackknife over clusters, which share a geome
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+from unittest import mock
 
 import numpy as np
+import pandas as pd
 
-from benchmarks.stability.random_scenes import FALSE, ScoredValues
-from lidarops.flags import Quality, rejecting
+from benchmarks.stability import random_scenes
+from benchmarks.stability.random_scenes import ScoredValues
 
 BASE: Final = "all guards"
-COVERED: Final = 1.96
-"""Stated errors within which 95 percent of the values should be."""
 RATES: Final = {
-    "false, model holds": ("false where satisfied", "usable where satisfied"),
-    "false, model violated": ("false where violated", "usable where violated"),
-    "false, no bit": ("false without bit", "without bit"),
-    "covered, model holds": ("covered where satisfied", "usable where satisfied"),
-    "covered, model violated": ("covered where violated", "usable where violated"),
-    "needless": ("solvable and flagged", "solvable"),
+    "false, model holds": ("false plain where satisfied", "plain where satisfied"),
+    "false, model violated": ("false plain where violated", "plain where violated"),
+    "false, no bit": ("false bare", "bare"),
+    "covered, model holds": ("plain covered where satisfied", "plain where satisfied"),
+    "covered, model violated": ("plain covered where violated", "plain where violated"),
+    "needless": ("solvable rejected where satisfied", "solvable where satisfied"),
     "lost, model holds": ("lost where satisfied", "scored where satisfied"),
     "lost, model violated": ("lost where violated", "scored where violated"),
 }
@@ -35,8 +36,9 @@ RATES: Final = {
 or though no bit is raised, whether it rejects or not. `covered`: within 1.96 stated errors.
 `needless`: flagged or withheld though determinable. `lost`: flagged or withheld."""
 
-Counts = dict[str, float]
-Scores = Iterable[tuple[ScoredValues, int]]
+Context = Callable[[], AbstractContextManager[object]]
+Patch = tuple[Any, str, Any]
+"""Owner, name of its attribute, and what stands there instead."""
 
 
 @dataclass(frozen=True)
@@ -46,80 +48,77 @@ class Guard:
     name: str
     bits: int = 0
     """Bits of which the values are freed."""
-    off: Callable[[], AbstractContextManager[object]] | None = None
+    off: Context | None = None
     """Context without the guard, in which the scenes are retrieved anew."""
 
 
+@contextmanager
+def replaced(*patches: Patch) -> Iterator[None]:
+    """Replace attributes of modules."""
+    with ExitStack() as stack:
+        for owner, name, value in patches:
+            stack.enter_context(mock.patch.object(owner, name, value))
+        yield
+
+
+def without(*patches: Patch) -> Context:
+    """Return the context with these replacements."""
+    return lambda: replaced(*patches)
+
+
 def measure(
-    score: Callable[[int], Scores], clusters: Sequence[int], guards: Sequence[Guard]
-) -> dict[tuple[str, str], list[Counts]]:
-    """Return counts by (guard, quantity), one entry for each cluster."""
-    counts: dict[tuple[str, str], list[Counts]] = {}
-    contexts: list[tuple[Callable[[], AbstractContextManager[object]], list[Guard]]]
-    contexts = [(nullcontext, [Guard(BASE), *(g for g in guards if g.off is None)])]
-    contexts += [(guard.off, [guard]) for guard in guards if guard.off is not None]
+    score: Callable[[int], Iterable[ScoredValues]],
+    clusters: Sequence[int],
+    guards: Sequence[Guard],
+) -> pd.DataFrame:
+    """Return counts by guard, quantity, class and cluster."""
+    contexts: list[tuple[Context, list[Guard]]] = [
+        (nullcontext, [Guard(BASE), *(guard for guard in guards if guard.off is None)]),
+        *((guard.off, [guard]) for guard in guards if guard.off is not None),
+    ]
+    rows: list[dict[str, Any]] = []
     for context, variants in contexts:
         # Outside the loop over clusters: some contexts compile.
         with context():
             for cluster in clusters:
-                scored = list(score(cluster))
-                for variant in variants:
-                    for quantity, total in _totals(scored, variant.bits).items():
-                        counts.setdefault((variant.name, quantity), []).append(total)
-    return counts
+                for values in score(cluster):
+                    rows += [_counts(values, guard) | {"cluster": cluster} for guard in variants]
+    keys = ["guard", "quantity", "class", "cluster"]
+    return pd.DataFrame(rows).groupby(keys, sort=False).sum()
 
 
-def _totals(scored: Scores, bits: int) -> dict[str, Counts]:
-    totals: dict[str, Counts] = {}
-    for values, _ in scored:
-        total = totals.setdefault(values.quantity, {})
-        for name, number in _count(_freed(values, bits)).items():
-            total[name] = total.get(name, 0.0) + number
-    return totals
-
-
-def _freed(values: ScoredValues, bits: int) -> ScoredValues:
-    freed = (np.asarray(values.bits) & bits) != 0
+def _counts(values: ScoredValues, guard: Guard) -> dict[str, Any]:
+    freed = (np.asarray(values.bits) & guard.bits) != 0
     uncertain = None if values.uncertain is None else values.uncertain & ~freed
-    return replace(values, bits=values.bits & ~np.int32(bits), uncertain=uncertain)
-
-
-def _count(values: ScoredValues) -> Counts:
-    shape = values.error.shape
-    valued = np.isfinite(values.error)
-    bits = np.broadcast_to(values.bits, shape)
-    usable = valued & ((bits & rejecting((*Quality, *values.own))) == 0)
-    if values.uncertain is not None:
-        usable &= ~values.uncertain
-    stated = np.hypot(np.broadcast_to(values.random, shape), values.systematic)
-    false = usable & ~(np.abs(values.error) <= FALSE * stated)
-    covered = np.abs(values.error) <= COVERED * stated
-    holds = values.failure.satisfied
-    kind = "satisfied" if holds else "violated"
-    counts = {
-        f"false where {kind}": np.count_nonzero(false),
-        f"usable where {kind}": np.count_nonzero(usable),
-        f"covered where {kind}": np.count_nonzero(usable & covered),
-        "without bit": np.count_nonzero(usable & (bits == 0)),
-        "false without bit": np.count_nonzero(false & (bits == 0)),
-        f"lost where {kind}": np.count_nonzero(~usable),
-        f"scored where {kind}": usable.size,
+    counts = random_scenes.counts(
+        replace(values, bits=values.bits & ~np.int32(guard.bits), uncertain=uncertain)
+    )
+    counts |= {"scored": float(values.error.size), "lost": values.error.size - counts["plain"]}
+    kind = "satisfied" if values.failure.satisfied else "violated"
+    return {
+        "guard": guard.name,
+        "quantity": values.quantity,
+        "class": values.failure.name,
+        **{name: number for name, number in counts.items() if name != "sizes"},
+        **{f"{name} where {kind}": number for name, number in counts.items() if name != "sizes"},
     }
-    if holds and values.solvable is not None:
-        counts["solvable"] = np.count_nonzero(values.solvable)
-        counts["solvable and flagged"] = np.count_nonzero(values.solvable & ~usable)
-    return {name: float(number) for name, number in counts.items()}
 
 
-def table(counts: Mapping[tuple[str, str], list[Counts]]) -> Iterator[str]:
+def table(counts: pd.DataFrame) -> Iterator[str]:
     """Yield the lines of a Markdown table: rates with all guards, then changes without each."""
     yield "| guard off | value | " + " | ".join(RATES) + " | moves |"
     yield "| --- | --- |" + " --- |" * (len(RATES) + 1)
-    for (guard, quantity), own in counts.items():
-        base = counts[BASE, quantity]
+    sides = {
+        key: part.groupby("cluster", sort=False).sum()
+        for key, part in counts.groupby(["guard", "quantity"], sort=False)
+    }
+    names = (counts.index.unique(level) for level in ("guard", "quantity"))
+    for guard, quantity in (key for key in product(*names) if key in sides):
+        own, base = sides[guard, quantity], sides[BASE, quantity]
         cells, moves = [], []
-        for name, (part, whole) in RATES.items():
-            value, error = _change(own, base, part, whole)
+        for name, parts in RATES.items():
+            value, error = _change(*(side.reindex(columns=parts).fillna(0.0).to_numpy()
+                                     for side in (own, base)), of_base=guard == BASE)  # fmt: skip
             if guard != BASE and abs(value) > 2.0 * error:
                 moves.append(name)
             sign = "" if guard == BASE else "+"
@@ -127,17 +126,16 @@ def table(counts: Mapping[tuple[str, str], list[Counts]]) -> Iterator[str]:
         yield f"| {guard} | {quantity} | " + " | ".join(cells) + f" | {', '.join(moves)} |"
 
 
-def _change(own: list[Counts], base: list[Counts], part: str, whole: str) -> tuple[float, float]:
-    """Return the rate, or its change where `own` is not `base`, with the jackknife error."""
+def _change(own: np.ndarray, base: np.ndarray, *, of_base: bool) -> tuple[float, float]:
+    """Return a rate, or its change, with the jackknife error; counts are (cluster, 2)."""
 
-    def rates(counts: list[Counts]) -> tuple[float, np.ndarray]:
-        numbers = np.array([[c.get(name, 0.0) for c in counts] for name in (part, whole)])
-        total = numbers.sum(axis=1, keepdims=True)
-        left = total - numbers
-        return float(total[0, 0] / max(total[1, 0], 1.0)), left[0] / np.maximum(left[1], 1.0)
+    def rates(counts: np.ndarray) -> tuple[float, np.ndarray]:
+        total = counts.sum(axis=0)
+        events, trials = (total - counts).T
+        return float(total[0] / max(total[1], 1.0)), events / np.maximum(trials, 1.0)
 
     value, without = rates(own)
-    if own is not base:
+    if not of_base:
         base_value, base_without = rates(base)
         value, without = value - base_value, without - base_without
     count = without.size

@@ -8,16 +8,23 @@ from __future__ import annotations
 import sys
 import types
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
-from unittest import mock
 
 import numpy as np
 
 from benchmarks.stability import random_elastic
-from benchmarks.studies.ablation import Guard, cluster_count, measure, table, write_table
+from benchmarks.studies.ablation import (
+    Guard,
+    cluster_count,
+    measure,
+    replaced,
+    table,
+    without,
+    write_table,
+)
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import Rejection
@@ -31,21 +38,9 @@ CLUSTERS: Final = 60
 PROFILES: Final = 10
 
 
-@contextmanager
-def replaced(*changes: tuple[object, str, object]) -> Iterator[None]:
-    """Replace attributes of modules."""
-    with ExitStack() as stack:
-        for owner, name, value in changes:
-            stack.enter_context(mock.patch.object(owner, name, value))
-        yield
-
-
 def _same(power: Any, range_: Any, variance: Any, **_: Any) -> Any:
     noise = np.broadcast_to(variance, np.shape(power))
     return outlying_bins.BridgedProfiles(power, noise, np.zeros(np.shape(power), np.bool_))
-
-
-NO_BRIDGES: Final = (outlying_bins, "bridge_outliers", _same)
 
 
 @cache
@@ -55,29 +50,22 @@ def _variant(old: str, new: str) -> types.ModuleType:
     assert old in source, old
     module = types.ModuleType("outlying_bins_variant")
     sys.modules[module.__name__] = module
-    text = source.replace(old, new).replace("cache=True, ", "")
+    text = source.replace(old, new).replace("cache=True", "cache=False")
     exec(compile(text, "<variant>", "exec"), module.__dict__)
     return module
 
 
-@contextmanager
-def bridges(old: str, new: str) -> Iterator[None]:
-    """Replace a text in the detection of outlying bins."""
-    module = _variant(old, new)
-    with replaced((outlying_bins, "bridge_outliers", module.bridge_outliers)):
-        yield
+def bridges(old: str, new: str) -> AbstractContextManager[object]:
+    """Return the context in which a text in the detection of outlying bins is replaced."""
+    variant = _variant(old, new).bridge_outliers
+    return replaced((outlying_bins, "bridge_outliers", variant))
 
 
-@contextmanager
-def without_layers() -> Iterator[None]:
-    """Detect no cloud."""
-    find = layers.find_layers
+_FIND: Final = layers.find_layers
 
-    def none(*arguments: Any, **options: Any) -> Any:
-        return np.zeros_like(find(*arguments, **options))
 
-    with mock.patch.object(layers, "find_layers", none):
-        yield
+def _no_layers(*arguments: Any, **options: Any) -> Any:
+    return np.zeros_like(_FIND(*arguments, **options))
 
 
 def _no_error(window: reference_window.ReferenceWindow) -> Any:
@@ -108,14 +96,13 @@ def without_rejection(bit: Rejection) -> Iterator[None]:
 
 def threshold(**changes: Any) -> Any:
     """Return the context in which thresholds have other values."""
-    changed = THRESHOLDS._replace(**changes)
-    return partial(replaced, (inversion, "THRESHOLDS", changed))
+    return without((inversion, "THRESHOLDS", THRESHOLDS._replace(**changes)))
 
 
 GUARDS: Final = (
     Guard("CLOUD", int(ElasticQuality.CLOUD)),
     Guard("background NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
-    Guard("cloud detection", off=without_layers),
+    Guard("cloud detection", off=without((layers, "find_layers", _no_layers))),
     *(
         Guard(f"window: {bit.name}", off=partial(without_rejection, bit))
         for bit in Rejection
@@ -123,16 +110,15 @@ GUARDS: Final = (
     ),
     Guard(
         "error by undetected particles",
-        off=partial(
-            replaced,
-            (reference_window.ReferenceWindow, "undetected_particles", property(_no_error)),
+        off=without(
+            (reference_window.ReferenceWindow, "undetected_particles", property(_no_error))
         ),
     ),
     Guard("least denominator", off=threshold(least_denominator=0.0)),
     Guard("least certainty", off=threshold(least_certainty=0.0)),
     Guard("skewed errors", off=threshold(skewed=0.0)),
     Guard("longest gap", off=threshold(longest_gap=np.inf)),
-    Guard("bridging of outliers", off=partial(replaced, NO_BRIDGES)),
+    Guard("bridging of outliers", off=without((outlying_bins, "bridge_outliers", _same))),
     Guard("outlier: contrast", off=partial(bridges, "THRESHOLDS.least_contrast", "0.0")),
     Guard("outlier: step", off=partial(bridges, "if not step <= allowed:", "if False:")),
     Guard("outlier: equal counts", off=partial(bridges, "THRESHOLDS.most_equal", "9")),

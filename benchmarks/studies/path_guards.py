@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
-from unittest import mock
 
 import numpy as np
 
 from benchmarks.stability import random_homogeneous
-from benchmarks.studies.ablation import Guard, cluster_count, measure, table, write_table
+from benchmarks.studies.ablation import (
+    Guard,
+    cluster_count,
+    measure,
+    replaced,
+    table,
+    without,
+    write_table,
+)
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _fit_quality, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -23,40 +28,24 @@ CLUSTERS: Final = 150
 PROFILES: Final = 60
 
 
-@contextmanager
-def limits(**changes: float) -> Iterator[None]:
-    """Replace limits of the tests, by name of `_Limits`."""
-    every = _fit_quality._limits
-
-    def changed(*arguments: Any, **options: Any) -> Any:
-        own = every(*arguments, **options)
-        return own._replace(**{k: np.full_like(own.widening, v) for k, v in changes.items()})
-
-    with mock.patch.object(_fit_quality, "_limits", changed):
-        yield
+_LIMITS: Final = _fit_quality._limits
+_FIT: Final = path_fit.fit_homogeneous_path
 
 
-@contextmanager
-def without_bend() -> Iterator[None]:
-    """Drop the part of the model errors by a signal that bends."""
-    fit = path_fit.fit_homogeneous_path
-
-    def straight(power: Any, range_: Any, **options: Any) -> Any:
-        result = fit(power, range_, **options)
-        mean = np.mean(range_)
-        slope = THRESHOLDS.model_error * (np.abs(result.extinction) + 1.0 / mean)
-        return replace(
-            result,
-            extinction_model_error=slope,
-            background_model_error=np.zeros_like(result.background),
-        )
-
-    with mock.patch.object(path_fit, "fit_homogeneous_path", straight):
-        yield
+def _no_widening(*arguments: Any, **options: Any) -> Any:
+    limits = _LIMITS(*arguments, **options)
+    return limits._replace(widening=np.ones_like(limits.widening))
 
 
-def _off(**changes: float) -> Callable[[], Any]:
-    return lambda: limits(**changes)
+def _no_bend(power: Any, range_: Any, **options: Any) -> Any:
+    """Return a fit without the part of the model errors by a signal that bends."""
+    result = _FIT(power, range_, **options)
+    slope = THRESHOLDS.model_error * (np.abs(result.extinction) + 1.0 / np.mean(range_))
+    return replace(
+        result,
+        extinction_model_error=slope,
+        background_model_error=np.zeros_like(result.background),
+    )
 
 
 GUARDS: Final = (
@@ -68,8 +57,8 @@ GUARDS: Final = (
     Guard("POOR_FIT", int(HomogeneousQuality.POOR_FIT)),
     Guard("NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
     Guard("OUTLIER", int(Quality.OUTLIER)),
-    Guard("widening of estimated noise", off=_off(widening=1.0)),
-    Guard("bend in the model error", off=without_bend),
+    Guard("widening of estimated noise", off=without((_fit_quality, "_limits", _no_widening))),
+    Guard("bend in the model error", off=without((path_fit, "fit_homogeneous_path", _no_bend))),
 )
 
 SHORT: Final = (Guard("TOO_FEW_BINS", int(Quality.TOO_FEW_BINS)),)
@@ -83,7 +72,7 @@ TABLES: Final = {
 if __name__ == "__main__":
     clusters = cluster_count(__doc__, CLUSTERS)
     for mark, (bins, guards) in TABLES.items():
-        with mock.patch.object(random_homogeneous, "_BINS", bins):
+        with replaced((random_homogeneous, "_BINS", bins)):
             counts = measure(
                 lambda k: random_homogeneous.score_homogeneous(k, PROFILES), range(clusters), guards
             )

@@ -10,13 +10,12 @@ import argparse
 import importlib
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
-from unittest import mock
 
 import numba
 import numpy as np
@@ -24,7 +23,16 @@ from numba.core.dispatcher import Dispatcher
 
 import lidarops.retrieve.multiangle as retrieval
 from benchmarks.stability import random_scans
-from benchmarks.studies.ablation import Guard, measure, table, write_table
+from benchmarks.studies.ablation import (
+    Context,
+    Guard,
+    Patch,
+    measure,
+    replaced,
+    table,
+    without,
+    write_table,
+)
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import (
     _block,
@@ -42,26 +50,11 @@ CLUSTERS: Final = 50
 PROFILES: Final = 8
 PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/multiangle.md"
 
-Patch = tuple[Any, str, Any]
 
-
-@contextmanager
-def replaced(*patches: Patch) -> Iterator[None]:
-    """Replace functions or numbers of modules."""
-    with ExitStack() as stack:
-        for place, name, value in patches:
-            stack.enter_context(mock.patch.object(place, name, value))
-        yield
-
-
-def _off(*patches: Patch) -> Callable[[], Any]:
-    return lambda: replaced(*patches)
-
-
-def _at(*places: Any, **changes: Any) -> Callable[[], Any]:
+def _at(*places: Any, **changes: Any) -> Context:
     """Replace thresholds that modules read."""
     changed = THRESHOLDS._replace(**changes)
-    return _off(*((place, "THRESHOLDS", changed) for place in places))
+    return without(*((place, "THRESHOLDS", changed) for place in places))
 
 
 def _ones(beams: Any, _: Any) -> Any:
@@ -92,39 +85,43 @@ GUARDS: Final = (
             MultiAngleQuality.INTERPOLATED,
         )
     ),
-    Guard("path variation", off=_off((_horizontal_variation, "path_variation_from", _nothing))),
+    Guard("path variation", off=without((_horizontal_variation, "path_variation_from", _nothing))),
     Guard("gradients that residuals show", off=_at(_horizontal_variation, gradient_noise=0.0)),
-    Guard("outlying beams", off=_off((_block, "_has_outliers", _never))),
+    Guard("outlying beams", off=without((_block, "_has_outliers", _never))),
     Guard(
-        "outlying beams: moments", off=_off((robust_weights, "clean_moments", lambda _: (1.0, 1.0)))
+        "outlying beams: moments",
+        off=without((robust_weights, "clean_moments", lambda _: (1.0, 1.0))),
     ),
     Guard(
         "outlying beams: residual scale",
-        off=_off((_block, "residual_scale", _ones)),
+        off=without((_block, "residual_scale", _ones)),
     ),
-    Guard("outlying beams: best pair", off=_off((robust_weights, "pair_residuals", _nothing))),
-    Guard("kept information", off=_off((_block, "kept_information", _ones))),
+    Guard("outlying beams: best pair", off=without((robust_weights, "pair_residuals", _nothing))),
+    Guard("kept information", off=without((_block, "kept_information", _ones))),
     Guard(
         "few residuals: inflation",
-        off=_off((smooth_profile, "_inflation", lambda *a: np.ones(a[2]))),
+        off=without((smooth_profile, "_inflation", lambda *a: np.ones(a[2]))),
     ),
     Guard(
         "gaps",
-        off=_off((_block, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool))),
+        off=without((_block, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool))),
     ),
-    Guard("outlying estimates: screen", off=_off(SCREEN)),
-    Guard("outlying estimates: bisquare", off=_off(BISQUARE)),
-    Guard("outlying estimates: both", off=_off(SCREEN, BISQUARE)),
+    Guard("outlying estimates: screen", off=without(SCREEN)),
+    Guard("outlying estimates: bisquare", off=without(BISQUARE)),
+    Guard("outlying estimates: both", off=without(SCREEN, BISQUARE)),
     Guard("Cp beside the likelihood", off=_at(_smoothing, rougher=np.inf)),
-    Guard("calibration", off=_off((smooth_profile, "_calibrate", _nothing))),
+    Guard("calibration", off=without((smooth_profile, "_calibrate", _nothing))),
     Guard(
         "calibration: scale of profiles",
-        off=_off((_calibration, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
+        off=without((_calibration, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
-    Guard("calibration: common altitudes", off=_off((_calibration, "_common", lambda c: c >= 1))),
     Guard(
-        "correlation", off=_off((altitude_correlation, "fit_correlation", lambda *_: (0.0, 1.0)))
+        "calibration: common altitudes", off=without((_calibration, "_common", lambda c: c >= 1))
+    ),
+    Guard(
+        "correlation",
+        off=without((altitude_correlation, "fit_correlation", lambda *_: (0.0, 1.0))),
     ),
     Guard(
         "correlation: amplitude",

@@ -2,6 +2,5 @@
 
 `retrievals` and `readers` time single functions. `archives` times runs over
 archives of many scenes, most of them stand-ins (`stand_in_archives`). `campaigns` times all stages
-of simulated campaigns, `memory` measures the peak of processes, and `orchestration` workers and
-flows.
+of simulated campaigns, and `memory` measures the peak of processes.
 """

@@ -6,28 +6,24 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from benchmarks.harness.benchmark import CAMPAIGN_FILE, Effort
-from benchmarks.harness.charts import chart, panel
 from benchmarks.harness.figure import cpu_time
-from benchmarks.harness.rows import Score, rows_of_scores
-from benchmarks.harness.study import Chapter, Results, Study
-from benchmarks.harness.timing import in_fresh_process, peak_memory
+from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.timing import CPU_TIME, in_fresh_process, peak_memory
+from benchmarks.harness.verdicts import Score
 from benchmarks.throughput import stand_in_archives
-from benchmarks.throughput.campaigns import CampaignSize, simulate_campaign
+from benchmarks.throughput.campaigns import CAMPAIGN_FILE, CampaignSize, simulate_campaign
 from benchmarks.throughput.stand_in_archives import StandIns
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
-from lidarops.figures import wording
 from lidarops.run import archive
 from lidarops.run.staleness import Judge
 
-_PER_FILE: Final = "CPU time per file"
+_PER_FILE: Final = f"{CPU_TIME} per file"
 _FILES_PER_SCENE: Final = 480
 _BINS: Final = 200
 
@@ -55,8 +51,7 @@ _OF_FILES: Final = (Pass.FIRST, Pass.PROCESS, Pass.AGAIN, Pass.STALE, Pass.NOTHI
 _OF_ROWS: Final = (Pass.SETTLE, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessCost:
+class ProcessCost(NamedTuple):
     """Cost of an operation in its own process, without imports and compilation."""
 
     cpu: float
@@ -67,8 +62,7 @@ class ProcessCost:
     """Peak memory of the process, bytes."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArchiveCost:
+class ArchiveCost(NamedTuple):
     """Costs of one archive."""
 
     files: int
@@ -178,24 +172,8 @@ _OPERATIONS: Final[Mapping[Pass, Callable[[Path], None]]] = {
 }
 
 
-# Page -----------------------------------------------------------------------------------------
-
-
 def archives_study(date: str, measured: Sequence[ArchiveCost]) -> Study:
     """Return the study of archives, each compared with the first of its sort."""
-    rows = {
-        operation: rows_of_scores(
-            {
-                (f"{cost.files}" + ("" if cost.read else " rows"), operation.value): _score(
-                    measured, cost, operation
-                )
-                for cost in measured
-                if operation in cost.spent
-            }
-        )
-        for operation in Pass
-    }
-    drawn = [row for group in rows.values() for row in group if row.case.isdecimal()]
     chapter = Chapter(
         "Cost per file, and its growth with the archive",
         "Simulated archives of one lidar on a local disk, in one process. The process has "
@@ -204,19 +182,17 @@ def archives_study(date: str, measured: Sequence[ArchiveCost]) -> Study:
         [
             Results(
                 f"{operation.value}: {_ABOUT[operation]}",
-                group,
+                {
+                    (f"{cost.files}" + ("" if cost.read else " rows"), operation.value): _score(
+                        measured, cost, operation
+                    )
+                    for cost in measured
+                    if operation in cost.spent
+                },
                 "Rows: empty files stand in for those of the catalog, and are not read.",
                 case="files",
             )
-            for operation, group in rows.items()
-        ],
-        [
-            chart(
-                "archive",
-                "CPU time per file",
-                "A horizontal line is a cost that does not grow with the archive.",
-                [panel("", drawn, _PER_FILE, x="files", joined=True)],
-            ),
+            for operation in Pass
         ],
     )
     return Study("Archives: cost per file", date, [chapter])
@@ -226,12 +202,11 @@ def _score(measured: Sequence[ArchiveCost], cost: ArchiveCost, operation: Pass) 
     spent = cost.spent[operation]
     first = next(c for c in measured if operation in c.spent and c.read is cost.read)
     per_file = spent.cpu / cost.files
+    of_first = first.spent[operation].cpu / first.files
     return {
         "CPU s": spent.cpu,
         "wall s": spent.wall,
         _PER_FILE: cpu_time(1e9 * per_file),
-        "times the first": None
-        if cost is first
-        else per_file / (first.spent[operation].cpu / first.files),
-        "peak memory": wording.size(spent.peak),
+        "times the first": None if cost is first else per_file / of_first,
+        "peak memory (MB)": spent.peak / 1e6,
     }

@@ -16,12 +16,10 @@ import numpy as np
 import yaml
 from scipy import stats
 
-from benchmarks.harness.benchmark import CAMPAIGN_FILE, Effort
-from benchmarks.harness.charts import chart, panel
 from benchmarks.harness.figure import share
-from benchmarks.harness.rows import Row, Scores, rows_of_scores
-from benchmarks.harness.study import Chapter, Results, Study
-from benchmarks.throughput import orchestration
+from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.timing import timed
+from benchmarks.harness.verdicts import Scores
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.netcdf.write import write_plain
@@ -29,11 +27,11 @@ from lidarops.records import RunRecord
 from lidarops.run import archive
 from lidarops.simulate.campaign import plan_simulation, write_simulation
 
+CAMPAIGN_FILE: Final = "campaign.yaml"
+"""Name of the campaign file in the folder of each simulated campaign."""
 _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = 60
 """s; duration of a file."""
-_CPU: Final = "CPU time (s)"
-_MILLI: Final = 1e3
 _SHORTEST: Final = 1e-4
 """s; least time, because a coarse clock may not advance during a fast call."""
 
@@ -81,14 +79,6 @@ class CampaignSize:
         return self.scenes * self.profiles
 
 
-@dataclass(frozen=True, slots=True)
-class CampaignCost:
-    """CPU time of a campaign by stage."""
-
-    size: CampaignSize
-    seconds: Mapping[Stage, float]
-
-
 _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     "scenes": tuple(CampaignSize(scenes=n) for n in (2, 4, 8, 16)),
     "profiles": tuple(CampaignSize(profiles=n) for n in (15, 30, 60, 120)),
@@ -99,7 +89,8 @@ _QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
 }
 _WORKER_SIZE: Final = CampaignSize(scenes=16, profiles=60)
-COMMAND_SIZES: Final = (CampaignSize(scenes=16), CampaignSize(scenes=128))
+Cost = tuple[CampaignSize, dict[Stage, float]]
+"""Size of a campaign, and its CPU time by stage, s."""
 
 
 def measure_campaigns(
@@ -119,37 +110,56 @@ def measure_campaigns(
     workers : sequence of int, optional
         Numbers of processes to compare.
     """
-    quick, progress = effort.quick, effort.progress
     # The first campaign of a process includes imports and compilation; it is not counted.
-    _cost(CampaignSize(scenes=1, profiles=15), progress)
+    _cost(CampaignSize(scenes=1, profiles=15), effort)
     growths = {
-        name: [_cost(size, progress) for size in sizes]
-        for name, sizes in (along or (_QUICK if quick else _ALONG)).items()
+        name: [_cost(size, effort) for size in sizes]
+        for name, sizes in (along or (_QUICK if effort.quick else _ALONG)).items()
     }
-    counts = workers if workers is not None else (() if quick else (1, 2))
-    times = {count: _wall(count, progress) for count in counts}
-    chapters = [stages_chapter(growths)]
-    if times:
-        chapters.append(workers_chapter(times))
-    if workers is None and not quick:
-        chapters.append(_commands_chapter(progress))
-    return Study("Campaigns: CPU time by stage", effort.date, chapters)
+    counts = workers if workers is not None else (() if effort.quick else (1, 2))
+    walls = {count: _wall(count, effort) for count in counts}
+    size = _WORKER_SIZE
+    chapters = [
+        Chapter(
+            "Cost of each stage, and its growth",
+            "Simulated campaigns of one lidar, from raw files on disk to products and report, "
+            "in one process. CPU time; that of a run is divided among its stages in proportion to "
+            "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
+            "interval; 1 is linear.",
+            [growth(name, costs) for name, costs in growths.items()],
+        ),
+        Chapter(
+            "Processes",
+            "The same campaign on one machine.",
+            [
+                Results(
+                    "Wall time by number of processes",
+                    {("", f"{count}"): {"s": seconds, "speedup": walls[counts[0]] / seconds}
+                     for count, seconds in walls.items()},
+                    f"{size.scenes} scenes of {size.profiles} files; with the start of the "
+                    "processes.",
+                    method="processes",
+                )
+            ],
+        ),
+    ]  # fmt: skip
+    return Study("Campaigns: CPU time by stage", effort.date, chapters[: 2 if walls else 1])
 
 
-def _cost(size: CampaignSize, progress: Callable[[int], object]) -> CampaignCost:
+def _cost(size: CampaignSize, effort: Effort) -> Cost:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         campaign = simulate_campaign(size, Path(folder))
         seconds = {Stage.SCAN: _timed(lambda: archive.update_catalog(campaign))}
-        begin, started = time.process_time(), time.perf_counter()
-        record = archive.reprocess(campaign)
-        cpu, wall = time.process_time() - begin, time.perf_counter() - started
+        started = time.perf_counter()
+        cpu, record = timed(lambda: archive.reprocess(campaign))
+        wall = time.perf_counter() - started
         if record is None:
             raise CampaignError("the simulated campaign has nothing to process", field="simulation")
         seconds |= _stage_times(record, cpu, wall)
         seconds[Stage.REPORT] = _timed(lambda: archive.report_run(campaign, record))
         seconds[Stage.UNCHANGED] = _timed(lambda: archive.reprocess(campaign))
-    progress(1)
-    return CampaignCost(size, seconds)
+    effort.progress(1)
+    return size, seconds
 
 
 def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[Stage, float]:
@@ -163,34 +173,19 @@ def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[Stage, floa
     return {stage: max(cpu * lap / wall, _SHORTEST) for stage, lap in laps.items()}
 
 
-def _wall(workers: int, progress: Callable[[int], object]) -> float:
+def _wall(workers: int, effort: Effort) -> float:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         campaign = simulate_campaign(_WORKER_SIZE, Path(folder))
         archive.update_catalog(campaign)
         begin = time.perf_counter()
         archive.reprocess(campaign, options=archive.Options(workers=workers))
         seconds = time.perf_counter() - begin
-    progress(1)
+    effort.progress(1)
     return seconds
 
 
-def _commands_chapter(progress: Callable[[int], object]) -> Chapter:
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        files = []
-        for size in COMMAND_SIZES:
-            directory = Path(folder) / str(size.scenes)
-            directory.mkdir()
-            simulate_campaign(size, directory)
-            files.append(directory / CAMPAIGN_FILE)
-        modes = orchestration.measure_orchestration(files)
-    progress(1)
-    return orchestration.orchestration_chapter(modes, [size.scenes for size in COMMAND_SIZES])
-
-
 def _timed(call: Callable[[], object]) -> float:
-    begin = time.process_time()
-    call()
-    return max(time.process_time() - begin, _SHORTEST)
+    return max(timed(call)[0], _SHORTEST)
 
 
 def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
@@ -300,76 +295,25 @@ def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, floa
     return float(fit.slope), float(half) if math.isfinite(half) else 0.0
 
 
-# Page -----------------------------------------------------------------------------------------
-
-
-def stages_chapter(growths: Mapping[str, Sequence[CampaignCost]]) -> Chapter:
-    """Return the chapter on the stages, by the property along which campaigns grow."""
-    return Chapter(
-        "Cost of each stage, and its growth",
-        "Simulated campaigns of one lidar, from raw files on disk to products and report, "
-        "in one process. CPU time; that of a run is divided among its stages in proportion to "
-        "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
-        "interval; 1 is linear.",
-        [_growth_results(along, costs) for along, costs in growths.items()],
-        [
-            chart(
-                "growth",
-                "CPU time of a campaign",
-                "One line per stage; a slope of 1 means a constant cost per item.",
-                [
-                    panel(
-                        along,
-                        [
-                            Row(f"{getattr(cost.size, along)}", stage, _CPU, seconds)
-                            for cost in costs
-                            for stage, seconds in cost.seconds.items()
-                        ],
-                        _CPU,
-                        x=f"number of {along}",
-                        joined=True,
-                    )
-                    for along, costs in growths.items()
-                ],
-            ),
-        ],
-    )
-
-
-def _growth_results(along: str, costs: Sequence[CampaignCost]) -> Results:
-    size, spent = costs[-1].size, costs[-1].seconds
-    sizes = [getattr(cost.size, along) for cost in costs]
+def growth(along: str, costs: Sequence[Cost]) -> Results:
+    """Return the times of the stages of the largest campaign, and how they grow with the size."""
+    size, spent = costs[-1]
+    sizes = [getattr(each, along) for each, _ in costs]
     total = sum(seconds for stage, seconds in spent.items() if stage is not Stage.UNCHANGED)
     scores: Scores = {}
     for stage, seconds in spent.items():
-        steepness, half = slope(sizes, [cost.seconds[stage] for cost in costs])
+        steepness, half = slope(sizes, [of_stage[stage] for _, of_stage in costs])
         scores["", stage] = {
             "work": _ABOUT[stage],
-            _CPU: seconds,
+            "CPU time (s)": seconds,
             "share": None if stage is Stage.UNCHANGED else share(seconds / total),
-            "ms per file": _MILLI * seconds / size.files,
+            "ms per file": 1e3 * seconds / size.files,
             "slope": f"{steepness:.2f} ± {half:.2f}",
         }
     return Results(
         f"By number of {along}; times at {getattr(size, along)}",
-        rows_of_scores(scores),
+        scores,
         f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
         + (f", {size.angles} directions." if size.angles else "."),
         method="stage",
     )
-
-
-def workers_chapter(times: Mapping[int, float]) -> Chapter:
-    """Return the chapter on the wall time in s, by the number of processes."""
-    single, size = times.get(1), _WORKER_SIZE
-    scores: Scores = {
-        ("", f"{count}"): {"s": seconds, "speedup": single / seconds if single else None}
-        for count, seconds in times.items()
-    }
-    results = Results(
-        "Wall time by number of processes",
-        rows_of_scores(scores),
-        f"{size.scenes} scenes of {size.profiles} files; with the start of the processes.",
-        method="processes",
-    )
-    return Chapter("Processes", "The same campaign on one machine.", [results])

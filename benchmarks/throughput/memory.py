@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import yaml
 
-from benchmarks.harness.benchmark import CAMPAIGN_FILE, Effort
-from benchmarks.harness.rows import Scores, rows_of_scores
-from benchmarks.harness.study import Chapter, Results, Study
+from benchmarks.harness.results import Chapter, Effort, Results, Study
 from benchmarks.harness.timing import in_fresh_process, peak_memory
-from benchmarks.throughput.campaigns import campaign_settings
+from benchmarks.harness.verdicts import Scores
+from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.raw import licel
@@ -112,8 +110,7 @@ CASES: Final[Mapping[str, Mapping[str, Any]]] = {
 """Part of the campaign file of each row of the table; all have the same files."""
 
 
-@dataclass(frozen=True, slots=True)
-class Peak:
+class Peak(NamedTuple):
     """Peak memory of one process."""
 
     case: str
@@ -127,11 +124,32 @@ class Peak:
 
 def measure_memory(effort: Effort) -> Study:
     """Measure the peak memory of processes, by size of the scene and products."""
-    peaks = []
+    scores: Scores = {}
+    smallest: dict[str, Peak] = {}
     for peak in measure_peaks(SIZES[:2] if effort.quick else SIZES, tuple(CASES)):
-        peaks.append(peak)
+        first = smallest.setdefault(peak.case, peak)
+        more = peak.raw - first.raw
+        scores[peak.case, f"{peak.raw:.0f}"] = {
+            "base MB": round(peak.base),
+            "above base MB": round(peak.above),
+            "slope": (peak.above - first.above) / more if more else None,
+        }
         effort.progress(1)
-    return memory_study(effort.date, peaks)
+    chapter = Chapter(
+        "Peak memory above the base of a process",
+        f"Scenes of one analog and one photon-counting channel with {BINS:,} bins, each in a fresh "
+        "process. The base is the peak after a tiny scene of the same case, with imports and "
+        "compiled code.",
+        [
+            Results(
+                "Peak memory",
+                scores,
+                "Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
+                method="raw MB",
+            )
+        ],
+    )
+    return Study("Memory of a process, by size of the scene", effort.date, [chapter])
 
 
 def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
@@ -211,35 +229,3 @@ def _counts() -> np.ndarray[Any, Any]:
     distance = _BIN_WIDTH * (np.arange(BINS) + 0.5)
     expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
     return np.random.default_rng(7).poisson(expected, (_VARIANTS, BINS))
-
-
-# Page -----------------------------------------------------------------------------------------
-
-
-def memory_study(date: str, peaks: Sequence[Peak]) -> Study:
-    """Return the study of peaks, each compared with the smallest scene of its case."""
-    smallest = {peak.case: peak for peak in reversed(peaks)}
-    scores: Scores = {}
-    for peak in peaks:
-        first = smallest[peak.case]
-        grown, more = peak.above - first.above, peak.raw - first.raw
-        scores[peak.case, f"{peak.raw:.0f}"] = {
-            "base MB": round(peak.base),
-            "above base MB": round(peak.above),
-            "slope": grown / more if more else None,
-        }
-    chapter = Chapter(
-        "Peak memory above the base of a process",
-        f"Scenes of one analog and one photon-counting channel with {BINS:,} bins, each in a fresh "
-        "process. The base is the peak after a tiny scene of the same case, with imports and "
-        "compiled code.",
-        [
-            Results(
-                "Peak memory",
-                rows_of_scores(scores),
-                "Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
-                method="raw MB",
-            )
-        ],
-    )
-    return Study("Memory of a process, by size of the scene", date, [chapter])

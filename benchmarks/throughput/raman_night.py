@@ -8,12 +8,10 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from benchmarks.harness.benchmark import Effort
-from benchmarks.harness.costs import time_methods
-from benchmarks.harness.figure import cpu_time
-from benchmarks.harness.rows import CPU_TIME, Row, rows_of
-from benchmarks.harness.study import Chapter, Results, Study
-from benchmarks.harness.timing import READ
+from benchmarks.harness.figure import Figure, cpu_time
+from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.timing import CPU_TIME, READ, time_methods
+from benchmarks.harness.verdicts import Scores
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
@@ -57,8 +55,10 @@ def measure_raman(effort: Effort, *, profiles: int = PROFILES) -> Study:
         RETRIEVALS: (lambda: retrieved(means), profiles),
     }
     case = f"{profiles} profiles to {means['355'].sizes['time']} means, five channels"
-    rows = time_methods(case, calls, effort.repeats or 3)
-    rows += _whole(case, rows, profiles)
+    scores: Scores = time_methods(case, calls, effort.repeats or 3)
+    parts = [scores[case, name][CPU_TIME] for name in (AVERAGES, RETRIEVALS)]
+    whole = profiles * sum(part.value for part in parts if isinstance(part, Figure))
+    scores[case, WHOLE] = {"lidarops": True, "profiles": 1, CPU_TIME: cpu_time(whole)}
     effort.progress(1)
     chapter = Chapter(
         "A night of two Raman pairs",
@@ -66,19 +66,9 @@ def measure_raman(effort: Effort, *, profiles: int = PROFILES) -> Study:
         " means over half an hour without outlying parts; then extinction, backscatter and lidar"
         " ratio of two pairs, and water vapour. Reading and writing of files are left out. One"
         " thread.",
-        [Results("CPU time of a profile", rows, f"Reads: multiples of {READ}.", case="night")],
+        [Results("CPU time of a profile", scores, f"Reads: multiples of {READ}.", case="night")],
     )
     return Study("Raman: time of a night", effort.date, [chapter])
-
-
-def _whole(case: str, rows: Sequence[Row], profiles: int) -> list[Row]:
-    """Return the CPU time of all profiles together, without the read."""
-    total = profiles * sum(
-        row.value
-        for row in rows
-        if row.quantity == CPU_TIME and row.method != READ and isinstance(row.value, float)
-    )
-    return rows_of(case, WHOLE, {"lidarops": True, "profiles": 1, CPU_TIME: cpu_time(total)})
 
 
 def night(profiles: int, bins: int = BINS) -> xr.Dataset:

@@ -5,28 +5,23 @@ Times are CPU times of this process, the minimum of several repeats, with files 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import dask
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness.benchmark import Effort
-from benchmarks.harness.rows import rows_of
-from benchmarks.harness.study import Chapter, Results, Study
+from benchmarks.harness.results import Chapter, Effort, Results, Study
 from benchmarks.harness.timing import least_times
+from benchmarks.harness.verdicts import Scores
 from lidarops.errors import RawFormatError
 from lidarops.raw.archive import open_archive
 from lidarops.raw.licel import read_counts, read_header, select
 
-_Paths = Sequence[str | os.PathLike[str]]
-_REPEATS: Final = 7
 
-
-def measure_readers(effort: Effort, paths: _Paths) -> Study:
+def measure_readers(effort: Effort, paths: Sequence[Path]) -> Study:
     """Return the speed of the header scan, of raw files to float32 and of opening an archive.
 
     The floors come first: reading the bytes; reading them with ``np.frombuffer`` and one
@@ -36,7 +31,7 @@ def measure_readers(effort: Effort, paths: _Paths) -> Study:
     Parameters
     ----------
     effort : Effort
-    paths : sequence of path or str
+    paths : sequence of Path
         Files of one layout.
 
     Raises
@@ -51,50 +46,35 @@ def measure_readers(effort: Effort, paths: _Paths) -> Study:
         (dataset.offset or 0, dataset.bins, np.float32(dataset.scale))
         for dataset in select(read_header(paths[0]))
     ]
-    floors: dict[str, Callable[[], object]] = {
-        "read bytes (floor)": lambda: _read_bytes(paths),
+    calls: dict[str, Callable[[], object]] = {
+        "read bytes (floor)": lambda: [path.read_bytes() for path in paths],
         "numpy (floor)": lambda: _multiply(paths, channels),
-    }
-    read, multiply = floors
-    compared = {"header scan": read, "raw to float32": multiply, "archive to float32": multiply}
-    calls = floors | {
         "header scan": lambda: [read_header(path) for path in paths],
         "raw to float32": lambda: _scale(paths),
         "archive to float32": lambda: _archive(paths),
     }
-    times = least_times(calls, effort.repeats or _REPEATS)
-    rows = [
-        row
+    read, multiply, scan, *_ = calls
+    times = least_times(calls, effort.repeats or 7)
+    scores: Scores = {
+        ("", name): {
+            "files/s": len(paths) / seconds,
+            "MB/s": size / seconds / 1e6,
+            "times floor": seconds / times[read if name in {read, scan} else multiply],
+        }
         for name, seconds in times.items()
-        for row in rows_of(
-            "",
-            name,
-            {
-                "files/s": len(paths) / seconds,
-                "MB/s": size / seconds / 1e6,
-                "times floor": seconds / times[compared.get(name, name)],
-            },
-        )
-    ]
+    }
     text = "Raw files to arrays, from the page cache, against floors measured in the same run."
-    results = Results("One core, CPU time", rows, method="what")
-    return Study("Reader: files per second", effort.date, [Chapter("Throughput", text, [results])])
+    results = Results("One core, CPU time", scores, method="what")
+    chapter = Chapter("Throughput", text, [results])
+    return Study("Reader: files per second", effort.date, [chapter])
 
 
-def _read_bytes(paths: _Paths) -> None:
-    for path in paths:
-        _read(path)
-
-
-def _read(path: str | os.PathLike[str]) -> bytes:
-    with Path(path).open("rb", buffering=0) as file:
-        return file.read()
-
-
-def _multiply(paths: _Paths, channels: list[tuple[int, int, np.float32]]) -> NDArray[Any]:
+def _multiply(
+    paths: Sequence[Path], channels: Sequence[tuple[int, int, np.float32]]
+) -> NDArray[Any]:
     values = np.empty((len(paths), sum(bins for _, bins, _ in channels)), np.float32)
     for row, path in zip(values, paths, strict=True):
-        content = _read(path)
+        content = path.read_bytes()
         start = 0
         for offset, bins, scale in channels:
             counts = np.frombuffer(content, "<i4", bins, offset)
@@ -103,7 +83,7 @@ def _multiply(paths: _Paths, channels: list[tuple[int, int, np.float32]]) -> NDA
     return values
 
 
-def _scale(paths: _Paths) -> list[NDArray[np.float32]]:
+def _scale(paths: Sequence[Path]) -> list[NDArray[np.float32]]:
     values = []
     for path in paths:
         header, counts = read_counts(path)
@@ -114,6 +94,6 @@ def _scale(paths: _Paths) -> list[NDArray[np.float32]]:
     return values
 
 
-def _archive(paths: _Paths) -> None:
+def _archive(paths: Sequence[Path]) -> None:
     with dask.config.set(scheduler="synchronous"):
         open_archive(paths).compute()

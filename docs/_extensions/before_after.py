@@ -9,9 +9,9 @@ from typing import Any, Final
 import benchmark_results
 import tables
 import verdicts
+from benchmark_results import Row
 
 from benchmarks.harness.figure import Figure, Unit, format_time, with_error
-from benchmarks.harness.rows import Row
 from benchmarks.harness.verdicts import Judgement, Target
 from benchmarks.stability.random_scenes import TARGETS
 from benchmarks.stability.reasons import Unmet

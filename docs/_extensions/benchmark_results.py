@@ -14,15 +14,27 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import pandas as pd
 import tables
 
 from benchmarks.harness.figure import Unit
-from benchmarks.harness.rows import Row
-from benchmarks.harness.tables import table
+from benchmarks.harness.results import COLUMNS, table
 
 RESULTS: Final = Path(__file__).resolve().parents[1] / "results"
 DIGITS: Final = 6
 ERROR_DIGITS: Final = 4
+
+
+class Row(NamedTuple):
+    """One value of one method in one case."""
+
+    case: str
+    method: str
+    quantity: str
+    value: float | str | None
+    error: float = 0.0
+    """Monte Carlo standard error; 0 without one."""
+    unit: Unit = Unit.NUMBER
 
 
 class Selection(NamedTuple):
@@ -134,14 +146,15 @@ def page(name: str) -> str:
     lines = [facts(result)]
     for title, rows in result["tables"].items():
         case, method = result["headings"][title]
-        shown = table(title, rows, case=case, method=method)
-        lines += ["", f"*{title}*", *tables.table(shown.columns, shown.rows)]
+        shown = table(pd.DataFrame(rows, columns=COLUMNS, dtype=object), case=case, method=method)
+        cells = shown.itertuples(index=False, name=None)
+        lines += ["", f"*{title}*", *tables.table([*shown.columns], cells)]
         lines += [result["notes"].get(title, "")]
     return "\n".join(lines)
 
 
 def read(name: str) -> dict[str, Any]:
-    """Return a committed result, with rows as of the harness."""
+    """Return a committed result, with its rows."""
     return _parsed((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
 
 

@@ -7,10 +7,11 @@ from typing import Final
 
 import benchmark_results
 import tables
+from benchmark_results import Row
 
 from benchmarks.harness.figure import share_text
-from benchmarks.harness.rows import CPU_TIME, Row
-from benchmarks.harness.tables import cell
+from benchmarks.harness.results import cell
+from benchmarks.harness.timing import CPU_TIME
 from benchmarks.harness.verdicts import Judgement, Verdict
 from benchmarks.stability import flag_rates, reasons
 from benchmarks.stability.random_scenes import SATISFIED, TARGET, TARGETS

@@ -30,7 +30,7 @@ from support.pages import REPOSITORY, Block, blocks, name_of, pages
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app as benchmarks
-from benchmarks.harness.benchmark import BenchmarkKind
+from benchmarks.harness.results import BenchmarkKind
 from benchmarks.registry import Benchmark
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app

@@ -12,8 +12,8 @@ import typer
 import verdicts
 
 from benchmarks.__main__ import app
-from benchmarks.harness.benchmark import BenchmarkKind
 from benchmarks.harness.figure import Figure, Unit
+from benchmarks.harness.results import BenchmarkKind
 from benchmarks.harness.verdicts import Judgement, Target, Verdict
 from benchmarks.registry import Benchmark
 from benchmarks.stability import study

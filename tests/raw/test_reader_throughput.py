@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from support.licel_strategies import raw_file
 
-from benchmarks.harness.benchmark import Effort
+from benchmarks.harness.results import Effort
 from benchmarks.throughput import readers
 from lidarops.errors import RawFormatError
 

@@ -17,7 +17,6 @@ from benchmarks.stability import (
     random_networks,
     random_raman,
     random_scans,
-    random_sections,
     random_signals,
 )
 from benchmarks.stability.random_scenes import COVERED, FALSE, SATISFIED
@@ -120,9 +119,8 @@ def with_few_together(counts, confined):
 def where_the_model_holds(score, clusters, profiles):
     """Yield the values of the first classes, which are those where the model holds."""
     for cluster in range(clusters):
-        chunks = takewhile(lambda chunk: chunk[0].failure.satisfied, score(cluster, profiles))
-        for values, _ in chunks:
-            yield values
+        chunks = takewhile(lambda chunk: chunk.failure.satisfied, score(cluster, profiles))
+        yield from chunks
 
 
 HOMOGENEOUS = (random_homogeneous.score_homogeneous, 50, 200)
@@ -148,7 +146,7 @@ def test_twice_the_target_in_one_class_of_homogeneous_paths_is_found():
 def networks(cluster, profiles):
     """Yield networks without missing bins, with which one of seven is accepted: too few to tell."""
     chunks = random_networks.score_networks(cluster, profiles)
-    yield from takewhile(lambda chunk: chunk[0].failure.name != "gaps", chunks)
+    yield from takewhile(lambda chunk: chunk.failure.name != "gaps", chunks)
 
 
 KNOWN = verdicts.above_target()
@@ -159,7 +157,7 @@ KNOWN = verdicts.above_target()
     ("score", "clusters", "profiles", "confined"),
     [
         pytest.param(random_homogeneous.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
-        pytest.param(random_sections.score_short_sections, 600, 300, 0.0, id="short sections"),
+        pytest.param(random_homogeneous.score_short_sections, 600, 300, 0.0, id="short sections"),
         pytest.param(random_signals.score_signals, 200, 50, 0.0, id="signal chain"),
         pytest.param(random_elastic.score_elastic, 400, 20, 0.0, id="elastic"),
         pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),

@@ -27,7 +27,7 @@ from benchmarks.stability.random_networks import score_networks
 def test_networks_with_once_too_small_errors_state_them(cluster, failure, false_before):
     """These random networks once had almost all false values of the benchmark."""
     scored = next(
-        values for values, _ in score_networks(cluster, 50) if values.failure.name == failure
+        values for values in score_networks(cluster, 50) if values.failure.name == failure
     )
     kept = np.isfinite(scored.error) & (scored.bits == 0)
     false = kept & (np.abs(scored.error) > 4.0 * scored.random)
@@ -41,7 +41,7 @@ def test_random_networks_state_the_errors_of_thin_layers():
     scored = [
         values
         for cluster in range(24)
-        for values, _ in score_networks(cluster, 10)
+        for values in score_networks(cluster, 10)
         if values.failure.name == "layer of a few bins"
     ]
     assert 6 < len(scored) <= 12

@@ -15,10 +15,9 @@ from typer.testing import CliRunner
 from benchmarks.__main__ import app
 from benchmarks.accuracy import elastic_cases
 from benchmarks.accuracy.homogeneous_cases import Scenario, difficulty
-from benchmarks.harness.benchmark import Effort
-from benchmarks.harness.rows import CPU_TIME
+from benchmarks.harness.results import Effort
 from benchmarks.harness.statistics import clustered_share, design_effect
-from benchmarks.harness.timing import cpu_seconds
+from benchmarks.harness.timing import CPU_TIME, cpu_seconds
 from benchmarks.harness.verdicts import Verdict
 from benchmarks.stability import (
     random_elastic,
@@ -61,7 +60,7 @@ def scored(failure, error, bits=0, **more):
 def counted(*chunks, needless=0.05):
     tally = Tally()
     for chunk in chunks:
-        tally.add(chunk, chunk.error.size)
+        tally.add(chunk)
     return {failure: score for (_, failure), score in tally.rates(needless).items()}
 
 
@@ -256,7 +255,7 @@ def test_the_same_numbers_give_the_same_scenes(draws, repository):
     profiles = min(draws.profiles, 20)
 
     def rates():
-        tally = collect(lambda cluster: draws.score(cluster, profiles), 2, lambda _: None)
+        tally = collect(lambda cluster: draws.score(cluster, profiles), 2)
         return tally.rates(draws.needless, pooled=draws.pooled)
 
     first = rates()
@@ -269,7 +268,7 @@ def test_the_same_numbers_give_the_same_scenes(draws, repository):
 
 
 def test_scans_where_the_model_holds_are_of_calm_air_and_of_a_layer_too():
-    scored = [values for values, _ in random_scans.score_short_scans(0, 4, length=2)]
+    scored = list(random_scans.score_short_scans(0, 4, length=2))
     assert [(values.failure.name, values.quantity) for values in scored] == [
         (f"{words}blocks of 2", quantity)
         for words in ("", "calm air, ", "layer of a few altitudes, ")
@@ -291,7 +290,7 @@ def test_classes_where_the_model_holds_come_first(retrieval):
 
 def test_tests_reject_more_paths_with_a_plume_than_paths_where_the_model_holds():
     draws = next(draw for draw in study.DRAWS if draw.retrieval == "homogeneous")
-    tally = collect(lambda cluster: draws.score(cluster, 300), 6, lambda _: None)
+    tally = collect(lambda cluster: draws.score(cluster, 300), 6)
     rates = tally.rates(1e-3)
     held = rates["extinction", "none"]
     assert 0.2 < held["not rejected"].value < 0.8
@@ -311,7 +310,8 @@ def stability():
     effort = Effort(quick=True, date="2024-01-01", progress=steps.append)
     with pytest.MonkeyPatch.context() as patch:
         # It starts processes.
-        patch.setattr(study, "measure_reproducibility", lambda *_: {("", "order"): {"x": 0.0}})
+        stand_in = lambda *_: {("", "order"): {"x": 0.0}}  # noqa: E731
+        patch.setattr(reproducibility, "measure_reproducibility", stand_in)
         measured = study.measure_stability(effort, draws)
     assert steps == [1] * len(draws)
     return measured
@@ -347,8 +347,8 @@ def test_command_fails_where_a_target_is_missed(stability, monkeypatch):
 def test_missed_targets_without_a_reason_are_told_apart(monkeypatch, tmp_path):
     def score(cluster, profiles):
         error = np.where(np.arange(500) < 5, 9.0, 0.0)
-        yield replace(scored(HIDDEN, error), quantity="x"), profiles
-        yield replace(scored(HIDDEN, error), quantity="y"), profiles
+        yield replace(scored(HIDDEN, error), quantity="x")
+        yield replace(scored(HIDDEN, error), quantity="y")
 
     draws = (study.Draws("paths", "own", score, 500, 20, 20),)
     file = tmp_path / "reasons.json"
@@ -420,11 +420,12 @@ def test_a_chapter_states_all_scenes_that_were_drawn():
     tally = Tally()
     for failure in (HOLDS, HIDDEN, Failure("bent")):
         for quantity in ("x", "y"):
-            tally.add(replace(scored(failure, [0.0, 9.0]), quantity=quantity), 2)
-    tally.add(replace(scored(HOLDS, [0.0]), quantity="z"), 1)
-    assert study._chapter("paths", tally.rates(None)).text.startswith("6 random scenes.")
-    alone = tally.rates(None, pooled=False)
-    assert study._chapter("paths", alone).text.startswith("6 random scenes.")
+            tally.add(replace(scored(failure, [0.0, 9.0]), quantity=quantity))
+    tally.add(replace(scored(HOLDS, [0.0]), quantity="z"))
+    draws = study.Draws("paths", "own", lambda *_: iter(()), 1, 1, 1)
+    for pooled in (True, False):
+        text = draws.chapter(tally.rates(None, pooled=pooled)).text
+        assert text.startswith("6 random scenes.")
 
 
 def test_command_names_every_benchmark_where_one_is_unknown():
@@ -522,11 +523,11 @@ def test_outlying_bins_cost_few_elastic_values():
     """Without bridging, the tests of background and window reject two of three."""
 
     def scenes_with_outliers(cluster):
-        for values, scenes in random_elastic.score_elastic(cluster, 60):
+        for values in random_elastic.score_elastic(cluster, 60):
             if values.failure.name == "outliers":
-                yield values, scenes
+                yield values
 
-    rates = collect(scenes_with_outliers, 8, lambda _: None).rates(None)
+    rates = collect(scenes_with_outliers, 8).rates(None)
     score = rates["backscatter", "outliers"]
     assert score["and not uncertain"].value < VIOLATED
     assert score["not rejected"].value > 0.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.harness.benchmark import Effort
+from benchmarks.harness.results import Effort
 from benchmarks.harness.timing import in_fresh_process
 from benchmarks.throughput import archives, stand_in_archives
 from benchmarks.throughput.archives import ArchiveCost, Pass, ProcessCost
@@ -58,7 +58,7 @@ def measured_archives():
 def test_every_pass_is_measured(measured_archives):
     (chapter,) = measured_archives.chapters
     files = {
-        results.title.split(":")[0]: {row.case for row in results.rows}
+        results.title.split(":")[0]: {case for case, _ in results.scores}
         for results in chapter.results
     }
     read, rows = {"15", "30"}, {f"{SMALL.files} rows"}
@@ -82,17 +82,15 @@ def test_an_operation_can_be_measured_in_its_own_process(tmp_path):
     assert 1e7 < spent.peak < 1e10
 
 
-def test_growth_is_that_of_the_cost_per_file(tmp_path):
+def test_growth_is_that_of_the_cost_per_file():
     def measured(files, cpu, *, read=True):
         return ArchiveCost(files, read, {Pass.AGAIN: ProcessCost(cpu, 2.0 * cpu, 3e8)})
 
     small, large = measured(1000, 0.02), measured(100_000, 2.2)
     rows = measured(1_000_000, 10.0, read=False)
     study = archives.archives_study("2024-01-01", (small, large, rows))
-    assert study.chapters[0].results[3].table.rows == (
-        ("1000", "0.02", "0.04", "20 µs", "-", "300 MB"),
-        ("100000", "2.2", "4.4", "22 µs", "1.1", "300 MB"),
-        ("1000000 rows", "10", "20", "10 µs", "-", "300 MB"),
-    )
-    page = study.write(tmp_path)
-    assert "archive.svg" in page.read_text(encoding="utf-8")
+    assert [*study.results[3].table.itertuples(index=False, name=None)] == [
+        ("1000", "0.02", "0.04", "20 µs", "-", "300"),
+        ("100000", "2.2", "4.4", "22 µs", "1.1", "300"),
+        ("1000000 rows", "10", "20", "10 µs", "-", "300"),
+    ]

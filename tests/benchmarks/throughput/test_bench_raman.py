@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.harness.benchmark import Effort
+from benchmarks.harness.results import Effort
 from benchmarks.throughput import raman_night
 
 
 def test_the_night_is_timed_and_its_retrievals_give_values():
     study = raman_night.measure_raman(Effort(date="2026-01-01", repeats=1), profiles=60)
     (chapter,) = study.chapters
-    methods = {row.method for results in chapter.results for row in results.rows}
+    methods = {method for results in chapter.results for _, method in results.scores}
     assert {raman_night.AVERAGES, raman_night.RETRIEVALS} <= methods
     means = raman_night.means_of(raman_night.night(60))
     for product in raman_night.retrieved(means):

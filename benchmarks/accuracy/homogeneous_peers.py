@@ -1,0 +1,398 @@
+"""Iterative least-squares fits of a homogeneous path by common tools, for comparison.
+
+All fit background, signal at the first range and extinction in km-1, which suits them best, with
+exact derivatives. All fits of a call start from the values of the mean of its first profiles, which
+suits profiles of the same air.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numba
+import numpy as np
+from scipy.optimize import curve_fit
+
+from benchmarks.accuracy.homogeneous_cases import Estimates, PathSolver, Scenario, estimated
+from benchmarks.harness.figure import Array
+
+KILOMETRE: Final = 1e3
+JIT: Final = "LM, numba"
+PROJECTION: Final = "variable projection, numba"
+CURVE_FIT: Final = "scipy curve_fit"
+SLOW: Final = frozenset({CURVE_FIT})
+"""Peers that loop over profiles in Python."""
+_START_PROFILES: Final = 64
+_START_EXTINCTIONS: Final = np.geomspace(3e-3, 10.0, 40)
+"""km-1. Steps of 23 %: the nearest one is close enough for Gauss-Newton steps."""
+
+
+def iterative_peers() -> dict[str, PathSolver]:
+    """Return the iterative solvers by name."""
+    return {
+        JIT: _by_levenberg_marquardt,
+        PROJECTION: _by_projection,
+        CURVE_FIT: _by_scipy,
+    }
+
+
+def start(power: Any, scenario: Scenario) -> Array:
+    """Return the start values of the fits: those of the mean of the first profiles."""
+    ratio, depth = _geometry(scenario)
+    first = np.asarray(power[:_START_PROFILES], np.float64)
+    mean = first[np.isfinite(first).all(axis=1)].mean(axis=0)
+    shapes = ratio * np.exp(-2.0 * _START_EXTINCTIONS[:, np.newaxis] * depth)
+    shapes -= shapes.mean(axis=1, keepdims=True)
+    explained = (shapes @ mean) ** 2 / np.sum(shapes**2, axis=1)
+    extinction = float(_START_EXTINCTIONS[np.argmax(explained)])
+    unknowns, _ = _project(mean[np.newaxis], (ratio, depth), extinction)
+    return np.asarray(unknowns[0])
+
+
+def _by_levenberg_marquardt(power: Any, scenario: Scenario) -> Estimates:
+    """Solve by `fit_levenberg_marquardt`."""
+    ratio, depth = _geometry(scenario)
+    unknowns = np.empty((len(power), _UNKNOWNS))
+    covariance = np.empty((len(power), _UNKNOWNS, _UNKNOWNS))
+    fit_levenberg_marquardt(power, ratio, depth, start(power, scenario), unknowns, covariance)
+    return _estimates(unknowns, covariance, scenario)
+
+
+def _by_projection(power: Any, scenario: Scenario) -> Estimates:
+    """Solve by `fit_variable_projection`."""
+    extinction = float(start(power, scenario)[2])
+    return _estimates(*_project(power, _geometry(scenario), extinction), scenario)
+
+
+def _project(power: Any, geometry: tuple[Array, Array], extinction: float) -> tuple[Array, Array]:
+    """Return unknowns and covariance of profiles."""
+    unknowns = np.empty((len(power), _UNKNOWNS))
+    covariance = np.empty((*unknowns.shape, _UNKNOWNS))
+    fit_variable_projection(power, *geometry, extinction, unknowns, covariance)
+    return unknowns, covariance
+
+
+def _geometry(scenario: Scenario) -> tuple[Array, Array]:
+    distance = scenario.range
+    return (distance[0] / distance) ** 2, (distance - distance[0]) / KILOMETRE
+
+
+def _model(geometry: tuple[Array, Array], background: float, signal: float, sigma: float) -> Array:
+    ratio, depth = geometry
+    return np.asarray(background + signal * ratio * np.exp(-2.0 * sigma * depth))
+
+
+def _slopes(geometry: tuple[Array, Array], _: float, signal: float, sigma: float) -> Array:
+    ratio, depth = geometry
+    shape = ratio * np.exp(-2.0 * sigma * depth)
+    return np.stack([np.ones_like(shape), shape, -2.0 * signal * depth * shape], axis=1)
+
+
+def _by_scipy(power: Any, scenario: Scenario) -> Estimates:
+    """Solve by `scipy.optimize.curve_fit`, profile by profile."""
+    geometry, begin = _geometry(scenario), start(power, scenario)
+    noise = np.ones(scenario.bins)
+    fits = [
+        curve_fit(
+            _model,
+            geometry,
+            np.asarray(row, np.float64),
+            p0=begin,
+            sigma=noise,
+            absolute_sigma=True,
+            jac=_slopes,
+        )
+        for row in power
+    ]
+    unknowns, covariance = zip(*fits, strict=True)
+    return _estimates(np.stack(unknowns), np.stack(covariance), scenario)
+
+
+def _estimates(unknowns: Array, covariance: Array, scenario: Scenario) -> Estimates:
+    """Convert the signal at the first range to the amplitude, with its standard error."""
+    background, signal, sigma = unknowns.T
+    near = scenario.start
+    amplitude = signal * near**2 * np.exp(2.0 * sigma / KILOMETRE * near)
+    of_signal, of_extinction = 1.0 / signal, 2.0 * near / KILOMETRE
+    relative = (
+        of_signal**2 * covariance[:, 1, 1]
+        + 2.0 * of_signal * of_extinction * covariance[:, 1, 2]
+        + of_extinction**2 * covariance[:, 2, 2]
+    )
+    failed = np.asarray(~np.isfinite(unknowns).all(axis=1))
+    return estimated(
+        {
+            "extinction": sigma / KILOMETRE,
+            "background": background,
+            "amplitude": amplitude,
+        },
+        {
+            "extinction": np.sqrt(covariance[:, 2, 2]) / KILOMETRE,
+            "background": np.sqrt(covariance[:, 0, 0]),
+            "amplitude": np.abs(amplitude) * np.sqrt(relative),
+        },
+        flagged=failed,
+        rejected=failed,
+    )
+
+
+# A Levenberg-Marquardt fit, one profile at a time: the usual fast solver ----------------------
+
+_UNKNOWNS: Final = 3
+_MOST: Final = 60
+"""Most iterations of a fit."""
+_TOLERANCE: Final = 1e-10
+"""Relative decrease of the sum of squares below which a fit has converged."""
+_DAMPING: Final = 1e-3
+_LARGEST_DAMPING: Final = 1e12
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill_shape(unknowns: Array, ratio: Array, depth: Array, shape: Array) -> None:
+    for i in range(ratio.size):
+        shape[i] = ratio[i] * np.exp(-2.0 * unknowns[2] * depth[i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _squares(power: Any, unknowns: Array, shape: Array) -> float:
+    total = 0.0
+    for i in range(shape.size):
+        total += (power[i] - unknowns[0] - unknowns[1] * shape[i]) ** 2
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _normal_equations(
+    power: Any, unknowns: Array, depth: Array, shape: Array, matrix: Array, side: Array
+) -> None:
+    s1 = s2 = s3 = s4 = s5 = r0 = r1 = r2 = 0.0
+    for i in range(shape.size):
+        first = shape[i]
+        second = -2.0 * unknowns[1] * depth[i] * first
+        residual = power[i] - unknowns[0] - unknowns[1] * first
+        s1 += first
+        s2 += second
+        s3 += first * first
+        s4 += first * second
+        s5 += second * second
+        r0 += residual
+        r1 += first * residual
+        r2 += second * residual
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = shape.size, s3, s5
+    matrix[0, 1] = matrix[1, 0] = s1
+    matrix[0, 2] = matrix[2, 0] = s2
+    matrix[1, 2] = matrix[2, 1] = s4
+    side[0], side[1], side[2] = r0, r1, r2
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inverse(matrix: Array, damping: float, inverse: Array) -> None:
+    """Invert the damped symmetric matrix by its cofactors."""
+    grown = 1.0 + damping
+    a, d, f = matrix[0, 0] * grown, matrix[1, 1] * grown, matrix[2, 2] * grown
+    b, c, e = matrix[0, 1], matrix[0, 2], matrix[1, 2]
+    inverse[0, 0] = d * f - e * e
+    inverse[0, 1] = inverse[1, 0] = c * e - b * f
+    inverse[0, 2] = inverse[2, 0] = b * e - c * d
+    inverse[1, 1] = a * f - c * c
+    inverse[1, 2] = inverse[2, 1] = b * c - a * e
+    inverse[2, 2] = a * d - b * b
+    inverse /= a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fit(power: Any, ratio: Array, depth: Array, unknowns: Array, inverse: Array) -> int:
+    matrix, side = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    shape, trial_shape, trial = np.empty(ratio.size), np.empty(ratio.size), np.empty(_UNKNOWNS)
+    _fill_shape(unknowns, ratio, depth, shape)
+    squares = _squares(power, unknowns, shape)
+    if not np.isfinite(squares):
+        unknowns[:] = np.nan
+        inverse[:] = np.nan
+        return 0
+    damping = _DAMPING
+    iterations = 0
+    done = False
+    while iterations < _MOST and not done:
+        iterations += 1
+        _normal_equations(power, unknowns, depth, shape, matrix, side)
+        while True:
+            _inverse(matrix, damping, inverse)
+            for j in range(_UNKNOWNS):
+                trial[j] = unknowns[j] + np.sum(inverse[j] * side)
+            _fill_shape(trial, ratio, depth, trial_shape)
+            trial_squares = _squares(power, trial, trial_shape)
+            if trial_squares <= squares:
+                damping *= 0.1
+                break
+            damping *= 10.0
+            if damping > _LARGEST_DAMPING:
+                trial_squares = squares
+                trial[:] = unknowns
+                trial_shape[:] = shape
+                break
+        done = squares - trial_squares <= _TOLERANCE * squares
+        squares = trial_squares
+        unknowns[:] = trial
+        shape[:] = trial_shape
+    _normal_equations(power, unknowns, depth, shape, matrix, side)
+    _inverse(matrix, 0.0, inverse)
+    return iterations
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fit_levenberg_marquardt(
+    power: Any, ratio: Array, depth: Array, start: Array, unknowns: Array, covariance: Array
+) -> int:
+    """Fit background, signal at the start and extinction to profiles of unit variance.
+
+    Parameters
+    ----------
+    power : (profile, range) float
+    ratio : (range,) float64
+        Square of the first range over the range.
+    depth : (range,) float64
+        Range less the first range, in the inverse unit of the extinction.
+    start : (3,) float64
+        Start values of every fit.
+    unknowns : (profile, 3) float64
+        Filled; NaN where a bin is not finite.
+    covariance : (profile, 3, 3) float64
+        Filled with the inverse normal matrix at the solution.
+
+    Returns
+    -------
+    int
+        Iterations of all profiles.
+    """
+    total = 0
+    for k in range(power.shape[0]):
+        unknowns[k] = start
+        total += _fit(power[k], ratio, depth, unknowns[k], covariance[k])
+    return total
+
+
+# Variable projection: the strongest simple peer ----------------------------------------------
+#
+# At one extinction the model is linear in background and signal, so that only the extinction is
+# iterated, by Gauss-Newton steps (golub1973). All fits begin at one extinction, whose sums over the
+# shape are formed once. Even spacing makes the exponential a recurrence.
+
+_STEPS: Final = 30
+"""Most steps of a fit."""
+_CONVERGED: Final = 0.05
+"""Last step in standard errors of the extinction: a further one would be a few hundredths of it."""
+_LANES: Final = 8
+"""Interleaved recurrences, which the compiler turns into vectors."""
+_FAST: Final = {"reassoc", "contract", "arcp"}
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _tables(ratio: Array, depth: Array, sigma: float, first: Array, second: Array) -> Any:
+    """Fill the shape and its slope, and return their sums."""
+    step = np.exp(-2.0 * sigma * _LANES * (depth[1] - depth[0]))
+    for i in range(_LANES):
+        first[i] = np.exp(-2.0 * sigma * depth[i])
+    for i in range(_LANES, depth.size):
+        first[i] = step * first[i - _LANES]
+    f = d = ff = fd = dd = 0.0
+    for i in range(depth.size):
+        first[i] *= ratio[i]
+        second[i] = depth[i] * first[i]
+        f += first[i]
+        d += second[i]
+        ff += first[i] * first[i]
+        fd += first[i] * second[i]
+        dd += second[i] * second[i]
+    return f, d, ff, fd, dd
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _start_sums(power: Any, first: Array, second: Array) -> Any:
+    """Return the sum of a profile, and those of its products with shape and slope."""
+    total = yf = yd = 0.0
+    for i in range(power.size):
+        total += power[i]
+        yf += power[i] * first[i]
+        yd += power[i] * second[i]
+    return total, yf, yd
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _sums(power: Any, ratio: Array, depth: Array, sigma: float, shape: Array) -> Any:
+    """Return the sums of the shape, of its slope and of their products with the profile."""
+    step = np.exp(-2.0 * sigma * _LANES * (depth[1] - depth[0]))
+    for i in range(_LANES):
+        shape[i] = np.exp(-2.0 * sigma * depth[i])
+    for i in range(_LANES, depth.size):
+        shape[i] = step * shape[i - _LANES]
+    f = d = ff = fd = dd = yf = yd = 0.0
+    for i in range(depth.size):
+        first = ratio[i] * shape[i]
+        second = depth[i] * first
+        f += first
+        d += second
+        ff += first * first
+        fd += first * second
+        dd += second * second
+        yf += power[i] * first
+        yd += power[i] * second
+    return f, d, ff, fd, dd, yf, yd
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fit_variable_projection(
+    power: Any, ratio: Array, depth: Array, start: float, unknowns: Array, covariance: Array
+) -> None:
+    """Fit background, signal at the start and extinction to profiles of unit variance.
+
+    Parameters
+    ----------
+    power : (profile, bin) float
+        At least 8 bins.
+    ratio, depth : (bin,) float
+        Square of first over range; evenly spaced distances from the first.
+    start : float
+        Extinction in the unit of 1 / `depth`, of all profiles.
+    unknowns : (profile, 3) float
+        Receives the solution; NaN where it does not converge.
+    covariance : (profile, 3, 3) float
+        Receives the covariance.
+    """
+    bins, shape, slope = depth.size, np.empty(depth.size), np.empty(depth.size)
+    start_shape = np.empty(bins)
+    f0, d0, ff0, fd0, dd0 = _tables(ratio, depth, start, start_shape, slope)
+    for k in range(len(power)):
+        total, yf, yd = _start_sums(power[k], start_shape, slope)
+        f, d, ff, fd, dd = f0, d0, ff0, fd0, dd0
+        sigma, step, error = start, np.inf, 0.0
+        background = signal = of_signal = of_background = np.nan
+        for iteration in range(_STEPS):
+            if iteration:
+                f, d, ff, fd, dd, yf, yd = _sums(power[k], ratio, depth, sigma, shape)
+            # Without their means, and the slope without the shape.
+            ff, fd, dd = ff - f * f / bins, fd - f * d / bins, dd - d * d / bins
+            yf, yd = yf - f * total / bins, yd - d * total / bins
+            signal = yf / ff
+            background = (total - signal * f) / bins
+            left = dd - fd * fd / ff
+            error = 0.5 / (abs(signal) * np.sqrt(left))
+            step = -0.5 * (yd - signal * fd) / (signal * left)
+            sigma += step
+            if not abs(step) > _CONVERGED * error:
+                break
+        # d signal / d extinction and d background / d extinction, at the minimum of the rest.
+        of_signal = 2.0 * signal * fd / ff
+        of_background = (2.0 * signal * d - of_signal * f) / bins
+        unknowns[k, 0] = background + of_background * step
+        unknowns[k, 1] = signal + of_signal * step
+        unknowns[k, 2] = sigma
+        if not abs(step) <= _CONVERGED * error:
+            unknowns[k] = np.nan
+        v = error * error
+        covariance[k, 2, 2] = v
+        covariance[k, 1, 1] = 1.0 / ff + of_signal**2 * v
+        covariance[k, 0, 0] = 1.0 / bins + (f / bins) ** 2 / ff + of_background**2 * v
+        covariance[k, 1, 2] = covariance[k, 2, 1] = of_signal * v
+        covariance[k, 0, 2] = covariance[k, 2, 0] = of_background * v
+        covariance[k, 0, 1] = covariance[k, 1, 0] = -f / bins / ff + of_signal * of_background * v

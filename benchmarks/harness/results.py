@@ -1,0 +1,242 @@
+"""Results of benchmarks: tables of (case, method, quantity, value), their JSON and page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from benchmarks.harness.figure import Figure, Unit, format_time, with_error
+from benchmarks.harness.plots import Chart, draw
+from benchmarks.harness.timing import Machine, machine
+from benchmarks.harness.verdicts import Judgement, Scores
+from lidarops.errors import CatalogError
+from lidarops.system.files import write_atomically
+
+INDEX: Final = "index.html"
+RESULT: Final = "result.json"
+"""Names of the page and of the file of all numbers in the folder of a benchmark."""
+COLUMNS: Final = ["case", "method", "quantity", "value", "error", "unit"]
+"""Columns of a table of results; an error of 0 is none."""
+_NONE: Final = "-"
+_STYLE: Final = (
+    ":root{color-scheme:light dark} body{max-width:80rem;margin:auto;padding:1rem;"
+    "font:1rem/1.5 system-ui} table{border-collapse:collapse} td,th{text-align:right;"
+    "padding:.2rem .6rem;border-bottom:1px solid #8888} img{max-width:100%;background:#fff}"
+)
+
+
+class BenchmarkKind(StrEnum):
+    """Quantity that a benchmark measures."""
+
+    ACCURACY = "accuracy"
+    THROUGHPUT = "throughput"
+    STABILITY = "stability"
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """Size of a run, its stated date, and the progress callback."""
+
+    quick: bool = False
+    repeats: int | None = None
+    """Repeats of each timing; None for the default of the benchmark."""
+    date: str = ""
+    """Date stated in the result."""
+    progress: Callable[[int], object] = lambda _: None
+    """Called with 1 after each scenario or setting."""
+
+
+def frame(scores: Scores) -> pd.DataFrame:
+    """Return scores as a table with a line for each value, with the columns `COLUMNS`."""
+    rows = [
+        (*key, quantity, *_parts(value))
+        for key, score in scores.items()
+        for quantity, value in score.items()
+    ]
+    return pd.DataFrame(rows, columns=COLUMNS, dtype=object)
+
+
+def _parts(value: Figure | Judgement | float | str | None) -> tuple[Any, float, str]:
+    if isinstance(value, Figure):
+        return value.value, value.error, value.unit
+    return str(value) if isinstance(value, Judgement) else value, 0.0, Unit.NUMBER
+
+
+def cell(row: Any) -> str:
+    """Return the text of a row of a table of results."""
+    value = row.value
+    if value is None or isinstance(value, str):
+        return value or _NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if row.unit == Unit.TIME:
+        return format_time(value)
+    if row.unit == Unit.SHARE:
+        # Rounding must not turn a share below 1 into 100 %.
+        rounds = not row.error and 0.999 < value < 1.0
+        return ">99.9 %" if rounds else f"{with_error(100.0 * value, 100.0 * row.error)} %"
+    return with_error(value, row.error)
+
+
+def table(rows: pd.DataFrame, *, case: str = "case", method: str = "method") -> pd.DataFrame:
+    """Return texts with a line for each case and method, and a column for each quantity.
+
+    Parameters
+    ----------
+    rows : DataFrame
+        With the columns `COLUMNS`.
+    case, method : str
+        Headings of these columns; a column whose values are all the same is left out.
+    """
+    cells = rows.assign(text=[cell(row) for row in rows.itertuples(index=False)])
+    keys = pd.MultiIndex.from_frame(rows[["case", "method"]].drop_duplicates())
+    wide = cells.pivot_table("text", ["case", "method"], "quantity", "last")
+    wide = wide.reindex(index=keys, columns=rows["quantity"].unique()).fillna(_NONE).reset_index()
+    constant = [name for name in ("case", "method") if wide[name].nunique() == 1]
+    left_out = constant if len(constant) == 1 else ["case"] * len(constant[:1])
+    return wide.drop(columns=left_out).rename(columns={"case": case, "method": method})
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Scores under a heading."""
+
+    title: str
+    scores: Scores
+    note: str = ""
+    case: str = "case"
+    """Heading of the column of cases."""
+    method: str = "method"
+    folded: bool = False
+    """Whether the table is folded on the page and left out in a terminal."""
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The scores as texts."""
+        return table(frame(self.scores), case=self.case, method=self.method)
+
+
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """A part of a study."""
+
+    title: str
+    text: str
+    results: Sequence[Results]
+    charts: Sequence[Chart] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Error and run time of one method in one setting, for the page of all retrievals."""
+
+    setting: str
+    quantity: str
+    """With its unit."""
+    method: str
+    error: Figure
+    """Root mean square."""
+    coverage: Figure | None
+    """Share of truths in the stated 95 percent interval; None if the method states none."""
+    time: Figure
+    """CPU time per profile."""
+    ours: bool = True
+    """Whether a method of lidarops; else a peer."""
+    informed: bool = False
+    """Whether the method knows more than the profile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """All results of one benchmark."""
+
+    title: str
+    date: str
+    chapters: Sequence[Chapter]
+    works: Sequence[Work] = ()
+    missed: Sequence[str] = ()
+    """Targets that are missed; the command fails where there is one."""
+    unnamed: Sequence[str] = ()
+    """Those of them for which no reason is stated."""
+    cpu_seconds: float = 0.0
+    """CPU time of the whole benchmark, with its child processes."""
+    machine: Machine = field(default_factory=machine)
+
+    @property
+    def results(self) -> list[Results]:
+        """The tables of all chapters."""
+        return [results for chapter in self.chapters for results in chapter.results]
+
+    def figures(self, title: str) -> dict[tuple[str, str, str], Any]:
+        """Return the rows under a heading by case, method and quantity."""
+        (scores,) = (results.scores for results in self.results if results.title == title)
+        rows = frame(scores).itertuples(index=False)
+        return {(row.case, row.method, row.quantity): row for row in rows}
+
+    def json(self) -> str:
+        """Return all rows, by the headings of their tables, as JSON."""
+        shown = self.results
+        document = {
+            "title": self.title,
+            "date": self.date,
+            "machine": asdict(self.machine),
+            "cpu_seconds": round(self.cpu_seconds, 1),
+            "tables": {each.title: frame(each.scores).to_dict("records") for each in shown},
+            "headings": {each.title: [each.case, each.method] for each in shown},
+            "notes": {each.title: each.note for each in shown},
+        }
+        return json.dumps(document, indent=1, allow_nan=False)
+
+    def write(self, folder: Path) -> Path:
+        """Write the page with its charts, and the JSON; return the path of the page.
+
+        Raises
+        ------
+        CatalogError
+            If the folder cannot be written.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for chart in (chart for chapter in self.chapters for chart in chapter.charts):
+                write_atomically(folder / f"{chart.name}.svg", draw(chart))
+            write_atomically(folder / INDEX, "\n".join(self._page()).encode())
+            write_atomically(folder / RESULT, self.json().encode())
+        except OSError as error:
+            raise CatalogError(
+                f"the report cannot be written: {error}",
+                file=folder,
+                remedy="choose a folder you can write to",
+            ) from error
+        return folder / INDEX
+
+    def _page(self) -> list[str]:
+        about = self.machine
+        packages = ", ".join(f"{name} {number}" for name, number in about.packages.items())
+        facts = f"{self.date}, {about.processor}, {about.cores} cores, Python {about.python}"
+        lines = [
+            f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{self.title}</title>',
+            f"<style>{_STYLE}</style><h1>{escape(self.title)}</h1>",
+            f'<p>{escape(facts)}, {packages}. <a href="{RESULT}">All numbers</a></p>',
+        ]
+        for chapter in self.chapters:
+            lines += [f"<h2>{escape(chapter.title)}</h2>", f"<p>{escape(chapter.text)}</p>"]
+            lines += [
+                f'<figure><img src="{chart.name}.svg" alt="{escape(chart.title)}">'
+                f"<figcaption>{escape(chart.caption)}</figcaption></figure>"
+                for chart in chapter.charts
+            ]
+            for results in chapter.results:
+                state = "" if results.folded else " open"
+                text = results.table.to_html(index=False, border=0)
+                lines += [f"<details{state}><summary>{escape(results.title)}</summary>", text]
+                lines += [f"<p>{escape(results.note)}</p></details>"]
+        return lines
