@@ -1,23 +1,36 @@
 """Many raw files of one format and layout as one dask-backed Dataset.
 
-The data model is that of `lidarops.raw.model`. Headers are read when the archive is opened; of
-files whose headers the catalog knows to be equal, one header is read. A task of the graph reads
-the bytes of one channel in the files of one chunk.
+Every channel is a variable ``<channel>(time, range)`` in mV (analog) or MHz (photon counting), or
+in raw counts, with ``<channel>_shots(time)`` and, for analog channels,
+``<channel>_input_range(time)`` in V. ``time`` is the middle of the interval in
+``time_bnds(time, nv)``; ``range`` is the centre of the bin. Channels on another range grid have
+their own dimension, ``range_2`` and so on. ``zenith_angle(time)`` and, if known, ``azimuth(time)``
+are coordinates, as are latitude, longitude and altitude. A property that is the same in all files
+is an attribute of the channel; one that varies is a variable ``<channel>_<property>(time)``.
+
+Nothing is masked: a value at or above the attribute ``full_scale`` (in the units of the variable,
+present if it is the same in all files) is saturated or a glitch, and the processing flags it.
+
+Headers are read when the archive is opened; of files whose headers the catalog knows to be equal,
+one header is read. A task of the graph reads the bytes of one channel in the files of one chunk.
 """
 
 from __future__ import annotations
 
 import glob
+import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from functools import lru_cache
+from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple, get_args
 
 import dask.array as da
 import numpy as np
@@ -26,23 +39,47 @@ from dask.base import tokenize
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import raw_format, read_raw_header
+from lidarops.raw.formats import RawFile, raw_format, read_raw_header
 from lidarops.raw.header import (
+    POLARISATIONS,
     Layout,
     RawChannel,
     RawHeader,
     Stretches,
+    chosen,
     named_layout,
     recorder_names,
-    to_physical,
 )
-from lidarops.raw.model import Position, RawFiles, StatedFile, build_raw_dataset
-from lidarops.records import Granule
+from lidarops.records import Granule, Header
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
+Position = Literal["longitude_first", "latitude_first", "ignore"]
+Signal = Callable[[int, RawChannel], Any]
+"""Number of a channel, the channel in the first file -> array (time, range), lazy or not."""
 
 _CHUNK_BYTES = 16_000_000
+_EPOCH = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
+_MICROSECOND = timedelta(microseconds=1)
+
+
+class _Property(NamedTuple):
+    description: str
+    units: str
+    """Empty for the units of the channel."""
+    dtype: type
+    may_be_attribute: bool = True
+    """Whether it becomes an attribute if all files agree."""
+
+
+_PROPERTIES: Mapping[str, _Property] = {
+    "shots": _Property("laser shots", "1", np.int32, may_be_attribute=False),
+    "input_range": _Property("digitiser input range", "V", np.float64, may_be_attribute=False),
+    "scale": _Property("value of one count", "", np.float64, may_be_attribute=False),
+    "laser": _Property("laser", "1", np.int32),
+    "high_voltage": _Property("detector voltage", "V", np.float64),
+    "discriminator": _Property("discriminator level", "V", np.float64),
+    "bin_shift": _Property("bin shift", "1", np.float64),
+}
 
 
 @dataclass(slots=True)
@@ -118,8 +155,8 @@ def open_archive(
     token = tokenize(repr(stamps), files.kept)
 
     def signal(index: int, channel: RawChannel) -> da.Array:
-        places = files.channel_places(index)
-        scales = files.channel_values(index, "scale") if mask_and_scale else None
+        places = tuple(selected[index].places for selected in files.channels)
+        scales = files.values(index, "scale") if mask_and_scale else None
         lengths = tuple(len(chunk) for _, chunk in chunks)
         kept = files.kept.get(channel.name)
         name = f"{files.format}-{channel.name}-{tokenize(token, places, scales, lengths)}"
@@ -133,115 +170,6 @@ def open_archive(
         return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
 
     return build_raw_dataset(files, signal, scaled=mask_and_scale)
-
-
-def _read_headers(
-    files: Mapping[str, Granule | None], position_order: Position
-) -> list[StatedFile]:
-    """Return the files with their headers, in the same order.
-
-    Of granules with equal header digests one header is read, unless the position of the header
-    is requested: the catalog may hold another position.
-    """
-    read: list[StatedFile] = []
-    alike: dict[tuple[object, ...], RawHeader] = {}
-    for path, granule in files.items():
-        known = granule if granule and position_order == "ignore" and granule.start else None
-        key = (known.header_digest, known.size, known.layout) if known else ()
-        if known and key in alike:
-            read.append(StatedFile(path, known.size, known.mtime_ns, alike[key], known))
-            continue
-        file = _read_header(path, granule)
-        read.append(replace(file, stated=known) if known else file)
-        digest = file.header.header_digest
-        if known and digest and key == (digest, file.size, known.layout):
-            alike[key] = file.header
-    unnamed = [file.header for file in read if files[file.path] is None]
-    names = recorder_names((header.layout, 1, header.start) for header in unnamed)
-    return [
-        replace(file, header=_renamed(file.header, named_layout(file.header.layout, names)))
-        if files[file.path] is None
-        else file
-        for file in read
-    ]
-
-
-def _read_header(path: str, granule: Granule | None) -> StatedFile:
-    with RawFile(path) as file:
-        header = read_raw_header(file, "" if granule is None else granule.format)
-        stamp = file.size, file.mtime_ns
-    if granule is not None:
-        header = _renamed(header, granule.layout or header.layout)
-    return StatedFile(path, *stamp, header, header)
-
-
-def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
-    """Return a header whose channels have the names of a layout of the same recorders."""
-    if [channel.device for channel in header.channels] != [own.recorder for own in layout]:
-        raise RawFormatError(
-            "holds other channels than the catalog states",
-            file=header.path,
-            remedy="run lidarops catalog again",
-        )
-    return replace(header, channels=_with_names(header.channels, layout))
-
-
-# Files with equal channels share one tuple.
-@lru_cache(maxsize=128)
-def _with_names(channels: tuple[RawChannel, ...], layout: Layout) -> tuple[RawChannel, ...]:
-    return tuple(replace(c, name=own.name) for c, own in zip(channels, layout, strict=True))
-
-
-@dataclass(frozen=True, slots=True)
-class _Chunk:
-    """Task that reads one channel of the files of one chunk; small, and can be pickled."""
-
-    format: str
-    """Name of their raw format."""
-    files: tuple[tuple[str, int], ...]
-    """Path and size of each, shared by the tasks of all channels."""
-    places: tuple[tuple[int, ...], ...]
-    """Of the channel, for each file."""
-    bins: int
-    kept: Stretches | None
-    """Stretches of bins to read; None for all bins."""
-    scales: NDArray[np.float64] | None
-    """None for counts."""
-
-    def __call__(self) -> NDArray[Any]:
-        shape = len(self.places), self.bins
-        counts = np.empty(shape if self.scales is None else shape[1:], np.dtype("<i4"))
-        values = counts if self.scales is None else np.empty(shape, np.float32)
-        read_channel = raw_format(self.format).read_channel
-        for index, ((path, size), places) in enumerate(zip(self.files, self.places, strict=True)):
-            row = counts if self.scales is not None else counts[index]
-            with RawFile(path) as file:
-                file.expect(size)
-                read_channel(file, places, self.kept, row)
-            if self.scales is not None:
-                to_physical(row, self.scales[index], values[index])
-        count = _COUNT.get()
-        if count is not None:
-            count.bytes += sum(map(len, self.places)) * self.bins * counts.itemsize
-        return values.astype(np.int32 if self.scales is None else np.float32, copy=False)
-
-
-def _chunks(
-    files: RawFiles, profiles: int | None
-) -> list[tuple[slice, tuple[tuple[str, int], ...]]]:
-    """Return the rows of each chunk, with path and size of its files."""
-    if profiles is None:
-        largest = max(channel.bins for channel in files.selected)
-        profiles = max(1, _CHUNK_BYTES // (4 * largest))
-    if profiles < 1:
-        raise RawFormatError(
-            f"{profiles} is not a possible number of profiles",
-            field="profiles_per_chunk",
-            remedy="give at least 1",
-        )
-    stamps = tuple((file.path, file.size) for file in files.files)
-    slices = [slice(i, i + profiles) for i in range(0, len(stamps), profiles)]
-    return [(rows, stamps[rows]) for rows in slices]
 
 
 def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Granule | None]:
@@ -287,3 +215,389 @@ def _walk(folder: Path) -> Iterator[str]:
     for parent, folders, names in os.walk(folder, onerror=fail):
         folders[:] = [name for name in folders if not name.startswith(".")]
         yield from (str(Path(parent, name)) for name in names if not name.startswith("."))
+
+
+@dataclass(frozen=True, slots=True)
+class StatedFile:
+    """A raw file, its header, and what is stated of it in place of the header."""
+
+    path: str
+    size: int
+    mtime_ns: int
+    header: RawHeader
+    """Of this file, or of one with the same site and channels."""
+    stated: Header
+    """The header of this file, or a granule, which supplies times, altitude and pointing."""
+
+    @property
+    def interval(self) -> tuple[int, int]:
+        """Start and stop in ns since 1970."""
+        start, stop = self.stated.start, self.stated.stop
+        if start is None or stop is None:
+            raise RawFormatError(
+                "has no start or stop in the catalog", file=self.path, field="start"
+            )
+        return (
+            1000 * ((start - _EPOCH) // _MICROSECOND),
+            1000 * ((stop - _EPOCH) // _MICROSECOND),
+        )
+
+
+def _read_headers(
+    files: Mapping[str, Granule | None], position_order: Position
+) -> list[StatedFile]:
+    """Return the files with their headers, in the same order.
+
+    Of granules with equal header digests one header is read, unless the position of the header
+    is requested: the catalog may hold another position.
+    """
+    read: list[StatedFile] = []
+    alike: dict[tuple[object, ...], RawHeader] = {}
+    for path, granule in files.items():
+        known = granule if granule and position_order == "ignore" and granule.start else None
+        key = (known.header_digest, known.size, known.layout) if known else ()
+        if known and key in alike:
+            read.append(StatedFile(path, known.size, known.mtime_ns, alike[key], known))
+            continue
+        with RawFile(path) as file:
+            header = read_raw_header(file, granule.format if granule else "")
+        if granule:
+            header = _renamed(header, granule.layout or header.layout)
+        read.append(StatedFile(path, file.size, file.mtime_ns, header, known or header))
+        if known and header.header_digest and key[:2] == (header.header_digest, file.size):
+            alike[key] = header
+    unnamed = [file.header for file in read if files[file.path] is None]
+    names = recorder_names((header.layout, 1, header.start) for header in unnamed)
+    return [
+        replace(file, header=_renamed(file.header, named_layout(file.header.layout, names)))
+        if files[file.path] is None
+        else file
+        for file in read
+    ]
+
+
+def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
+    """Return a header whose channels have the names of a layout of the same recorders."""
+    if [channel.device for channel in header.channels] != [own.recorder for own in layout]:
+        raise RawFormatError(
+            "holds other channels than the catalog states",
+            file=header.path,
+            remedy="run lidarops catalog again",
+        )
+    return replace(header, channels=_with_names(header.channels, layout))
+
+
+# Files with equal channels share one tuple.
+@lru_cache(maxsize=128)
+def _with_names(channels: tuple[RawChannel, ...], layout: Layout) -> tuple[RawChannel, ...]:
+    return tuple(replace(c, name=own.name) for c, own in zip(channels, layout, strict=True))
+
+
+class RawFiles:
+    """Files of one format and layout, by start, then path, and the channels to open.
+
+    Parameters
+    ----------
+    files : sequence of StatedFile
+        The first one gives the layout.
+    channels : iterable of str, optional
+        Names to open; by default all signal channels.
+    position_order : {"longitude_first", "latitude_first", "ignore"}
+    stretches : mapping of str to tuple of (int, int), optional
+        By channel, the stretches of bins to keep.
+
+    Raises
+    ------
+    RawFormatError
+        If a file is of another format than the first file, lacks a channel, has it on another range
+        grid than the first file, or has an impossible position, or if stretches do not ascend.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[StatedFile],
+        channels: Iterable[str] | None,
+        position_order: Position,
+        stretches: Mapping[str, Stretches] | None = None,
+    ) -> None:
+        if position_order not in get_args(Position):
+            raise RawFormatError(
+                f"{position_order!r} is unknown",
+                field="header_position",
+                remedy=f"choose one of {', '.join(get_args(Position))}",
+            )
+        first = files[0].header
+        found = chosen({channel.name: channel for channel in first.channels}, channels, first.path)
+        of_layout: dict[tuple[RawChannel, ...], tuple[RawChannel, ...]] = {}
+        for header in (file.header for file in files):
+            if header.format != first.format:
+                raise RawFormatError(
+                    f"is of raw format {header.format}, the files before it of {first.format}",
+                    file=header.path,
+                    remedy="open files of one format",
+                )
+            if header.channels not in of_layout:
+                of_layout[header.channels] = _alike(header, found, whole=channels is None)
+        self.format = first.format
+        """Name of the raw format."""
+        self.position_order = position_order
+        self.kept = _kept(stretches or {}, found)
+        """Stretches of the channels of which some bins are left out."""
+        self.selected = tuple(
+            replace(c, bins=sum(past - first for first, past in self.stretches(c))) for c in found
+        )
+        """Selected channels of the first file, with the bins to keep."""
+        self.files = sorted(files, key=lambda file: (file.interval[0], file.path))
+        self.times = np.array([file.interval for file in self.files], dtype=np.int64)
+        """Start and stop in ns since 1970, shape (files, 2)."""
+        self.channels = [of_layout[file.header.channels] for file in self.files]
+        """Selected channels of each file."""
+
+    def values(self, channel: int, name: str) -> NDArray[Any]:
+        """Return a property of selected channel number `channel`, one value per file."""
+        return np.array([getattr(selected[channel], name) for selected in self.channels])
+
+    def stretches(self, channel: RawChannel) -> Stretches:
+        """Return the kept stretches of bins of a channel."""
+        return self.kept.get(channel.name, ((0, channel.bins),))
+
+
+def _alike(
+    header: RawHeader, first: tuple[RawChannel, ...], *, whole: bool
+) -> tuple[RawChannel, ...]:
+    """Return the channels of a header that the first file has on the same grids, in its order."""
+    stored = {channel.name: channel for channel in header.channels}
+    names = None if whole else [channel.name for channel in first]
+    grids, expected = (
+        {(c.name, c.bins, c.bin_width, c.adc_bits) for c in channels}
+        for channels in (chosen(stored, names, header.path), first)
+    )
+    differing = {name for name, *_ in grids ^ expected}
+    if differing:
+        raise RawFormatError(
+            "is of another layout (channels, bins, bin width or ADC bits) than the files before it",
+            file=header.path,
+            field=", ".join(sorted(differing)),
+            remedy="open files of one layout, or choose channels that are equal in all files",
+        )
+    return tuple(stored[channel.name] for channel in first)
+
+
+def _kept(
+    stretches: Mapping[str, Stretches], selected: Sequence[RawChannel]
+) -> dict[str, Stretches]:
+    """Return the stretches within the channels, without those of whole channels."""
+    stored = {channel.name: channel.bins for channel in selected}
+    kept = {}
+    for name, requested in stretches.items():
+        edges = [edge for stretch in requested for edge in stretch]
+        ascending = all(low < high for low, high in pairwise(edges))
+        if not (ascending and edges and 0 <= edges[0] < stored.get(name, 0)):
+            raise RawFormatError(
+                f"bins {list(requested)} of {name} cannot be kept",
+                field="stretches",
+                remedy=f"give ascending stretches of bins (first, past) of {', '.join(stored)}",
+            )
+        clipped = [(first, min(past, stored[name])) for first, past in requested]
+        kept[name] = tuple(stretch for stretch in clipped if stretch[0] < stretch[1])
+    return {name: held for name, held in kept.items() if held != ((0, stored[name]),)}
+
+
+def _chunks(
+    files: RawFiles, profiles: int | None
+) -> list[tuple[slice, tuple[tuple[str, int], ...]]]:
+    """Return the rows of each chunk, with path and size of its files."""
+    if profiles is None:
+        largest = max(channel.bins for channel in files.selected)
+        profiles = max(1, _CHUNK_BYTES // (4 * largest))
+    if profiles < 1:
+        raise RawFormatError(
+            f"{profiles} is not a possible number of profiles",
+            field="profiles_per_chunk",
+            remedy="give at least 1",
+        )
+    stamps = tuple((file.path, file.size) for file in files.files)
+    slices = [slice(i, i + profiles) for i in range(0, len(stamps), profiles)]
+    return [(rows, stamps[rows]) for rows in slices]
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """Task that reads one channel of the files of one chunk; small, and can be pickled."""
+
+    format: str
+    """Name of their raw format."""
+    files: tuple[tuple[str, int], ...]
+    """Path and size of each, shared by the tasks of all channels."""
+    places: tuple[tuple[int, ...], ...]
+    """Of the channel, for each file."""
+    bins: int
+    kept: Stretches | None
+    """Stretches of bins to read; None for all bins."""
+    scales: NDArray[np.float64] | None
+    """None for counts."""
+
+    def __call__(self) -> NDArray[Any]:
+        shape = len(self.places), self.bins
+        counts = np.empty(shape if self.scales is None else shape[1:], np.dtype("<i4"))
+        values = counts if self.scales is None else np.empty(shape, np.float32)
+        read_channel = raw_format(self.format).read_channel
+        for index, ((path, size), places) in enumerate(zip(self.files, self.places, strict=True)):
+            row = counts if self.scales is not None else counts[index]
+            with RawFile(path) as file:
+                file.expect(size)
+                read_channel(file, places, self.kept, row)
+            if self.scales is not None:
+                # In double precision.
+                np.multiply(row, self.scales[index], out=values[index], casting="same_kind")
+        count = _COUNT.get()
+        if count is not None:
+            count.bytes += sum(map(len, self.places)) * self.bins * counts.itemsize
+        return values.astype(np.int32 if self.scales is None else np.float32, copy=False)
+
+
+def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Dataset:
+    """Return the Dataset of some files.
+
+    Parameters
+    ----------
+    files : RawFiles
+    signal : callable
+        Returns the array of a channel.
+    scaled : bool
+        Whether `signal` returns physical values or counts.
+    """
+    # The most common grid is "range"; the others follow in file order.
+    uses = Counter((files.stretches(c), c.bin_width) for c in files.selected)
+    ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
+    grids = {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
+    stated = [file.stated for file in files.files]
+    notes = {note for header in stated for note in header.notes}
+    notes |= {header.doubt for header in stated if isinstance(header, RawHeader)} - {""}
+    variables: dict[str, xr.Variable] = {}
+    for index, channel in enumerate(files.selected):
+        dims = ("time", grids[files.stretches(channel), channel.bin_width])
+        attributes, varying = _properties(files, index, scaled=scaled)
+        variables[channel.name] = xr.Variable(dims, signal(index, channel), attributes)
+        variables |= varying
+    return xr.Dataset(
+        variables,
+        {**_time(files), **_ranges(grids), **_place(files)},
+        {
+            "source_format": raw_format(files.format).title,
+            "site": ", ".join(sorted({file.header.site for file in files.files})),
+            **({"notes": "; ".join(sorted(notes))} if notes else {}),
+        },
+    )
+
+
+def _properties(
+    files: RawFiles, index: int, *, scaled: bool
+) -> tuple[dict[str, Any], dict[str, xr.Variable]]:
+    """Return the attributes of a channel, and the variables of what differs between files."""
+    channel = files.selected[index]
+    polarisation = POLARISATIONS.get(channel.polarisation, channel.polarisation)
+    mode = str(channel.mode)
+    label = int(channel.wavelength_label.partition(".")[0])
+    attributes: dict[str, Any] = {
+        "units": channel.units if scaled else "count",
+        "long_name": f"{mode} signal at {label} nm, {polarisation} polarisation",
+        "detection_mode": mode,
+        "wavelength_label": channel.wavelength_label,
+        **({} if math.isnan(channel.wavelength) else {"wavelength": channel.wavelength}),
+        "polarisation": polarisation,
+        "bin_width": channel.bin_width,
+        "adc_bits": channel.adc_bits,
+        "conversion": raw_format(files.format).conversion,
+        "device": channel.device,
+        **_full_scale(files, index, scaled=scaled),
+    }
+    varying = {}
+    for name, prop in _PROPERTIES.items():
+        values = files.values(index, name)
+        # Of type object where a file lacks the property.
+        if values.dtype == object or (name == "scale" and scaled):
+            continue
+        if prop.may_be_attribute and _is_constant(values):
+            attributes[name] = values[0].item()
+            continue
+        about = {
+            "units": prop.units or channel.units,
+            "long_name": f"{prop.description} of {channel.name}",
+        }
+        varying[f"{channel.name}_{name}"] = _in_time(values.astype(prop.dtype), about)
+    return attributes, varying
+
+
+def _full_scale(files: RawFiles, index: int, *, scaled: bool) -> dict[str, float]:
+    channel = files.selected[index]
+    if channel.input_range is None:
+        return {}
+    values = files.values(index, "full_scale")
+    if scaled:
+        # In the precision of the signal, so saturated values compare equal.
+        nominal = files.values(index, "input_range") * 1e3 * (1 - 0.5**channel.adc_bits)
+        values = nominal.astype(np.float32)
+    return {"full_scale": values[0].item()} if _is_constant(values) else {}
+
+
+def _is_constant(values: NDArray[Any]) -> bool:
+    return bool((values == values[0]).all())
+
+
+def _in_time(values: NDArray[Any], attributes: dict[str, str]) -> xr.Variable:
+    return xr.Variable(("time",), values, attributes)
+
+
+def _time(files: RawFiles) -> dict[str, xr.Variable]:
+    bounds = files.times
+    middle = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
+    about = {
+        "standard_name": "time",
+        "long_name": "middle of the measurement interval, UTC",
+        "bounds": "time_bnds",
+    }
+    return {
+        "time": _in_time(middle.astype("datetime64[ns]"), about),
+        "time_bnds": xr.Variable(("time", "nv"), bounds.astype("datetime64[ns]")),
+    }
+
+
+def _ranges(grids: Mapping[tuple[Stretches, float], str]) -> dict[str, xr.Variable]:
+    return {
+        name: xr.Variable(
+            (name,),
+            (np.concatenate([np.arange(*stretch) for stretch in stretches]) + 0.5) * width,
+            {"units": "m", "long_name": "distance of the bin centre from the lidar"},
+        )
+        for (stretches, width), name in grids.items()
+    }
+
+
+def _place(files: RawFiles) -> dict[str, xr.Variable]:
+    stated = [file.stated for file in files.files]
+    pointings = [(header.altitude, header.zenith_angle, header.azimuth) for header in stated]
+    # None becomes NaN.
+    altitude, zenith, azimuth = np.array(pointings, dtype=np.float64).T
+    up = {"units": "degree", "long_name": "zenith angle of the beam, 0 = up"}
+    height = {"units": "m", "standard_name": "altitude", "long_name": "altitude of the lidar"}
+    place = {"zenith_angle": _in_time(zenith, up), "altitude": _constant(altitude, height)}
+    if np.isfinite(azimuth).any():
+        north = {"units": "degree", "long_name": "azimuth of the beam, clockwise from north"}
+        place["azimuth"] = _in_time(azimuth, north)
+    order = files.position_order
+    if order != "ignore":
+        pairs = [file.header.position(order) or (math.nan, math.nan) for file in files.files]
+        for name, way, degrees in zip(
+            ("latitude", "longitude"), ("north", "east"), np.array(pairs).T, strict=True
+        ):
+            about = {"units": f"degrees_{way}", "standard_name": name}
+            place[name] = _constant(degrees, about)
+    return place
+
+
+def _constant(values: NDArray[np.float64], attributes: dict[str, str]) -> xr.Variable:
+    # A moving lidar has a position at every time.
+    if _is_constant(values):
+        return xr.Variable((), values[0], attributes)
+    return _in_time(values, attributes)

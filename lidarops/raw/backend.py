@@ -1,6 +1,6 @@
 """The xarray engine ``licel``: ``xr.open_dataset(path, engine="licel")``.
 
-The Dataset (`lidarops.raw.model`) is lazy: indexing a channel reads the bytes of the selected
+The Dataset (`lidarops.raw.archive`) is lazy: indexing a channel reads the bytes of the selected
 bins only. It can be pickled, because it holds the path and no open file.
 """
 
@@ -18,10 +18,10 @@ from xarray.core import indexing
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
-from lidarops.raw.file import RawFile
-from lidarops.raw.header import RawChannel, RawHeader, to_physical
+from lidarops.raw.archive import Position, RawFiles, StatedFile, build_raw_dataset
+from lidarops.raw.formats import RawFile
+from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.raw.licel_format import FORMAT
-from lidarops.raw.model import Position, RawFiles, StatedFile, build_raw_dataset
 
 
 class LicelBackendEntrypoint(BackendEntrypoint):
@@ -113,8 +113,7 @@ class _LazyChannel(BackendArray):
             with RawFile(self._path) as file:
                 file.expect(self._size)
                 FORMAT.read_channel(file, self._places, None if whole else ((low, past),), counts)
-            if self._scale is None:
-                values[...] = counts[selected - low]
-            else:
-                to_physical(counts[selected - low], self._scale, values)
+            scale = 1 if self._scale is None else self._scale
+            # In double precision.
+            np.multiply(counts[selected - low], scale, out=values, casting="same_kind")
         return values[np.newaxis][time]

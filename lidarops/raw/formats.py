@@ -1,4 +1,4 @@
-"""Registry of the raw formats, which are found by entry point.
+"""Open raw files, and find their format: the registry of raw formats, by entry point.
 
 A raw format is one `RawFormat`. A package outside lidarops adds one by an entry point of the group
 ``lidarops.raw_formats``, and lidarops then catalogues and processes its files like any others::
@@ -9,23 +9,105 @@ A raw format is one `RawFormat`. A package outside lidarops adds one by an entry
 
 from __future__ import annotations
 
+import os
+import stat
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.errors import RawFormatError
+from lidarops.errors import RawFormatError, UnreadableFileError
 from lidarops.kinds import RAW_FORMATS, by_name, registered
-from lidarops.raw.file import RawFile
-from lidarops.raw.header import RawHeader, Stretches, holds_text
+from lidarops.raw.header import IncompleteHeaderError, RawHeader, Stretches, holds_text
 from lidarops.records import UNKNOWN_FORMAT
 
+_Header = TypeVar("_Header")
+
 _INT32: Final = np.iinfo(np.int32)
+_PREFIX: Final = 8 * 1024
+_HEADER_LIMIT: Final = 512 * 1024
+
+
+class RawFile:
+    """An open local raw file; all raw files are opened here.
+
+    Raises
+    ------
+    RawFormatError
+        If the file cannot be opened, or is not a regular file.
+    """
+
+    __slots__ = ("_descriptor", "mtime_ns", "path", "size")
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        try:
+            # Without O_NONBLOCK, opening a pipe would wait for a writer.
+            self._descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise UnreadableFileError(f"cannot be opened: {error}", file=self.path) from None
+        except ValueError as error:
+            raise RawFormatError(f"cannot be opened: {error}", file=self.path) from None
+        try:
+            status = os.fstat(self._descriptor)
+        except OSError as error:
+            os.close(self._descriptor)
+            raise self._unreadable(error) from None
+        self.size = status.st_size
+        self.mtime_ns = status.st_mtime_ns
+        if not stat.S_ISREG(status.st_mode):
+            os.close(self._descriptor)
+            raise RawFormatError("is not a regular file", file=self.path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # What was read is right, whether the file can be closed or not.
+        with suppress(OSError):
+            os.close(self._descriptor)
+
+    def read_header(self, parse: Callable[[bytes], _Header]) -> _Header:
+        """Return what `parse` makes of the first bytes, of more where these are too few.
+
+        Raises
+        ------
+        RawFormatError
+            As `parse`.
+        """
+        head = self.read(0, _PREFIX)
+        try:
+            return parse(head)
+        except IncompleteHeaderError:
+            if len(head) < _PREFIX:
+                raise
+        return parse(self.read(0, _HEADER_LIMIT))
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Return at most `length` bytes from `offset` on."""
+        try:
+            return os.pread(self._descriptor, length, offset)
+        except OSError as error:
+            raise self._unreadable(error) from None
+
+    def expect(self, size: int) -> None:
+        """Raise if the size of the file has changed since its header was read."""
+        if self.size != size:
+            raise RawFormatError(
+                f"had {size} bytes when its header was read, has {self.size} now",
+                file=self.path,
+                field="size",
+                remedy="open the archive again when no process writes to it",
+            )
+
+    def _unreadable(self, error: OSError) -> UnreadableFileError:
+        return UnreadableFileError(f"cannot be read: {error.strerror}", file=self.path)
 
 
 def _not_stated(_: bytes) -> None:
@@ -117,14 +199,11 @@ def parse_raw_header(head: bytes, *, file: str, size: int, known: str = "") -> R
         If no format or more than one recognises the file, or if it is damaged; the error names
         file and field.
     """
-    raw = raw_format(known) if known else _recognised(head, file)
-    return raw.parse_header(head, file, size)
-
-
-def _recognised(head: bytes, file: str) -> RawFormat:
-    formats = [raw for raw in raw_formats().values() if raw.recognises(head)]
+    if known:
+        return raw_format(known).parse_header(head, file, size)
+    formats = _recognised(head)
     if len(formats) == 1:
-        return formats[0]
+        return formats[0].parse_header(head, file, size)
     if formats:
         raise RawFormatError(
             f"is recognised by several raw formats: {', '.join(raw.name for raw in formats)}",
@@ -139,9 +218,13 @@ def _recognised(head: bytes, file: str) -> RawFormat:
     )
 
 
+def _recognised(head: bytes) -> list[RawFormat]:
+    return [raw for raw in raw_formats().values() if raw.recognises(head)]
+
+
 def read_start(head: bytes) -> datetime | None:
     """Return when a refused file starts by its first bytes; None where they do not tell."""
-    formats = [raw for raw in raw_formats().values() if raw.recognises(head)]
+    formats = _recognised(head)
     return formats[0].read_start(head) if len(formats) == 1 else None
 
 

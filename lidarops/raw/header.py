@@ -11,14 +11,11 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from functools import lru_cache
 from typing import Any, Final, Literal, Self, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.records import FEWEST_ALIKE, ChannelLayout, DetectionMode, Header
@@ -226,21 +223,19 @@ def _setup(site: str, channels: tuple[RawChannel, ...]) -> str:
     return digest.hexdigest()[:16]
 
 
-def channel_names(channels: Iterable[str] | None) -> tuple[str, ...] | None:
-    """Return channel names without duplicates, also of a single name; None stands for all."""
-    if channels is None:
-        return None
-    return tuple(dict.fromkeys([channels] if isinstance(channels, str) else channels))
-
-
-def chosen(stored: Mapping[str, _Channel], names: Sequence[str], file: str) -> tuple[_Channel, ...]:
-    """Return the channels of these names, in their order.
+def chosen(
+    stored: Mapping[str, _Channel], channels: Iterable[str] | None, file: str
+) -> tuple[_Channel, ...]:
+    """Return the channels of these names (one, some, or None for all), each once, in their order.
 
     Raises
     ------
     RawFormatError
         If one is not stored, or there is none; the error names the stored ones.
     """
+    if channels is None:
+        channels = stored
+    names = list(dict.fromkeys([channels] if isinstance(channels, str) else channels))
     missing = [name for name in names if name not in stored]
     if missing or not names:
         raise RawFormatError(
@@ -310,8 +305,3 @@ def named_layout(layout: Layout, names: Names) -> Layout:
     """Return the channels of a file with the names of their recorders, where they have any."""
     bound = zip(layout, _recorders(layout), strict=True)
     return tuple(replace(c, name=names.get(recorder, c.name)) for c, recorder in bound)
-
-
-def to_physical(counts: NDArray[np.int32], scale: float, out: NDArray[Any]) -> None:
-    """Fill `out` with ``counts * scale``, computed in double precision."""
-    np.multiply(counts, scale, out=out, casting="same_kind")

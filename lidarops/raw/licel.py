@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.file import RawFile
-from lidarops.raw.header import HeaderOrder, channel_names, chosen
-from lidarops.raw.licel_format import COUNTS, Counts, read_datasets
+from lidarops.raw.formats import RawFile
+from lidarops.raw.header import HeaderOrder, chosen
+from lidarops.raw.licel_format import COUNTS, Counts
+from lidarops.raw.licel_format import read_counts as read_row
 from lidarops.raw.licel_header import (
     CONVENTION,
     Dataset,
@@ -60,11 +61,20 @@ __all__ = [
 PathLike = str | os.PathLike[str]
 Dialect = Literal["classic", "extended", "raymetrics"]
 
-_MOST_ROWS: Final = 256
-"""Rows of one vectored read; systems allow 1024 buffers, two per row."""
 _LINE: Final = 78
 _INT32: Final = np.iinfo(np.int32)
 _ICE_POINT: Final = 273.15
+_PLACES: Final = {
+    "classic": "{altitude:04.0f} {longitude:06.1f} {latitude:06.1f} {zenith_angle:02.0f}",
+    "extended": "{altitude:04.0f} {longitude:011.6f} {latitude:011.6f} {zenith_angle:04.1f}"
+    " {azimuth:04.1f}",
+    # A number without meaning follows the zenith angle.
+    "raymetrics": "{altitude:04.0f} {longitude:06.1f} {latitude:06.1f} {zenith_angle:02.0f} 00"
+    " {temperature:.1f} {pressure:.1f}",
+    "scan": "{altitude:04.0f} {longitude:.4f} {latitude:.4f} {zenith_angle:.1f} {azimuth:.1f}"
+    " {temperature:.1f} {pressure:.1f}",
+}
+"""What line 2 holds after the dates, by dialect, and in scans of Raymetrics: degC and hPa."""
 
 
 def _header(file: RawFile) -> Header:
@@ -99,9 +109,9 @@ def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Datas
         If a channel is not stored, or there is no channel; the error names the stored ones.
     """
     stored = {d.name: d for d in header.datasets if d.places}
-    names = channel_names(channels)
-    signals = [d.name for d in stored.values() if d.is_signal]
-    return chosen(stored, signals if names is None else names, header.path)
+    if channels is None:
+        channels = [d.name for d in stored.values() if d.mode is not None]
+    return chosen(stored, channels, header.path)
 
 
 def read_counts(
@@ -127,33 +137,17 @@ def read_counts(
     RawFormatError
         If the file cannot be read, or has no such channel.
     """
+    counts = {}
     with RawFile(path) as file:
         header = _header(file)
         datasets = select(header, channels)
         if bins is not None and bins < 1:
             raise RawFormatError(f"{bins} bins cannot be read", file=file.path, field="bins")
-        rows = [np.empty(dataset.bins, COUNTS) for dataset in datasets]
-        _read_rows(file, datasets, rows)
-    return header, {
-        dataset.name: row[:bins].astype(np.int32, copy=False)
-        for dataset, row in zip(datasets, rows, strict=True)
-    }
-
-
-def _read_rows(file: RawFile, datasets: Sequence[Dataset], rows: Sequence[Counts]) -> None:
-    start, position = 0, None
-    for index, dataset in enumerate(datasets):
-        if index > start and (dataset.offset != position or index - start == _MOST_ROWS):
-            read_datasets(file, _offset(datasets[start]), rows[start:index])
-            start = index
-        position = _offset(dataset) + 4 * dataset.bins + 2
-    read_datasets(file, _offset(datasets[start]), rows[start:])
-
-
-def _offset(dataset: Dataset) -> int:
-    if dataset.offset is None:
-        raise RawFormatError("is not stored", field=dataset.name)
-    return dataset.offset
+        for dataset in datasets:
+            row = np.empty(dataset.bins, COUNTS)
+            read_row(file, dataset.places[0], None, row)
+            counts[dataset.name] = row[:bins].astype(np.int32, copy=False)
+    return header, counts
 
 
 def new_dataset(
@@ -208,7 +202,7 @@ def new_dataset(
     Returns
     -------
     Dataset
-        With `offset` 0; a header sets its offset and unique name.
+        Without place; a header sets its offset and unique name.
 
     Raises
     ------
@@ -305,17 +299,22 @@ def new_header(
     RawFormatError
         If a number does not fit the dialect.
     """
-    dialect = dialect or _dialect(azimuth, temperature, pressure, custom)
+    if dialect is None:
+        weather = temperature is not None or pressure is not None
+        classic = azimuth is None and custom is None
+        dialect = "raymetrics" if weather else "classic" if classic else "extended"
     if scan is not None and dialect != "raymetrics":
         raise RawFormatError("needs the raymetrics dialect", field="grid of the scan")
-    angles = (zenith_angle, azimuth)
-    place = [
-        f"{altitude:04.0f}",
-        *_coordinates(dialect, longitude, latitude, scan=scan is not None),
-        *(_angles(dialect, *angles) if scan is None else _scan_angles(*angles)),
-        *_weather(dialect, temperature, pressure),
-        *([] if custom is None else [f'"{custom}"']),
-    ]
+    place = _place(
+        dialect if scan is None else "scan",
+        altitude=altitude,
+        longitude=longitude,
+        latitude=latitude,
+        zenith_angle=zenith_angle,
+        azimuth=azimuth,
+        temperature=None if temperature is None else temperature - _ICE_POINT,
+        pressure=None if pressure is None else pressure / 100.0,
+    )
     text = b"".join(
         [
             _line(name),
@@ -323,7 +322,8 @@ def new_header(
                 site if dialect == "raymetrics" else f"{site:<8}",
                 _utc(start, "start"),
                 _utc(stop, "stop"),
-                *place,
+                place,
+                "" if custom is None else f'"{custom}"',
             ),
             *([] if scan is None else [_scan_line(scan)]),
             _line(*_laser_tokens(lasers, len(datasets), timestamp)),
@@ -436,37 +436,13 @@ def _four_characters(value: float, name: str) -> str:
     return text
 
 
-def _dialect(
-    azimuth: float | None, temperature: float | None, pressure: float | None, custom: str | None
-) -> Dialect:
-    if temperature is not None or pressure is not None:
-        return "raymetrics"
-    return "classic" if azimuth is None and custom is None else "extended"
-
-
-def _coordinates(dialect: Dialect, *degrees: float, scan: bool) -> list[str]:
-    if scan:
-        return [f"{value:.4f}" for value in degrees]
-    if dialect == "extended":
-        return [f"{value:011.6f}" for value in degrees]
-    return [f"{value:06.1f}" for value in degrees]
-
-
-def _angles(dialect: Dialect, zenith: float, azimuth: float | None) -> list[str]:
-    if dialect != "extended":
-        if azimuth is not None:
-            raise RawFormatError("needs the extended dialect", field="azimuth")
-        # Raymetrics writes a number without meaning behind the zenith angle.
-        return [f"{zenith:02.0f}", *(["00"] if dialect == "raymetrics" else [])]
-    if azimuth is None:
-        raise RawFormatError("the extended dialect needs one", field="azimuth")
-    return [f"{zenith:04.1f}", f"{azimuth:04.1f}"]
-
-
-def _scan_angles(elevation: float, azimuth: float | None) -> list[str]:
-    if azimuth is None:
-        raise RawFormatError("a scan needs one", field="azimuth")
-    return [f"{elevation:.1f}", f"{azimuth:.1f}"]
+def _place(form: str, **values: float | None) -> str:
+    """Return what line 2 holds after the dates, with the values that the form has places for."""
+    for name, value in values.items():
+        if (value is not None) != (f"{{{name}:" in _PLACES[form]):
+            problem = "needs one" if value is None else "holds none"
+            raise RawFormatError(f"a {form} header {problem}", field=name)
+    return _PLACES[form].format_map(values)
 
 
 def _scan_line(scan: ScanGrid) -> bytes:
@@ -474,16 +450,6 @@ def _scan_line(scan: ScanGrid) -> bytes:
     first, last = f"{scan.elevation_start:04.1f}", f"{scan.elevation_stop:05.1f}"
     elevation = f"{first} {last} {scan.elevation_step:04.1f}"
     return _line(azimuth, f" {elevation}", f" {scan.azimuth_offset:04.1f}")
-
-
-def _weather(dialect: Dialect, temperature: float | None, pressure: float | None) -> list[str]:
-    if dialect != "raymetrics":
-        if temperature is not None or pressure is not None:
-            raise RawFormatError("needs the raymetrics dialect", field="temperature and pressure")
-        return []
-    if temperature is None or pressure is None:
-        raise RawFormatError("the raymetrics dialect needs both", field="temperature and pressure")
-    return [f"{temperature - _ICE_POINT:.1f}", f"{pressure / 100:.1f}"]
 
 
 def _laser_tokens(lasers: Sequence[Laser], datasets: int, timestamp: int | None) -> list[str]:

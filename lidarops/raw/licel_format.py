@@ -8,23 +8,20 @@ The CRLF after a dataset is checked when the dataset is read.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel_header
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import RawFormat
+from lidarops.raw.formats import RawFile, RawFormat
 from lidarops.raw.header import RawChannel, RawHeader, Stretches
 
 Counts = NDArray[np.int32]
 
 COUNTS: Final = np.dtype("<i4")
 _FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
-
 
 _WRONG_IN_THEMSELVES: Final = 1
 """Bins that may hold any counts: one of 272 measured files has one bin beyond full scale."""
@@ -43,14 +40,14 @@ def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
     header = licel_header.parse_header(head, file=file, size=size)
     if len(head) == size:
         for channel in header.channels:
-            first, *further = (np.frombuffer(head, "<i4", channel.bins, p) for p in channel.places)
+            first, *further = (np.frombuffer(head, COUNTS, channel.bins, p) for p in channel.places)
             counts = sum(further, start=first)
             _check_full_scale(counts, channel, header.path)
             _check_blocks(counts, channel, header.path)
     return header
 
 
-def _check_full_scale(counts: NDArray[np.int32], channel: RawChannel, path: str) -> None:
+def _check_full_scale(counts: Counts, channel: RawChannel, path: str) -> None:
     """Refuse counts beyond the full scale of the shots and bits that a file states."""
     if channel.full_scale is None or not channel.shots:
         return
@@ -76,7 +73,7 @@ def _check_full_scale(counts: NDArray[np.int32], channel: RawChannel, path: str)
     )
 
 
-def _check_blocks(counts: NDArray[np.int32], channel: RawChannel, path: str) -> None:
+def _check_blocks(counts: Counts, channel: RawChannel, path: str) -> None:
     """Refuse a block of zeros between as many counts without a zero, as of a lost sector.
 
     A recorder that is off gives zeros only, one that stops early zeros at the end, and few
@@ -98,59 +95,32 @@ def _check_blocks(counts: NDArray[np.int32], channel: RawChannel, path: str) -> 
             )
 
 
-def read_datasets(file: RawFile, offset: int, rows: Sequence[Counts]) -> None:
-    """Fill `rows` with the counts of consecutive datasets from byte `offset` on.
+def read_counts(file: RawFile, place: int, stretches: Stretches | None, row: Counts) -> None:
+    """Fill a row with the counts of the dataset from byte `place` on.
 
     Raises
     ------
     RawFormatError
-        If counts are missing, or a dataset is not followed by CRLF.
+        If counts are missing, or a dataset that is read as a whole is not followed by CRLF.
     """
-    tails = [bytearray(2) for _ in rows]
-    buffers: list[Any] = [buffer for pair in zip(rows, tails, strict=True) for buffer in pair]
-    length = file.read_into(offset, buffers)
-    expected = sum([row.nbytes for row in rows]) + 2 * len(rows)
-    if length == file.size - offset and expected - 2 <= length < expected:
-        # Only the last CRLF of the file is missing.
-        tails[-1][length - expected :] = b"\r\n"[length - expected :]
-        length = expected
-    if length != expected or b"".join(tails) != b"\r\n" * len(rows):
-        raise RawFormatError(
-            f"no CRLF follows the counts from byte {offset}: the data are not where the"
-            " header says",
-            file=file.path,
-            field="data",
-            remedy="copy the file again from the instrument, or leave it out",
-        )
-
-
-def read_part(file: RawFile, offset: int, number: int) -> Counts:
-    """Return `number` counts from byte `offset` on.
-
-    Raises
-    ------
-    RawFormatError
-        If the file ends before.
-    """
-    content = file.read(offset, 4 * number)
-    if len(content) < 4 * number:
-        raise RawFormatError(
-            f"ends within the {number} counts at byte {offset}", file=file.path, field="data"
-        )
-    return np.frombuffer(content, COUNTS)
-
-
-def _read_counts(
-    file: RawFile, place: int, stretches: Stretches | None, row: NDArray[np.int32]
-) -> None:
-    if stretches is None:
-        read_datasets(file, place, [row])
-        return
-    start = 0
-    for first, past in stretches:
-        bins = past - first
-        row[start : start + bins] = read_part(file, place + row.itemsize * first, bins)
-        start += bins
+    start, size = 0, row.itemsize
+    for first, past in ((0, row.size),) if stretches is None else stretches:
+        offset, length = place + size * first, size * (past - first)
+        # Only the last CRLF of a file may be missing.
+        end = b"\r\n"[: max(file.size - offset - length, 0)] if stretches is None else b""
+        content = file.read(offset, length + len(end))
+        if len(content) < length or content[length:] != end:
+            raise RawFormatError(
+                f"no CRLF follows the counts from byte {place}: the data are not where the"
+                " header says"
+                if stretches is None
+                else f"ends within the {past - first} counts at byte {offset}",
+                file=file.path,
+                field="data",
+                remedy="copy the file again from the instrument, or leave it out",
+            )
+        row[start : start + past - first] = np.frombuffer(content, COUNTS, past - first)
+        start += past - first
 
 
 FORMAT: Final = RawFormat(
@@ -159,6 +129,6 @@ FORMAT: Final = RawFormat(
     conversion=licel_header.CONVENTION,
     recognises=_recognises,
     parse_header=_parse_header,
-    read_counts=_read_counts,
+    read_counts=read_counts,
     read_start=licel_header.stated_start,
 )

@@ -17,13 +17,13 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import IntEnum
 from functools import lru_cache
 from sys import intern
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
@@ -57,6 +57,7 @@ _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
 _DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
 _DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
+_BLOCK_LINE = re.compile(rb".*?\r\n", re.DOTALL)
 _DECIMAL = r"[+-]?\d{1,4}[.,]\d{1,6}"
 _SCAN = re.compile(rf" *{_DECIMAL}(?: +{_DECIMAL}){{6}} *", re.ASCII)
 
@@ -141,38 +142,6 @@ class Dataset(RawChannel):
         """Byte at which the counts start; None if the file does not store them."""
         return self.places[0] if self.places else None
 
-    @property
-    def is_signal(self) -> bool:
-        """Whether the file stores it and it is a signal."""
-        return bool(self.places) and self.mode is not None
-
-    @property
-    def recorded_as(self) -> tuple[object, ...]:
-        """What datasets of one channel have in common."""
-        return (
-            self.active, self.kind, self.device, self.laser, self.wavelength_label, self.bins,
-            self.bin_width, self.adc_bits, self.input_range, self.bin_shift,
-        )  # fmt: skip
-
-
-@lru_cache(maxsize=1024)
-def _wavelength(nanometres: str) -> float:
-    """Return the wavelength of a label, m; NaN outside of the optical range, such as 53200 nm."""
-    wavelength = int(nanometres) * 1e-9
-    return wavelength if _SHORTEST < wavelength < _LONGEST_WAVE else math.nan
-
-
-@lru_cache(maxsize=1024)
-def _scale(
-    kind: DatasetKind, bin_width: float, shots: int, adc_bits: int, input_range: float | None
-) -> float:
-    """Return the physical value of one count, mV or MHz; NaN without shots or signal."""
-    if shots == 0 or kind not in _MODES:
-        return math.nan
-    if input_range is not None:
-        return input_range * 1e3 / (shots << adc_bits)
-    return LICEL_RANGE_PER_MICROSECOND / bin_width / shots
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header(RawHeader):
@@ -208,18 +177,6 @@ class Header(RawHeader):
     """The header as written: `data_start` bytes."""
 
 
-class _Place(NamedTuple):
-    altitude: float
-    longitude: float
-    latitude: float
-    zenith: float
-    azimuth: float | None
-    temperature: float | None
-    pressure: float | None
-    custom: str | None
-    notes: tuple[str, ...]
-
-
 def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> Header:
     """Parse the header at the start of `buffer`.
 
@@ -246,10 +203,8 @@ def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> H
     try:
         return _parse(buffer, file, len(buffer) if size is None else size)
     except RawFormatError as error:
-        kind = type(error)
-        raise kind(
-            error.problem, file=file or None, field=error.field, remedy=error.remedy
-        ) from None
+        error.file = file or None
+        raise
 
 
 def _parse(buffer: bytes, file: str, size: int) -> Header:
@@ -258,8 +213,9 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         buffer[start:end].decode("latin-1")
         for start, end in zip((0, ends[0] + 2, ends[1] + 2), ends, strict=True)
     )
-    scan = _parse_scan(third)
-    if scan is not None:
+    scan = None
+    if _SCAN.fullmatch(third):
+        scan = ScanGrid(*(_number(token, "grid of the scan") for token in third.split()))
         ends += _line_ends(buffer, ends[2] + 2, 1)
         third = buffer[ends[2] + 2 : ends[3]].decode("latin-1")
     dates = _DATES.search(second)
@@ -267,20 +223,20 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         raise RawFormatError(
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
-    start, written_stop = _moments(dates)
-    place = _parse_place(second[dates.end() :].rstrip())
-    lasers, number, timestamp, notes = _parse_lasers(third)
+    start, stop = _moments(dates)
+    place, notes = _parse_place(second[dates.end() :].rstrip())
+    lasers, number, timestamp, unknown = _parse_lasers(third)
     block_start = ends[-1] + 2
     block_end = _line_ends(buffer, block_start, number)[-1] + 2
-    if buffer[block_end : block_end + 2] != b"\r\n":
-        if len(buffer) < block_end + 2:
+    data_start = block_end + 2
+    if buffer[block_end:data_start] != b"\r\n":
+        if len(buffer) < data_start:
             raise IncompleteHeaderError("the file ends inside the header", field="empty line")
         _refuse_export(buffer[block_end:])
         raise RawFormatError(
             "no empty line follows the dataset lines: the number of datasets in line 3 is wrong",
             field="number of datasets",
         )
-    data_start = block_end + 2
     block = buffer[block_start:block_end]
     parse = _parse_datasets if len(block) <= _CACHED_BLOCK else _parse_datasets.__wrapped__
     try:
@@ -288,44 +244,42 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     except RawFormatError:
         _refuse_export(buffer[data_start:])
         raise
-    _refuse_outlying_shots(datasets, lasers)
-    notes += _note_on_shots(datasets, lasers)
-    if written_stop < start:
+    notes += unknown + _check_shots(datasets, lasers)
+    if stop < start:
         notes += ("stop lies 1 s before start: the interval follows from the shots",)
     channels = _channels(datasets)
-    if sum(len(channel.places) for channel in channels) > len(channels):
+    if any(len(channel.places) > 1 for channel in channels):
         notes += ("channels have two memories: counts and shots of both are added",)
-    site, source = second[: dates.start()].strip(), buffer[:data_start]
-    zenith, azimuth, doubt = _pointing(place.zenith, place.azimuth, scan)
+    rate = max(laser.repetition_rate for laser in lasers)
+    if stop <= start:
+        shots = max((channel.shots for channel in channels), default=0)
+        stop = start + timedelta(seconds=shots / rate) if rate > 0.0 else start
+    site = second[: dates.start()].strip()
+    zenith, azimuth, doubt = _pointing(
+        place["zenith_as_written"], place["azimuth_as_written"], scan
+    )
     return Header(
+        **place,
         format=FORMAT,
         path=file or first.strip(),
         size=size,
         start=start,
-        stop=_true_stop(start, written_stop, lasers, channels),
+        stop=stop,
         zenith_angle=zenith,
         azimuth=azimuth,
-        latitude=place.latitude,
-        longitude=place.longitude,
-        altitude=place.altitude,
-        notes=place.notes + notes + dataset_notes,
-        header_digest=_digest(site, data_start, source[ends[-1] + 2 :]),
+        notes=notes + dataset_notes,
+        header_digest=_digest(site, data_start, block + b"\r\n"),
         channels=channels,
         site=site,
         doubt=doubt,
-        written_angle=place.zenith if scan is None else None,
+        written_angle=place["zenith_as_written"] if scan is None else None,
         name=first.strip(),
-        zenith_as_written=place.zenith,
-        azimuth_as_written=place.azimuth,
-        temperature=place.temperature,
-        pressure=place.pressure,
-        custom=place.custom,
         scan=scan,
         lasers=lasers,
         timestamp=timestamp,
         datasets=datasets,
         data_start=data_start,
-        source=source,
+        source=buffer[:data_start],
     )
 
 
@@ -339,20 +293,24 @@ def _digest(site: str, data_start: int, datasets: bytes) -> str:
 @lru_cache(maxsize=128)
 def _channels(datasets: tuple[Dataset, ...]) -> tuple[Dataset, ...]:
     """Return the signals, each with the shots and places of all its memories."""
-    return tuple(_added(group) for group in memories(datasets))
+    channels = []
+    for first, *others in memories(datasets):
+        channel = first
+        if others:
+            shots = sum((memory.shots for memory in others), first.shots)
+            places = sum((memory.places for memory in others), first.places)
+            channel = replace(first, shots=shots, scale=_scale(first, shots), places=places)
+        channels.append(channel)
+    return tuple(channels)
 
 
-def _added(group: tuple[Dataset, ...]) -> Dataset:
-    first, *others = group
-    if not others:
-        return first
-    shots = sum(memory.shots for memory in group)
-    return replace(
-        first,
-        shots=shots,
-        scale=_scale(first.kind, first.bin_width, shots, first.adc_bits, first.input_range),
-        places=tuple(place for memory in group for place in memory.places),
-    )
+def _scale(dataset: Dataset, shots: int) -> float:
+    """Return the physical value of one count, mV or MHz; NaN without shots or signal."""
+    if shots == 0 or dataset.mode is None:
+        return math.nan
+    if dataset.input_range is not None:
+        return dataset.input_range * 1e3 / (shots << dataset.adc_bits)
+    return LICEL_RANGE_PER_MICROSECOND / dataset.bin_width / shots
 
 
 def _pointing(
@@ -412,22 +370,23 @@ def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
 
 # Headers of an archive repeat the same few numbers.
 @lru_cache(maxsize=1024)
-def _number(token: str, name: str) -> float:
+def _number(token: str, name: str, low: float = -math.inf, high: float = math.inf) -> float:
     if _NUMBER.fullmatch(token) is None:
         raise RawFormatError(f"{token[:40]!r} is not a number", field=name)
-    return float(token.replace(",", "."))
+    return _bounded(float(token.replace(",", ".")), low, high, name)
 
 
 @lru_cache(maxsize=1024)
-def _integer(token: str, name: str) -> int:
+def _integer(token: str, name: str, low: float = -math.inf, high: float = math.inf) -> int:
     if _INTEGER.fullmatch(token) is None:
         raise RawFormatError(f"{token[:40]!r} is not an integer", field=name)
-    return int(token)
+    return int(_bounded(int(token), low, high, name))
 
 
-def _bounded(value: float, low: float, high: float, name: str) -> None:
+def _bounded(value: float, low: float, high: float, name: str) -> float:
     if not low <= value <= high:
         raise RawFormatError(f"{value:g} is not within {low:g} to {high:g}", field=name)
+    return value
 
 
 def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
@@ -454,17 +413,6 @@ def _moment(numbers: list[int], name: str) -> datetime:
         raise RawFormatError(f"is not a date and time: {error}", field=name) from None
 
 
-def _true_stop(
-    start: datetime, stop: datetime, lasers: tuple[Laser, ...], channels: tuple[Dataset, ...]
-) -> datetime:
-    """Return the stop; where the header states no duration, from shots and repetition rate."""
-    if stop > start:
-        return stop
-    rate = max(laser.repetition_rate for laser in lasers)
-    shots = max((channel.shots for channel in channels), default=0)
-    return start + timedelta(seconds=shots / rate) if rate > 0.0 else start
-
-
 @lru_cache(maxsize=128)
 def memories(datasets: tuple[Dataset, ...]) -> tuple[tuple[Dataset, ...], ...]:
     """Return the stored signal datasets in file order, those of one channel together.
@@ -474,38 +422,49 @@ def memories(datasets: tuple[Dataset, ...]) -> tuple[tuple[Dataset, ...], ...]:
     are those of one signal.
     """
     groups: dict[tuple[object, ...], list[Dataset]] = {}
-    for dataset in datasets:
-        if dataset.is_signal:
-            groups.setdefault(dataset.recorded_as, []).append(dataset)
+    for one in datasets:
+        if one.places and one.mode is not None:
+            recorded = (
+                one.active, one.kind, one.device, one.laser, one.wavelength_label, one.bins,
+                one.bin_width, one.adc_bits, one.input_range, one.bin_shift,
+            )  # fmt: skip
+            groups.setdefault(recorded, []).append(one)
     return tuple(tuple(group) for group in groups.values())
 
 
 @lru_cache(maxsize=128)
-def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, ...]) -> None:
-    """Refuse a file if two or more witnesses contradict the shots of a single channel.
+def _check_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, ...]) -> tuple[str, ...]:
+    """Return a note if line 3 contradicts the only channel: either may be damaged.
 
-    Witnesses are other channels; of a channel with one other of the same recorder, also line 3.
-    A recorder that misses triggers misses them for all its datasets; a damaged digit is one. All
-    channels of each of 272 measured files state the same shots, those of recorders with two
-    memories as the sum over both, and in 180 files they are those of line 3. A dataset without
-    shots gives no values.
+    A file is refused if two or more witnesses contradict the shots of a single channel. Witnesses
+    are other channels; of a channel with one other of the same recorder, also line 3. A recorder
+    that misses triggers misses them for all its datasets; a damaged digit is one. All channels of
+    each of 272 measured files state the same shots, those of recorders with two memories as the
+    sum over both, and in 180 files they are those of line 3. A dataset without shots gives no
+    values.
     """
-    fired = {laser.shots for laser in lasers}
     groups = memories(datasets)
+    fired = {laser.shots for laser in lasers}
     if len(groups) < _WITNESSES:
-        return
+        only, stated = [one for group in groups for one in group], fired - {0}
+        if len(only) != 1 or not stated or only[0].shots in fired | {0}:
+            return ()
+        words = ", ".join(map(str, sorted(stated)))
+        return (f"{only[0].name} states {only[0].shots} shots, line 3 {words}",)
     # A channel that alone is recorded twice cannot be compared with the others.
     usual = Counter(len(group) for group in groups).most_common(1)[0][0]
     shots = {g[0].name: sum(d.shots for d in g) for g in groups if len(g) == usual}
     counted = {name: number for name, number in shots.items() if number}
+    # The analog and photon ones of a recorder are named alike, as BT0 and BC0.
+    one_recorder = len({group[0].device[2:] for group in groups}) == 1
     if len(counted) > _WITNESSES:
         alike, channels = Counter(counted.values()).most_common(1)[0]
         # A recorder of two memories states line 3 for each of them, or less.
         others = {alike} if channels == len(counted) - 1 else fired
-    elif len(counted) == len(groups) and _of_one_recorder(groups):
+    elif len(counted) == len(groups) and one_recorder:
         others = fired & set(counted.values())
     else:
-        return
+        return ()
     outlying = {name: n for name, n in counted.items() if n not in others | fired}
     if len(outlying) == 1:
         ((name, number),) = outlying.items()
@@ -515,32 +474,7 @@ def _refuse_outlying_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, .
             field=f"shots of {name}",
             remedy="leave the file out, or correct the shots in its header",
         )
-
-
-@lru_cache(maxsize=128)
-def _note_on_shots(datasets: tuple[Dataset, ...], lasers: tuple[Laser, ...]) -> tuple[str, ...]:
-    """Return a note if line 3 contradicts the only channel: either may be damaged."""
-    groups = memories(datasets)
-    if len(groups) != 1 or len(groups[0]) > 1:
-        return ()
-    channel = groups[0][0]
-    fired = {laser.shots for laser in lasers if laser.shots}
-    if not fired or channel.shots in fired | {0}:
-        return ()
-    stated = ", ".join(map(str, sorted(fired)))
-    return (f"{channel.name} states {channel.shots} shots, line 3 {stated}",)
-
-
-def _of_one_recorder(groups: Iterable[tuple[Dataset, ...]]) -> bool:
-    """Return whether datasets are the analog and photon ones of a recorder, as BT0 and BC0."""
-    return len({group[0].device[2:] for group in groups}) == 1
-
-
-@lru_cache(maxsize=1024)
-def _parse_scan(text: str) -> ScanGrid | None:
-    if _SCAN.fullmatch(text) is None:
-        return None
-    return ScanGrid(*(_number(token, "grid of the scan") for token in text.split()))
+    return ()
 
 
 def _is_on_grid(value: float, start: float, stop: float, step: float) -> bool:
@@ -554,55 +488,44 @@ def _is_on_grid(value: float, start: float, stop: float, step: float) -> bool:
 
 # Position, pointing and lasers are the same in many files.
 @lru_cache(maxsize=1024)
-def _parse_place(text: str) -> _Place:
-    tokens, custom = _split_custom(text)
+def _parse_place(text: str) -> tuple[Mapping[str, Any], tuple[str, ...]]:
+    """Return what follows the dates in line 2, by fields of `Header`, and notes."""
+    before, quote, after = text.partition('"')
+    custom, end, _ = after.rpartition('"')
+    if quote and not end:
+        raise RawFormatError("the quoted text does not end", field="header line 2")
+    tokens = before.split()
     if len(tokens) < 4:
         raise RawFormatError(
             "altitude, longitude, latitude and zenith angle do not follow the dates",
             field="header line 2",
         )
-    names = ("altitude", "longitude", "latitude", "zenith angle")
-    altitude, longitude, latitude, zenith = map(_number, tokens, names)
-    _bounded(zenith, -180, 180, "zenith angle")
+    altitude, longitude, latitude = map(_number, tokens, ("altitude", "longitude", "latitude"))
+    zenith = _number(tokens[3], "zenith angle", -180, 180)
     notes: tuple[str, ...] = ("zenith angle -90 taken as vertical",) if zenith == -90.0 else ()
     azimuth = temperature = pressure = None
-    if len(tokens) in {5, 7} and _holds_azimuth(tokens):
-        azimuth = _number(tokens[4], "azimuth")
-        _bounded(azimuth, -360, 360, "azimuth")
-        azimuth %= 360.0
+    # Raymetrics: zenith, a dummy integer, temperature, pressure. Licel: zenith, azimuth.
+    if len(tokens) == 5 or (len(tokens) == 7 and set(".,") & set(tokens[4])):
+        azimuth = _number(tokens[4], "azimuth", -360, 360) % 360.0
     if len(tokens) == 7:
-        temperature, pressure, weather_notes = _parse_weather(*tokens[5:])
-        notes += weather_notes
+        temperature = _number(tokens[5], "temperature") + _ICE_POINT
+        pressure = _number(tokens[6], "pressure") * 1e2
+        if not (150 < temperature < 350 and 1e4 < pressure < 1.2e5):
+            temperature = pressure = None
+            notes += (f"{tokens[5]} degC, {tokens[6]} hPa are impossible and ignored",)
     elif len(tokens) not in {4, 5}:
         notes += (f"{len(tokens) - 4} values after the zenith angle are not interpreted",)
-    return _Place(
-        altitude, longitude, latitude, zenith, azimuth, temperature, pressure, custom, notes
-    )
-
-
-def _split_custom(text: str) -> tuple[list[str], str | None]:
-    before, quote, after = text.partition('"')
-    if not quote:
-        return before.split(), None
-    custom, quote, _ = after.rpartition('"')
-    if not quote:
-        raise RawFormatError("the quoted text does not end", field="header line 2")
-    return before.split(), custom
-
-
-def _holds_azimuth(tokens: list[str]) -> bool:
-    # Raymetrics: zenith, a dummy integer, temperature, pressure. Licel: zenith, azimuth.
-    return len(tokens) == 5 or "." in tokens[4] or "," in tokens[4]
-
-
-def _parse_weather(
-    celsius: str, hectopascal: str
-) -> tuple[float | None, float | None, tuple[str, ...]]:
-    temperature = _number(celsius, "temperature") + _ICE_POINT
-    pressure = _number(hectopascal, "pressure") * 1e2
-    if 150 < temperature < 350 and 1e4 < pressure < 1.2e5:
-        return temperature, pressure, ()
-    return None, None, (f"{celsius} degC, {hectopascal} hPa are impossible and ignored",)
+    place = {
+        "altitude": altitude,
+        "longitude": longitude,
+        "latitude": latitude,
+        "zenith_as_written": zenith,
+        "azimuth_as_written": azimuth,
+        "temperature": temperature,
+        "pressure": pressure,
+        "custom": custom if quote else None,
+    }
+    return place, notes
 
 
 @lru_cache(maxsize=1024)
@@ -610,8 +533,7 @@ def _parse_lasers(text: str) -> tuple[tuple[Laser, ...], int, str | None, tuple[
     tokens = text.split()
     if len(tokens) < 5:
         raise RawFormatError("holds fewer than 5 values", field="header line 3")
-    number = _integer(tokens[4], "number of datasets")
-    _bounded(number, 1, _MAX_DATASETS, "number of datasets")
+    number = _integer(tokens[4], "number of datasets", 1, _MAX_DATASETS)
     pairs = [tokens[0:2], tokens[2:4]] + ([tokens[5:7]] if len(tokens) >= 7 else [])
     lasers = tuple(
         Laser(_integer(shots, "laser shots"), _number(rate, "repetition rate"))
@@ -629,43 +551,49 @@ def _parse_datasets(
     block: bytes, data_start: int, size: int
 ) -> tuple[tuple[Dataset, ...], tuple[str, ...]]:
     """Return the datasets that fit the size of the file, and notes on them."""
+    datasets = _parse_lines(block)
+    notes = [
+        f"{d.name} has no shots: its values are undefined"
+        for d in datasets
+        if d.active and d.shots == 0
+    ]
+    notes += [
+        f"{d.name} is no signal by its type, and one by its device {d.device}"
+        for d in datasets
+        if d.active and d.mode is None and d.device.startswith(_SIGNAL_DEVICES)
+    ]
     # By the specification, inactive datasets are not stored; some software stores them.
-    expected = 0
-    for stored, note in ((False, ()), (True, ("inactive datasets are stored",))):
-        datasets = _parse_block(block, data_start, stored=stored)
-        promised = _promised_size(datasets, data_start)
-        if size == promised:
-            return datasets, (*_dataset_notes(datasets), *note)
-        if promised - 2 <= size < promised and promised > data_start:
-            return datasets, (*_dataset_notes(datasets), *note, "the last CRLF is missing")
-        expected = expected or promised
-        if all(dataset.active for dataset in datasets):
-            break
+    expected: list[int] = []
+    for all_stored in (False, True):
+        lengths = (4 * d.bins + 2 for d in datasets if d.active or all_stored)
+        expected.append(data_start + sum(lengths))
+        promised = expected[-1]
+        if not (size == promised or (promised - 2 <= size and data_start < promised > size)):
+            continue
+        notes += ["inactive datasets are stored"] * (promised > expected[0])
+        notes += ["the last CRLF is missing"] * (size < promised)
+        place = data_start
+        for index, dataset in enumerate(datasets):
+            if dataset.active or all_stored:
+                datasets[index] = replace(dataset, places=(place,))
+                place += 4 * dataset.bins + 2
+        return tuple(datasets), tuple(notes)
     raise RawFormatError(
-        f"the header promises {expected} bytes, the file has {size}:"
-        f" it {'is truncated' if size < expected else 'has surplus bytes'}",
+        f"the header promises {expected[0]} bytes, the file has {size}:"
+        f" it {'is truncated' if size < expected[0] else 'has surplus bytes'}",
         field="size",
         remedy="copy the file again from the instrument, or leave it out",
     )
 
 
-def _promised_size(datasets: Iterable[Dataset], data_start: int) -> int:
-    return data_start + sum(4 * d.bins + 2 for d in datasets if d.places)
-
-
-def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Dataset, ...]:
+def _parse_lines(block: bytes) -> list[Dataset]:
     datasets: list[Dataset] = []
-    offset, start = data_start, 0
-    while start < len(block):
-        end = block.index(b"\r\n", start) + 2
+    for line in _BLOCK_LINE.finditer(block):
         try:
-            dataset = _parse_line(block[start:end], offset, stored)
+            datasets.append(parse_dataset(line[0]))
         except RawFormatError as error:
-            field = f"dataset {len(datasets) + 1}, {error.field}"
-            raise RawFormatError(error.problem, field=field) from None
-        datasets.append(dataset)
-        offset += 4 * dataset.bins + 2 if dataset.places else 0
-        start = end
+            error.field = f"dataset {len(datasets) + 1}, {error.field}"
+            raise
     uses: Counter[str] = Counter()
     # Active datasets get their names first: an inactive one must not take the plain name.
     for index in sorted(range(len(datasets)), key=lambda index: not datasets[index].active):
@@ -673,93 +601,54 @@ def _parse_block(block: bytes, data_start: int, *, stored: bool) -> tuple[Datase
         uses[name] += 1
         if uses[name] > 1:
             datasets[index] = replace(datasets[index], name=f"{name}_{uses[name]}")
-    return tuple(datasets)
+    return datasets
 
 
 def parse_dataset(line: bytes) -> Dataset:
-    """Parse one dataset line outside of a header; its offset is 0 and its name not yet unique.
+    """Parse one dataset line outside of a header: it has no place, and its name is not yet unique.
 
     Raises
     ------
     RawFormatError
         If a value is missing or impossible.
     """
-    return _parse_line(line, 0, stored=True)
-
-
-def _parse_line(line: bytes, offset: int, stored: bool) -> Dataset:  # noqa: FBT001
     tokens = line.decode("latin-1").split()
     if len(tokens) < 16:
         raise RawFormatError(f"holds {len(tokens)} values instead of 16", field="line")
-    kind = _kind(tokens[1])
+    if tokens[0] not in {"0", "1"}:
+        raise RawFormatError(f"{tokens[0][:40]!r} is neither 0 nor 1", field="active")
+    kind = DatasetKind(_integer(tokens[1], "type", DatasetKind.ANALOG, DatasetKind.OVERFLOW))
     label = _WAVELENGTH.fullmatch(tokens[7])
     if label is None:
         raise RawFormatError(f"{tokens[7][:40]!r} is not of the form 00532.o", field="wavelength")
     polarisation = label[2].lower().replace("0", "o")
-    bits = _integer(tokens[12], "ADC bits")
-    level = _number(tokens[14], "input range")
+    wavelength = int(label[1]) * 1e-9
     analog, photon = kind in _ANALOG, kind in _PHOTON
-    if analog:
-        _bounded(level, 1e-6, _MAX_INPUT_RANGE, "input range")
-    _bounded(bits, 1 if analog else 0, _MAX_BITS, "ADC bits")
-    bins = _integer(tokens[3], "bins")
-    _bounded(bins, 1, _MAX_BINS, "bins")
-    width = _number(tokens[6], "bin width")
-    _bounded(width, 1e-3 if analog or photon else 0, _MAX_BIN_WIDTH, "bin width")
-    shots = _integer(tokens[13], "shots")
-    _bounded(shots, 0, 10**9, "shots")
-    active = _active(tokens[0])
-    input_range = level if analog else None
-    return Dataset(
+    least = 1e-6 if analog else -math.inf
+    level = _number(tokens[14], "input range", least, _MAX_INPUT_RANGE if analog else math.inf)
+    fraction = abs(_integer(tokens[11], "bin shift"))
+    dataset = Dataset(
         name=f"{kind.name.lower()}_{int(label[1])}{polarisation}",
         mode=_MODES.get(kind),
-        wavelength=_wavelength(label[1]),
-        scale=_scale(kind, width, shots, bits, input_range),
-        places=(offset,) if active or stored else (),
+        wavelength=wavelength if _SHORTEST < wavelength < _LONGEST_WAVE else math.nan,
+        scale=math.nan,
+        places=(),
         kind=kind,
-        active=active,
+        active=tokens[0] == "1",
         laser=_integer(tokens[2], "laser"),
-        bins=bins,
+        bins=_integer(tokens[3], "bins", 1, _MAX_BINS),
         laser_polarisation=_integer(tokens[4], "laser polarisation"),
         high_voltage=_number(tokens[5], "high voltage"),
-        bin_width=width,
+        bin_width=_number(tokens[6], "bin width", 1e-3 if analog or photon else 0, _MAX_BIN_WIDTH),
         wavelength_label=intern(f"{label[1]}.{label[2]}"),
         polarisation=polarisation,
-        bin_shift=_bin_shift(*tokens[10:12]),
-        adc_bits=bits,
-        shots=shots,
-        input_range=input_range,
+        bin_shift=_integer(tokens[10], "bin shift") + float(f"0.{fraction:0{len(tokens[11])}d}"),
+        adc_bits=_integer(tokens[12], "ADC bits", 1 if analog else 0, _MAX_BITS),
+        shots=_integer(tokens[13], "shots", 0, 10**9),
+        input_range=level if analog else None,
         discriminator=level * 1e-3 if photon else None,
         device=intern(tokens[15]),
         comment=" ".join(tokens[16:]),
         line=line,
     )
-
-
-def _kind(token: str) -> DatasetKind:
-    code = _integer(token, "type")
-    _bounded(code, DatasetKind.ANALOG, DatasetKind.OVERFLOW, "type")
-    return DatasetKind(code)
-
-
-def _active(text: str) -> bool:
-    if text not in {"0", "1"}:
-        raise RawFormatError(f"{text[:40]!r} is neither 0 nor 1", field="active")
-    return text == "1"
-
-
-def _bin_shift(whole: str, decimals: str) -> float:
-    fraction = float(f"0.{abs(_integer(decimals, 'bin shift')):0{len(decimals)}d}")
-    return _integer(whole, "bin shift") + fraction
-
-
-def _dataset_notes(datasets: tuple[Dataset, ...]) -> tuple[str, ...]:
-    active = [dataset for dataset in datasets if dataset.active]
-    return (
-        *(f"{d.name} has no shots: its values are undefined" for d in active if d.shots == 0),
-        *(
-            f"{d.name} is no signal by its type, and one by its device {d.device}"
-            for d in active
-            if d.kind not in _MODES and d.device.startswith(_SIGNAL_DEVICES)
-        ),
-    )
+    return replace(dataset, scale=_scale(dataset, dataset.shots))

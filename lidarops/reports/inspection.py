@@ -25,8 +25,7 @@ from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
 from lidarops.netcdf.read import NETCDF_MAGIC, opened_product, read_provenance
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import raw_formats, read_raw_header
+from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
 
 _LONG: Final = {"comment", "history", "references"}

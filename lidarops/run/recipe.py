@@ -14,8 +14,7 @@ from pydantic import ValidationError
 from lidarops.campaign.model import Campaign
 from lidarops.errors import ProductError
 from lidarops.netcdf.read import read_origin
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import read_raw_header
+from lidarops.raw.formats import RawFile, read_raw_header
 from lidarops.raw.header import named_layout, recorder_names
 from lidarops.records import (
     Granule,

@@ -16,8 +16,7 @@ import xarray as xr
 from lidarops.campaign.model import Campaign
 from lidarops.errors import CatalogError, LidarOpsError, SceneError, UnreadableFileError
 from lidarops.raw.archive import open_archive
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import parse_raw_header, read_all_counts
+from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
 from lidarops.scene.dependence import scene_facts

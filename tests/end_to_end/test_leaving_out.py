@@ -18,7 +18,7 @@ from support.oracles.angle_scenes import on_altitudes
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.plan.scenes import cut_scenes
-from lidarops.raw.file import RawFile
+from lidarops.raw.formats import RawFile
 from lidarops.records import Plan, PlannedStep, ProductRecord, Role, RunRecord
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess

@@ -12,8 +12,7 @@ from lidarops.campaign.model import load_campaign
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.plan.outlying_headers import Outlying, outlying_headers
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import read_raw_header
+from lidarops.raw.formats import RawFile, read_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import Granule, RunRecord, Status, day_of
 from lidarops.reports.findings import finding_rows

@@ -34,20 +34,14 @@ def write(tmp_path, **changes):
 def reads(monkeypatch):
     """Return a list that collects (offset, bytes) of every read."""
     seen = []
-    pread, preadv = os.pread, os.preadv
+    pread = os.pread
 
     def record(descriptor, length, offset):
         content = pread(descriptor, length, offset)
         seen.append((offset, len(content)))
         return content
 
-    def record_vector(descriptor, buffers, offset):
-        length = preadv(descriptor, buffers, offset)
-        seen.append((offset, length))
-        return length
-
     monkeypatch.setattr(os, "pread", record)
-    monkeypatch.setattr(os, "preadv", record_vector)
     return seen
 
 

@@ -85,7 +85,6 @@ def test_a_scene_whose_counts_could_not_be_read_is_tried_again(
         raise OSError(errno.ESTALE, "Stale file handle")
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "preadv", failing)
         patch.setattr(os, "pread", failing)
         record = bring_up_to_date(campaign).record
     assert record is not None

@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.file import RawFile
-from lidarops.raw.formats import RawFormat
+from lidarops.raw.formats import RawFile, RawFormat
 from lidarops.raw.header import IncompleteHeaderError, RawChannel, RawHeader, Stretches
 from lidarops.records import DetectionMode
 
