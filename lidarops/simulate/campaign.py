@@ -219,7 +219,7 @@ def _write_batch(batch: _Batch, archive: Path) -> _Truths:
     truths: _Truths = []
     for planned, row in work:
         content, truth = simulator.simulate(planned)
-        _write_whole(archive / truth.path, content)
+        _write_whole(archive / planned.path, content)
         truths.append((row, truth))
     return truths
 
@@ -333,13 +333,11 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
         if detector.photon is not None
     ]
     for planned in files:
-        start = site.start_of(planned.role, planned.index)
         for name in counted:
-            photon_dead_time(site, start, name)
-        damage = site.damage_of(planned.index)
-        if damage is DamageKind.ZENITH_MINUS_90:
+            photon_dead_time(site, planned.start, name)
+        if planned.damage is DamageKind.ZENITH_MINUS_90:
             _check_vertical(site, planned)
-        if damage is DamageKind.STALE_POINTING and not site.dialect.scans:
+        if planned.damage is DamageKind.STALE_POINTING and not site.dialect.scans:
             raise CampaignError(
                 "stale_pointing needs the grid of a scan in the headers",
                 field=f"simulation.instruments.{site.key}.damage",
@@ -348,7 +346,7 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
 
 
 def _check_vertical(site: SimulatedInstrument, planned: PlannedFile) -> None:
-    facts = site.instrument.facts_at(site.start_of(planned.role, planned.index))
+    facts = site.instrument.facts_at(planned.start)
     if site.pointing_of(planned, facts)[0] and facts.zenith_angle is None:
         raise CampaignError(
             f"file {planned.index} is not vertical: zenith_minus_90 would falsify it unnoticed",
@@ -375,14 +373,13 @@ def _paths(
     paths: dict[str, None] = {}
     for site, planned_files in zip(sites, files, strict=True):
         for planned in planned_files:
-            path = site.path_of(planned)
-            if path in paths:
+            if planned.path in paths:
                 raise CampaignError(
-                    f"two files of {site.key} would have the name {path}",
+                    f"two files of {site.key} would have the name {planned.path}",
                     field=f"simulation.instruments.{site.key}.acquisition",
                     remedy="take files at longer intervals, or change the jumps of the clock",
                 )
-            paths[path] = None
+            paths[planned.path] = None
     return tuple(paths)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
@@ -51,13 +51,7 @@ from lidarops.simulate.planned_files import (
 )
 from lidarops.simulate.pulse import pulse_echo
 from lidarops.simulate.signal import backscatter_signal, bin_centres
-from lidarops.simulate.truth import (
-    ChannelTruth,
-    FileTruth,
-    ProfileTruth,
-    TruthGrid,
-    cell_stops,
-)
+from lidarops.simulate.truth import FileTruth, TruthGrid, cell_stops
 
 Array = NDArray[np.float64]
 AnyCounts = NDArray[np.signedinteger[Any]]
@@ -67,6 +61,8 @@ Cached = TypeVar("Cached")
 _CACHED: Final = 64
 """Entries of a cache; a full cache is emptied."""
 
+_SAME: Final = 1e-9
+"""Relative difference below which two extinctions count as equal."""
 _AIR_STEP: Final = timedelta(minutes=10)
 """Interval at which the air changes in a fast simulation."""
 
@@ -85,17 +81,16 @@ class _Conditions:
 
     planned: PlannedFile
     acquisition: Acquisition
-    start: datetime
-    middle: datetime
     facts: InstrumentFacts
+    middle: datetime
+    hours: float
+    """From the start of the campaign to the middle of the file."""
     zenith_angle: float
     azimuth: float | None
-    sun: float
-    """Elevation of the sun, degree."""
+    sky: float
+    """Brightness of the sky, relative to that with the sun at the zenith."""
     energy: float
     """Laser energy, relative to the nominal energy."""
-    hours: float
-    """Hours since the start of the campaign."""
     beam: Beam
     air_time: datetime
     """Time at which the air is evaluated."""
@@ -107,23 +102,14 @@ class _Light:
     """Light on a detector, in MHz of photoelectrons."""
 
     rate: Array
-    sky: float
-    extinction: float
-    amplitude: float
     bin_time: float
     """s for which a bin is open after one shot."""
-    electrons: Photoelectrons | None
-    """None in a fast simulation."""
-
-
-@dataclass(frozen=True, slots=True)
-class _LaserSignal:
-    """Signal at nominal laser energy, MHz of photoelectrons."""
-
-    rate: Array
-    extinction: float
+    extinction: float = math.nan
     """m-1; NaN if the path is not homogeneous."""
-    amplitude: float
+    amplitude: float = math.nan
+    sky: float = 0.0
+    electrons: Photoelectrons | None = None
+    """None in a fast simulation."""
 
 
 class Simulator:
@@ -138,7 +124,7 @@ class Simulator:
         self.site = site
         self._datasets: dict[tuple[int, float, int], tuple[Dataset, ...]] = {}
         self._paths: dict[Key, BeamPath] = {}
-        self._signals: dict[Key, _LaserSignal] = {}
+        self._signals: dict[Key, _Light] = {}
         self._position = site.position
         self._air = Air(
             site.settings.air_of(site.key),
@@ -172,69 +158,77 @@ class Simulator:
         site = self.site
         random = random_stream(site.settings.seed, site.key, planned.role, planned.index)
         conditions = self._conditions(planned, random)
-        channels: dict[str, tuple[AnyCounts, ChannelTruth]] = {}
+        counts: dict[str, AnyCounts] = {}
+        true: dict[str, float] = {}
         for detector in site.simulated.detectors:
-            channels |= self._read_out(conditions, detector, random)
-        header = self._header(conditions)
-        counts = {name: values for name, (values, _) in channels.items()}
-        if site.dialect.two_memories:
+            lights = self._lights(conditions, detector, random)
+            for mode in modes(detector):
+                name = channel_name(mode, detector)
+                light = lights[_offset(conditions, name)]
+                counts[name], about = self._read_out(conditions, detector, mode, light, random)
+                true |= {f"{quantity}_{name}": value for quantity, value in about.items()}
+        if site.dialect.scans:
             # The second memory is empty, although the header shares the shots between both.
-            counts |= {f"{name}_2": np.zeros_like(values) for name, values in counts.items()}
-        content = encode(header, counts)
-        damage = site.damage_of(planned.index) if planned.role is Role.SIGNAL else None
+            counts |= {f"{name}_2": np.zeros_like(row) for name, row in counts.items()}
+        content = encode(self._header(conditions), counts)
+        damage = planned.damage
         if damage is not None:
             content = damage_file(damage, content, random)
-        return content, FileTruth(
-            path=site.path_of(planned),
-            instrument=site.key,
-            time=conditions.middle,
-            zenith_angle=conditions.zenith_angle,
-            azimuth=math.nan if conditions.azimuth is None else conditions.azimuth,
-            clock_error=site.simulated.acquisition.clock_error(conditions.start)[1].total_seconds(),
-            energy=conditions.energy,
-            channels={name: values for name, (_, values) in channels.items()},
-            damage=damage if planned.copy or damage is not DamageKind.DUPLICATE else None,
-            profile=self._profile(conditions, [values for _, values in channels.values()]),
-        )
+        extinctions = [true[name] for name in true if name.startswith("total_extinction")]
+        first = extinctions[0]
+        alike = all(abs(value - first) <= _SAME * first for value in extinctions)
+        values: dict[str, Any] = {
+            **true,
+            "path": planned.path,
+            "instrument": site.key,
+            "time": np.datetime64(conditions.middle.replace(tzinfo=None), "ns"),
+            "zenith_angle": conditions.zenith_angle,
+            "azimuth": math.nan if conditions.azimuth is None else conditions.azimuth,
+            "clock_error": planned.clock_error.total_seconds(),
+            "energy": conditions.energy,
+            "total_extinction": first if alike else math.nan,
+            "damage": damage.value
+            if damage and (planned.copy or damage is not DamageKind.DUPLICATE)
+            else "",
+        }
+        homogeneous = all(map(math.isfinite, extinctions))
+        return content, FileTruth(values, None if homogeneous else self._profile(conditions))
 
     def _conditions(self, planned: PlannedFile, random: np.random.Generator) -> _Conditions:
-        site = self.site
-        start = site.start_of(planned.role, planned.index)
-        middle = start + site.duration_of(planned) / 2
+        site, acquisition = self.site, planned.acquisition
+        middle = planned.start + planned.duration / 2
         hours = (middle - site.settings.start).total_seconds() / 3600.0
-        facts = site.instrument.facts_at(start)
-        acquisition = site.acquisition_of(planned.role, planned.index)
+        facts = site.instrument.facts_at(planned.start)
         zenith, azimuth = site.pointing_of(planned, facts)
+        sun = solar_elevation(middle, site.station.latitude, site.station.longitude)
         air_time = self._air_time(middle)
         return _Conditions(
             planned=planned,
             acquisition=acquisition,
-            start=start,
-            middle=middle,
             facts=facts,
+            middle=middle,
+            hours=hours,
             zenith_angle=zenith,
             azimuth=azimuth,
-            sun=solar_elevation(middle, site.station.latitude, site.station.longitude),
+            sky=sky_brightness(sun),
             energy=site.simulated.laser.energy(hours, acquisition.shots, random),
-            hours=hours,
             beam=Beam(*self._position, zenith, azimuth or 0.0),
             air_time=air_time,
             air_state=self._air.state(air_time),
         )
 
     def _header(self, conditions: _Conditions) -> Header:
-        site, acquisition = self.site, conditions.acquisition
+        site, planned, acquisition = self.site, conditions.planned, conditions.acquisition
         dialect, pointing = site.dialect, site.simulated.pointing
-        _, error = site.simulated.acquisition.clock_error(conditions.start)
-        start = conditions.start + error
+        start = planned.start + planned.clock_error
         scan = scan_grid(pointing.cycle()) if pointing is not None and dialect.scans else None
         longitude, latitude = site.written_position
         temperature, pressure = dialect.weather
         return new_header(
-            name=site.name_of(conditions.planned),
+            name=planned.name,
             site=dialect.site_of(site.instrument.station, site.station.name),
             start=start,
-            stop=start + site.duration_of(conditions.planned) if scan is None else start,
+            stop=start + planned.duration if scan is None else start,
             altitude=site.station.altitude,
             longitude=longitude,
             latitude=latitude,
@@ -266,40 +260,42 @@ class Simulator:
         return self._datasets[key]
 
     def _read_out(
-        self, conditions: _Conditions, detector: Detector, random: np.random.Generator
-    ) -> dict[str, tuple[AnyCounts, ChannelTruth]]:
-        lights = self._lights(conditions, detector, random)
-        shots = conditions.acquisition.shots
-        channels: dict[str, tuple[AnyCounts, ChannelTruth]] = {}
-        for mode in modes(detector):
+        self,
+        conditions: _Conditions,
+        detector: Detector,
+        mode: DetectionMode,
+        light: _Light,
+        random: np.random.Generator,
+    ) -> tuple[AnyCounts, dict[str, float]]:
+        """Return the counts of a recorder, and its true values."""
+        unit, dark = 1.0, {}
+        if mode is DetectionMode.ANALOG and detector.analog is not None:
+            recorder = _drifted(detector.analog, conditions.hours)
+            counts = self._digitised(light, recorder, conditions, random)
+            unit, dark = recorder.gain, {"dark_offset": recorder.dark_offset}
+        else:
             name = channel_name(mode, detector)
-            light = lights[_offset(conditions, name)]
-            if mode is DetectionMode.ANALOG and detector.analog is not None:
-                recorder = _drifted(detector.analog, conditions.hours)
-                counts = self._digitised(light, recorder, conditions, random)
-                unit, dark_offset = recorder.gain, recorder.dark_offset
-            else:
-                counter: Callable[..., AnyCounts] = (
-                    partial(count_photons, light.electrons)
-                    if light.electrons
-                    else partial(count_fast, light.rate, shots=shots, bin_time=light.bin_time)
+            counter: Callable[..., AnyCounts] = (
+                partial(count_photons, light.electrons)
+                if light.electrons
+                else partial(
+                    count_fast,
+                    light.rate,
+                    shots=conditions.acquisition.shots,
+                    bin_time=light.bin_time,
                 )
-                counts = counter(
-                    dead_time=photon_dead_time(self.site, conditions.start, name),
-                    paralyzable=(detector.photon or PhotonCounter()).paralyzable,
-                    random=random,
-                )
-                unit, dark_offset = 1.0, math.nan
-            channels[name] = (
-                counts,
-                ChannelTruth(
-                    total_extinction=light.extinction,
-                    background=unit * light.sky,
-                    amplitude=unit * light.amplitude,
-                    dark_offset=dark_offset,
-                ),
             )
-        return channels
+            counts = counter(
+                dead_time=photon_dead_time(self.site, conditions.planned.start, name),
+                paralyzable=(detector.photon or PhotonCounter()).paralyzable,
+                random=random,
+            )
+        return counts, {
+            "total_extinction": light.extinction,
+            "background": unit * light.sky,
+            "amplitude": unit * light.amplitude,
+            **dark,
+        }
 
     def _digitised(
         self,
@@ -353,35 +349,35 @@ class Simulator:
         grid: _BinGrid,
         random: np.random.Generator,
     ) -> _Light:
-        bins, bin_width, _ = grid
-        shots = conditions.acquisition.shots
+        acquisition, background = conditions.acquisition, detector.background
         if conditions.planned.role is Role.DARK:
-            rate, sky, extinction, amplitude = np.zeros(bins), 0.0, math.nan, math.nan
+            light = _Light(np.zeros(grid.bins), _bin_time(grid))
         else:
-            signal = self._laser_signal(conditions, detector, grid)
-            background = detector.background
-            sky = background.night + (background.day - background.night) * sky_brightness(
-                conditions.sun
+            nominal = self._nominal_light(conditions, detector, grid)
+            sky = background.night + (background.day - background.night) * conditions.sky
+            light = replace(
+                nominal,
+                rate=np.minimum(conditions.energy * nominal.rate + sky, BRIGHTEST),
+                amplitude=conditions.energy * nominal.amplitude,
+                sky=sky,
             )
-            rate = np.minimum(conditions.energy * signal.rate + sky, BRIGHTEST)
-            extinction, amplitude = signal.extinction, conditions.energy * signal.amplitude
-        electrons = None
-        if not self.site.settings.fast:
-            electrons = release(rate, shots=shots, bin_width=bin_width, random=random)
-        bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
-        return _Light(rate, sky, extinction, amplitude, bin_time, electrons)
+        if self.site.settings.fast:
+            return light
+        electrons = release(
+            light.rate, shots=acquisition.shots, bin_width=grid.bin_width, random=random
+        )
+        return replace(light, electrons=electrons)
 
-    def _laser_signal(
-        self, conditions: _Conditions, detector: Detector, grid: _BinGrid
-    ) -> _LaserSignal:
+    def _nominal_light(self, conditions: _Conditions, detector: Detector, grid: _BinGrid) -> _Light:
+        """Return the signal at nominal laser energy, without sky."""
         full = conditions.facts.full_overlap_range
         key = detector.label, full, grid, conditions.beam, conditions.air_state
         if key in self._signals:
             return self._signals[key]
         path = self._path(conditions, detector.wavelength * 1e-9, grid)
         distance = bin_centres(*grid)
-        constant = detector.system_constant
-        pulse = self.site.simulated.pulse
+        constant, pulse = detector.system_constant, self.site.simulated.pulse
+        extinction = amplitude = math.nan
         if detector.raman is not None:
             rate = backscatter_signal(
                 distance,
@@ -391,9 +387,7 @@ class Simulator:
                 full_overlap_range=full,
                 returning_extinction=path.extinction,
             )
-            signal = _LaserSignal(rate, math.nan, math.nan)
-            return _cache(self._signals, key, signal)
-        if pulse is None:
+        elif pulse is None:
             rate = backscatter_signal(
                 distance,
                 extinction=path.extinction,
@@ -405,11 +399,11 @@ class Simulator:
             rate = pulse_echo(
                 distance, path, pulse, system_constant=constant, full_overlap_range=full
             )
-        extinction = amplitude = math.nan
-        if path.homogeneous:
+        if path.homogeneous and detector.raman is None:
             extinction = float(path.extinction[0])
             amplitude = constant * float(path.backscatter[0])
-        return _cache(self._signals, key, _LaserSignal(rate, extinction, amplitude))
+        light = _Light(rate, _bin_time(grid), extinction, amplitude)
+        return _cache(self._signals, key, light)
 
     def _path(self, conditions: _Conditions, wavelength: float, grid: _BinGrid) -> BeamPath:
         key = wavelength, grid, conditions.beam, conditions.air_state
@@ -424,23 +418,22 @@ class Simulator:
             return middle
         return start + (middle - start) // _AIR_STEP * _AIR_STEP
 
-    def _profile(
-        self, conditions: _Conditions, channels: Sequence[ChannelTruth]
-    ) -> ProfileTruth | None:
+    def _profile(self, conditions: _Conditions) -> dict[str, NDArray[np.float32]] | None:
         planned, grid = conditions.planned, self.grid
-        homogeneous = all(math.isfinite(channel.total_extinction) for channel in channels)
-        skipped = planned.role is Role.DARK or planned.index % grid.stride
-        if skipped or homogeneous or grid.stops.size < 2:
+        if planned.role is Role.DARK or planned.index % grid.stride or grid.stops.size < 2:
             return None
         bins = _BinGrid(int(grid.stops[-1]), grid.bin_width, 0.0)
         paths = [self._path(conditions, wavelength, bins) for wavelength in grid.wavelengths]
         extinction = np.stack([path.extinction for path in paths])
-        backscatter = np.stack([path.backscatter for path in paths])
-        return ProfileTruth(grid.mean(extinction), grid.mean(backscatter), grid.depth(extinction))
+        return grid.profile(extinction, np.stack([path.backscatter for path in paths]))
 
 
 def _offset(conditions: _Conditions, channel: str) -> float:
     return channel_facts(conditions.facts, channel).range_offset or 0.0
+
+
+def _bin_time(grid: _BinGrid) -> float:
+    return grid.bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
 
 
 def _cache(cache: dict[Key, Cached], key: Key, value: Cached) -> Cached:
@@ -468,7 +461,6 @@ def _truth_grid(site: SimulatedInstrument) -> TruthGrid:
     bin_width = min(width for _, width in grids)
     bins = int(max(bins * width for bins, width in grids) // bin_width)
     return TruthGrid(
-        instrument=site.key,
         wavelengths=tuple(sorted({d.wavelength * 1e-9 for d in site.simulated.detectors})),
         bin_width=bin_width,
         stops=cell_stops(bins, bin_width, settings.truth.cells),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Final, Literal
 
@@ -55,10 +55,8 @@ class Dialect:
     """Whether the file name ends in minutes and tens of seconds, ``mmX``."""
     scans: bool = False
     """Whether headers state elevations, negative upwards, and the grid of the scan, and the stop
-    is the start."""
-    two_memories: bool = False
-    """Whether every channel is written twice, of which the first holds all counts, and each states
-    half of the shots."""
+    is the start; and every channel is written twice, of which the first holds all counts, and each
+    states half of the shots."""
 
     @property
     def holds_azimuth(self) -> bool:
@@ -67,7 +65,7 @@ class Dialect:
 
     def shots_of_memories(self, shots: int) -> tuple[int, ...]:
         """Return the shots that headers state for each memory of a channel."""
-        return (shots - shots // 2, shots // 2) if self.two_memories else (shots,)
+        return (shots - shots // 2, shots // 2) if self.scans else (shots,)
 
     @property
     def laser(self) -> int:
@@ -97,7 +95,7 @@ class Dialect:
         firing = Laser(stated, repetition_rate)
         if self.both_lasers:
             return firing, firing
-        if self.two_memories:
+        if self.scans:
             return firing, Laser(stated, 0.0)
         if self.second_laser:
             return Laser(0, repetition_rate), firing
@@ -131,7 +129,7 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     "saopaulo": Dialect(layout="classic", site="cut", second_laser=True),
     "pilar": Dialect(layout="classic", site="cut"),
     "golmud": Dialect(layout="classic", site="whole", whole_bin_widths=True),
-    "raymetrics_scan": Dialect(layout="raymetrics", scans=True, two_memories=True),
+    "raymetrics_scan": Dialect(layout="raymetrics", scans=True),
 }
 
 
@@ -157,8 +155,24 @@ class PlannedFile:
     role: Role
     index: int
     """Index from 0 among the files of that role."""
+    start: datetime
+    """True time."""
+    acquisition: Acquisition
+    """With the changes that hold for it."""
+    clock_error: timedelta
+    """Clock of the computer minus true time."""
+    name: str
+    """In its header."""
+    path: str
+    """In the archive."""
+    damage: DamageKind | None = None
     copy: bool = False
     """Whether it is a copy of a file under another name."""
+
+    @property
+    def duration(self) -> timedelta:
+        """From start to stop."""
+        return timedelta(seconds=self.acquisition.duration)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +228,21 @@ class SimulatedInstrument:
         north = EARTH_RADIUS * math.radians(self.station.latitude - self.origin.latitude)
         return east, north, self.station.altitude - self.origin.altitude
 
-    def damage_of(self, index: int) -> DamageKind | None:
+    def planned_files(self) -> Iterator[PlannedFile]:
+        """Yield every file of the instrument: dark files first, then signal files in time."""
+        settings, acquisition = self.settings, self.simulated.acquisition
+        for index in range(acquisition.dark_files):
+            yield self._planned(Role.DARK, index, settings.start_of_dark(self.key, index))
+        for index in range(settings.files(self.key)):
+            start = settings.start_of(self.key, index)
+            if acquisition.is_missing(start):
+                continue
+            planned = self._planned(Role.SIGNAL, index, start, self._damage_of(index))
+            yield planned
+            if planned.damage is DamageKind.DUPLICATE:
+                yield replace(planned, path=planned.path + _COPY_SUFFIX, copy=True)
+
+    def _damage_of(self, index: int) -> DamageKind | None:
         """Return the damage of the signal file `index`; None for a good file."""
         random_damage = self.simulated.random_damage
         if index in self.damage or random_damage is None:
@@ -224,54 +252,24 @@ class SimulatedInstrument:
             return None
         return random_damage.kinds[kind % len(random_damage.kinds)]
 
-    def start_of(self, role: Role, index: int) -> datetime:
-        """Return the start of a file in true time."""
-        if role is Role.DARK:
-            return self.settings.start_of_dark(self.key, index)
-        return self.settings.start_of(self.key, index)
-
-    def acquisition_of(self, role: Role, index: int) -> Acquisition:
-        """Return the acquisition settings of a file, dark files included."""
-        return self.simulated.acquisition.at(self.start_of(role, index))
-
-    def planned_files(self) -> Iterator[PlannedFile]:
-        """Yield every file of the instrument: dark files first, then signal files in time."""
-        acquisition = self.simulated.acquisition
-        for index in range(acquisition.dark_files):
-            yield PlannedFile(Role.DARK, index)
-        for index in range(self.settings.files(self.key)):
-            if acquisition.is_missing(self.start_of(Role.SIGNAL, index)):
-                continue
-            yield PlannedFile(Role.SIGNAL, index)
-            if self.damage_of(index) is DamageKind.DUPLICATE:
-                yield PlannedFile(Role.SIGNAL, index, copy=True)
-
-    def path_of(self, planned: PlannedFile) -> str:
-        """Return the path of a file in the archive.
+    def _planned(
+        self, role: Role, index: int, start: datetime, damage: DamageKind | None = None
+    ) -> PlannedFile:
+        """Return a file.
 
         Names follow Licel: prefix, two digits of the year, month in hexadecimal, day, hour, and
         after the point minute, second and hundredths of a second, all of the stop time.
         """
-        folder, prefix = self.folder[planned.role], self.prefix[planned.role]
-        kind = self.damage_of(planned.index) if planned.role is Role.SIGNAL else None
-        if kind is DamageKind.FOREIGN:
-            return f"{folder}{prefix}{planned.index}{FOREIGN_NAME}"
-        name = self.name_of(planned)
-        if kind is DamageKind.RENAMED:
-            name = f"{prefix}_{name}"
-        return folder + name + (_COPY_SUFFIX if planned.copy else "")
-
-    def name_of(self, planned: PlannedFile) -> str:
-        """Return the name of a file in its header."""
-        start = self.start_of(planned.role, planned.index)
-        jumps, error = self.simulated.acquisition.clock_error(start)
-        stop = start + self.duration_of(planned) + error
-        suffix = self.dialect.name_suffix(stop, jumps)
-        return f"{self.prefix[planned.role]}{stop:%y}{stop.month:X}{stop:%d%H}.{suffix}"
-
-    def duration_of(self, planned: PlannedFile) -> timedelta:
-        """Return the duration of a file."""
-        return timedelta(seconds=self.acquisition_of(planned.role, planned.index).duration)
+        acquisition = self.simulated.acquisition.at(start)
+        jumps, error = acquisition.clock_error(start)
+        stop = start + timedelta(seconds=acquisition.duration) + error
+        prefix, suffix = self.prefix[role], self.dialect.name_suffix(stop, jumps)
+        name = f"{prefix}{stop:%y}{stop.month:X}{stop:%d%H}.{suffix}"
+        file = f"{prefix}_{name}" if damage is DamageKind.RENAMED else name
+        if damage is DamageKind.FOREIGN:
+            file = f"{prefix}{index}{FOREIGN_NAME}"
+        path = self.folder[role] + file
+        return PlannedFile(role, index, start, acquisition, error, name, path, damage)
 
     def pointing_of(
         self, planned: PlannedFile, facts: InstrumentFacts

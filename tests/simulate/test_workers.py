@@ -72,7 +72,7 @@ def test_any_order_gives_the_same_files(small):
         simulator = Simulator(site)
         for planned in reversed(list(site.planned_files())):
             content, truth = simulator.simulate(planned)
-            assert content == written[truth.path]
+            assert content == written[truth.values["path"]]
             # The same once more, from the same simulator.
             assert simulator.simulate(planned)[0] == content
 
