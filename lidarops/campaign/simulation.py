@@ -102,16 +102,6 @@ class _Instrument(SettingsModel):
             )
         return self
 
-    @property
-    def air(self) -> AtmosphereSettings | None:
-        """Air in front of the lidar; None for the shared atmosphere."""
-        return None
-
-    @property
-    def pointing(self) -> Pointing | None:
-        """Pointing of the beam; None if the facts of the campaign give it."""
-        return None
-
 
 class HorizontalPath(_Instrument):
     """Lidar on a homogeneous path."""
@@ -165,16 +155,6 @@ class Lidar(_Instrument):
     scan: Pointing | None = Field(
         default=None, description="sequence of zenith angles; by default the pointing of the facts"
     )
-
-    @property
-    def air(self) -> AtmosphereSettings | None:
-        """Air in front of the lidar; None for the shared atmosphere."""
-        return self.atmosphere
-
-    @property
-    def pointing(self) -> Pointing | None:
-        """Pointing of the beam; None if the facts of the campaign give it."""
-        return self.scan
 
 
 InstrumentSimulation = Annotated[
@@ -252,7 +232,7 @@ class SimulationSettings(SettingsModel):
     @model_validator(mode="after")
     def _air_exists(self) -> Self:
         for key in self.instruments:
-            if self.instruments[key].air is None and self.atmosphere is None:
+            if self.own_air(key) is None and self.atmosphere is None:
                 raise located_error(
                     "has no atmosphere: give it one, or give simulation.atmosphere for all",
                     "instruments",
@@ -262,7 +242,12 @@ class SimulationSettings(SettingsModel):
 
     def air_of(self, key: str) -> AtmosphereSettings:
         """Return the atmosphere of an instrument."""
-        return self.instruments[key].air or self.atmosphere or AtmosphereSettings()
+        return self.own_air(key) or self.atmosphere or AtmosphereSettings()
+
+    def own_air(self, key: str) -> AtmosphereSettings | None:
+        """Return the atmosphere of an instrument alone; None where it is in the shared one."""
+        instrument = self.instruments[key]
+        return instrument.atmosphere if isinstance(instrument, Lidar) else instrument.air
 
     def files(self, key: str) -> int:
         """Return the number of signal files of an instrument; all end within the campaign."""

@@ -57,6 +57,9 @@ Position = Literal["longitude_first", "latitude_first", "ignore"]
 Signal = Callable[[int, RawChannel], Any]
 """Number of a channel, the channel in the first file -> array (time, range), lazy or not."""
 
+_Variable = tuple[str | tuple[str, ...], Any, Mapping[str, Any]]
+"""Dimensions, values and attributes."""
+
 _CHUNK_BYTES = 16_000_000
 _EPOCH = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
 _MICROSECOND = timedelta(microseconds=1)
@@ -163,7 +166,7 @@ def open_archive(
         graph = {}
         for number, (rows, chunk) in enumerate(chunks):
             scale = None if scales is None else scales[rows]
-            task = _Chunk(files.format, chunk, places[rows], channel.bins, kept, scale)
+            task = Chunk(files.format, chunk, places[rows], channel.bins, kept, scale)
             graph[name, number, 0] = (task,)
         shape = (lengths, (channel.bins,))
         dtype = np.int32 if scales is None else np.float32
@@ -422,7 +425,7 @@ def _chunks(
 
 
 @dataclass(frozen=True, slots=True)
-class _Chunk:
+class Chunk:
     """Task that reads one channel of the files of one chunk; small, and can be pickled."""
 
     format: str
@@ -438,22 +441,22 @@ class _Chunk:
     """None for counts."""
 
     def __call__(self) -> NDArray[Any]:
-        shape = len(self.places), self.bins
-        counts = np.empty(shape if self.scales is None else shape[1:], np.dtype("<i4"))
-        values = counts if self.scales is None else np.empty(shape, np.float32)
+        """Return the values, shape (files, bins)."""
+        dtype = np.int32 if self.scales is None else np.float32
+        values = np.empty((len(self.places), self.bins), dtype)
+        row = np.empty(self.bins, np.dtype("<i4"))
         read_channel = raw_format(self.format).read_channel
         for index, ((path, size), places) in enumerate(zip(self.files, self.places, strict=True)):
-            row = counts if self.scales is not None else counts[index]
             with RawFile(path) as file:
                 file.expect(size)
                 read_channel(file, places, self.kept, row)
-            if self.scales is not None:
-                # In double precision.
-                np.multiply(row, self.scales[index], out=values[index], casting="same_kind")
+            scale = 1 if self.scales is None else self.scales[index]
+            # In double precision.
+            np.multiply(row, scale, out=values[index], casting="same_kind")
         count = _COUNT.get()
         if count is not None:
-            count.bytes += sum(map(len, self.places)) * self.bins * counts.itemsize
-        return values.astype(np.int32 if self.scales is None else np.float32, copy=False)
+            count.bytes += sum(map(len, self.places)) * row.nbytes
+        return values
 
 
 def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Dataset:
@@ -474,15 +477,15 @@ def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Da
     stated = [file.stated for file in files.files]
     notes = {note for header in stated for note in header.notes}
     notes |= {header.doubt for header in stated if isinstance(header, RawHeader)} - {""}
-    variables: dict[str, xr.Variable] = {}
+    variables: dict[str, _Variable] = {}
     for index, channel in enumerate(files.selected):
         dims = ("time", grids[files.stretches(channel), channel.bin_width])
         attributes, varying = _properties(files, index, scaled=scaled)
-        variables[channel.name] = xr.Variable(dims, signal(index, channel), attributes)
+        variables[channel.name] = dims, signal(index, channel), attributes
         variables |= varying
     return xr.Dataset(
         variables,
-        {**_time(files), **_ranges(grids), **_place(files)},
+        {**_axes(files, grids), **_place(files)},
         {
             "source_format": raw_format(files.format).title,
             "site": ", ".join(sorted({file.header.site for file in files.files})),
@@ -493,7 +496,7 @@ def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Da
 
 def _properties(
     files: RawFiles, index: int, *, scaled: bool
-) -> tuple[dict[str, Any], dict[str, xr.Variable]]:
+) -> tuple[dict[str, Any], dict[str, _Variable]]:
     """Return the attributes of a channel, and the variables of what differs between files."""
     channel = files.selected[index]
     polarisation = POLARISATIONS.get(channel.polarisation, channel.polarisation)
@@ -512,7 +515,7 @@ def _properties(
         "device": channel.device,
         **_full_scale(files, index, scaled=scaled),
     }
-    varying = {}
+    varying: dict[str, _Variable] = {}
     for name, prop in _PROPERTIES.items():
         values = files.values(index, name)
         # Of type object where a file lacks the property.
@@ -525,7 +528,7 @@ def _properties(
             "units": prop.units or channel.units,
             "long_name": f"{prop.description} of {channel.name}",
         }
-        varying[f"{channel.name}_{name}"] = _in_time(values.astype(prop.dtype), about)
+        varying[f"{channel.name}_{name}"] = "time", values.astype(prop.dtype), about
     return attributes, varying
 
 
@@ -545,11 +548,7 @@ def _is_constant(values: NDArray[Any]) -> bool:
     return bool((values == values[0]).all())
 
 
-def _in_time(values: NDArray[Any], attributes: dict[str, str]) -> xr.Variable:
-    return xr.Variable(("time",), values, attributes)
-
-
-def _time(files: RawFiles) -> dict[str, xr.Variable]:
+def _axes(files: RawFiles, grids: Mapping[tuple[Stretches, float], str]) -> dict[str, _Variable]:
     bounds = files.times
     middle = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     about = {
@@ -557,34 +556,31 @@ def _time(files: RawFiles) -> dict[str, xr.Variable]:
         "long_name": "middle of the measurement interval, UTC",
         "bounds": "time_bnds",
     }
-    return {
-        "time": _in_time(middle.astype("datetime64[ns]"), about),
-        "time_bnds": xr.Variable(("time", "nv"), bounds.astype("datetime64[ns]")),
+    away = {"units": "m", "long_name": "distance of the bin centre from the lidar"}
+    axes: dict[str, _Variable] = {
+        "time": ("time", middle.astype("datetime64[ns]"), about),
+        "time_bnds": (("time", "nv"), bounds.astype("datetime64[ns]"), {}),
     }
+    for (stretches, width), name in grids.items():
+        bins = np.concatenate([np.arange(*stretch) for stretch in stretches])
+        axes[name] = name, (bins + 0.5) * width, away
+    return axes
 
 
-def _ranges(grids: Mapping[tuple[Stretches, float], str]) -> dict[str, xr.Variable]:
-    return {
-        name: xr.Variable(
-            (name,),
-            (np.concatenate([np.arange(*stretch) for stretch in stretches]) + 0.5) * width,
-            {"units": "m", "long_name": "distance of the bin centre from the lidar"},
-        )
-        for (stretches, width), name in grids.items()
-    }
-
-
-def _place(files: RawFiles) -> dict[str, xr.Variable]:
+def _place(files: RawFiles) -> dict[str, _Variable]:
     stated = [file.stated for file in files.files]
     pointings = [(header.altitude, header.zenith_angle, header.azimuth) for header in stated]
     # None becomes NaN.
     altitude, zenith, azimuth = np.array(pointings, dtype=np.float64).T
     up = {"units": "degree", "long_name": "zenith angle of the beam, 0 = up"}
     height = {"units": "m", "standard_name": "altitude", "long_name": "altitude of the lidar"}
-    place = {"zenith_angle": _in_time(zenith, up), "altitude": _constant(altitude, height)}
+    place: dict[str, _Variable] = {
+        "zenith_angle": ("time", zenith, up),
+        "altitude": _constant(altitude, height),
+    }
     if np.isfinite(azimuth).any():
         north = {"units": "degree", "long_name": "azimuth of the beam, clockwise from north"}
-        place["azimuth"] = _in_time(azimuth, north)
+        place["azimuth"] = "time", azimuth, north
     order = files.position_order
     if order != "ignore":
         pairs = [file.header.position(order) or (math.nan, math.nan) for file in files.files]
@@ -596,8 +592,6 @@ def _place(files: RawFiles) -> dict[str, xr.Variable]:
     return place
 
 
-def _constant(values: NDArray[np.float64], attributes: dict[str, str]) -> xr.Variable:
+def _constant(values: NDArray[np.float64], attributes: dict[str, str]) -> _Variable:
     # A moving lidar has a position at every time.
-    if _is_constant(values):
-        return xr.Variable((), values[0], attributes)
-    return _in_time(values, attributes)
+    return ((), values[0], attributes) if _is_constant(values) else ("time", values, attributes)

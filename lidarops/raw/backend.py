@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,9 +19,9 @@ from xarray.core import indexing
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
-from lidarops.raw.archive import Position, RawFiles, StatedFile, build_raw_dataset
+from lidarops.raw.archive import Chunk, Position, RawFiles, StatedFile, build_raw_dataset
 from lidarops.raw.formats import RawFile
-from lidarops.raw.header import RawChannel, RawHeader
+from lidarops.raw.header import RawChannel
 from lidarops.raw.licel_format import FORMAT
 
 
@@ -67,8 +68,10 @@ class LicelBackendEntrypoint(BackendEntrypoint):
         files = RawFiles([file], channels, header_position)
 
         def signal(_: int, channel: RawChannel) -> Any:
-            lazy = _LazyChannel(header, channel, scaled=mask_and_scale)
-            return indexing.LazilyIndexedArray(lazy)
+            scales = np.array([channel.scale]) if mask_and_scale else None
+            stamp = (header.path, header.size)
+            chunk = Chunk(FORMAT.name, (stamp,), (channel.places,), channel.bins, None, scales)
+            return indexing.LazilyIndexedArray(_LazyChannel(chunk))
 
         opened = build_raw_dataset(files, signal, scaled=mask_and_scale)
         dropped = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
@@ -90,12 +93,10 @@ class LicelBackendEntrypoint(BackendEntrypoint):
 class _LazyChannel(BackendArray):
     """One channel of one file as an array (1, bins); reads from the lowest to the highest bin."""
 
-    def __init__(self, header: RawHeader, channel: RawChannel, *, scaled: bool) -> None:
-        self._path, self._size = header.path, header.size
-        self._places = channel.places
-        self._scale = channel.scale if scaled else None
-        self.shape = (1, channel.bins)
-        self.dtype = np.dtype(np.float32 if scaled else np.int32)
+    def __init__(self, chunk: Chunk) -> None:
+        self._chunk = chunk
+        self.shape = (1, chunk.bins)
+        self.dtype = np.dtype(np.int32 if chunk.scales is None else np.float32)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
         support = indexing.IndexingSupport.BASIC
@@ -105,15 +106,10 @@ class _LazyChannel(BackendArray):
     def _read(self, key: tuple[int | slice, int | slice]) -> NDArray[Any]:
         time, bins = key
         selected = np.asarray(np.arange(self.shape[1])[bins])
-        values = np.empty(selected.shape, self.dtype)
-        if selected.size:
-            low, past = int(selected.min()), int(selected.max()) + 1
-            counts = np.empty(past - low, np.dtype("<i4"))
-            whole = counts.size == self.shape[1]
-            with RawFile(self._path) as file:
-                file.expect(self._size)
-                FORMAT.read_channel(file, self._places, None if whole else ((low, past),), counts)
-            scale = 1 if self._scale is None else self._scale
-            # In double precision.
-            np.multiply(counts[selected - low], scale, out=values, casting="same_kind")
-        return values[np.newaxis][time]
+        if not selected.size:
+            return np.empty((1, *selected.shape), self.dtype)[time]
+        low, past = int(selected.min()), int(selected.max()) + 1
+        chunk = self._chunk
+        if past - low < chunk.bins:
+            chunk = replace(chunk, bins=past - low, kept=((low, past),))
+        return chunk()[:, selected - low][time]

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import RawFile
 from lidarops.raw.header import HeaderOrder, chosen
-from lidarops.raw.licel_format import COUNTS, Counts
-from lidarops.raw.licel_format import read_counts as read_row
+from lidarops.raw.licel_format import COUNTS, Counts, read_dataset
 from lidarops.raw.licel_header import (
     CONVENTION,
     Dataset,
@@ -35,6 +34,7 @@ from lidarops.raw.licel_header import (
     Header,
     Laser,
     ScanGrid,
+    four_characters,
     parse_dataset,
     parse_header,
 )
@@ -145,7 +145,7 @@ def read_counts(
             raise RawFormatError(f"{bins} bins cannot be read", file=file.path, field="bins")
         for dataset in datasets:
             row = np.empty(dataset.bins, COUNTS)
-            read_row(file, dataset.places[0], None, row)
+            read_dataset(file, dataset.places[0], None, row)
             counts[dataset.name] = row[:bins].astype(np.int32, copy=False)
     return header, counts
 
@@ -218,7 +218,7 @@ def new_dataset(
         f"{bins:05d}",
         f"{laser_polarisation:d}",
         f"{high_voltage:04.0f}",
-        _four_characters(bin_width, "bin width"),
+        four_characters(bin_width),
         f"{round(wavelength * 1e9):05d}.{polarisation}",
         "0 0",
         f"{thousandths // 1000:02d}",
@@ -427,13 +427,6 @@ def _line(*tokens: str) -> bytes:
         return text.ljust(_LINE).encode("latin-1") + b"\r\n"
     except UnicodeEncodeError:
         raise RawFormatError(f"{text!r} is not Latin-1 text") from None
-
-
-def _four_characters(value: float, name: str) -> str:
-    text = f"{value:.2f}"[:4] if value < 100 else f"{value:04.0f}"
-    if not np.isclose(float(text), value, rtol=1e-12, atol=0):
-        raise RawFormatError(f"{value:g} cannot be written in four characters", field=name)
-    return text
 
 
 def _place(form: str, **values: float | None) -> str:

@@ -95,7 +95,7 @@ def _check_blocks(counts: Counts, channel: RawChannel, path: str) -> None:
             )
 
 
-def read_counts(file: RawFile, place: int, stretches: Stretches | None, row: Counts) -> None:
+def read_dataset(file: RawFile, place: int, stretches: Stretches | None, row: Counts) -> None:
     """Fill a row with the counts of the dataset from byte `place` on.
 
     Raises
@@ -129,6 +129,6 @@ FORMAT: Final = RawFormat(
     conversion=licel_header.CONVENTION,
     recognises=_recognises,
     parse_header=_parse_header,
-    read_counts=read_counts,
+    read_counts=read_dataset,
     read_start=licel_header.stated_start,
 )

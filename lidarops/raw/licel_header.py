@@ -373,25 +373,29 @@ def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
 def _number(token: str, name: str, low: float = -math.inf, high: float = math.inf) -> float:
     if _NUMBER.fullmatch(token) is None:
         raise RawFormatError(f"{token[:40]!r} is not a number", field=name)
-    return _bounded(float(token.replace(",", ".")), low, high, name)
+    value = float(token.replace(",", "."))
+    if not low <= value <= high:
+        raise RawFormatError(f"{value:g} is not within {low:g} to {high:g}", field=name)
+    return value
 
 
 @lru_cache(maxsize=1024)
 def _integer(token: str, name: str, low: float = -math.inf, high: float = math.inf) -> int:
     if _INTEGER.fullmatch(token) is None:
         raise RawFormatError(f"{token[:40]!r} is not an integer", field=name)
-    return int(_bounded(int(token), low, high, name))
-
-
-def _bounded(value: float, low: float, high: float, name: str) -> float:
-    if not low <= value <= high:
-        raise RawFormatError(f"{value:g} is not within {low:g} to {high:g}", field=name)
-    return value
+    return int(_number(token, name, low, high))
 
 
 def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
-    numbers = list(map(int, dates.groups()))
-    start, stop = _moment(numbers[:6], "start"), _moment(numbers[6:], "stop")
+    moments = []
+    for name, numbers in (("start", dates.groups()[:6]), ("stop", dates.groups()[6:])):
+        day, month, _, hour, minute, second = map(int, numbers)
+        year = _integer(numbers[2], name, *_YEARS)
+        try:
+            moments.append(datetime(year, month, day, hour, minute, second, tzinfo=UTC))
+        except ValueError as error:
+            raise RawFormatError(f"is not a date and time: {error}", field=name) from None
+    start, stop = moments
     if stop < start - _CLOCK_STEP:
         raise RawFormatError(f"{stop:%Y-%m-%d %H:%M:%S} lies before the start", field="stop")
     if stop - start > _LONGEST:
@@ -402,15 +406,6 @@ def _moments(dates: re.Match[str]) -> tuple[datetime, datetime]:
             remedy="leave the file out, or correct the damaged date in its header",
         )
     return start, stop
-
-
-def _moment(numbers: list[int], name: str) -> datetime:
-    day, month, year, hour, minute, second = numbers
-    _bounded(year, *_YEARS, name)
-    try:
-        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError as error:
-        raise RawFormatError(f"is not a date and time: {error}", field=name) from None
 
 
 @lru_cache(maxsize=128)
@@ -584,6 +579,22 @@ def _parse_datasets(
         field="size",
         remedy="copy the file again from the instrument, or leave it out",
     )
+
+
+def four_characters(width: float) -> str:
+    """Return a bin width (m) as dataset lines hold it.
+
+    Raises
+    ------
+    RawFormatError
+        If it does not fit.
+    """
+    text = f"{width:.2f}"[:4] if width < 100 else f"{width:04.0f}"
+    if not math.isclose(float(text), width, rel_tol=1e-12):
+        raise RawFormatError(
+            f"{width:g} does not fit into the four characters of a raw header, such as 7.5 or 3.75"
+        )
+    return text
 
 
 def _parse_lines(block: bytes) -> list[Dataset]:

@@ -16,7 +16,7 @@ step, where rounding errors do not average out over shots.
 from __future__ import annotations
 
 from math import cos, erfc, exp, pi, sin, sqrt
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numba
 import numpy as np
@@ -75,12 +75,10 @@ def digitise(
     """
     if released.shots == 0:
         return np.zeros(released.number.shape, dtype=np.int64)
-    sample = _sample_parameters(recorder, released.bin_time)
-    dark = _dark(recorder, released.rate.shape)
-    top = 2**recorder.adc_bits - 1
+    sample = _sample(recorder, released.bin_time)
     noise = random.standard_normal(released.rate.size)
     total: Counts = _sum_samples(
-        released.rate, released.number, noise, dark, *sample, float(released.shots), float(top)
+        released.rate, released.number, noise, sample, float(released.shots)
     )
     return total
 
@@ -127,15 +125,8 @@ def digitise_fast(
             remedy="take fewer shots, or use digitise",
         )
     noise = random.standard_normal(rate.size, dtype=np.float32)
-    dark = _dark(recorder, rate.shape)
-    total: FastCounts = _draw_sums(
-        rate,
-        noise,
-        dark,
-        *_sample_parameters(recorder, bin_time, _NEGLIGIBLE_FAST),
-        float(shots),
-        float(top),
-    )
+    sample = _sample(recorder, bin_time, _NEGLIGIBLE_FAST)
+    total: FastCounts = _draw_sums(rate, noise, sample, float(shots))
     return total
 
 
@@ -151,8 +142,7 @@ def sample_moments(
     bin_time : float, s
     """
     rate = _checked(rate, bin_time)
-    dark = _dark(recorder, rate.shape)
-    both = _moments_of(rate, dark, *_sample_parameters(recorder, bin_time))
+    both = _moments_of(rate, _sample(recorder, bin_time))
     return both[0], both[1]
 
 
@@ -161,15 +151,28 @@ def _checked(rate: Array, bin_time: float) -> Array:
     return limited_rate(rate)
 
 
-def _dark(recorder: AnalogRecorder, shape: tuple[int, ...]) -> Array:
-    """Return the voltage without light, steps."""
-    return np.full(shape, recorder.dark_offset) / recorder.step
+class _Sample(NamedTuple):
+    """One sample of one shot, in digitiser steps."""
+
+    window: float
+    """Microseconds for which a bin is open."""
+    dark: float
+    """Voltage without light."""
+    unit: float
+    """Mean charge of a photoelectron."""
+    spread: float
+    """Variance of the charge over the square of its mean."""
+    noise: float
+    """Standard deviation of the electronic noise."""
+    gauss: NDArray[np.float64]
+    """Harmonics of the noise."""
+    harmonics: NDArray[np.complex128]
+    """Those of the charge, and their slopes."""
+    top: float
+    """Full scale."""
 
 
-def _sample_parameters(
-    recorder: AnalogRecorder, bin_time: float, negligible: float = _NEGLIGIBLE
-) -> tuple[float, float, float, float, NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the parameters that all bins share, with the harmonics of a photoelectron's charge."""
+def _sample(recorder: AnalogRecorder, bin_time: float, negligible: float = _NEGLIGIBLE) -> _Sample:
     unit = recorder.gain / recorder.step / (bin_time * 1e6)
     spread, dark_noise = recorder.excess_noise - 1.0, recorder.noise / recorder.step
     most = int(sqrt(negligible / (2.0 * pi**2)) / dark_noise)
@@ -180,20 +183,14 @@ def _sample_parameters(
     charge = np.exp(power)
     slope = 1j * unit * charge / inner
     harmonics = np.stack([charge, slope])
-    return 1e6 * bin_time, unit, spread, dark_noise, gauss, harmonics
+    dark, top = recorder.dark_offset / recorder.step, float(2**recorder.adc_bits - 1)
+    return _Sample(1e6 * bin_time, dark, unit, spread, dark_noise, gauss, harmonics, top)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rounded(
-    events: float,
-    dark: float,
-    unit: float,
-    spread: float,
-    dark_noise: float,
-    gauss: Any,
-    harmonics: Any,
-) -> tuple[float, float, float]:
+def _rounded(events: float, sample: Any) -> tuple[float, float, float]:
     """Return mean and variance of a rounded sample, and its covariance with the voltage."""
+    _, dark, unit, spread, dark_noise, gauss, harmonics, _ = sample
     mean = unit * events + dark
     variance = (1.0 + spread) * unit * unit * events + dark_noise * dark_noise
     bias, square, product = 0.0, 1.0 / 12.0, 0.0
@@ -260,17 +257,9 @@ def _mixture(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _clipped(
-    mean: float,
-    rounded: float,
-    events: float,
-    dark: float,
-    unit: float,
-    spread: float,
-    dark_noise: float,
-    top: float,
-) -> tuple[float, float]:
+def _clipped(mean: float, rounded: float, events: float, sample: Any) -> tuple[float, float]:
     """Return the mean of a sample clipped to 0..top, and the remaining share of its deviation."""
+    _, dark, unit, spread, dark_noise, _, _, top = sample
     reach = _FAR * sqrt(rounded)
     # Photoelectrons only add to the dark voltage.
     above, below = mean + reach > top, dark < _FAR * dark_noise + 0.5 and mean < reach + 0.5
@@ -287,75 +276,38 @@ def _clipped(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sum_samples(
-    rate: Any,
-    number: Any,
-    noise: Any,
-    dark: Any,
-    window: float,
-    unit: float,
-    spread: float,
-    dark_noise: float,
-    gauss: Any,
-    harmonics: Any,
-    shots: float,
-    top: float,
-) -> Any:
+def _sum_samples(rate: Any, number: Any, noise: Any, sample: Any, shots: float) -> Any:
+    window, _, unit, spread, dark_noise, _, _, top = sample
     total = np.empty_like(number)
     for i in range(number.size):
         events = rate[i] * window
-        mean, rounded, covariance = _rounded(
-            events, dark[i], unit, spread, dark_noise, gauss, harmonics
-        )
+        mean, rounded, covariance = _rounded(events, sample)
         variance = (1.0 + spread) * unit * unit * events + dark_noise * dark_noise
         slope = covariance / variance
         own = max(rounded - slope * covariance, 0.0) + (slope * dark_noise) ** 2
         charge = slope * slope * unit * unit * spread * number[i]
         light = slope * unit * (number[i] - events * shots)
-        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, dark_noise, top)
+        centre, kept = _clipped(mean, rounded, events, sample)
         value = shots * centre + kept * (light + sqrt(charge + shots * own) * noise[i])
         total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
     return total
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _draw_sums(
-    rate: Any,
-    noise: Any,
-    dark: Any,
-    window: float,
-    unit: float,
-    spread: float,
-    dark_noise: float,
-    gauss: Any,
-    harmonics: Any,
-    shots: float,
-    top: float,
-) -> Any:
+def _draw_sums(rate: Any, noise: Any, sample: Any, shots: float) -> Any:
     total = np.empty(rate.size, np.int32)
     for i in range(rate.size):
-        events = rate[i] * window
-        mean, rounded, _ = _rounded(events, dark[i], unit, spread, dark_noise, gauss, harmonics)
-        centre, kept = _clipped(mean, rounded, events, dark[i], unit, spread, dark_noise, top)
+        events = rate[i] * sample.window
+        mean, rounded, _ = _rounded(events, sample)
+        centre, kept = _clipped(mean, rounded, events, sample)
         value = shots * centre + kept * sqrt(rounded * shots) * noise[i]
-        total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
+        total[i] = int(min(max(value, 0.0), shots * sample.top) + 0.5)
     return total
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moments_of(
-    rate: Any,
-    dark: Any,
-    window: float,
-    unit: float,
-    spread: float,
-    dark_noise: float,
-    gauss: Any,
-    harmonics: Any,
-) -> Any:
+def _moments_of(rate: Any, sample: Any) -> Any:
     both = np.empty((2, rate.size))
     for i in range(rate.size):
-        both[0, i], both[1, i], _ = _rounded(
-            rate[i] * window, dark[i], unit, spread, dark_noise, gauss, harmonics
-        )
+        both[0, i], both[1, i], _ = _rounded(rate[i] * sample.window, sample)
     return both

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import secrets
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
@@ -66,11 +67,13 @@ class SimulationPlan:
     """Every file that a simulation will write."""
 
     campaign: Campaign
-    sites: tuple[SimulatedInstrument, ...]
-    files: tuple[tuple[PlannedFile, ...], ...]
-    """Files of each site: dark files first, then signal files in time."""
-    paths: tuple[str, ...]
-    """Paths in the archive, in the same order."""
+    files: tuple[tuple[SimulatedInstrument, tuple[PlannedFile, ...]], ...]
+    """Of each instrument: dark files first, then signal files in time."""
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """Paths in the archive, in the same order."""
+        return tuple(planned.path for _, files in self.files for planned in files)
 
 
 def simulate_campaign(
@@ -141,24 +144,24 @@ def plan_simulation(campaign: Campaign) -> SimulationPlan:
             field="archive",
             remedy="give a path",
         )
-    sites = _sites(campaign)
-    files = tuple(tuple(site.planned_files()) for site in sites)
-    for site, planned_files in zip(sites, files, strict=True):
+    files = tuple((site, tuple(site.planned_files())) for site in _sites(campaign))
+    for site, planned_files in files:
         _check_air(site)
         _check_facts(site, planned_files)
-    return SimulationPlan(campaign, tuple(sites), files, _paths(sites, files))
+        _check_names(site, planned_files)
+    return SimulationPlan(campaign, files)
 
 
 def write_simulation(
     plan: SimulationPlan, *, client: Client | None = None, progress: Progress | None = None
 ) -> SimulatedCampaign:
     """Write the files of a plan; see `simulate_campaign`."""
-    archive = Path(plan.campaign.archive)
-    _refuse_foreign_files(archive, plan.sites, frozenset(plan.paths))
-    for folder in {path.rpartition("/")[0] for path in plan.paths}:
+    archive, paths = Path(plan.campaign.archive), plan.paths
+    _refuse_foreign_files(archive, [site for site, _ in plan.files], frozenset(paths))
+    for folder in {path.rpartition("/")[0] for path in paths}:
         _make_folder(archive / folder)
-    rows = sum(planned.role is Role.SIGNAL for files in plan.files for planned in files)
-    table = TruthTable(rows, {site.key: Simulator(site).grid for site in plan.sites})
+    rows = sum(planned.role is Role.SIGNAL for _, files in plan.files for planned in files)
+    table = TruthTable(rows, {site.key: Simulator(site).grid for site, _ in plan.files})
     work = _batches(plan)
     results = (
         (_write_batch(batch, archive) for batch in work)
@@ -171,7 +174,7 @@ def write_simulation(
                 table.add(row, file_truth)
         if progress:
             progress(len(truths))
-    return SimulatedCampaign(archive, plan.paths, table.dataset(plan.campaign.name))
+    return SimulatedCampaign(archive, paths, table.dataset(plan.campaign.name))
 
 
 def _make_folder(folder: Path) -> None:
@@ -188,7 +191,7 @@ def _make_folder(folder: Path) -> None:
 
 def _batches(plan: SimulationPlan) -> Iterator[_Batch]:
     rows = count()
-    for site, files in zip(plan.sites, plan.files, strict=True):
+    for site, files in plan.files:
         work = [(file, next(rows) if file.role is Role.SIGNAL else None) for file in files]
         for first in range(0, len(work), _BATCH):
             yield site, work[first : first + _BATCH]
@@ -273,7 +276,7 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Simulat
         settings=settings,
         instrument=instrument,
         station=station,
-        origin=station if simulated.air else _origin(campaign, settings),
+        origin=station if settings.own_air(key) else _origin(campaign, settings),
         folder={role: folder for role, (folder, _) in places.items()},
         prefix={role: prefix for role, (_, prefix) in places.items()},
         damage={damage.index: damage.kind for damage in simulated.damage},
@@ -307,7 +310,7 @@ def _check_air(site: SimulatedInstrument) -> None:
 def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> None:
     """Check the facts at every file before the first file is written."""
     field = f"instruments.{site.key}.facts"
-    if site.simulated.pointing is not None:
+    if site.scan is not None:
         if not site.dialect.holds_azimuth:
             raise CampaignError(
                 f"headers of the {site.simulated.acquisition.dialect} dialect do not hold the"
@@ -367,20 +370,15 @@ def _place_of(key: str, role: Role, patterns: list[str]) -> tuple[str, str]:
     return match["folder"], match["prefix"]
 
 
-def _paths(
-    sites: Sequence[SimulatedInstrument], files: Sequence[Sequence[PlannedFile]]
-) -> tuple[str, ...]:
-    paths: dict[str, None] = {}
-    for site, planned_files in zip(sites, files, strict=True):
-        for planned in planned_files:
-            if planned.path in paths:
-                raise CampaignError(
-                    f"two files of {site.key} would have the name {planned.path}",
-                    field=f"simulation.instruments.{site.key}.acquisition",
-                    remedy="take files at longer intervals, or change the jumps of the clock",
-                )
-            paths[planned.path] = None
-    return tuple(paths)
+def _check_names(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> None:
+    # Those of other instruments have another folder or prefix.
+    for path, uses in Counter(planned.path for planned in files).most_common(1):
+        if uses > 1:
+            raise CampaignError(
+                f"two files of {site.key} would have the name {path}",
+                field=f"simulation.instruments.{site.key}.acquisition",
+                remedy="take files at longer intervals, or change the jumps of the clock",
+            )
 
 
 def _refuse_foreign_files(

@@ -219,9 +219,9 @@ class Simulator:
 
     def _header(self, conditions: _Conditions) -> Header:
         site, planned, acquisition = self.site, conditions.planned, conditions.acquisition
-        dialect, pointing = site.dialect, site.simulated.pointing
+        dialect = site.dialect
         start = planned.start + planned.clock_error
-        scan = scan_grid(pointing.cycle()) if pointing is not None and dialect.scans else None
+        scan = scan_grid(site.scan.cycle()) if site.scan is not None and dialect.scans else None
         longitude, latitude = site.written_position
         temperature, pressure = dialect.weather
         return new_header(
@@ -246,18 +246,44 @@ class Simulator:
         key = acquisition.bins, acquisition.bin_width, acquisition.shots
         if key not in self._datasets:
             self._datasets[key] = tuple(
-                _dataset(
-                    self.site,
-                    acquisition.model_copy(update={"shots": shots}),
-                    detector,
-                    mode,
-                    number,
-                )
+                self._dataset(number, mode, shots, *_grid_of(acquisition, detector))
                 for number, detector in enumerate(self.site.simulated.detectors)
                 for shots in self.site.dialect.shots_of_memories(acquisition.shots)
                 for mode in modes(detector)
             )
         return self._datasets[key]
+
+    def _dataset(
+        self, number: int, mode: DetectionMode, shots: int, bins: int, bin_width: float
+    ) -> Dataset:
+        """Return the line of a recorder of detector `number`."""
+        detector, dialect = self.site.simulated.detectors[number], self.site.dialect
+        recorded: dict[str, Any]
+        if mode is DetectionMode.ANALOG and detector.analog is not None:
+            recorded = {
+                "kind": DatasetKind.ANALOG,
+                "device": f"BT{number}",
+                "adc_bits": detector.analog.adc_bits,
+                "input_range": detector.analog.adc_range * 1e-3,
+            }
+        else:
+            level = (detector.photon or PhotonCounter()).discriminator_level
+            recorded = {
+                "kind": DatasetKind.PHOTON,
+                "device": f"BC{number}",
+                "discriminator": level * LICEL_DISCRIMINATOR_STEP,
+            }
+        dataset = new_dataset(
+            wavelength=detector.wavelength * 1e-9,
+            polarisation=detector.polarisation,
+            bins=bins,
+            bin_width=bin_width,
+            shots=shots,
+            laser=dialect.laser,
+            high_voltage=detector.high_voltage,
+            **recorded,
+        )
+        return dialect.written_dataset(dataset)
 
     def _read_out(
         self,
@@ -466,30 +492,3 @@ def _truth_grid(site: SimulatedInstrument) -> TruthGrid:
         stops=cell_stops(bins, bin_width, settings.truth.cells),
         stride=-(-settings.files(site.key) // settings.truth.profiles),
     )
-
-
-def _dataset(
-    site: SimulatedInstrument,
-    acquisition: Acquisition,
-    detector: Detector,
-    mode: DetectionMode,
-    number: int,
-) -> Dataset:
-    analog = detector.analog if mode is DetectionMode.ANALOG else None
-    level = 0 if detector.photon is None else detector.photon.discriminator_level
-    bins, bin_width = _grid_of(acquisition, detector)
-    dataset = new_dataset(
-        kind=DatasetKind.PHOTON if analog is None else DatasetKind.ANALOG,
-        wavelength=detector.wavelength * 1e-9,
-        polarisation=detector.polarisation,
-        bins=bins,
-        bin_width=bin_width,
-        shots=acquisition.shots,
-        laser=site.dialect.laser,
-        high_voltage=detector.high_voltage,
-        adc_bits=0 if analog is None else analog.adc_bits,
-        input_range=0.0 if analog is None else analog.adc_range * 1e-3,
-        discriminator=level * LICEL_DISCRIMINATOR_STEP,
-        device=f"BC{number}" if analog is None else f"BT{number}",
-    )
-    return site.dialect.written_dataset(dataset)

@@ -17,8 +17,19 @@ from typing import Final, Literal
 import numpy as np
 
 from lidarops.campaign.model import Instrument, InstrumentFacts, Station, channel_facts
-from lidarops.campaign.simulated_instrument import Acquisition, DamageKind, Detector, DialectName
-from lidarops.campaign.simulation import HorizontalPath, InstrumentSimulation, SimulationSettings
+from lidarops.campaign.simulated_instrument import (
+    Acquisition,
+    DamageKind,
+    Detector,
+    DialectName,
+    Pointing,
+)
+from lidarops.campaign.simulation import (
+    HorizontalPath,
+    InstrumentSimulation,
+    Lidar,
+    SimulationSettings,
+)
 from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.raw.licel import Dataset, Laser, ScanGrid
@@ -199,6 +210,11 @@ class SimulatedInstrument:
         return self.settings.instruments[self.key]
 
     @property
+    def scan(self) -> Pointing | None:
+        """Sequence of zenith angles; None where the facts of the campaign give the pointing."""
+        return self.simulated.scan if isinstance(self.simulated, Lidar) else None
+
+    @property
     def dialect(self) -> Dialect:
         """Dialect of the headers."""
         return DIALECTS[self.simulated.acquisition.dialect]
@@ -275,9 +291,8 @@ class SimulatedInstrument:
         self, planned: PlannedFile, facts: InstrumentFacts
     ) -> tuple[float, float | None]:
         """Return zenith angle and azimuth of a file, degree; the azimuth is None if unknown."""
-        scan = self.simulated.pointing
-        if scan is not None:
-            cycle = scan.cycle()
+        if self.scan is not None:
+            cycle = self.scan.cycle()
             return cycle[planned.index % len(cycle)]
         if facts.zenith_angle is not None:
             return facts.zenith_angle, facts.azimuth

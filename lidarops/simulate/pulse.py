@@ -15,10 +15,11 @@ is the integral of :math:`R^{-2}` itself: a rectangular pulse gives the near-ran
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numba
 import numpy as np
@@ -48,139 +49,125 @@ class Origin(Enum):
     PEAK = "peak"
 
 
-class Pulse(Protocol):
+@dataclass(frozen=True, slots=True)
+class Pulse(ABC):
     """Power of a laser pulse of unit energy over time; time zero is range 0."""
 
-    @property
-    def start(self) -> float:
-        """Time before which no energy leaves, s."""
-
-    @property
-    def stop(self) -> float:
-        """Time after which no energy leaves, s."""
-
-    def passed(self, time: Array) -> Array:
-        """Return the share of the energy that has left by a time (s), from 0 to 1."""
-
-    def passed_integral(self, time: Array) -> Array:
-        """Return the integral of `passed` up to a time, s."""
-
-
-@dataclass(frozen=True, slots=True)
-class RectangularPulse:
-    """Constant power for a given time; the leading edge leaves at time zero."""
-
-    duration: float
-    """s."""
+    width: float
+    """s: duration of a rectangle, full width at half maximum of a Gaussian, or the time in which
+    the power of an exponential falls to 1/e."""
 
     def __post_init__(self) -> None:
-        _checks.between("duration", self.duration, 1e-15, 1e-3, "s")
+        _checks.between("width", self.width, 1e-15, 1e-3, "s")
 
     @property
-    def start(self) -> float:
-        """Time before which no energy leaves, s."""
+    def peak(self) -> float:
+        """Time of the highest power, s."""
         return 0.0
 
     @property
+    def unit(self) -> float:
+        """Unit of the time in which the shape is given, s."""
+        return self.width
+
+    @property
+    @abstractmethod
+    def ends(self) -> tuple[float, float]:
+        """Where the pulse is cut, in units from the peak."""
+
+    @property
+    def start(self) -> float:
+        """Time before which no energy leaves, s."""
+        return self.peak + self.ends[0] * self.unit
+
+    @property
     def stop(self) -> float:
         """Time after which no energy leaves, s."""
-        return self.duration
+        return self.peak + self.ends[1] * self.unit
 
     def passed(self, time: Array) -> Array:
-        """Return the share of the energy that has left by a time (s)."""
-        return np.clip(time / self.duration, 0.0, 1.0)
+        """Return the share of the energy that has left by a time (s), from 0 to 1."""
+        return self._share(np.clip((time - self.peak) / self.unit, *self.ends))
 
     def passed_integral(self, time: Array) -> Array:
         """Return the integral of `passed` up to a time, s."""
-        inside = np.clip(time, 0.0, self.duration)
-        after = np.clip(time - self.duration, 0.0, None)
-        return 0.5 * inside**2 / self.duration + after
+        u = np.clip((time - self.peak) / self.unit, *self.ends)
+        return self.unit * self._integral(u) + np.clip(time - self.stop, 0.0, None)
+
+    @abstractmethod
+    def _share(self, u: Array) -> Array:
+        """Return `passed` at times in units from the peak."""
+
+    @abstractmethod
+    def _integral(self, u: Array) -> Array:
+        """Return the integral of `_share` up to times in units from the peak."""
+
+
+class RectangularPulse(Pulse):
+    """Constant power for a given time; the leading edge leaves at time zero."""
+
+    ends = (0.0, 1.0)
+
+    def _share(self, u: Array) -> Array:
+        return u
+
+    def _integral(self, u: Array) -> Array:
+        return 0.5 * u**2
 
 
 @dataclass(frozen=True, slots=True)
-class GaussianPulse:
+class GaussianPulse(Pulse):
     """Gaussian power, cut at `reach` standard deviations on both sides of its peak."""
 
-    fwhm: float
-    """s, full width at half maximum of the power."""
     origin: Origin = Origin.LEADING_EDGE
     """Where time zero lies: at the leading cut or at the peak."""
     reach: float = 3.0
     """Standard deviations."""
 
     def __post_init__(self) -> None:
-        _checks.between("fwhm", self.fwhm, 1e-15, 1e-3, "s")
+        _checks.between("width", self.width, 1e-15, 1e-3, "s")
         _checks.between("reach", self.reach, 1.0, 8.0)
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the uncut Gaussian, s."""
-        return self.fwhm / _FWHM
 
     @property
     def peak(self) -> float:
         """Time of the highest power, s."""
-        return 0.0 if self.origin is Origin.PEAK else self.reach * self.deviation
+        return 0.0 if self.origin is Origin.PEAK else self.reach * self.unit
 
     @property
-    def start(self) -> float:
-        """Time before which no energy leaves, s."""
-        return self.peak - self.reach * self.deviation
+    def unit(self) -> float:
+        """Standard deviation of the uncut Gaussian, s."""
+        return self.width / _FWHM
 
     @property
-    def stop(self) -> float:
-        """Time after which no energy leaves, s."""
-        return self.peak + self.reach * self.deviation
+    def ends(self) -> tuple[float, float]:
+        """Where the pulse is cut, in units from the peak."""
+        return -self.reach, self.reach
 
-    def passed(self, time: Array) -> Array:
-        """Return the share of the energy that has left by a time (s)."""
-        z = np.clip((time - self.peak) / self.deviation, -self.reach, self.reach)
+    def _share(self, u: Array) -> Array:
         cut = ndtr(-self.reach)
-        share: Array = (ndtr(z) - cut) / (1.0 - 2.0 * cut)
+        share: Array = (ndtr(u) - cut) / (1.0 - 2.0 * cut)
         return share
 
-    def passed_integral(self, time: Array) -> Array:
-        """Return the integral of `passed` up to a time, s."""
+    def _integral(self, u: Array) -> Array:
         reach, cut = self.reach, ndtr(-self.reach)
-        z = np.clip((time - self.peak) / self.deviation, -reach, reach)
         low = -reach * cut + _density(np.array(reach))
-        inside = (z * ndtr(z) + _density(z) - low - cut * (z + reach)) / (1.0 - 2.0 * cut)
-        whole: Array = self.deviation * inside + np.clip(time - self.stop, 0.0, None)
-        return whole
+        inside = u * ndtr(u) + _density(u) - low - cut * (u + reach)
+        integral: Array = inside / (1.0 - 2.0 * cut)
+        return integral
 
 
-@dataclass(frozen=True, slots=True)
-class ExponentialPulse:
+class ExponentialPulse(Pulse):
     """Full power at time zero, then exponential decay, cut after 16 decay times."""
 
-    decay: float
-    """s, in which the power falls to 1/e."""
+    ends = (0.0, _DECAYS)
 
-    def __post_init__(self) -> None:
-        _checks.between("decay", self.decay, 1e-15, 1e-3, "s")
-
-    @property
-    def start(self) -> float:
-        """Time before which no energy leaves, s."""
-        return 0.0
-
-    @property
-    def stop(self) -> float:
-        """Time after which no energy leaves, s."""
-        return _DECAYS * self.decay
-
-    def passed(self, time: Array) -> Array:
-        """Return the share of the energy that has left by a time (s)."""
-        u = np.clip(time / self.decay, 0.0, _DECAYS)
+    def _share(self, u: Array) -> Array:
         share: Array = np.expm1(-u) / math.expm1(-_DECAYS)
         return share
 
-    def passed_integral(self, time: Array) -> Array:
-        """Return the integral of `passed` up to a time, s."""
-        u = np.clip(time / self.decay, 0.0, _DECAYS)
-        inside = (u + np.expm1(-u)) / -math.expm1(-_DECAYS)
-        whole: Array = self.decay * inside + np.clip(time - self.stop, 0.0, None)
-        return whole
+    def _integral(self, u: Array) -> Array:
+        integral: Array = (u + np.expm1(-u)) / -math.expm1(-_DECAYS)
+        return integral
 
 
 @dataclass(frozen=True, slots=True)
