@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from lidarops.campaign.simulated_instrument import AnalogRecorder
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.counting import Array, Counts, FastCounts, Photoelectrons, limited_rate
+from lidarops.simulate.counting import Array, Counts, Photoelectrons, limited_rate
 
 _NEGLIGIBLE: Final = 20.0
 """Harmonics of less than exp(-20) = 2e-9 steps are left out."""
 _NEGLIGIBLE_FAST: Final = 9.2
-"""The same for `digitise_fast`: 1e-4 steps."""
+"""The same where no photoelectrons were drawn: 1e-4 steps."""
 _LARGEST: Final = 2**31 - 1
 """Largest signed integer of 32 bits."""
 _FAR: Final = 8.0
@@ -58,8 +58,16 @@ def digitise(
     ndarray of int, shape (bins,)
         Digitiser steps summed over shots, 0 to shots times full scale; 0 without shots.
 
+    Raises
+    ------
+    SimulationInputError
+        If fast sums do not fit into 32 bits.
+
     Notes
     -----
+    Where no photoelectrons were drawn, sums have the same mean and variance by one Gaussian draw
+    per bin, and the bias of the rounding is accurate to 1e-4 steps.
+
     The mean of one sample of one shot is gain times rate, plus the dark offset, plus the bias of
     the rounding. Its noise is the shot noise of the photoelectrons (the same as in the photon
     counter), the spread of their charge (`excess_noise`), electronic noise and rounding noise;
@@ -73,60 +81,24 @@ def digitise(
     Where only some shots are clipped, the sum is too low although it is below full scale, as in
     a real instrument.
     """
-    if released.shots == 0:
-        return np.zeros(released.number.shape, dtype=np.int64)
-    sample = _sample(recorder, released.bin_time)
-    noise = random.standard_normal(released.rate.size)
-    total: Counts = _sum_samples(
-        released.rate, released.number, noise, sample, float(released.shots)
-    )
-    return total
-
-
-def digitise_fast(
-    rate: Array,
-    recorder: AnalogRecorder,
-    *,
-    shots: int,
-    bin_time: float,
-    random: np.random.Generator,
-) -> FastCounts:
-    """Draw sums over shots with the mean and variance of `digitise`, one Gaussian draw per bin.
-
-    Parameters
-    ----------
-    rate : ndarray, MHz, shape (bins,)
-        Expected rate of photoelectrons.
-    recorder : AnalogRecorder
-    shots : int
-    bin_time : float, s
-        For which a bin is open after one shot.
-    random : numpy.random.Generator
-
-    Raises
-    ------
-    SimulationInputError
-        If a rate, a time or the number of shots is negative or NaN, or the sums do not fit into 32
-        bits.
-
-    Notes
-    -----
-    The bias of the rounding is accurate to 1e-4 steps.
-    """
-    rate = _checked(rate, bin_time)
-    _checks.not_negative("shots", shots)
+    shots, rate = released.shots, released.rate
     if shots == 0:
-        return np.zeros(rate.shape, dtype=np.int32)
-    top = 2**recorder.adc_bits - 1
-    if shots * top > _LARGEST:
+        return np.zeros(rate.shape, dtype=np.int64)
+    total: Counts
+    if released.number is not None:
+        sample = _sample(recorder, released.bin_time)
+        noise = random.standard_normal(rate.size)
+        total = _sum_samples(rate, released.number, noise, sample, float(shots))
+        return total
+    sample = _sample(recorder, released.bin_time, _NEGLIGIBLE_FAST)
+    if shots * sample.top > _LARGEST:
         raise SimulationInputError(
             f"of {shots} with {recorder.adc_bits} bits do not fit into 32 bits",
             field="shots",
-            remedy="take fewer shots, or use digitise",
+            remedy="take fewer shots, or draw photoelectrons",
         )
-    noise = random.standard_normal(rate.size, dtype=np.float32)
-    sample = _sample(recorder, bin_time, _NEGLIGIBLE_FAST)
-    total: FastCounts = _draw_sums(rate, noise, sample, float(shots))
+    fast_noise = random.standard_normal(rate.size, dtype=np.float32)
+    total = _draw_sums(rate, fast_noise, sample, float(shots))
     return total
 
 
@@ -141,14 +113,9 @@ def sample_moments(
     recorder : AnalogRecorder
     bin_time : float, s
     """
-    rate = _checked(rate, bin_time)
-    both = _moments_of(rate, _sample(recorder, bin_time))
-    return both[0], both[1]
-
-
-def _checked(rate: Array, bin_time: float) -> Array:
     _checks.positive("bin_time", bin_time, "s")
-    return limited_rate(rate)
+    both = _moments_of(limited_rate(rate), _sample(recorder, bin_time))
+    return both[0], both[1]
 
 
 class _Sample(NamedTuple):

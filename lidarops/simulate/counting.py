@@ -14,8 +14,7 @@ from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.simulate import _checks
 from lidarops.simulate._checks import SimulationInputError
 
-Counts = NDArray[np.int64]
-FastCounts = NDArray[np.int32]
+Counts = NDArray[np.signedinteger[Any]]
 Array = NDArray[np.float64]
 
 BRIGHTEST: Final = 1.0e6
@@ -32,8 +31,9 @@ class Photoelectrons:
 
     rate: Array
     """Expected rate, MHz, shape (bins,)."""
-    number: Counts
-    """Number released in each bin, summed over shots."""
+    number: Counts | None
+    """Number released in each bin, summed over shots; None where noise is drawn in a fast,
+    approximate way: one Gaussian draw per bin, not shared by the recorders of a detector."""
     shots: int
     bin_time: float
     """s for which a bin is open after one shot."""
@@ -58,7 +58,7 @@ def limited_rate(rate: Array) -> Array:
 
 
 def release(
-    rate: Array, *, shots: int, bin_width: float, random: np.random.Generator
+    rate: Array, *, shots: int, bin_width: float, random: np.random.Generator | None
 ) -> Photoelectrons:
     """Draw the photoelectrons of a file, Poisson-distributed in every bin.
 
@@ -71,7 +71,8 @@ def release(
     bin_width : float, m
         Converted to time by the nominal 150 m per microsecond of the format (`licel2023`), as
         readers convert counts to MHz.
-    random : numpy.random.Generator
+    random : numpy.random.Generator or None
+        None for a fast simulation: no photoelectrons are drawn.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def release(
     _checks.positive("bin_width", bin_width, "m")
     bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
     rate = limited_rate(rate)
-    number = random.poisson(rate * (shots * bin_time * 1e6))
+    number = None if random is None else random.poisson(rate * (shots * bin_time * 1e6))
     return Photoelectrons(rate=rate, number=number, shots=shots, bin_time=bin_time)
 
 
@@ -129,12 +130,14 @@ def delay_recorder(
             field="first",
             remedy="release the photoelectrons on a longer axis",
         )
-    rate, number = released.rate[whole:last], released.number[whole:last]
+    rate = released.rate[whole:last]
+    number = None if released.number is None else released.number[whole:last]
     if fraction > 0.0:
         late = _later_share(released.rate, fraction)[whole:last]
-        later = random.binomial(number, late)
         rate = rate[:-1] * late[:-1] + (rate * (1.0 - late))[1:]
-        number = later[:-1] + (number - later)[1:]
+        if number is not None:
+            later = random.binomial(number, late)
+            number = later[:-1] + (number - later)[1:]
     return Photoelectrons(rate, number, released.shots, released.bin_time)
 
 
@@ -171,8 +174,16 @@ def count_photons(
     ndarray of int, shape (bins,)
         Counts summed over shots; 0 without shots.
 
+    Raises
+    ------
+    SimulationInputError
+        If the dead time is negative or NaN, or fast counts do not fit into 32 bits.
+
     Notes
     -----
+    Where no photoelectrons were drawn, counts have the mean and variance of `counter_moments` by
+    Gaussian noise: few counts are not Poisson. Else:
+
     Of N events in the exposure T, each meets on average :math:`x_0 = (N - 1) \tau / T` others in
     one dead time. For bins of length t, the share a = tau / 2 t of the dead time before an event
     lies in the previous bin, with :math:`N_-` events of which :math:`C_-` were counted. The
@@ -204,65 +215,27 @@ def count_photons(
     `cox1962`.
     """
     _checks.not_negative("dead_time", dead_time, "s")
+    in_previous = _share_in_previous(dead_time, released.bin_time)
+    counted: Counts
+    if released.number is None:
+        rate, exposure = released.rate, released.exposure
+        most = exposure * min(rate.max(initial=0.0), 1e-6 / dead_time if dead_time else np.inf)
+        if most + 10.0 * sqrt(most) > _LARGEST:
+            raise SimulationInputError(
+                f"of {released.shots} give {most:.3g} counts, more than 32 bits hold",
+                field="shots",
+                remedy="take fewer shots, or draw photoelectrons",
+            )
+        noise = random.standard_normal(rate.size, dtype=np.float32)
+        counted = _draw_counts(
+            rate, noise, exposure, dead_time * 1e6, 2.0 * in_previous, paralyzable
+        )
+        return counted
     if released.shots == 0 or dead_time == 0.0:
         return released.number.copy()
-    exposure = released.exposure * 1e-6
-    in_previous = _share_in_previous(dead_time, released.bin_time)
-    counted: Counts = _count_events(
-        released.number, dead_time / exposure, in_previous, paralyzable, random
-    )
+    per_event = dead_time / (released.exposure * 1e-6)
+    counted = _count_events(released.number, per_event, in_previous, paralyzable, random)
     return counted
-
-
-def count_fast(
-    rate: Array,
-    *,
-    shots: int,
-    bin_time: float,
-    dead_time: float,
-    random: np.random.Generator,
-    paralyzable: bool = False,
-) -> FastCounts:
-    """Draw counts with the right mean and variance from Gaussian noise, one draw per bin.
-
-    Parameters
-    ----------
-    rate : ndarray, MHz, shape (bins,)
-        Expected rate of photoelectrons.
-    shots : int
-    bin_time : float, s
-        For which a bin is open after one shot.
-    dead_time : float, s
-    random : numpy.random.Generator
-    paralyzable : bool
-
-    Raises
-    ------
-    SimulationInputError
-        If a rate, a time or the number of shots is negative or NaN, or the counts do not fit into
-        32 bits.
-
-    Notes
-    -----
-    Meant for many counts: few counts have the right mean and variance, but are not Poisson. The
-    noise is not shared with an analog recorder.
-    """
-    rate = _checked(rate, bin_time, dead_time)
-    _checks.not_negative("shots", shots)
-    exposure = shots * bin_time * 1e6
-    most = exposure * min(rate.max(initial=0.0), 1e-6 / dead_time if dead_time else np.inf)
-    if most + 10.0 * sqrt(most) > _LARGEST:
-        raise SimulationInputError(
-            f"of {shots} give {most:.3g} counts, more than 32 bits hold",
-            field="shots",
-            remedy="take fewer shots, or use count_photons",
-        )
-    noise = random.standard_normal(rate.size, dtype=np.float32)
-    in_previous = 2.0 * _share_in_previous(dead_time, bin_time)
-    counts: FastCounts = _draw_counts(
-        rate, noise, exposure, dead_time * 1e6, in_previous, paralyzable
-    )
-    return counts
 
 
 def counter_moments(
@@ -288,16 +261,12 @@ def counter_moments(
     ----------
     `cox1962`.
     """
-    rate = _checked(rate, bin_time, dead_time)
+    _checks.positive("bin_time", bin_time, "s")
+    _checks.not_negative("dead_time", dead_time, "s")
+    rate = limited_rate(rate)
     in_previous = 2.0 * _share_in_previous(dead_time, bin_time)
     both = _moments_of(rate, bin_time * 1e6, dead_time * 1e6, in_previous, paralyzable)
     return both[0], both[1]
-
-
-def _checked(rate: Array, bin_time: float, dead_time: float) -> Array:
-    _checks.positive("bin_time", bin_time, "s")
-    _checks.not_negative("dead_time", dead_time, "s")
-    return limited_rate(rate)
 
 
 def _share_in_previous(dead_time: float, bin_time: float) -> float:

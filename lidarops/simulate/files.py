@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +19,10 @@ from lidarops.campaign.simulated_instrument import (
     Detector,
     PhotonCounter,
 )
-from lidarops.constants import LICEL_DISCRIMINATOR_STEP, LICEL_RANGE_PER_MICROSECOND
+from lidarops.constants import LICEL_DISCRIMINATOR_STEP
 from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset, new_header
 from lidarops.records import DetectionMode, Role
-from lidarops.simulate.analog import digitise, digitise_fast
+from lidarops.simulate.analog import digitise
 from lidarops.simulate.atmosphere import (
     Air,
     Beam,
@@ -32,9 +31,8 @@ from lidarops.simulate.atmosphere import (
     solar_elevation,
 )
 from lidarops.simulate.counting import (
-    BRIGHTEST,
+    Counts,
     Photoelectrons,
-    count_fast,
     count_photons,
     delay_recorder,
     release,
@@ -54,7 +52,6 @@ from lidarops.simulate.signal import backscatter_signal, bin_centres
 from lidarops.simulate.truth import FileTruth, TruthGrid, cell_stops
 
 Array = NDArray[np.float64]
-AnyCounts = NDArray[np.signedinteger[Any]]
 Key = tuple[object, ...]
 Cached = TypeVar("Cached")
 
@@ -101,15 +98,19 @@ class _Conditions:
 class _Light:
     """Light on a detector, in MHz of photoelectrons."""
 
-    rate: Array
-    bin_time: float
-    """s for which a bin is open after one shot."""
+    electrons: Photoelectrons
+    sky: float = 0.0
     extinction: float = math.nan
     """m-1; NaN if the path is not homogeneous."""
     amplitude: float = math.nan
-    sky: float = 0.0
-    electrons: Photoelectrons | None = None
-    """None in a fast simulation."""
+
+
+class _Nominal(NamedTuple):
+    """Light at nominal laser energy, without sky."""
+
+    rate: Array
+    extinction: float
+    amplitude: float
 
 
 class Simulator:
@@ -124,7 +125,7 @@ class Simulator:
         self.site = site
         self._datasets: dict[tuple[int, float, int], tuple[Dataset, ...]] = {}
         self._paths: dict[Key, BeamPath] = {}
-        self._signals: dict[Key, _Light] = {}
+        self._signals: dict[Key, _Nominal] = {}
         self._position = site.position
         self._air = Air(
             site.settings.air_of(site.key),
@@ -158,7 +159,7 @@ class Simulator:
         site = self.site
         random = random_stream(site.settings.seed, site.key, planned.role, planned.index)
         conditions = self._conditions(planned, random)
-        counts: dict[str, AnyCounts] = {}
+        counts: dict[str, Counts] = {}
         true: dict[str, float] = {}
         for detector in site.simulated.detectors:
             lights = self._lights(conditions, detector, random)
@@ -292,26 +293,17 @@ class Simulator:
         mode: DetectionMode,
         light: _Light,
         random: np.random.Generator,
-    ) -> tuple[AnyCounts, dict[str, float]]:
+    ) -> tuple[Counts, dict[str, float]]:
         """Return the counts of a recorder, and its true values."""
         unit, dark = 1.0, {}
         if mode is DetectionMode.ANALOG and detector.analog is not None:
             recorder = _drifted(detector.analog, conditions.hours)
-            counts = self._digitised(light, recorder, conditions, random)
+            counts = digitise(light.electrons, recorder, random=random)
             unit, dark = recorder.gain, {"dark_offset": recorder.dark_offset}
         else:
             name = channel_name(mode, detector)
-            counter: Callable[..., AnyCounts] = (
-                partial(count_photons, light.electrons)
-                if light.electrons
-                else partial(
-                    count_fast,
-                    light.rate,
-                    shots=conditions.acquisition.shots,
-                    bin_time=light.bin_time,
-                )
-            )
-            counts = counter(
+            counts = count_photons(
+                light.electrons,
                 dead_time=photon_dead_time(self.site, conditions.planned.start, name),
                 paralyzable=(detector.photon or PhotonCounter()).paralyzable,
                 random=random,
@@ -322,23 +314,6 @@ class Simulator:
             "amplitude": unit * light.amplitude,
             **dark,
         }
-
-    def _digitised(
-        self,
-        light: _Light,
-        recorder: AnalogRecorder,
-        conditions: _Conditions,
-        random: np.random.Generator,
-    ) -> AnyCounts:
-        if light.electrons is not None:
-            return digitise(light.electrons, recorder, random=random)
-        return digitise_fast(
-            light.rate,
-            recorder,
-            shots=conditions.acquisition.shots,
-            bin_time=light.bin_time,
-            random=random,
-        )
 
     def _lights(
         self, conditions: _Conditions, detector: Detector, random: np.random.Generator
@@ -362,10 +337,8 @@ class Simulator:
         lights = {}
         for offset in offsets:
             start = (offset - first) / bin_width
-            electrons = delay_recorder(
-                cast("Photoelectrons", common.electrons), start, bins, random=random
-            )
-            lights[offset] = replace(common, rate=electrons.rate, electrons=electrons)
+            electrons = delay_recorder(common.electrons, start, bins, random=random)
+            lights[offset] = replace(common, electrons=electrons)
         return lights
 
     def _light(
@@ -375,27 +348,23 @@ class Simulator:
         grid: _BinGrid,
         random: np.random.Generator,
     ) -> _Light:
-        acquisition, background = conditions.acquisition, detector.background
-        if conditions.planned.role is Role.DARK:
-            light = _Light(np.zeros(grid.bins), _bin_time(grid))
-        else:
-            nominal = self._nominal_light(conditions, detector, grid)
-            sky = background.night + (background.day - background.night) * conditions.sky
-            light = replace(
-                nominal,
-                rate=np.minimum(conditions.energy * nominal.rate + sky, BRIGHTEST),
-                amplitude=conditions.energy * nominal.amplitude,
-                sky=sky,
-            )
-        if self.site.settings.fast:
-            return light
-        electrons = release(
-            light.rate, shots=acquisition.shots, bin_width=grid.bin_width, random=random
+        released = partial(
+            release,
+            shots=conditions.acquisition.shots,
+            bin_width=grid.bin_width,
+            random=None if self.site.settings.fast else random,
         )
-        return replace(light, electrons=electrons)
+        if conditions.planned.role is Role.DARK:
+            return _Light(released(np.zeros(grid.bins)))
+        nominal, energy = self._nominal_light(conditions, detector, grid), conditions.energy
+        background = detector.background
+        sky = background.night + (background.day - background.night) * conditions.sky
+        electrons = released(energy * nominal.rate + sky)
+        return _Light(electrons, sky, nominal.extinction, energy * nominal.amplitude)
 
-    def _nominal_light(self, conditions: _Conditions, detector: Detector, grid: _BinGrid) -> _Light:
-        """Return the signal at nominal laser energy, without sky."""
+    def _nominal_light(
+        self, conditions: _Conditions, detector: Detector, grid: _BinGrid
+    ) -> _Nominal:
         full = conditions.facts.full_overlap_range
         key = detector.label, full, grid, conditions.beam, conditions.air_state
         if key in self._signals:
@@ -403,33 +372,26 @@ class Simulator:
         path = self._path(conditions, detector.wavelength * 1e-9, grid)
         distance = bin_centres(*grid)
         constant, pulse = detector.system_constant, self.site.simulated.pulse
+        receiver: dict[str, Any] = {"system_constant": constant, "full_overlap_range": full}
         extinction = amplitude = math.nan
         if detector.raman is not None:
             rate = backscatter_signal(
                 distance,
                 extinction=self._path(conditions, detector.raman.laser * 1e-9, grid).extinction,
                 backscatter=self._air.raman_along(conditions.beam, distance, detector.raman),
-                system_constant=constant,
-                full_overlap_range=full,
                 returning_extinction=path.extinction,
+                **receiver,
             )
         elif pulse is None:
             rate = backscatter_signal(
-                distance,
-                extinction=path.extinction,
-                backscatter=path.backscatter,
-                system_constant=constant,
-                full_overlap_range=full,
+                distance, extinction=path.extinction, backscatter=path.backscatter, **receiver
             )
         else:
-            rate = pulse_echo(
-                distance, path, pulse, system_constant=constant, full_overlap_range=full
-            )
+            rate = pulse_echo(distance, path, pulse, **receiver)
         if path.homogeneous and detector.raman is None:
             extinction = float(path.extinction[0])
             amplitude = constant * float(path.backscatter[0])
-        light = _Light(rate, _bin_time(grid), extinction, amplitude)
-        return _cache(self._signals, key, light)
+        return _cache(self._signals, key, _Nominal(rate, extinction, amplitude))
 
     def _path(self, conditions: _Conditions, wavelength: float, grid: _BinGrid) -> BeamPath:
         key = wavelength, grid, conditions.beam, conditions.air_state
@@ -456,10 +418,6 @@ class Simulator:
 
 def _offset(conditions: _Conditions, channel: str) -> float:
     return channel_facts(conditions.facts, channel).range_offset or 0.0
-
-
-def _bin_time(grid: _BinGrid) -> float:
-    return grid.bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
 
 
 def _cache(cache: dict[Key, Cached], key: Key, value: Cached) -> Cached:

@@ -13,7 +13,6 @@ from support.oracles.counter import registered
 from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.counting import (
     BRIGHTEST,
-    count_fast,
     count_photons,
     counter_moments,
     release,
@@ -136,10 +135,9 @@ def test_a_bright_bin_blinds_the_start_of_the_next(paralyzable):
 @pytest.mark.parametrize("rate", [0.02, 0.3, 2.0, 25.0, 200.0])
 def test_fast_counts_have_the_moments_of_the_full_ones(rate, paralyzable):
     bins, shots = 100_000, 600
-    fast = count_fast(
-        np.full(bins, rate), shots=shots, bin_time=BIN_TIME, dead_time=DEAD_TIME,
-        paralyzable=paralyzable, random=np.random.default_rng(8),
-    )  # fmt: skip
+    light = release(np.full(bins, rate), shots=shots, bin_width=BIN_WIDTH, random=None)
+    random = np.random.default_rng(8)
+    fast = count_photons(light, dead_time=DEAD_TIME, paralyzable=paralyzable, random=random)
     full = _counted(rate, paralyzable, shots=shots, bins=bins)[1]
     error = full.std() * np.sqrt(2 / bins)
     # Negative draws of the faintest are cut at zero.
@@ -172,10 +170,8 @@ def test_without_shots_nothing_is_measured():
     light = release(np.full(100, 50.0), shots=0, bin_width=BIN_WIDTH, random=random)
     counted = count_photons(light, dead_time=DEAD_TIME, random=random)
     assert not counted.any()
-    fast = count_fast(
-        np.full(9, 3.0), shots=0, bin_time=BIN_TIME, dead_time=DEAD_TIME, random=random
-    )
-    assert not fast.any()
+    light = release(np.full(9, 3.0), shots=0, bin_width=BIN_WIDTH, random=None)
+    assert not count_photons(light, dead_time=DEAD_TIME, random=random).any()
 
 
 def test_impossible_light_is_refused():

@@ -14,37 +14,26 @@ from lidarops.campaign.simulated_instrument import AnalogRecorder
 from lidarops.campaign.simulation import SimulationSettings
 from lidarops.errors import CatalogError
 from lidarops.retrieve.air.molecular import us_standard
+from lidarops.simulate import analog
 from lidarops.simulate._checks import SimulationInputError
-from lidarops.simulate.analog import digitise_fast
 from lidarops.simulate.atmosphere import Air, solar_elevation
 from lidarops.simulate.campaign import simulate_campaign
-from lidarops.simulate.counting import count_fast, counter_moments
+from lidarops.simulate.counting import count_photons, counter_moments, release
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
+BIN_WIDTH = 7.5
 BIN_TIME = 50e-9
 RECORDER = AnalogRecorder(gain=0.1, noise=0.3, dark_offset=3.0)
 
 
-def count(rate, shots=600, dead_time=4e-9, bin_time=BIN_TIME):
-    random = np.random.Generator(np.random.Philox(1))
-    return count_fast(
-        np.asarray(rate, dtype=np.float64),
-        shots=shots,
-        bin_time=bin_time,
-        dead_time=dead_time,
-        random=random,
-    )
+def count(rate, shots=600):
+    light = release(np.asarray(rate, np.float64), shots=shots, bin_width=BIN_WIDTH, random=None)
+    return count_photons(light, dead_time=4e-9, random=np.random.Generator(np.random.Philox(1)))
 
 
-def digitise(rate, shots=600, recorder=RECORDER):
-    random = np.random.Generator(np.random.Philox(1))
-    return digitise_fast(
-        np.asarray(rate, dtype=np.float64),
-        recorder,
-        shots=shots,
-        bin_time=BIN_TIME,
-        random=random,
-    )
+def digitise(rate, shots=600):
+    light = release(np.asarray(rate, np.float64), shots=shots, bin_width=BIN_WIDTH, random=None)
+    return analog.digitise(light, RECORDER, random=np.random.Generator(np.random.Philox(1)))
 
 
 @pytest.mark.parametrize("record", [count, digitise])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lidarops.records import DetectionMode
 from lidarops.simulate import files
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -38,18 +39,24 @@ def undershoot(share: float, length: float) -> Baseline:
 
 def record_with(monkeypatch: pytest.MonkeyPatch, baseline: Baseline | None) -> None:
     """Add a baseline to all analog records that are simulated, of dark files too."""
-    plain = files.Simulator._digitised
+    plain = files.Simulator._read_out
 
-    def digitised(simulator: Any, light: Any, recorder: Any, conditions: Any, random: Any) -> Any:
-        acquisition = conditions.acquisition
-        distance = (np.arange(light.rate.size) + 0.5) * acquisition.bin_width
+    def read_out(simulator: Any, conditions: Any, detector: Any, *about: Any) -> Any:
+        mode, light, random = about
+        acquisition, rate = conditions.acquisition, light.electrons.rate
+        distance = (np.arange(rate.size) + 0.5) * acquisition.bin_width
+        if mode is not DetectionMode.ANALOG:
+            return plain(simulator, conditions, detector, *about)
         if 90.0 - conditions.zenith_angle < LOWEST_FREE:
-            light = replace(light, rate=np.where(distance > WALL, light.sky, light.rate))
-        counts = plain(simulator, light, recorder, conditions, random)
+            rate = np.where(distance > WALL, light.sky, rate)
+            light = replace(light, electrons=replace(light.electrons, rate=rate))
+        counts, truth = plain(simulator, conditions, detector, mode, light, random)
         if baseline is None:
-            return counts
-        voltage = baseline(distance, (light.rate - light.sky) * recorder.gain)
+            return counts, truth
+        recorder = detector.analog
+        voltage = baseline(distance, (rate - light.sky) * recorder.gain)
         added = np.rint(voltage * acquisition.shots / recorder.step).astype(counts.dtype)
-        return np.clip(counts + added, 0, acquisition.shots * (2**recorder.adc_bits - 1))
+        top = acquisition.shots * (2**recorder.adc_bits - 1)
+        return np.clip(counts + added, 0, top), truth
 
-    monkeypatch.setattr(files.Simulator, "_digitised", digitised)
+    monkeypatch.setattr(files.Simulator, "_read_out", read_out)

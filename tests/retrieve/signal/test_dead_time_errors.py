@@ -12,7 +12,7 @@ from lidarops.products.signal.variables import FLAGS
 from lidarops.retrieve.signal.labeled import condition, correct_for_range
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage
 from lidarops.retrieve.signal.labeled_gluing import glue
-from lidarops.simulate.counting import count_fast
+from lidarops.simulate.counting import count_photons, release
 
 BIN_WIDTH = 7.5
 RANGE = BIN_WIDTH * (np.arange(2000) + 0.5)
@@ -32,19 +32,9 @@ def light(constant):
 def archive(rate, dead_time, *, paralyzable=False, seed=1):
     """Return raw counts of a photon-counting and an analog recorder of the same light."""
     rng = np.random.default_rng(seed)
-    photon = np.stack(
-        [
-            count_fast(
-                rate,
-                shots=SHOTS,
-                bin_time=BIN_WIDTH / 150e6,
-                dead_time=dead_time,
-                paralyzable=paralyzable,
-                random=rng,
-            )
-            for _ in range(PROFILES)
-        ]
-    )
+    released = release(rate, shots=SHOTS, bin_width=BIN_WIDTH, random=None)
+    counter = {"dead_time": dead_time, "paralyzable": paralyzable, "random": rng}
+    photon = np.stack([count_photons(released, **counter) for _ in range(PROFILES)])
     voltage = rate / 20.0 + 2.0 + 0.005 * rng.standard_normal(photon.shape)
     counts = {"photon": photon, "analog": np.rint(voltage * SHOTS * 4096 / 500.0)}
     attributes = {
