@@ -14,7 +14,6 @@ from pydantic import AfterValidator, Field, model_validator
 
 from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period, ordered
 from lidarops.constants import PLANCK, SPEED_OF_LIGHT
-from lidarops.raw.licel_header import four_characters
 from lidarops.settings import SettingsModel, quantity
 
 if TYPE_CHECKING:
@@ -27,12 +26,16 @@ LEAST_NOISE: Final = 0.02
 this would need more harmonics of it than double precision resolves."""
 
 
-def _fits_lines(width: float) -> float:
-    four_characters(width)
-    return width
+def _four_characters(value: float) -> float:
+    written = f"{value:.2f}"[:4] if value < 100 else f"{value:04.0f}"
+    if abs(float(written) - value) > 1e-12 * value:
+        raise ValueError(
+            f"{value:g} does not fit into the four characters of a raw header, such as 7.5 or 3.75"
+        )
+    return value
 
 
-BinWidth = Annotated[float, Field(ge=0.5, le=150), AfterValidator(_fits_lines)]
+BinWidth = Annotated[float, Field(ge=0.5, le=150), AfterValidator(_four_characters)]
 """m."""
 
 

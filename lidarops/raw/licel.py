@@ -13,6 +13,7 @@ Writing
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,7 +35,6 @@ from lidarops.raw.licel_header import (
     Header,
     Laser,
     ScanGrid,
-    four_characters,
     parse_dataset,
     parse_header,
 )
@@ -218,7 +218,7 @@ def new_dataset(
         f"{bins:05d}",
         f"{laser_polarisation:d}",
         f"{high_voltage:04.0f}",
-        four_characters(bin_width),
+        _four_characters(bin_width),
         f"{round(wavelength * 1e9):05d}.{polarisation}",
         "0 0",
         f"{thousandths // 1000:02d}",
@@ -427,6 +427,13 @@ def _line(*tokens: str) -> bytes:
         return text.ljust(_LINE).encode("latin-1") + b"\r\n"
     except UnicodeEncodeError:
         raise RawFormatError(f"{text!r} is not Latin-1 text") from None
+
+
+def _four_characters(width: float) -> str:
+    text = f"{width:.2f}"[:4] if width < 100 else f"{width:04.0f}"
+    if not math.isclose(float(text), width, rel_tol=1e-12):
+        raise RawFormatError(f"{width:g} cannot be written in four characters", field="bin width")
+    return text
 
 
 def _place(form: str, **values: float | None) -> str:

@@ -581,22 +581,6 @@ def _parse_datasets(
     )
 
 
-def four_characters(width: float) -> str:
-    """Return a bin width (m) as dataset lines hold it.
-
-    Raises
-    ------
-    RawFormatError
-        If it does not fit.
-    """
-    text = f"{width:.2f}"[:4] if width < 100 else f"{width:04.0f}"
-    if not math.isclose(float(text), width, rel_tol=1e-12):
-        raise RawFormatError(
-            f"{width:g} does not fit into the four characters of a raw header, such as 7.5 or 3.75"
-        )
-    return text
-
-
 def _parse_lines(block: bytes) -> list[Dataset]:
     datasets: list[Dataset] = []
     for line in _BLOCK_LINE.finditer(block):
