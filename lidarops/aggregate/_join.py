@@ -9,11 +9,12 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names, refuse_changed
+from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.read import reading
 from lidarops.netcdf.variables import attributes
+from lidarops.system.files import within
 
 _PER_PRODUCT: Final = (
     "date_", "history", "id", "lidarops_input_count", "lidarops_plan", "lidarops_scene",
@@ -34,12 +35,13 @@ def shared_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     }
 
 
-def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
+def open_piece(root: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
     """Open a product, with the dimension ``product`` for variables of the whole product.
 
     Parameters
     ----------
-    file : path
+    root : path
+        Folder that the path of the product is relative to.
     facts : Facts
     dask : bool
         Whether values become dask arrays; without it, each read costs less.
@@ -56,12 +58,13 @@ def open_piece(file: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
         If the file cannot be read, or has changed since its facts were read.
     """
     chunks: dict[str, int] | None = {} if dask else None
+    file = within(root, facts.path)
     with reading(file):
         opened = xr.open_dataset(
             file, engine="netcdf4", chunks=chunks, drop_variables=list(UNSHARED), decode_cf=False
         )
     try:
-        refuse_changed(opened, facts)
+        facts.refuse_changed(opened)
     except ProductError:
         opened.close()
         raise

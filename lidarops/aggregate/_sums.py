@@ -2,35 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate.facts import Facts, opened, refuse_changed
-from lidarops.aggregate.means_variables import (
-    Weights,
-    averaged,
-    budget_of,
-    states_clouds,
-    systematic,
-)
+from lidarops.aggregate.means_variables import Weights, averaged, budget_of, systematic
 from lidarops.flags import Quality
-from lidarops.kinds import flags_of
 from lidarops.netcdf.quantities import CLOUD_FRACTION, CLOUD_MASK
 from lidarops.netcdf.stored_flags import with_current_flags
-from lidarops.netcdf.variables import QUALITY_FLAG, ErrorBudget, Row, layout_of, whole_error
-from lidarops.system.files import within
+from lidarops.netcdf.variables import QUALITY_FLAG, Layout, Row, whole_error
 
 _ALL_BITS: Final = np.int32(-1)
 _WEIGHED: Final = np.int32(Quality.LOW_SIGNAL_TO_NOISE)
 
 Array = NDArray[np.float64]
-Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,17 +52,6 @@ class Sample:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Mean:
-    """Mean and errors of a period; arrays of shape (...), NaN without a usable value."""
-
-    mean: Array
-    standard_error: Array
-    standard_deviation: Array
-    systematic: Mapping[str, Array]
-    observations: Counts
-
-
 @dataclass(slots=True)
 class Sums:
     r"""Weighted sums of one quantity over the profiles of one period.
@@ -89,31 +67,14 @@ class Sums:
     squared (`gum2008`, section 5.2).
     """
 
-    weight: Array
-    value: Array
-    random: Array
-    shared: tuple[Array, ...]
-    systematic: Mapping[str, Array]
-    count: Counts
-    centre: Array
+    totals: dict[Hashable, Any] = field(default_factory=dict)
+    """Sums of weights, and of values and errors times their weights; of shared errors by their
+    number, of systematic ones by their variable."""
+    count: Any = 0
+    centre: Any = 0.0
     """Unweighted mean so far, for `spread`."""
-    spread: Array
+    spread: Any = 0.0
     """Sum of squared deviations from `centre`."""
-
-    @classmethod
-    def like(cls, sample: Sample) -> Sums:
-        """Return empty sums with the shape of a sample."""
-        zeros = np.zeros(sample.values.shape[1:])
-        return cls(
-            weight=zeros.copy(),
-            value=zeros.copy(),
-            random=zeros.copy(),
-            shared=tuple(zeros.copy() for _ in sample.shared),
-            systematic={name: zeros.copy() for name in sample.systematic},
-            count=zeros.astype(np.int64),
-            centre=zeros.copy(),
-            spread=zeros.copy(),
-        )
 
     def add(self, sample: Sample, weights: Array) -> None:
         """Add the profiles of one product.
@@ -127,14 +88,8 @@ class Sums:
         used = _used(sample) & (weights > 0.0) & np.isfinite(weights)
         # Unused values must be finite too, because 0 x NaN is NaN.
         weights = np.where(used, weights, 0.0)
-        self.weight += weights.sum(axis=0)
-        self.value += _sum(weights, sample.values, used)
-        self.random += _sum(weights**2, sample.random**2, used)
-        for total, part in zip(self.shared, sample.shared, strict=True):
-            np.add(total, _sum(weights, part, used), out=total)
-        for name, total in self.systematic.items():
-            # The error of a mean is unknown where that of one profile is.
-            np.add(total, np.where(used, weights * sample.systematic[name], 0.0).sum(0), out=total)
+        for key, term in _terms(sample, weights):
+            self.totals[key] = self.totals.get(key, 0.0) + np.where(used, term, 0.0).sum(axis=0)
         self._spread(np.where(used, sample.values, 0.0), used)
 
     def _spread(self, values: Array, used: NDArray[np.bool_]) -> None:
@@ -144,30 +99,39 @@ class Sums:
         centre = values.sum(axis=0) / np.maximum(count, 1)
         inner = np.where(used, (values - centre) ** 2, 0.0).sum(axis=0)
         shift = np.where(count > 0, centre - self.centre, 0.0)
-        self.spread += inner + shift**2 * (self.count * count / np.maximum(total, 1))
-        self.centre += shift * (count / np.maximum(total, 1))
+        self.spread = self.spread + (inner + shift**2 * (self.count * count / np.maximum(total, 1)))
+        self.centre = self.centre + shift * (count / np.maximum(total, 1))
         self.count = total
 
-    def mean(self) -> Mean:
-        """Return the mean and its errors."""
-        weight = np.where(self.count > 0, self.weight, np.nan)
-        variance = self.random / weight**2
-        for part in self.shared:
-            variance += (part / weight) ** 2
+    def mean(self, name: str) -> dict[str, NDArray[Any]]:
+        """Return the variables of the mean of a quantity with this name.
+
+        They have the shape (...) of a profile, and are NaN without a usable value.
+        """
+        totals = self.totals
+        weight = np.where(self.count > 0, totals["weight"], np.nan)
+        variance = totals["random"] / weight**2
+        for key, total in totals.items():
+            if isinstance(key, int):
+                variance += (total / weight) ** 2
         degrees = np.where(self.count > 1, self.count - 1.0, np.nan)
-        return Mean(
-            self.value / weight,
-            np.sqrt(variance),
-            np.sqrt(self.spread / degrees),
-            {name: total / weight for name, total in self.systematic.items()},
-            self.count,
-        )
+        plain = ("weight", "value", "random")
+        return {
+            name: totals["value"] / weight,
+            f"{name}_standard_error": np.sqrt(variance),
+            f"{name}_standard_deviation": np.sqrt(self.spread / degrees),
+            f"{name}_observations": self.count,
+            **{
+                key: total / weight
+                for key, total in totals.items()
+                if isinstance(key, str) and key not in plain
+            },
+        }
 
 
 def _used(sample: Sample) -> NDArray[np.bool_]:
-    parts = [sample.values, sample.errors, sample.random, *sample.shared]
     used = sample.usable.copy()
-    for part in parts:
+    for part in (sample.values, sample.errors, sample.random, *sample.shared):
         used &= np.isfinite(part)
     if sample.systematic:
         # One that does not apply, as that of the dead time to analog signals, is missing.
@@ -175,94 +139,91 @@ def _used(sample: Sample) -> NDArray[np.bool_]:
     return used
 
 
-def _sum(weights: Array, values: Array, used: NDArray[np.bool_]) -> Array:
-    total: Array = (weights * np.where(used, values, 0.0)).sum(axis=0)
-    return total
+def _terms(sample: Sample, weights: Array) -> Iterator[tuple[Hashable, Array]]:
+    """Yield what is summed, by its key in `Sums.totals`."""
+    yield "weight", weights
+    yield "value", weights * sample.values
+    yield "random", weights**2 * sample.random**2
+    # The error of a mean is unknown where that of one profile is.
+    for key, error in (*enumerate(sample.shared), *sample.systematic.items()):
+        yield key, weights * error
 
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
-    """The profiles of one product, in memory."""
+    """What means need of the profiles of one product, in memory."""
 
-    facts: Facts
-    attributes: Mapping[str, Any]
-    times: Array
-    """s since 1970, middle of each profile."""
     samples: Mapping[str, Sample]
     flags: NDArray[np.int32]
     """Bits at the places of now, whatever their places in the file."""
+    usable: NDArray[np.bool_]
+    """Whether no quality bit rejects a value."""
     shots: Array
-    cloud_fraction: Array | None
-    """Share of cloudy profiles of each value; NaN where it is not known. None for kinds that seek
-    no clouds."""
+    clouds: Sample | None
+    """Share of cloudy profiles of each value. None for kinds that seek no clouds."""
 
 
-def read_profiles(root: Path, facts: Facts) -> Profiles:
+def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
     """Read what means need from a product, completely, so that a damaged product affects no sum.
 
     Parameters
     ----------
-    root : path
-    facts : Facts
-
-    Returns
-    -------
-    Profiles
+    product : xr.Dataset
+        Not decoded.
+    layout : Layout
+        Of its kind.
 
     Raises
     ------
     ProductError
-        If the product cannot be read, has changed since its facts were read, or carries a quality
-        bit that its kind does not have.
+        If it carries a quality bit that its kind does not have.
     """
-    with opened(within(root, facts.path)) as product:
-        refuse_changed(product, facts)
-        flags = with_current_flags(product)[QUALITY_FLAG].values
-        usable = (flags & np.int32(flags_of(facts.kind).rejecting)) == 0
-        rows = [row for row in averaged(facts.kind) if row.name in product]
-        return Profiles(
-            facts,
-            dict(product.attrs),
-            product["time"].values,
-            {row.name: _sample(product, facts.kind, row, usable) for row in rows},
-            flags,
-            product["shots"].values.astype(np.float64),
-            _cloud_fraction(product, facts.kind),
-        )
+    flags = with_current_flags(product)[QUALITY_FLAG].values
+    usable = (flags & np.int32(layout.flags.rejecting)) == 0
+    return Profiles(
+        {
+            row.name: _sample(product, row, usable)
+            for row in averaged(layout)
+            if row.name in product
+        },
+        flags,
+        usable,
+        product["shots"].values.astype(np.float64),
+        _clouds(product, layout, usable),
+    )
 
 
-def _cloud_fraction(product: xr.Dataset, kind: str) -> Array | None:
+def _clouds(product: xr.Dataset, layout: Layout, usable: NDArray[np.bool_]) -> Sample | None:
     """Return the share of cloudy profiles: 1 also where only the mean shows a cloud."""
-    if not states_clouds(kind):
+    if not layout.holds(CLOUD_FRACTION):
         return None
-    if CLOUD_FRACTION not in product:
-        return np.full(product[QUALITY_FLAG].shape, np.nan)
-    fraction = _numbers(product, CLOUD_FRACTION)
-    cloudy = product[CLOUD_MASK].values == layout_of(kind).row(CLOUD_MASK).code("cloudy")
-    return np.where(cloudy & np.isnan(fraction), 1.0, fraction)
+    exact = np.zeros(usable.shape)
+    fraction = np.full(usable.shape, np.nan)
+    if CLOUD_FRACTION in product:
+        fraction = _numbers(product, CLOUD_FRACTION)
+        cloudy = product[CLOUD_MASK].values == layout.row(CLOUD_MASK).code("cloudy")
+        fraction = np.where(cloudy & np.isnan(fraction), 1.0, fraction)
+    return Sample(fraction, exact, exact, (), {}, usable)
 
 
-def _sample(product: xr.Dataset, kind: str, row: Row, usable: NDArray[np.bool_]) -> Sample:
+def _sample(product: xr.Dataset, row: Row, usable: NDArray[np.bool_]) -> Sample:
     values = _numbers(product, row.name)
     errors = _numbers(product, f"{row.name}_standard_error")
-    budget = budget_of(row)
-    random, shared = (errors, ()) if budget is None else _divide(product, budget, errors)
     has_flags = row.dims == product[QUALITY_FLAG].dims
     return Sample(
         values,
         errors,
-        random,
-        shared,
-        _systematic_errors(product, kind, row, values, errors),
+        *_divided(product, row, errors),
+        _systematic_errors(product, row, values, errors),
         usable if has_flags else np.ones(values.shape, np.bool_),
     )
 
 
 def _systematic_errors(
-    product: xr.Dataset, kind: str, row: Row, values: Array, errors: Array
+    product: xr.Dataset, row: Row, values: Array, errors: Array
 ) -> dict[str, Array]:
     """Return the systematic errors that are not part of the standard error, by variable."""
-    names = systematic(kind, row.name)
+    names = systematic(row)
     if row.lower_end:
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = values / _numbers(product, row.lower_end) - 1.0
@@ -272,10 +233,11 @@ def _systematic_errors(
     return {name: _numbers(product, name) for name in names if name in product}
 
 
-def _divide(
-    product: xr.Dataset, budget: ErrorBudget, errors: Array
-) -> tuple[Array, tuple[Array, ...]]:
+def _divided(product: xr.Dataset, row: Row, errors: Array) -> tuple[Array, tuple[Array, ...]]:
     """Divide a standard error into a part independent between profiles and shared parts."""
+    budget = budget_of(row)
+    if budget is None:
+        return errors, ()
     variance = np.zeros_like(errors)
     for name in budget.random:
         variance += _numbers(product, name) ** 2
@@ -302,7 +264,8 @@ def _numbers(product: xr.Dataset, name: str) -> Array:
 class PeriodSums:
     """Sums of all quantities over one period."""
 
-    kind: str
+    layout: Layout
+    """Of the kind of product."""
     weights: Weights
     quantities: dict[str, Sums] = field(default_factory=dict)
     profiles: int = 0
@@ -321,13 +284,13 @@ class PeriodSums:
 
     def add(self, profiles: Profiles, chosen: NDArray[np.intp]) -> None:
         """Add some of the profiles of a product."""
+        flags, usable, shots = (
+            part[chosen] for part in (profiles.flags, profiles.usable, profiles.shots)
+        )
         for name, sample in profiles.samples.items():
             part = sample.take(chosen)
-            if name not in self.quantities:
-                self.quantities[name] = Sums.like(part)
-            self.quantities[name].add(part, _weights(self.weights, part, profiles.shots[chosen]))
-        flags = profiles.flags[chosen]
-        usable = (flags & np.int32(flags_of(self.kind).rejecting)) == 0
+            sums = self.quantities.setdefault(name, Sums())
+            sums.add(part, _weights(self.weights, part, shots))
         self.profiles += chosen.size
         self.usable = self.usable + usable.sum(axis=0)
         self.good = self.good + (flags == 0).sum(axis=0)
@@ -337,57 +300,48 @@ class PeriodSums:
         self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
         common = np.bitwise_and.reduce(np.where(usable, flags, _ALL_BITS), axis=0)
         self.common_flags = self.common_flags & common
-        shots = profiles.shots[chosen]
         self.shots += float(shots.sum())
-        if profiles.cloud_fraction is not None:
-            fraction = profiles.cloud_fraction[chosen]
-            exact = np.zeros(fraction.shape)
-            clouds = Sample(fraction, exact, exact, (), {}, usable)
+        if profiles.clouds is not None:
+            clouds = profiles.clouds.take(chosen)
             plain = self.weights is Weights.PLAIN
-            weights = Weights.PLAIN if plain else Weights.SHOTS
-            self.clouds = self.clouds or Sums.like(clouds)
-            self.clouds.add(clouds, _weights(weights, clouds, shots))
+            weights = _weights(Weights.PLAIN if plain else Weights.SHOTS, clouds, shots)
+            self.clouds = self.clouds or Sums()
+            self.clouds.add(clouds, weights)
 
     def record(self) -> dict[str, NDArray[Any]]:
         """Return the variables of the period, without dimension time."""
-        usable_flags = self.usable_flags
-        if self.clouds is not None:
-            usable_flags = _cloudy_flags(self.kind, usable_flags, self.common_flags)
-        flags = np.where(self.usable > 0, usable_flags, self.flags)
-        weighed = layout_of(self.kind).weighed
         variables: dict[str, NDArray[Any]] = {
             "usable_share": self.usable / np.float64(self.profiles),
             "good_share": self.good / np.float64(self.profiles),
             "shots": np.asarray(self.shots),
         }
+        usable_flags = self.usable_flags
         if self.clouds is not None:
-            variables[CLOUD_FRACTION] = self.clouds.mean().mean
+            variables[CLOUD_FRACTION] = self.clouds.mean(CLOUD_FRACTION)[CLOUD_FRACTION]
+            usable_flags = self._cloudy_flags()
+        flags = np.where(self.usable > 0, usable_flags, self.flags)
         for name, sums in self.quantities.items():
-            mean = sums.mean()
-            variables[name] = mean.mean
-            variables[f"{name}_standard_error"] = mean.standard_error
-            variables[f"{name}_standard_deviation"] = mean.standard_deviation
-            variables[f"{name}_observations"] = mean.observations
-            variables |= mean.systematic
-            if name in weighed:
+            variables |= sums.mean(name)
+            mean = variables[name]
+            if name in self.layout.weighed:
                 error = whole_error(variables, name)
-                flags = flags | np.where(np.abs(mean.mean) < error, _WEIGHED, np.int32(0))
-            if mean.mean.shape == flags.shape:
+                flags = flags | np.where(np.abs(mean) < error, _WEIGHED, np.int32(0))
+            if mean.shape == flags.shape:
                 # Usable values without an error for weighting give no mean: flag it as missing.
-                unflagged = ~np.isfinite(mean.mean) & (flags == 0)
+                unflagged = ~np.isfinite(mean) & (flags == 0)
                 flags = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags)
-        return {**variables, "quality_flag": flags}
+        return {**variables, QUALITY_FLAG: flags}
+
+    def _cloudy_flags(self) -> Any:
+        """Return the bits of a mean, of which some values or all in it are those of clouds."""
+        flags = self.usable_flags
+        bits = (self.layout.flags.named(word) for word in ("cloud", "partly_cloudy"))
+        cloud, partly = (np.int32(bit or 0) for bit in bits)
+        some = ((flags & (cloud | partly)) != 0) & ((self.common_flags & cloud) == 0)
+        return np.where(some, flags & ~cloud | partly, flags)
 
 
-def _cloudy_flags(kind: str, flags: Any, common: Any) -> Any:
-    """Return the bits of a mean, of which some values or all in it are those of clouds."""
-    bits = (flags_of(kind).named(word) for word in ("cloud", "partly_cloudy"))
-    cloud, partly = (np.int32(bit or 0) for bit in bits)
-    some = ((flags & (cloud | partly)) != 0) & ((common & cloud) == 0)
-    return np.where(some, flags & ~cloud | partly, flags)
-
-
-def _weights(weights: Weights, sample: Sample, shots: NDArray[np.float64]) -> NDArray[np.float64]:
+def _weights(weights: Weights, sample: Sample, shots: Array) -> Array:
     """Return the weights of the values of a sample."""
     if weights is Weights.INVERSE_VARIANCE:
         with np.errstate(divide="ignore"):

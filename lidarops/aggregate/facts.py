@@ -93,6 +93,24 @@ class Facts:
         """Group of products that this one can be joined with."""
         return Group(*(getattr(self, name) for name in Group._fields))
 
+    def refuse_changed(self, product: xr.Dataset) -> None:
+        """Refuse an open product that is no longer the one of these facts.
+
+        Raises
+        ------
+        ProductError
+            If its id is another one.
+        """
+        if product.attrs.get("id") != self.id:
+            raise ProductError("changed while it was read", file=self.path, remedy="run again")
+
+    @contextmanager
+    def opened(self, root: Path) -> Iterator[xr.Dataset]:
+        """Open the product of these facts, of a root, without decoding; see `refuse_changed`."""
+        with _opened(within(root, self.path)) as product:
+            self.refuse_changed(product)
+            yield product
+
 
 class Group(NamedTuple):
     """Products that can be joined along time: one instrument, kind, channel and grid."""
@@ -175,17 +193,11 @@ def read_product_facts(
     """
     for path in paths:
         try:
-            file = within(root, path)
-            with opened(file) as product:
-                kind, start, stop = _kind_of(product, file), *_times(product)
-                names = {name: product.attrs[f"lidarops_{name}"] for name in NAMES}
-                selected = selection.admits({**names, "kind": kind}, start, stop)
-                facts = _facts(product, file, path) if selected else None
+            facts = _selected_facts(root, path, selection)
         except ProductError as error:
             yield Refused(path, error.problem)
         else:
-            if facts is not None:
-                yield facts
+            yield from facts
 
 
 def read_facts(root: Path, path: str) -> Facts:
@@ -202,15 +214,27 @@ def read_facts(root: Path, path: str) -> Facts:
     ProductError
         If the file leads out of `root`, cannot be read, or is not a product of lidarops.
     """
+    (facts,) = _selected_facts(root, path, EVERYTHING)
+    return facts
+
+
+def _selected_facts(root: Path, path: str, selection: ProductSelection) -> list[Facts]:
+    """Return the facts of a product, if it is selected."""
     file = within(root, path)
-    with opened(file) as product:
-        return _facts(product, file, path)
+    with _opened(file) as product:
+        kind = _kind_of(product, file)
+        ends = (product.attrs[f"time_coverage_{end}"] for end in ("start", "end"))
+        start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in ends)
+        names = {name: product.attrs[f"lidarops_{name}"] for name in NAMES}
+        if selection.admits(names, start, stop):
+            return [_facts(product, file, path, kind, start, stop)]
+    return []
 
 
-def _facts(product: xr.Dataset, file: Path, path: str) -> Facts:
+def _facts(
+    product: xr.Dataset, file: Path, path: str, kind: str, start: datetime, stop: datetime
+) -> Facts:
     attributes = product.attrs
-    kind = _kind_of(product, file)
-    start, stop = _times(product)
     flags = product[QUALITY_FLAG].values
     bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
     rejecting = np.int32(rejecting_mask(bits))
@@ -244,41 +268,14 @@ def _facts(product: xr.Dataset, file: Path, path: str) -> Facts:
 
 
 @contextmanager
-def opened(file: Path) -> Iterator[xr.Dataset]:
-    """Open a product without decoding; damage raises an error with a clear message.
-
-    Parameters
-    ----------
-    file : path
-
-    Yields
-    ------
-    xr.Dataset
-        Lazy, not decoded.
-
-    Raises
-    ------
-    ProductError
-        If the file cannot be read, or lacks what every product has.
-    """
+def _opened(file: Path) -> Iterator[xr.Dataset]:
+    """Open a product without decoding; what lacks what every product has is refused."""
     with opened_product(file, decode_cf=False) as product:
         try:
             yield product
         except KeyError as error:
             problem = f"is not a product of lidarops: it has no {error}"
             raise ProductError(problem, file=file) from error
-
-
-def refuse_changed(product: xr.Dataset, facts: Facts) -> None:
-    """Refuse an open product that is no longer the one whose facts were read.
-
-    Raises
-    ------
-    ProductError
-        If its id is another one.
-    """
-    if product.attrs.get("id") != facts.id:
-        raise ProductError("changed while it was read", file=facts.path, remedy="run again")
 
 
 def _kind_of(product: xr.Dataset, file: Path) -> str:
@@ -420,13 +417,6 @@ def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> No
             file=first,
             remedy="leave one of the products out",
         )
-
-
-def _times(product: xr.Dataset) -> tuple[datetime, datetime]:
-    """Return the start of the first profile and the end of the last one."""
-    texts = (product.attrs[f"time_coverage_{end}"] for end in ("start", "end"))
-    start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in texts)
-    return start, stop
 
 
 def _middle(product: xr.Dataset, name: str) -> float:

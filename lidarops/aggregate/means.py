@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,33 +12,26 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops import __version__
 from lidarops.aggregate._join import shared_attributes
 from lidarops.aggregate._sums import Array, PeriodSums, Profiles, read_profiles
 from lidarops.aggregate.facts import (
     FOLDER,
+    PERIOD,
     Facts,
-    Group,
     Refused,
     coordinate_names,
-    opened,
     refuse_duplicates,
 )
-from lidarops.aggregate.means_variables import (
-    MeansDescription,
-    Period,
-    Weights,
-    global_attributes,
-    layout,
-)
+from lidarops.aggregate.means_variables import Period, Weights, layout
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
-from lidarops.netcdf.context import UNUSED_INPUTS
+from lidarops.netcdf.context import UNUSED_INPUTS, iso
 from lidarops.netcdf.encoding import as_stored, as_text
-from lidarops.netcdf.provenance import package_versions, prov_document, prov_type
-from lidarops.netcdf.variables import QUANTIZATION, Layout, Row, attributes
+from lidarops.netcdf.provenance import identifier, package_versions, prov_document, prov_type
+from lidarops.netcdf.variables import QUANTIZATION, Layout, attributes, layout_of
 from lidarops.netcdf.write import write_product
-from lidarops.records import DetectionMode
-from lidarops.system.files import within
+from lidarops.system.code_version import code_version
 
 _MOVING: Final = ("zenith_angle", "azimuth")
 
@@ -96,32 +90,34 @@ def write_means(
         written.
     """
     averaging = _Averaging(period, weights)
-    frame: _Frame | None = None
     refused = []
     for facts in products:
         try:
-            group_frame = frame or _read_frame(root, facts)
-            profiles = read_profiles(root, facts)
+            with facts.opened(root) as product:
+                source = layout_of(facts.kind)
+                profiles, times = read_profiles(product, source), product["time"].values
+                if any(product[name].dims for name in _MOVING if name in product):
+                    note = f"no means of {facts.kind}: profiles of several directions have none"
+                    return MeansResult((), tuple(refused), f"{note} ({facts.path})")
+                averaging.frame = averaging.frame or _frame(product, facts)
+                stated = dict(product.attrs)
         except ProductError as error:
             refused.append(Refused(facts.path, error.problem))
-            continue
-        if group_frame.moving:
-            note = f"no means of {facts.kind}: profiles of several directions have none"
-            return MeansResult((), tuple(refused), f"{note} ({facts.path})")
-        frame = group_frame
-        averaging.add(profiles)
-    averaging.finish()
-    files = () if frame is None else tuple(_written(root, products[0].group, frame, averaging))
-    return MeansResult(files, tuple(refused))
+        else:
+            averaging.add(facts, profiles, times, stated)
+    return MeansResult(tuple(averaging.written(root)), tuple(refused))
 
 
 @dataclass(slots=True)
 class _Year:
-    """Means of one calendar year and their inputs."""
+    """Means of one calendar year, and of what they are made."""
 
+    period: Period
+    weights: Weights
     keys: list[np.datetime64] = field(default_factory=list)
     records: list[dict[str, NDArray[Any]]] = field(default_factory=list)
     inputs: dict[str, Facts] = field(default_factory=dict)
+    """By path."""
     shared: dict[str, Any] | None = None
     """Attributes that are equal in all products so far."""
     modified: str = ""
@@ -131,15 +127,66 @@ class _Year:
     partial: int = 0
     """Number of products so far that lack raw files of their scenes."""
 
-    def note(self, profiles: Profiles) -> None:
-        path = profiles.facts.path
-        if path not in self.inputs:
-            self.inputs[path] = profiles.facts
-            so_far = profiles.attributes if self.shared is None else self.shared
-            self.shared = shared_attributes([so_far, profiles.attributes])
-            self.version += int(profiles.attributes["product_version"])
-            self.partial += UNUSED_INPUTS in profiles.attributes
-            self.modified = max(self.modified, str(profiles.attributes.get("date_modified", "")))
+    def note(self, facts: Facts, stated: Mapping[str, Any]) -> None:
+        """Note a product, with the attributes that it states."""
+        if facts.path not in self.inputs:
+            self.inputs[facts.path] = facts
+            so_far = stated if self.shared is None else self.shared
+            self.shared = shared_attributes([so_far, stated])
+            self.version += int(stated["product_version"])
+            self.partial += UNUSED_INPUTS in stated
+            self.modified = max(self.modified, str(stated.get("date_modified", "")))
+
+    @property
+    def first(self) -> Facts:
+        """The first of its products."""
+        return next(iter(self.inputs.values()))
+
+    @property
+    def bounds(self) -> NDArray[np.datetime64]:
+        """Start and end of each period, (time, 2)."""
+        keys = np.array(self.keys)
+        return np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]")
+
+    @property
+    def span(self) -> tuple[datetime, datetime]:
+        """Start of the first period, end of the last one."""
+        return _datetime(self.bounds[0, 0]), _datetime(self.bounds[-1, 1])
+
+    @property
+    def code_version(self) -> str:
+        """Digest of the code that makes products of the kind and their means."""
+        return code_version(self.first.kind, "lidarops.aggregate.means")
+
+    @property
+    def id(self) -> str:
+        """UUID version 5 of the inputs' sha256, period, weights, time and code version."""
+        return identifier(
+            {
+                "means": {"period": self.period.value, "weights": self.weights.value},
+                "inputs": sorted(facts.sha256 for facts in self.inputs.values()),
+                "time": [moment.isoformat() for moment in self.span],
+                "code_version": self.code_version,
+            }
+        )
+
+    @property
+    def path(self) -> str:
+        """Path of its file relative to the root of the products."""
+        group, period = self.first.group, self.period.value
+        folder = f"{group.station}/{group.instrument}/{group.kind}/{period}"
+        weighted = "" if self.weights is Weights.SHOTS else f"_{self.weights.value}"
+        name = f"{group.name}_{period}{weighted}_{_year(self.keys[0])}.nc"
+        return f"{FOLDER}/means/{folder}/{name}"
+
+
+def _datetime(moment: np.datetime64) -> datetime:
+    plain: datetime = moment.astype("datetime64[us]").item()
+    return plain.replace(tzinfo=UTC)
+
+
+def _year(key: np.datetime64) -> int:
+    return int(key.astype("datetime64[Y]").astype(int)) + 1970
 
 
 @dataclass(slots=True)
@@ -148,136 +195,104 @@ class _Averaging:
 
     period: Period
     weights: Weights
-    years: dict[int, _Year] = field(default_factory=dict)
+    frame: _Frame | None = None
+    """Of the first product."""
+    _years: dict[int, _Year] = field(default_factory=dict)
     _open: dict[np.datetime64, PeriodSums] = field(default_factory=dict)
     _times: list[tuple[str, Array]] = field(default_factory=list)
 
-    def add(self, profiles: Profiles) -> None:
-        """Add a product; products must be added in order of their start."""
-        facts = profiles.facts
-        self._close(before=np.datetime64(facts.start.replace(tzinfo=None), "ms"))
-        self._times.append((facts.path, profiles.times))
-        for key, chosen in self._periods(profiles.times):
-            self.years.setdefault(_year(key), _Year()).note(profiles)
-            sums = self._open.setdefault(key, PeriodSums(facts.kind, self.weights))
-            sums.add(profiles, chosen)
+    def add(
+        self, facts: Facts, profiles: Profiles, times: Array, stated: Mapping[str, Any]
+    ) -> None:
+        """Add a product, with its times (s since 1970) and what it states.
 
-    def finish(self) -> None:
-        """Close all periods.
-
-        Raises
-        ------
-        ProductError
-            If two products have a profile at the same time.
+        Products must be added in order of their start.
         """
-        if self._times:
-            refuse_duplicates(self._times)
-        self._close(before=None)
-
-    def _close(self, *, before: np.datetime64 | None) -> None:
-        done = [key for key in self._open if before is None or key + 1 <= before]
-        for key in sorted(done):
-            year = self.years[_year(key)]
-            year.keys.append(key)
-            year.records.append(self._open.pop(key).record())
-
-    def _periods(self, times: Array) -> Iterator[tuple[np.datetime64, NDArray[np.intp]]]:
+        self._close(before=np.datetime64(facts.start.replace(tzinfo=None), "ms"))
+        self._times.append((facts.path, times))
         # Rounded to milliseconds, the accuracy of the middle of a profile.
         moments = np.datetime64(0, "ms") + np.rint(times * 1e3).astype("timedelta64[ms]")
         keys = moments.astype(f"datetime64[{self.period.unit}]")
         for key in np.unique(keys):
-            yield key, np.flatnonzero(keys == key)
+            year = self._years.setdefault(_year(key), _Year(self.period, self.weights))
+            year.note(facts, stated)
+            sums = self._open.setdefault(key, PeriodSums(layout_of(facts.kind), self.weights))
+            sums.add(profiles, np.flatnonzero(keys == key))
 
+    def _close(self, *, before: np.datetime64 | None = None) -> None:
+        done = [key for key in self._open if before is None or key + 1 <= before]
+        for key in sorted(done):
+            year = self._years[_year(key)]
+            year.keys.append(key)
+            year.records.append(self._open.pop(key).record())
 
-def _year(key: np.datetime64) -> int:
-    return int(key.astype("datetime64[Y]").astype(int)) + 1970
+    def written(self, root: Path) -> Iterator[MeansFile]:
+        """Close all periods and write the files.
+
+        Raises
+        ------
+        ProductError
+            If two products have a profile at the same time, or a file cannot be written.
+        """
+        if self.frame is None:
+            return
+        refuse_duplicates(self._times)
+        self._close()
+        for _, year in sorted(self._years.items()):
+            done = write_product(_encoded(self.frame, year), root / year.path)
+            yield MeansFile(year.path, done.sha256, done.size, len(year.keys), len(year.inputs))
 
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """Coordinates and attributes of means that are equal in all products of a group."""
+    """What is equal in the means and all products of a group."""
 
-    kind: str
-    mode: DetectionMode
     variables: Mapping[str, xr.Variable]
     """Coordinates that do not change with time, and the station; in memory."""
     listed: Mapping[tuple[str, ...], tuple[str, ...]]
     """Dimensions -> auxiliary coordinates of the data that have them."""
-    moving: tuple[str, ...]
-    """Names of beam angles that change with time."""
 
 
-def _read_frame(root: Path, facts: Facts) -> _Frame:
-    """Read static coordinates and attributes from a product."""
-    with opened(within(root, facts.path)) as product:
-        static = coordinate_names(facts.kind)
-        kept = [
-            str(name)
+def _frame(product: xr.Dataset, facts: Facts) -> _Frame:
+    """Read what means take over from a product."""
+    static = coordinate_names(facts.kind)
+    return _Frame(
+        {
+            str(name): variable.load()
             for name, variable in product.variables.items()
             if (name in static and "time" not in variable.dims)
             or name in ("station", QUANTIZATION.name)
-        ]
-        return _Frame(
-            facts.kind,
-            facts.counting,
-            {name: product.variables[name].load() for name in kept},
-            {
-                tuple(str(dim) for dim in variable.dims): tuple(
-                    variable.attrs["coordinates"].split()
-                )
-                for variable in product.variables.values()
-                if "coordinates" in variable.attrs
-            },
-            tuple(name for name in _MOVING if name in product and product[name].dims),
-        )
+        },
+        {
+            tuple(map(str, variable.dims)): tuple(variable.attrs["coordinates"].split())
+            for variable in product.variables.values()
+            if "coordinates" in variable.attrs
+        },
+    )
 
 
-def _written(root: Path, group: Group, frame: _Frame, averaging: _Averaging) -> Iterator[MeansFile]:
-    for number, year in sorted(averaging.years.items()):
-        keys = np.array(year.keys)
-        about = MeansDescription(
-            tuple(year.inputs.values()),
-            averaging.period,
-            averaging.weights,
-            np.stack([keys, keys + 1], axis=-1).astype("datetime64[s]"),
-            year.partial,
-            year.modified,
-            year.version,
-        )
-        path = _path(group, averaging.period, averaging.weights, number)
-        done = write_product(_encoded(frame, year, about), root / path)
-        yield MeansFile(path, done.sha256, done.size, len(keys), len(year.inputs))
-
-
-def _path(group: Group, period: Period, weights: Weights, year: int) -> str:
-    folder = f"{group.station}/{group.instrument}/{group.kind}/{period.value}"
-    weighted = "" if weights is Weights.SHOTS else f"_{weights.value}"
-    return f"{FOLDER}/means/{folder}/{group.name}_{period.value}{weighted}_{year}.nc"
-
-
-def _encoded(frame: _Frame, year: _Year, about: MeansDescription) -> xr.Dataset:
+def _encoded(frame: _Frame, year: _Year) -> xr.Dataset:
     """Return the dataset of a file of means, for `lidarops.netcdf.write.write_product`."""
-    table = layout(about.kind, about.period, about.weights)
+    mode = year.first.counting
+    table = layout(year.first.kind, year.period, year.weights)
     time = table.row("time")
-    bounds = about.bounds.astype(np.float64)
-    provenance = as_text(rows.PROVENANCE, _provenance(about), frame.mode)
+    bounds = year.bounds.astype(np.float64)
     variables = {
-        time.name: xr.Variable(time.dims, bounds.mean(axis=1), attributes(time, mode=frame.mode)),
+        time.name: xr.Variable(time.dims, bounds.mean(axis=1), attributes(time, mode=mode)),
         f"{time.bounds}": xr.Variable((*time.dims, rows.BOUNDS_DIM), bounds),
         **{name: values for name, values in frame.variables.items() if name != "station"},
-        **dict(_data(table, year.records, frame)),
+        **dict(_data(table, year, frame)),
         "station": frame.variables["station"],
-        rows.PROVENANCE.name: provenance,
+        rows.PROVENANCE.name: as_text(rows.PROVENANCE, _provenance(year), mode),
     }
-    dataset = xr.Dataset(variables, attrs=global_attributes(year.shared or {}, table, about))
+    dataset = xr.Dataset(variables, attrs=_global_attributes(table, year))
     dataset.encoding["unlimited_dims"] = {"time"}
     return dataset
 
 
-def _data(
-    table: Layout, records: Sequence[Mapping[str, NDArray[Any]]], frame: _Frame
-) -> Iterator[tuple[str, xr.Variable]]:
+def _data(table: Layout, year: _Year, frame: _Frame) -> Iterator[tuple[str, xr.Variable]]:
     """Yield the variables of means, from their values in each period."""
+    records = year.records
     flags = np.stack([record[rows.QUALITY_FLAG] for record in records]).astype(np.int32)
     # An optional variable may be in no product.
     present = [row for row in table.variables if row.summary or row.name in records[0]]
@@ -290,28 +305,25 @@ def _data(
             values = flags
         else:
             values = as_stored(row, np.stack([record[row.name] for record in records]))
-        ancillaries = tuple(name for name in row.ancillaries if name in names)
-        attrs = _attributes(replace(row, ancillaries=ancillaries), frame)
+        known = replace(row, ancillaries=tuple(name for name in row.ancillaries if name in names))
+        listed = frame.listed.get(row.dims, ())
+        attrs = attributes(known, mode=year.first.counting, coordinates=listed)
+        if row.dtype == "f8":
+            # A sum that is never missing; the fill value is for 4 bytes only.
+            del attrs["_FillValue"]
         yield row.name, xr.Variable(row.dims, values, attrs)
 
 
-def _attributes(row: Row, frame: _Frame) -> dict[str, Any]:
-    attrs = attributes(row, mode=frame.mode, coordinates=frame.listed.get(row.dims, ()))
-    if row.dtype == "f8":
-        # A sum that is never missing; the fill value is for 4 bytes only.
-        del attrs["_FillValue"]
-    return attrs
-
-
-def _provenance(about: MeansDescription) -> str:
+def _provenance(year: _Year) -> str:
     """Return the provenance of means as W3C PROV-JSON, whatever the order of inputs."""
-    inputs = sorted(about.inputs, key=lambda facts: (facts.sha256, facts.path))
+    inputs = sorted(year.inputs.values(), key=lambda facts: (facts.sha256, facts.path))
     group = inputs[0].group
+    start, stop = year.span
     averaging = {
-        "lidarops:period": about.period.value,
-        "lidarops:weights": about.weights.value,
-        "prov:startTime": about.start.isoformat(),
-        "prov:endTime": about.stop.isoformat(),
+        "lidarops:period": year.period.value,
+        "lidarops:weights": year.weights.value,
+        "prov:startTime": start.isoformat(),
+        "prov:endTime": stop.isoformat(),
     }
     return prov_document(
         "lidarops:means",
@@ -319,7 +331,7 @@ def _provenance(about: MeansDescription) -> str:
         {
             "lidarops:means": {
                 "prov:type": prov_type("lidarops:Means"),
-                "lidarops:id": about.id,
+                "lidarops:id": year.id,
                 "lidarops:kind": group.kind,
                 "lidarops:channel": group.channel,
                 "lidarops:grid": group.grid,
@@ -335,6 +347,47 @@ def _provenance(about: MeansDescription) -> str:
             },
         },
         ({"prov:entity": f"sha256:{facts.sha256}"} for facts in inputs),
-        (about.code_version, package_versions()),
+        (year.code_version, package_versions()),
         {},
     )
+
+
+def _global_attributes(table: Layout, year: _Year) -> dict[str, Any]:
+    """Return the global attributes of means, in the order in which they are written."""
+    shared, source = year.shared or {}, layout_of(year.first.kind)
+    comment = _replaced(shared.get("comment", ""), source.comment, table.comment)
+    program = f"lidarops {__version__} ({year.code_version})"
+    count, (start, stop) = len(year.inputs), year.span
+    first, last = (_datetime(pair[0] + (pair[1] - pair[0]) // 2) for pair in year.bounds[[0, -1]])
+    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
+    stated = {
+        **shared,
+        "title": _replaced(shared.get("title", ""), source.title, table.title),
+        "summary": _replaced(shared.get("summary", ""), source.summary, table.summary),
+        "id": year.id,
+        "processing_level": table.processing_level,
+        "product_version": str(year.version),
+        "history": f"{year.modified} averaged {count} products over UTC"
+        f" {year.period.value}s, weights {year.weights.value} [{program}]",
+        "comment": f"{comment} Dates of creation and change are those of the newest product, and"
+        " product_version is the sum of those of the products, so that equal inputs give equal"
+        " files: it grows with each product that is added or replaced.",
+        # As ACDD has it: the times of the first and last value, which are middles of periods.
+        "time_coverage_start": iso(first),
+        "time_coverage_end": iso(last),
+        "time_coverage_duration": f"P{(stop - start).days}D",
+        "time_coverage_resolution": f"P1{year.period.unit}",
+        **dict.fromkeys(dates, year.modified),
+        PERIOD: year.period.value,
+        "lidarops_weights": year.weights.value,
+        "lidarops_code_version": year.code_version,
+        "lidarops_input_count": np.int32(count),
+    }
+    if year.partial:
+        stated[UNUSED_INPUTS] = f"{year.partial} of {count} products lack raw files, and name them"
+    return stated
+
+
+def _replaced(text: str, old: str, new: str) -> str:
+    """Return a text with the text of the product kind replaced by that of means."""
+    return text.replace(old, new) if old in text else new

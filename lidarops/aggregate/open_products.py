@@ -27,7 +27,6 @@ from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.netcdf.read import reading
 from lidarops.netcdf.variables import USABLE
-from lidarops.system.files import within
 
 CARE: Final = 1
 ALL: Final = 2
@@ -150,7 +149,7 @@ def _strictly(scanned: Iterator[Facts | Refused]) -> list[Facts]:
 
 
 def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
-    pieces = [open_piece(within(root, facts.path), facts, dask=True) for facts in products]
+    pieces = [open_piece(root, facts, dask=True) for facts in products]
     times = []
     for facts, piece in zip(products, pieces, strict=True):
         with reading(facts.path):

@@ -25,9 +25,7 @@ from lidarops.aggregate.facts import (
     Facts,
     Refused,
     groups,
-    opened,
     plain,
-    refuse_changed,
     refuse_duplicates,
     refuse_several,
 )
@@ -35,7 +33,7 @@ from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError
 from lidarops.netcdf.read import reading
-from lidarops.system.files import only_one, within
+from lidarops.system.files import only_one
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
@@ -275,14 +273,14 @@ def _write_group(
         lacking = list(range(len(ids)))
     # What all have in common is known of those that stay, unless others go.
     read = range(len(ids)) if gone else lacking
-    stated = {at: _stated(root, products[at]) for at in read}
-    times = [
-        stated[at].times if at in stated else held.times[slice(*rows)]
-        for at, rows in enumerate(pairwise(starts))
-    ]
-    refuse_duplicates(zip((product.path for product in products), times, strict=True))
+    times = {at: held.times[slice(*rows)] for at, rows in enumerate(pairwise(starts))}
+    attributes = {}
+    for at in read:
+        with _piece(root, products[at]) as piece, reading(products[at].path):
+            attributes[at], times[at] = piece.attrs, piece["time"].values
+    refuse_duplicates((products[at].path, part) for at, part in times.items())
     known = [] if gone or 0 in lacking else [held.attributes]
-    shared = shared_attributes([*known, *(file.attributes for file in stated.values())])
+    shared = shared_attributes([*known, *attributes.values()])
     if 0 in lacking:
         with _piece(root, products[0]) as piece:
             _create(store, name, piece)
@@ -290,7 +288,7 @@ def _write_group(
     group.attrs.put({key: plain(value) for key, value in shared.items()})
     _write_rows(group, root, products, lacking, starts)
     new = [at for at in lacking if ids[at] not in held.places]
-    changes.added += [(products[at].path, stated[at].attributes["product_version"]) for at in new]
+    changes.added += [(products[at].path, attributes[at]["product_version"]) for at in new]
     changes.dropped += len(gone)
 
 
@@ -315,24 +313,12 @@ def _held(store: Any, name: str) -> _Held:
     return _Held(group.attrs.asdict(), group["time"][:], places)
 
 
-class _Stated(NamedTuple):
-    """What the file of a product states."""
-
-    attributes: Mapping[str, Any]
-    times: NDArray[np.float64]
-
-
-def _stated(root: Path, facts: Facts) -> _Stated:
-    with _readable(facts), opened(within(root, facts.path)) as product:
-        refuse_changed(product, facts)
-        return _Stated(dict(product.attrs), product["time"].values)
-
-
 @contextmanager
-def _readable(facts: Facts) -> Iterator[None]:
-    """Raise `UnreadableProductError` where a product cannot be read."""
+def _piece(root: Path, facts: Facts) -> Iterator[xr.Dataset]:
+    """Open a product as a piece; where it cannot be read, raise `UnreadableProductError`."""
     try:
-        yield
+        with open_piece(root, facts, dask=False) as piece:
+            yield piece
     except ProductError as error:
         raise UnreadableProductError(facts, error.problem) from error
 
@@ -421,7 +407,7 @@ def _write_product(
             array = rows[str(name)]
             first = start if "time" in variable.dims else number
             for low, high in _blocks(first, first + variable.shape[0], array.array.chunks[0]):
-                with _readable(facts), reading(facts.path):
+                with reading(facts.path):
                     values = variable[low - first : high - first].values
                 array.add(low, values)
 
@@ -429,11 +415,6 @@ def _write_product(
 def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:
     """Yield the rows from `start` to `stop` in blocks within chunks, so that memory holds few."""
     return pairwise((start, *range((start // chunk + 1) * chunk, stop, chunk), stop))
-
-
-def _piece(root: Path, facts: Facts) -> xr.Dataset:
-    with _readable(facts):
-        return open_piece(within(root, facts.path), facts, dask=False)
 
 
 def open_store(path: Path, selection: ProductSelection, version: str | None) -> xr.Dataset:

@@ -68,7 +68,7 @@ def locate_product(
     by_name["time"] = time
     bins = {} if vertical.profiles else _air_positions(by_name, layout, context)
     for name, value in _fixed(context).items():
-        if name in by_name or not any(row.name == name for row in layout.coordinates):
+        if name in by_name or not layout.holds(name):
             continue
         row = layout.row(name)
         if f"bin_{name}" in bins:
@@ -116,8 +116,7 @@ def _air_positions(
     by_name: Mapping[str, Coordinate], layout: Layout, context: Context
 ) -> dict[str, Coordinate]:
     """Return latitude and longitude of the air along a fixed slant beam of known azimuth."""
-    has_bins = any(row.name == "bin_latitude" for row in layout.coordinates)
-    if not has_bins or "azimuth" not in by_name:
+    if not layout.holds("bin_latitude") or "azimuth" not in by_name:
         return {}
     # No tool reads positions that also change over time: CDO reads garbage.
     if by_name["zenith_angle"].dims or by_name["azimuth"].dims:

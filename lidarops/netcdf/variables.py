@@ -287,6 +287,10 @@ class Layout:
     def _rows(self) -> dict[str, Row]:
         return {row.name: row for row in (*self.coordinates, *self.variables)}
 
+    def holds(self, name: str) -> bool:
+        """Return whether the layout has a variable or coordinate of this name."""
+        return name in self._rows
+
     def row(self, name: str) -> Row:
         """Return the row of a variable or coordinate.
 

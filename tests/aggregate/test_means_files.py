@@ -389,7 +389,7 @@ def test_a_profile_belongs_to_the_day_of_its_middle(tmp_path: Path):
 def test_every_kind_has_means_with_attributes_of_the_table(kind: str, tmp_path: Path):
     add_day(tmp_path, 0, kind)
     means = only(tmp_path, means_of(tmp_path))
-    for row in averaged(kind):
+    for row in averaged(layout_of(kind)):
         if row.name in means:
             mode = DetectionMode.PHOTON
             assert means[row.name].attrs["units"] == row.units.format(signal="MHz")
@@ -478,8 +478,8 @@ def test_means_are_no_products(tmp_path: Path):
 @pytest.mark.parametrize("kind", list(kinds()))
 def test_every_systematic_error_is_averaged(kind: str):
     source = layout_of(kind)
-    covered = {name for row in averaged(kind) for name in systematic(kind, row.name)}
-    covered |= {name for row in averaged(kind) if row.budget for name in row.budget.shared}
+    covered = {name for row in averaged(source) for name in systematic(row)}
+    covered |= {name for row in averaged(source) if row.budget for name in row.budget.shared}
     for row in source.variables:
         if row.error_kind is ErrorKind.SYSTEMATIC and not row.uncertain and "time" in row.dims:
             assert row.name in covered, row.name

@@ -19,7 +19,7 @@ from support.products import fabricated as fab
 from support.products.made_products import MAKERS
 
 from lidarops import kinds
-from lidarops.aggregate import means_variables
+from lidarops.aggregate import means as means_of_products
 from lidarops.aggregate.facts import groups
 from lidarops.aggregate.means import write_means
 from lidarops.aggregate.means_variables import Period
@@ -176,7 +176,7 @@ def test_means_follow_its_budget(
 ) -> None:
     register()
     # It has no source on disk whose digest could be taken.
-    monkeypatch.setattr(means_variables, "code_version", lambda *_: "0" * 16)
+    monkeypatch.setattr(means_of_products, "code_version", lambda *_: "0" * 16)
     path = site_archive.add(tmp_path, "smooth")
     (products,) = groups(facts_of(tmp_path)).values()
     (file,) = write_means(tmp_path, products, Period.DAY).files
