@@ -284,9 +284,8 @@ class PeriodSums:
 
     def add(self, profiles: Profiles, chosen: NDArray[np.intp]) -> None:
         """Add some of the profiles of a product."""
-        flags, usable, shots = (
-            part[chosen] for part in (profiles.flags, profiles.usable, profiles.shots)
-        )
+        flags, usable = profiles.flags[chosen], profiles.usable[chosen]
+        shots = profiles.shots[chosen]
         for name, sample in profiles.samples.items():
             part = sample.take(chosen)
             sums = self.quantities.setdefault(name, Sums())

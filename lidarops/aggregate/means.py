@@ -59,11 +59,7 @@ class MeansResult:
 
 
 def write_means(
-    root: Path,
-    products: Sequence[Facts],
-    period: Period,
-    *,
-    weights: Weights = Weights.SHOTS,
+    root: Path, products: Sequence[Facts], period: Period, *, weights: Weights = Weights.SHOTS
 ) -> MeansResult:
     """Write the means of one group of products, one file per calendar year.
 
@@ -90,7 +86,7 @@ def write_means(
         written.
     """
     averaging = _Averaging(period, weights)
-    refused = []
+    refused: list[Refused] = []
     for facts in products:
         try:
             with facts.opened(root) as product:

@@ -26,19 +26,18 @@ from lidarops.netcdf.variables import (
 
 PRODUCT: Final = Row(
     "product",
-    ("product",),
-    None,
     "identifier of the product, its global attribute id",
-    Coverage.REFERENCE,
+    dims=("product",),
+    units=None,
+    coverage=Coverage.REFERENCE,
     dtype="S1",
 )
 PRODUCT_INDEX: Final = Row(
     "product_index",
-    ("time",),
-    "1",
     "index along dimension product of the product that contains the profile",
-    Coverage.REFERENCE,
-    comment="",
+    "",
+    dims=("time",),
+    coverage=Coverage.REFERENCE,
     dtype="i4",
 )
 
@@ -189,11 +188,10 @@ def _shares(source: Layout, flags: Row) -> Iterator[Row]:
     ):
         yield Row(
             name,
-            flags.dims,
-            "1",
             f"share of the profiles of the period whose value {words}",
-            Coverage.QUALITY,
             comment,
+            dims=flags.dims,
+            coverage=Coverage.QUALITY,
             valid_min=0.0,
             valid_max=1.0,
         )
@@ -232,7 +230,7 @@ def _mean_rows(row: Row, weights: Weights, further: Sequence[str]) -> Iterator[R
         " values.",
     )
     words = f"number of profiles in the mean of {row.name}"
-    yield count(number, row.dims, words, coverage=Coverage.QUALITY)
+    yield count(number, words, dims=row.dims, coverage=Coverage.QUALITY)
 
 
 _ALONE: Final[dict[str, Any]] = {

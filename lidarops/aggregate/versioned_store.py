@@ -136,7 +136,10 @@ def update_store(
     icechunk = need("icechunk")
     target = store_path(root, kind)
     wanted, refused = list(products), []
-    with _only_writer(target), _clear_errors(target):
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # A folder could not tell the commit of a second writer from that of the first one.
+    lock = target.parent / f".{target.name}.lock"
+    with _clear_errors(target), only_one(lock, wait=False):
         repository = icechunk.Repository.open_or_create(_storage(target))
         while True:
             session = repository.writable_session(_BRANCH)
@@ -160,23 +163,14 @@ def update_store(
 
 
 @contextmanager
-def _only_writer(target: Path) -> Iterator[None]:
-    """Refuse a second writer, whose commit a folder could not tell from the first one's."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with only_one(target.parent / f".{target.name}.lock", wait=False):
-            yield
-    except BlockingIOError as error:
-        raise _conflict(target) from error
-
-
-@contextmanager
 def _clear_errors(target: Path) -> Iterator[None]:
     icechunk = need("icechunk")
     try:
         yield
-    except icechunk.ConflictError as error:
-        raise _conflict(target) from error
+    except (BlockingIOError, icechunk.ConflictError) as error:
+        raise ProductError(
+            "another process writes this store", file=target, remedy="run again when it has ended"
+        ) from error
     # Zarr finds no group where it cannot read one.
     except (icechunk.IcechunkError, FileNotFoundError) as error:
         # Icechunk draws a tree of causes, whose first line begins with a cross.
@@ -184,15 +178,9 @@ def _clear_errors(target: Path) -> Iterator[None]:
         raise ProductError(f"the store cannot be read or written: {reason}", file=target) from error
 
 
-def _conflict(target: Path) -> ProductError:
-    return ProductError(
-        "another process writes this store", file=target, remedy="run again when it has ended"
-    )
-
-
 def _storage(target: Path) -> Any:
     icechunk = need("icechunk")
-    # It warns of concurrent commits in a folder, which `_only_writer` refuses.
+    # It warns of concurrent commits in a folder, which `update_store` refuses.
     icechunk.set_logs_filter("error")
     return icechunk.local_filesystem_storage(str(target.resolve()))
 
@@ -344,10 +332,11 @@ def _create(store: Any, name: str, piece: xr.Dataset) -> None:
     text = piece[PRODUCT.name].astype(np.dtypes.StringDType(), keep_attrs=True)
     like = piece.reset_coords().assign_coords({PRODUCT.name: text})
     encoding = {}
+    compressor = need("zarr.codecs").BloscCodec(cname="zstd", clevel=5, shuffle="shuffle")
     for key, variable in like.variables.items():
         variable.encoding = {}
         if key != PRODUCT.name:
-            encoding[key] = {"chunks": _chunk(variable), "compressors": _compressor()}
+            encoding[key] = {"chunks": _chunk(variable), "compressors": compressor}
     like.isel(time=slice(0), product=slice(0)).drop_attrs(deep=False).to_zarr(
         store, group=name, mode="w", encoding=encoding, zarr_format=3, consolidated=False
     )
@@ -363,10 +352,6 @@ def _chunk(variable: xr.Variable) -> tuple[int, ...]:
 
 def _is_long(variable: xr.Variable) -> bool:
     return bool({"time", PRODUCT.name} & set(variable.dims))
-
-
-def _compressor() -> Any:
-    return need("zarr.codecs").BloscCodec(cname="zstd", clevel=5, shuffle="shuffle")
 
 
 @dataclass(slots=True)

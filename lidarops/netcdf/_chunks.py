@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -27,47 +26,35 @@ _SMALL: Final = 1 << 13
 Offset = tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Consecutive rows that fill the chunks at one place along the first axis."""
-
-    name: str
-    first: int
-    """Number of the first row."""
-    values: NDArray[Any]
-
-    @property
-    def end(self) -> int:
-        """Number of the row after the last."""
-        return self.first + len(self.values)
-
-
 class RowBlocks:
     """The rows of one variable, cut into the blocks that its chunks hold.
 
     Parameters
     ----------
-    name : str
     total : int
         Number of rows that will come.
     step : int
         Rows of a block; the last block may have fewer.
     """
 
-    def __init__(self, name: str, total: int, step: int) -> None:
-        self._name = name
+    def __init__(self, total: int, step: int) -> None:
         self._total = total
         self._step = step
         self._first = 0
         self._held: list[NDArray[Any]] = []
 
-    def take(self, rows: NDArray[Any]) -> Iterator[Block]:
+    def take(self, rows: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
         """Take the next rows, and yield the blocks that are complete with them.
 
         Parameters
         ----------
         rows : ndarray, shape (n, ...)
             No more than are still to come. A copy is kept of rows whose block is incomplete.
+
+        Yields
+        ------
+        (int, ndarray)
+            Number of the first row, and the rows.
         """
         while len(rows):
             size = min(self._step, self._total - self._first)
@@ -77,8 +64,7 @@ class RowBlocks:
                 return
             pieces = [*self._held, rows[:missing]]
             rows = rows[missing:]
-            values = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-            yield Block(self._name, self._first, values)
+            yield self._first, pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
             self._held = []
             self._first += size
 

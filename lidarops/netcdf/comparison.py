@@ -127,7 +127,8 @@ def compare_products(old: Path, new: Path) -> Change:
 
 
 def _opened(file: Path) -> AbstractContextManager[xr.Dataset]:
-    return opened_product(file, in_parts=True, decode_cf=False)
+    """Open a product whose missing values are NaN, and are not decoded otherwise."""
+    return opened_product(file, in_parts=True, decode_times=False, decode_coords=False)
 
 
 def _refuse_another(before: xr.Dataset, after: xr.Dataset, new: Path) -> None:
@@ -253,22 +254,15 @@ def _parts(variable: xr.Variable) -> Iterator[Any]:
 
 def _differs(before: xr.Variable, after: xr.Variable, part: Any) -> NDArray[np.bool_]:
     """Return which values of a part differ."""
-    missing, now_missing = (_missing(variable, part) for variable in (before, after))
-    differs: NDArray[np.bool_] = before[part].values != after[part].values
-    return differs & ~(missing & now_missing)
-
-
-def _missing(variable: xr.Variable, part: Any) -> NDArray[np.bool_]:
-    values = variable[part].values
-    unknown: NDArray[np.bool_] = np.isnan(values)
-    fill = variable.attrs.get("_FillValue")
-    return unknown if fill is None else unknown | (values == fill)
+    then, now = (variable[part].values for variable in (before, after))
+    differs: NDArray[np.bool_] = (then != now) & ~(np.isnan(then) & np.isnan(now))
+    return differs
 
 
 def _stated(product: xr.Dataset, name: str, part: Any) -> NDArray[np.bool_]:
     """Return which values of a part are finite, not missing and not rejected."""
     variable = product[name].variable
-    stated: NDArray[np.bool_] = ~_missing(variable, part) & np.isfinite(variable[part].values)
+    stated: NDArray[np.bool_] = np.isfinite(variable[part].values)
     usable = product.variables.get(USABLE)
     if usable is None or usable.dims != variable.dims:
         return stated
@@ -279,7 +273,7 @@ def _stated(product: xr.Dataset, name: str, part: Any) -> NDArray[np.bool_]:
 def _numbers(variable: xr.Variable, part: Any) -> NDArray[np.float64]:
     """Return the values of a part, 0 where they are missing."""
     values = np.asarray(variable[part].values, np.float64)
-    return np.where(_missing(variable, part) | ~np.isfinite(values), 0.0, values)
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def _usual(variable: xr.Variable) -> float:

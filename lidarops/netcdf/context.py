@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, Final, cast
@@ -138,36 +138,36 @@ def product_of_path(path: str) -> tuple[str, str]:
     return names[2], file.removeprefix(f"{'_'.join(names)}_").rpartition("_")[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Extents:
-    """Extents of a product in time and space, computed from its coordinates."""
+def global_attributes(
+    context: Context, layout: Layout, extents: Mapping[str, Any], feature_type: str
+) -> dict[str, Any]:
+    """Return the global attributes of a product, in the order in which they are written.
 
-    start: datetime
-    stop: datetime
-    interval: float
-    """s, between profiles."""
-    latitudes: tuple[float, float]
-    """degree, smallest and largest of the sounded air."""
-    longitudes: tuple[float, float]
-    lowest: float
-    """m above the geoid."""
-    highest: float
-    step: float | None
-    """m, vertical distance of neighbouring values; None where it is not constant."""
-    vertical: bool
-    """Whether the beam is fixed and near the vertical, as CF profiles require."""
-
-
-def global_attributes(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
-    """Return the global attributes of a product, in the order in which they are written."""
-    feature_type = layout.feature_type or ("timeSeriesProfile" if extents.vertical else "")
+    Parameters
+    ----------
+    context : Context
+    layout : Layout
+    extents : mapping
+        Attributes on the extents in time and space, from its coordinates.
+    feature_type : str
+        CF ``featureType`` where the layout states none.
+    """
+    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
     attributes = {
         "Conventions": CONVENTIONS,
-        "featureType": feature_type,
+        "featureType": layout.feature_type or feature_type,
         **_description(context, layout),
         **_people(context),
-        **_place(context, layout, extents),
-        **_times(extents, context.written),
+        "platform": context.station.name,
+        "platform_vocabulary": "station names of the campaign",
+        # Identifiers as in files of EARLINET and E-PROFILE.
+        "station_ID": context.station_key,
+        "wigos_station_id": context.station.wigos_station_id,
+        "measurement_ID": context.scene,
+        "instrument": context.instrument_name,
+        "instrument_vocabulary": "instrument names of the campaign",
+        **extents,
+        **dict.fromkeys(dates, iso(context.written)),
         **_processing(context),
     }
     # What is not known is left out.
@@ -230,9 +230,9 @@ def _history(context: Context) -> str:
         return f"{entry.name} of {entry.channel}" if other else entry.name
 
     # The plan of a product holds what it depends on, such as the corrections of glued channels.
-    done = [f"{name(step)}: {step.words}" for step in plan.steps]
-    omitted = [f"left out {name(omission)}: {omission.reason}" for omission in plan.left_out]
-    lines = [*done, *omitted, f"wrote the {context.kind} product"]
+    lines = [f"{name(step)}: {step.words}" for step in plan.steps]
+    lines += [f"left out {name(omission)}: {omission.reason}" for omission in plan.left_out]
+    lines.append(f"wrote the {context.kind} product")
     return "\n".join(
         f"{iso(context.written)} {' '.join(line.split())} [{program}]" for line in lines
     )
@@ -270,74 +270,15 @@ def _kind_of(name: str, institution: str) -> str:
     return "institution" if name == institution else "person"
 
 
-def _place(context: Context, layout: Layout, extents: Extents) -> dict[str, Any]:
-    station = context.station
-    (south, north), (west, east) = extents.latitudes, extents.longitudes
-    spread = "not applicable: single position"
-    if (south, west) != (north, east):
-        spread = _SPREADS.get(layout.sampled, "along the beam")
-    return {
-        "platform": station.name,
-        "platform_vocabulary": "station names of the campaign",
-        # Identifiers as in files of EARLINET and E-PROFILE.
-        "station_ID": context.station_key,
-        "wigos_station_id": station.wigos_station_id,
-        "measurement_ID": context.scene,
-        "instrument": context.instrument_name,
-        "instrument_vocabulary": "instrument names of the campaign",
-        # Latitude first: the order of axes that EPSG:4326 defines.
-        "geospatial_bounds": _bounds(extents),
-        "geospatial_bounds_crs": "EPSG:4326",
-        "geospatial_bounds_vertical_crs": "EPSG:5714",
-        "geospatial_lat_min": south,
-        "geospatial_lat_max": north,
-        "geospatial_lat_units": "degrees_north",
-        "geospatial_lat_resolution": spread,
-        "geospatial_lon_min": west,
-        "geospatial_lon_max": east,
-        "geospatial_lon_units": "degrees_east",
-        "geospatial_lon_resolution": spread,
-        "geospatial_vertical_min": extents.lowest,
-        "geospatial_vertical_max": extents.highest,
-        "geospatial_vertical_units": "m",
-        "geospatial_vertical_positive": "up",
-        "geospatial_vertical_resolution": _vertical_resolution(extents.step),
-    }
-
-
-def _vertical_resolution(step: float | None) -> str:
-    if step is None:
-        return "not constant"
-    # ACDD wants the attribute in every file.
-    return f"{step:.6g} m" if step else "none: the beam is level"
-
-
-_SPREADS = {"crossing": "irregular: crossings of beams"}
-
-
-def _bounds(extents: Extents) -> str:
-    """Return the area of the sounded air as WKT: a point, or the bounding rectangle."""
-    (south, north), (west, east) = extents.latitudes, extents.longitudes
-    if (south, west) == (north, east):
-        return f"POINT ({south!r} {west!r})"
-    corners = ((south, west), (south, east), (north, east), (north, west), (south, west))
-    return f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
-
-
-def _times(extents: Extents, date: datetime) -> dict[str, str]:
-    dates = ("date_created", "date_modified", "date_issued", "date_metadata_modified")
-    return {
-        "time_coverage_start": iso(extents.start),
-        "time_coverage_end": iso(extents.stop),
-        "time_coverage_duration": _duration((extents.stop - extents.start).total_seconds()),
-        "time_coverage_resolution": _duration(extents.interval),
-        **dict.fromkeys(dates, iso(date)),
-    }
-
-
 def _processing(context: Context) -> dict[str, Any]:
     """Return the attributes that lidarops itself reads."""
     provenance = context.provenance
+    unused = [
+        f"{'dark file ' if role is Role.DARK else ''}{path}: {reason}"
+        for path, role, reason in context.unused[:MOST_UNUSED]
+    ]
+    if len(context.unused) > MOST_UNUSED:
+        unused.append(f"{len(context.unused) - MOST_UNUSED} other raw files")
     return {
         "lidarops_campaign": provenance.campaign,
         "lidarops_scene": context.scene,
@@ -358,17 +299,8 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_code_version": provenance.code_version,
         "lidarops_input_count": np.int32(len(provenance.inputs)),
         "lidarops_input_notes": "\n".join(context.notes),
-        UNUSED_INPUTS: "\n".join(_unused(context)),
+        UNUSED_INPUTS: "\n".join(unused),
     }
-
-
-def _unused(context: Context) -> Iterator[str]:
-    files = context.unused
-    for path, role, reason in files[:MOST_UNUSED]:
-        dark = "dark file " if role is Role.DARK else ""
-        yield f"{dark}{path}: {reason}"
-    if len(files) > MOST_UNUSED:
-        yield f"{len(files) - MOST_UNUSED} other raw files"
 
 
 def iso(moment: datetime) -> str:
@@ -376,7 +308,7 @@ def iso(moment: datetime) -> str:
     return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Return an ISO 8601 duration, such as ``P1DT2H30M0.5S``."""
     whole, milliseconds = divmod(round(seconds * 1000), 1000)
     minutes, second = divmod(whole, 60)

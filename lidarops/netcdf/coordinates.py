@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.context import Context, Extents
+from lidarops.netcdf.context import Context, duration, iso
 from lidarops.netcdf.encoding import CheckedInput, Values, check_range, whole_numbers
 from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
 
@@ -45,16 +45,14 @@ class Coordinate:
         """Return the values of some profiles, for a coordinate over time."""
         return self.values[which] if self.moving is None else self.moving(which)
 
-    @property
-    def auxiliary(self) -> bool:
-        """Whether the attribute ``coordinates`` of variables must list it."""
-        return self.dims != (self.row.name,)
-
 
 def locate_product(
     source: CheckedInput, layout: Layout, context: Context
-) -> tuple[list[Coordinate], Extents]:
-    """Return the coordinates of a product in the order of its layout, and their extents.
+) -> tuple[list[Coordinate], dict[str, Any], bool]:
+    """Return the coordinates of a product in the order of its layout, and what follows from them.
+
+    These are global attributes on its extents, and whether the beam is fixed and near the vertical,
+    as CF profiles require.
 
     Raises
     ------
@@ -63,17 +61,22 @@ def locate_product(
     """
     moments, bounds = (_moments(source, name) for name in ("time", "time_bnds"))
     time = _time(layout.row("time"), moments, bounds)
+    station = context.station
     place = _PLACES.get(layout.sampled, _beam_place)
-    by_name, vertical = place(source, layout, context.station.altitude, time.values.size)
+    by_name, vertical = place(source, layout, station.altitude, time.values.size)
     by_name["time"] = time
     bins = {} if vertical.profiles else _air_positions(by_name, layout, context)
-    for name, value in _fixed(context).items():
-        if name in by_name or not layout.holds(name):
-            continue
-        row = layout.row(name)
-        if f"bin_{name}" in bins:
-            row = deployment(row)
-        if np.isfinite(value):
+    fixed = {
+        "latitude": station.latitude,
+        "longitude": station.longitude,
+        "station_altitude": station.altitude,
+        # Rounded, because metres times 1e9 is not exactly 532.
+        "wavelength": round(context.wavelength * 1e9, 6),
+    }
+    for name, value in fixed.items():
+        if name not in by_name and layout.holds(name) and np.isfinite(value):
+            row = layout.row(name)
+            row = deployment(row) if f"bin_{name}" in bins else row
             by_name[name] = Coordinate(row, (), np.asarray(value, np.float64))
     by_name |= bins
     ordered = [by_name[row.name] for row in layout.coordinates if row.name in by_name]
@@ -83,7 +86,12 @@ def locate_product(
         bins[f"bin_{name}"].values if bins else by_name[name].values
         for name in ("latitude", "longitude")
     ]
-    return ordered, _extents(moments, bounds, vertical, horizontal)
+    extents = {
+        **_horizontal_extent(horizontal, _SPREADS.get(layout.sampled, "along the beam")),
+        **_vertical_extent(vertical),
+        **_time_extent(moments, bounds),
+    }
+    return ordered, extents, vertical.profiles
 
 
 class _Vertical(NamedTuple):
@@ -167,17 +175,6 @@ def _network_place(source: CheckedInput, layout: Layout, _station: float, _profi
 
 _PLACES: Final = {"altitude": _scan_place, "crossing": _network_place}
 """Dimension besides time -> function that returns the coordinates; else `_beam_place`."""
-
-
-def _fixed(context: Context) -> dict[str, float]:
-    station = context.station
-    return {
-        "latitude": station.latitude,
-        "longitude": station.longitude,
-        "station_altitude": station.altitude,
-        # Rounded, because metres times 1e9 is not exactly 532.
-        "wavelength": round(context.wavelength * 1e9, 6),
-    }
 
 
 def _names_along(layout: Layout) -> list[str]:
@@ -309,21 +306,55 @@ def _common_step(profiles: Iterable[Values]) -> float | None:
     return first if largest > _LEVEL else 0.0
 
 
-def _extents(
-    moments: Values, bounds: Values, vertical: _Vertical, horizontal: list[Values]
-) -> Extents:
+_SPREADS: Final = {"crossing": "irregular: crossings of beams"}
+
+
+def _horizontal_extent(positions: Sequence[Values], spread: str) -> dict[str, Any]:
+    """Return the area of the sounded air, also as WKT: a point, or the bounding rectangle."""
+    (south, north), (west, east) = ((float(p.min()), float(p.max())) for p in positions)
+    area = f"POINT ({south!r} {west!r})"
+    if (south, west) != (north, east):
+        corners = ((south, west), (south, east), (north, east), (north, west), (south, west))
+        area = f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
+    else:
+        spread = "not applicable: single position"
+    return {
+        # Latitude first: the order of axes that EPSG:4326 defines.
+        "geospatial_bounds": area,
+        "geospatial_bounds_crs": "EPSG:4326",
+        "geospatial_bounds_vertical_crs": "EPSG:5714",
+        "geospatial_lat_min": south,
+        "geospatial_lat_max": north,
+        "geospatial_lat_units": "degrees_north",
+        "geospatial_lat_resolution": spread,
+        "geospatial_lon_min": west,
+        "geospatial_lon_max": east,
+        "geospatial_lon_units": "degrees_east",
+        "geospatial_lon_resolution": spread,
+    }
+
+
+def _vertical_extent(vertical: _Vertical) -> dict[str, Any]:
+    # ACDD wants the resolution in every file.
+    resolution = f"{vertical.step:.6g} m" if vertical.step else "none: the beam is level"
+    return {
+        "geospatial_vertical_min": float(vertical.altitude.min()),
+        "geospatial_vertical_max": float(vertical.altitude.max()),
+        "geospatial_vertical_units": "m",
+        "geospatial_vertical_positive": "up",
+        "geospatial_vertical_resolution": "not constant" if vertical.step is None else resolution,
+    }
+
+
+def _time_extent(moments: Values, bounds: Values) -> dict[str, str]:
+    start, stop = _datetime(bounds[:, 0].min()), _datetime(bounds[:, 1].max())
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
-    return Extents(
-        start=_datetime(bounds[:, 0].min()),
-        stop=_datetime(bounds[:, 1].max()),
-        interval=float(np.median(intervals / np.timedelta64(1, "s"))),
-        latitudes=(float(horizontal[0].min()), float(horizontal[0].max())),
-        longitudes=(float(horizontal[1].min()), float(horizontal[1].max())),
-        lowest=float(vertical.altitude.min()),
-        highest=float(vertical.altitude.max()),
-        step=vertical.step,
-        vertical=vertical.profiles,
-    )
+    return {
+        "time_coverage_start": iso(start),
+        "time_coverage_end": iso(stop),
+        "time_coverage_duration": duration((stop - start).total_seconds()),
+        "time_coverage_resolution": duration(float(np.median(intervals / np.timedelta64(1, "s")))),
+    }
 
 
 def _datetime(moment: np.datetime64) -> datetime:

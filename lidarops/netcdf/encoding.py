@@ -9,8 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.stored_flags import places
-from lidarops.netcdf.variables import FILL_VALUE, QUALITY_FLAG, Layout, Row, attributes
+from lidarops.netcdf.variables import FILL_VALUE, Layout, Row, attributes
 from lidarops.records import DetectionMode
 
 Values = npt.NDArray[Any]
@@ -77,6 +76,38 @@ class CheckedInput:
         return tuple(str(dim) for dim in self._data.variables[name].dims)
 
 
+def stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Values:
+    """Return a variable as it is stored: in the type of its row, with fill values.
+
+    Parameters
+    ----------
+    source : CheckedInput
+    row : Row
+    flags : ndarray of int32, optional
+        Of the same shape: every missing value must carry a quality bit that states why.
+
+    Raises
+    ------
+    ProductError
+        If it is missing, of other dimensions or type, or holds values that its row does not allow.
+    """
+    values = source.take(row.name, row.dims)
+    check_range(row, values)
+    if row.dtype.startswith("i"):
+        return whole_numbers(row, values)
+    encoded = as_stored(row, values)
+    missing = encoded == FILL_VALUE if flags is not None else None
+    unflagged = 0 if missing is None else int(np.count_nonzero(missing & (flags == 0)))
+    if unflagged:
+        raise ProductError(
+            f"{unflagged} of {encoded.size} values are missing or not finite and carry no quality"
+            " bit",
+            field=row.name,
+            remedy="raise a bit in quality_flag where a value is missing",
+        )
+    return encoded
+
+
 def whole_numbers(row: Row, values: Values) -> Values:
     """Return counts or bits in the type of their row.
 
@@ -85,15 +116,15 @@ def whole_numbers(row: Row, values: Values) -> Values:
     ProductError
         If a value is not a whole number that the type can hold.
     """
-    stored = np.dtype(row.dtype)
-    limits = np.iinfo(stored)
+    held = np.dtype(row.dtype)
+    limits = np.iinfo(held)
     if values.dtype.kind == "M":
         raise ProductError("holds times, not numbers", field=row.name)
     # NaN compares as false, so it is refused too.
     fits = (values >= limits.min) & (values <= limits.max)
     if not fits.all() or (values.dtype.kind == "f" and (values != np.rint(values)).any()):
-        raise ProductError(f"holds values that are not whole numbers of {stored}", field=row.name)
-    return values.astype(stored)
+        raise ProductError(f"holds values that are not whole numbers of {held}", field=row.name)
+    return values.astype(held)
 
 
 def check_range(row: Row, values: Values) -> None:
@@ -115,49 +146,6 @@ def check_range(row: Row, values: Values) -> None:
         )
 
 
-def check_flags(values: Values, known: int) -> None:
-    """Check that all quality bits belong to the kind of product, whose bits are `known`.
-
-    Raises
-    ------
-    ProductError
-        If any other bit is set.
-    """
-    foreign = int(np.bitwise_or.reduce(values & ~np.int32(known), axis=None))
-    if foreign:
-        raise ProductError(
-            f"holds bits that this kind of product does not have: {places(foreign)}",
-            field=QUALITY_FLAG,
-            remedy="add them to products/KIND/variables.py",
-        )
-
-
-def check_flagged(row: Row, missing: Values, flags: Values) -> None:
-    """Check that every missing value carries a quality bit that states why.
-
-    Parameters
-    ----------
-    row : Row
-    missing : ndarray of bool
-        Where values are missing or not finite.
-    flags : ndarray of int32
-        Of the same shape.
-
-    Raises
-    ------
-    ProductError
-        If a missing value carries no bit.
-    """
-    unflagged = int(np.count_nonzero(missing & (flags == 0)))
-    if unflagged:
-        raise ProductError(
-            f"{unflagged} of {missing.size} values are missing or not finite and carry no quality"
-            " bit",
-            field=row.name,
-            remedy="raise a bit in quality_flag where a value is missing",
-        )
-
-
 def as_stored(row: Row, values: Values) -> Values:
     """Return values in the type of their row.
 
@@ -165,12 +153,12 @@ def as_stored(row: Row, values: Values) -> Values:
     """
     # A value too large for the type becomes infinite, and counts as missing.
     with np.errstate(over="ignore"):
-        stored = values.astype(row.dtype)
-    if stored.dtype.kind == "f":
+        encoded = values.astype(row.dtype)
+    if encoded.dtype.kind == "f":
         if row.bits is not None:
-            stored = bitround(stored, row.bits)
-        stored[~np.isfinite(stored)] = FILL_VALUE
-    return stored
+            encoded = bitround(encoded, row.bits)
+        encoded[~np.isfinite(encoded)] = FILL_VALUE
+    return encoded
 
 
 def bitround(values: Values, bits: int) -> Values:

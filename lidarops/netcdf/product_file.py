@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,43 +19,18 @@ from lidarops.errors import ProductError
 from lidarops.flags import FlagBit
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
-from lidarops.netcdf.context import Context, global_attributes
+from lidarops.netcdf.context import Context, global_attributes, product_path
 from lidarops.netcdf.coordinates import locate_product
-from lidarops.netcdf.encoding import (
-    CheckedInput,
-    Values,
-    as_stored,
-    as_text,
-    check_flagged,
-    check_flags,
-    check_range,
-    whole_numbers,
-)
+from lidarops.netcdf.encoding import CheckedInput, Values, as_text, stored, whole_numbers
 from lidarops.netcdf.provenance import prov_json
+from lidarops.netcdf.stored_flags import places
 from lidarops.netcdf.variables import Row, attributes, layout_of
 from lidarops.netcdf.write import RowFile, Skeleton, Written, create_file
-from lidarops.records import Change, Grade
+from lidarops.records import Change, Grade, ProductRecord
 from lidarops.system.files import sha256_of
 
 _TIME: Final = rows.TIME.name
 _BEAMS: Final = ("time", "beam")
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenProduct:
-    """A product that was written, with counts of its ``quality_flag``."""
-
-    sha256: str
-    size: int
-    values: int
-    flagged: dict[str, int]
-    """Number of values with each bit that occurs."""
-    unflagged: int
-    """Number of values without any bit."""
-    usable: int
-    """Number of values without a bit of severity reject."""
-    change: Change | None
-    """How it differs from the product that it replaces; None without one."""
 
 
 @contextmanager
@@ -118,13 +92,13 @@ class ProductWriter:
         self._until_complete = until_complete
         self._former = former
         self._change: Change | None = None
-        self._coordinates, self._extents = locate_product(source, layout, context)
+        self._coordinates, self._extents, self._vertical = locate_product(source, layout, context)
         self._frame_texts = frame.attrs
         self._times = frame.variables[_TIME].values
         self._profiles = 0
         self._names: frozenset[str] = frozenset()
         self._fixed = {
-            row.name: _stored(source, row)
+            row.name: stored(source, row)
             for row in layout.variables
             if not _over_time(row.dims) and not (row.optional and row.name not in source)
         }
@@ -136,7 +110,6 @@ class ProductWriter:
             for dim, size in zip(dims, values.shape, strict=True)
         }
         self._flags = layout.flags
-        self._known_bits = sum(self._flags.bits)
         self._flagged: Counter[FlagBit] = Counter()
         self._verdicts = np.zeros(3, np.int64)
         """Numbers of good values, of those to be used with care, and of rejected ones."""
@@ -205,7 +178,13 @@ class ProductWriter:
     def _measured(self, source: CheckedInput) -> dict[str, Values]:
         judged = self._layout.row(rows.QUALITY_FLAG)
         flags = whole_numbers(judged, source.take(judged.name, judged.dims))
-        check_flags(flags, self._known_bits)
+        foreign = int(np.bitwise_or.reduce(flags & ~np.int32(sum(self._flags.bits)), axis=None))
+        if foreign:
+            raise ProductError(
+                f"holds bits that this kind of product does not have: {places(foreign)}",
+                field=judged.name,
+                remedy="add them to products/KIND/variables.py",
+            )
         encoded: dict[str, Values] = {}
         for row in self._layout.variables:
             if not _over_time(row.dims) or (row.optional and row.name not in source):
@@ -217,7 +196,7 @@ class ProductWriter:
             # missing without one.
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
             judging = row.dims == judged.dims and not spared
-            encoded[row.name] = _stored(source, row, flags if judging else None)
+            encoded[row.name] = stored(source, row, flags if judging else None)
             self._refuse_other_sizes(row, encoded[row.name])
         return encoded
 
@@ -244,7 +223,8 @@ class ProductWriter:
         ProductError
             If an optional variable is present without its ancillary variables.
         """
-        attrs = global_attributes(self._context, self._layout, self._extents)
+        feature_type = "timeSeriesProfile" if self._vertical else ""
+        attrs = global_attributes(self._context, self._layout, self._extents, feature_type)
         if self._frame_texts.get("steps"):
             attrs["lidarops_steps"] = str(self._frame_texts["steps"])
         if self._frame_texts.get("references"):
@@ -275,7 +255,7 @@ class ProductWriter:
                 continue
             attrs = attributes(row, mode=mode, coordinates=self._auxiliary_names(row))
             yield row.name, xr.Variable(row.dims, values, attrs)
-        station = rows.station(profiles=self._extents.vertical)
+        station = rows.station(profiles=self._vertical)
         name = self._context.station.name or self._context.station_key
         yield station.name, as_text(station, name, mode)
         provenance = prov_json(self._context.provenance)
@@ -313,15 +293,15 @@ class ProductWriter:
             self._flagged[bit] += int(np.count_nonzero(flags & np.int32(bit)))
 
     @property
-    def written(self) -> WrittenProduct:
-        """The product, after the ``with`` block.
+    def record(self) -> ProductRecord:
+        """What was written, after the ``with`` block, with counts of ``quality_flag``.
 
         Raises
         ------
         ProductError
             If it is not written.
         """
-        change = self._change
+        context, change = self._context, self._change
         if self.file is None:
             raise ProductError("is not written", file=self._path)
         if change is not None and change.grade is Grade.NONE:
@@ -329,28 +309,20 @@ class ProductWriter:
         else:
             file = self.file.written
         good, care, reject = self._verdicts.tolist()
-        return WrittenProduct(
-            sha256=file.sha256,
-            size=file.size,
+        return ProductRecord(
+            product_path(context),
+            context.kind,
+            context.channel,
+            file.sha256,
+            file.size,
             values=good + care + reject,
             flagged={str(bit.name): self._flagged[bit] for bit in sorted(self._flagged)},
             unflagged=good,
             usable=good + care,
+            stamp=context.stamp,
             change=change,
         )
 
 
 def _over_time(dims: tuple[str, ...]) -> bool:
     return dims[:1] == (_TIME,)
-
-
-def _stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Values:
-    """Return a variable as stored; with `flags`, a missing value must carry a bit."""
-    values = source.take(row.name, row.dims)
-    check_range(row, values)
-    if row.dtype.startswith("i"):
-        return whole_numbers(row, values)
-    stored = as_stored(row, values)
-    if flags is not None:
-        check_flagged(row, stored == rows.FILL_VALUE, flags)
-    return stored

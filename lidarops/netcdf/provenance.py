@@ -15,7 +15,7 @@ from typing import Any, Final
 from uuid import NAMESPACE_URL, uuid5
 
 from lidarops.errors import ProductError
-from lidarops.records import InputRecord, LeftOut, Provenance, Role
+from lidarops.records import Provenance, Role
 
 EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
@@ -34,6 +34,16 @@ def prov_json(provenance: Provenance) -> str:
         ASCII, with sorted keys; independent of the order of the inputs.
     """
     inputs = sorted(provenance.inputs, key=attrgetter("sha256", "path", "role"))
+    files = {}
+    for digest, group in groupby(inputs, key=attrgetter("sha256")):
+        records = list(group)
+        paths = [record.path for record in records]
+        sort = "Product" if records[0].role is Role.PRODUCT else "RawFile"
+        files[f"sha256:{digest}"] = {
+            "prov:type": prov_type(f"lidarops:{sort}"),
+            "lidarops:path": paths[0] if len(paths) == 1 else paths,
+            "lidarops:sha256": digest,
+        }
     return prov_document(
         "lidarops:product",
         ("lidarops:processing", {"lidarops:scene": provenance.scene}),
@@ -48,10 +58,7 @@ def prov_json(provenance: Provenance) -> str:
                 "lidarops:settings": canonical(dict(provenance.settings)),
             },
             "lidarops:plan": _plan(provenance),
-            **{
-                f"sha256:{digest}": _input(list(records))
-                for digest, records in groupby(inputs, key=attrgetter("sha256"))
-            },
+            **files,
         },
         ({"prov:entity": f"sha256:{record.sha256}", "prov:role": record.role} for record in inputs),
         (provenance.code_version, provenance.versions),
@@ -117,32 +124,17 @@ def prov_type(name: str) -> dict[str, str]:
 
 
 def _plan(provenance: Provenance) -> dict[str, Any]:
-    plan = provenance.plan
+    plan, omissions = provenance.plan, []
+    for omission in plan.left_out:
+        number = "" if omission.number is None else f", {omission.number:g}"
+        rule = f" [{omission.rule}{number}]" if omission.rule else ""
+        omissions.append(f"{omission.name} of {omission.channel}: {omission.reason}{rule}")
     return {
         "prov:type": prov_type("prov:Plan"),
         "lidarops:sha256": plan.hash,
         # The text of this digest.
         "lidarops:json": canonical(plan.as_dict()),
-        "lidarops:left_out": [
-            f"{omission.name} of {omission.channel}: {omission.reason}{_rule(omission)}"
-            for omission in plan.left_out
-        ],
-    }
-
-
-def _rule(omission: LeftOut) -> str:
-    """Return the rule that decided and its number, in brackets."""
-    number = "" if omission.number is None else f", {omission.number:g}"
-    return f" [{omission.rule}{number}]" if omission.rule else ""
-
-
-def _input(records: list[InputRecord]) -> dict[str, Any]:
-    paths = [record.path for record in records]
-    sort = "Product" if records[0].role is Role.PRODUCT else "RawFile"
-    return {
-        "prov:type": prov_type(f"lidarops:{sort}"),
-        "lidarops:path": paths[0] if len(paths) == 1 else paths,
-        "lidarops:sha256": records[0].sha256,
+        "lidarops:left_out": omissions,
     }
 
 

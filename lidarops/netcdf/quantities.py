@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Final
 
-from lidarops.netcdf.variables import (
-    ENDS,
-    Coverage,
-    ErrorKind,
-    Row,
-    count,
-    shots,
-)
+from lidarops.netcdf.variables import ENDS, Coverage, ErrorKind, Row, count, per_profile, shots
 from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS as CLOUD_THRESHOLDS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
 
-BINS: Final = ("time", "range")
 VALUE_BITS: Final = 12
 """Significant bits of a retrieved value: 1.2e-4 of it."""
 _OF_MEAN: Final = ("quality_flag", "profiles", "shots")
@@ -44,10 +35,9 @@ def mean_value(
     """Return the row of a quantity that is retrieved from each bin of a mean profile."""
     return Row(
         name,
-        BINS,
-        units,
         long_name,
-        comment=comment,
+        comment,
+        units=units,
         ancillaries=(*ancillaries, *_OF_MEAN),
         bits=VALUE_BITS,
         uncertain=True,
@@ -82,15 +72,9 @@ def aerosol_extinction(comment: str, ancillaries: tuple[str, ...], **more: Any) 
 
 
 AVERAGED: Final = (
-    count(
-        "profiles",
-        ("time",),
-        "number of raw profiles in the mean",
-        cell_methods="time: sum",
-    ),
+    count("profiles", "number of raw profiles in the mean", cell_methods="time: sum"),
     count(
         "profiles_left_out",
-        ("time",),
         "number of raw profiles that are left out of the mean as outlying",
         cell_methods="time: sum",
         comment="Profiles are left out where their signal, in any channel, exceeds that of all"
@@ -104,44 +88,38 @@ AVERAGED: Final = (
 
 MOLECULAR_BACKSCATTER: Final = Row(
     "molecular_backscatter",
-    ("range",),
-    "m-1 sr-1",
     "backscatter coefficient of molecules",
-    Coverage.REFERENCE,
     "Rayleigh scattering including rotational Raman lines.",
+    dims=("range",),
+    units="m-1 sr-1",
+    coverage=Coverage.REFERENCE,
 )
 _REFERENCE_WINDOW: Final = (
     *(
-        Row(
+        per_profile(
             f"reference_{end}{ending}",
-            ("time",),
-            "m",
             f"{where} at which the reference window {verb}",
-            Coverage.AUXILIARY,
             "Missing where no window passed the tests.",
+            units="m",
         )
         for ending, where in (("", "range"), ("_altitude", "altitude above the geoid"))
         for end, verb in ENDS
     ),
     Row(
         "reference_scattering_ratio",
-        (),
-        "1",
         "assumed ratio of backscatter of particles and molecules to that of molecules in the"
         " reference window",
-        Coverage.REFERENCE,
         "Set by the campaign, as its standard error is: the value by which profiles are"
         " calibrated.",
+        dims=(),
+        coverage=Coverage.REFERENCE,
         uncertain=True,
         error_kind=ErrorKind.SYSTEMATIC,
     ),
-    Row(
+    per_profile(
         "reference_detection_limit",
-        ("time",),
-        "1",
         "least ratio of backscatter of particles to that of molecules that is detected in the"
         " reference window with a probability of 0.95",
-        Coverage.AUXILIARY,
         "By comparison with other windows. Fewer particles may remain undetected:"
         " aerosol_backscatter_error_reference includes the noise of this comparison, and the ratio"
         " of the window to air in excess of the lowest ratio. Missing where no window passed the"
@@ -158,12 +136,9 @@ def reference_window(comment: str) -> tuple[Row, ...]:
     comment : str
         On the reasons for which candidates of the window fail.
     """
-    rejections = Row(
+    rejections = per_profile(
         "reference_rejections",
-        ("time",),
-        "1",
         "reasons for which candidates of the reference window were rejected",
-        Coverage.AUXILIARY,
         "Of all candidates together; where none passed, no_reference is raised in quality_flag."
         f" {comment}",
         dtype="i4",
@@ -178,80 +153,66 @@ CLOUD_FRACTION: Final = "cloud_fraction"
 CLOUDS: Final = (
     Row(
         CLOUD_MASK,
-        ("time", "range"),
-        "1",
         "clouds and dense layers in the mean profile",
-        Coverage.AUXILIARY,
         "partly_cloudy: some of the averaged profiles show a cloud, not all. cloudy: all of them"
         " do, or their mean does. unknown: no usable data, the overlap may be incomplete, or noise"
         f" would hide a cloud: in the noise of the mean, {CLOUD_THRESHOLDS.visible_depth:g} m with"
         f" {CLOUD_THRESHOLDS.visible_excess:g} times the least excess over air that makes a cloud"
         " would not be found. From base to apparent top: beyond a cloud that attenuates strongly"
         " there may be more. Profiles that are left out, or have no data there, do not count.",
+        coverage=Coverage.AUXILIARY,
         dtype="i1",
         standard_name="status_flag",
         states=("clear", "partly_cloudy", "cloudy", "unknown"),
     ),
     Row(
         CLOUD_FRACTION,
-        ("time", "range"),
-        "1",
         "share of the averaged profiles in which a cloud or dense layer is detected",
-        Coverage.AUXILIARY,
         f"The profiles of a mean are divided into up to {SIGNAL_THRESHOLDS.most_parts} parts, and"
         f" clouds are sought in each, in cells of about {SIGNAL_THRESHOLDS.cell_length:g} m; only"
         " those with data there count. Missing where no part has any, where cloud_mask is unknown,"
         " or where only the mean shows a cloud, so that cloud_mask is cloudy.",
+        coverage=Coverage.AUXILIARY,
         valid_min=0.0,
         valid_max=1.0,
     ),
-    Row(
+    per_profile(
         "cloud_base_range",
-        ("time",),
-        "m",
         "range at which the lowest cloud or dense layer begins",
-        Coverage.AUXILIARY,
         "Of all profiles in the mean. Missing where no cloud or dense layer was detected.",
+        units="m",
     ),
-    Row(
+    per_profile(
         "cloud_base_altitude",
-        ("time",),
-        "m",
         "altitude above the geoid at which the lowest cloud or dense layer begins",
-        Coverage.AUXILIARY,
         "Of all profiles in the mean. Missing where no cloud or dense layer was detected.",
+        units="m",
         standard_name="cloud_base_altitude",
     ),
-    Row(
+    per_profile(
         "cloud_top_altitude",
-        ("time",),
-        "m",
         "altitude above the geoid of the apparent top of the highest cloud or dense layer",
-        Coverage.AUXILIARY,
         "Of all profiles in the mean: where the ratio to air falls no more, or noise hides that it"
         " does: then this is below the true top. Missing where no cloud or dense layer was"
         " detected.",
+        units="m",
         standard_name="cloud_top_altitude",
     ),
 )
 """Of `lidarops.retrieve.clouds.labeled.Clouds`."""
 
 
-def total_extinction(dims: tuple[str, ...], comment: str = "", **more: Any) -> Row:
+def total_extinction(comment: str = "At the wavelength of the channel.", **more: Any) -> Row:
     """Return the row of the extinction of molecules and particles together."""
     words = "extinction coefficient of molecules and particles"
-    comment = comment or "At the wavelength of the channel."
-    return replace(Row("total_extinction", dims, "m-1", words, comment=comment), **more)
+    return Row("total_extinction", words, comment, units="m-1", **more)
 
 
-def visibility(
-    dims: tuple[str, ...], where: str, ancillaries: tuple[str, ...], **more: Any
-) -> tuple[Row, ...]:
+def visibility(where: str, ancillaries: tuple[str, ...], **more: Any) -> tuple[Row, ...]:
     """Return the rows of visibility and of the limits of its uncertainty interval.
 
     Parameters
     ----------
-    dims : tuple of str
     where : str
         Where the visibility applies, as the end of a phrase.
     ancillaries : tuple of str
@@ -262,12 +223,11 @@ def visibility(
     limits = tuple(
         Row(
             f"visibility_in_air_{end}",
-            dims,
-            "m",
             f"{end} limit of the uncertainty interval of visibility {where}",
-            Coverage.QUALITY,
             f"Visibility for extinction {sign} its combined random and systematic error (root of"
             " the sum of squares); the interval is not symmetric.",
+            units="m",
+            coverage=Coverage.QUALITY,
             valid_min=0.0,
             optional=bool(more.get("optional")),
         )
@@ -275,16 +235,16 @@ def visibility(
     )
     value = Row(
         "visibility_in_air",
-        dims,
-        "m",
         f"visibility {where}",
-        comment="-ln(contrast) / extinction of the averaging interval, not a mean of visibilities."
+        "-ln(contrast) / extinction of the averaging interval, not a mean of visibilities."
         " lidarops_steps states the contrast and, where applied, the conversion of extinction to"
         " 550 nm. Missing where extinction is not positive.",
+        units="m",
         standard_name="visibility_in_air",
         cell_methods="time: mean",
         uncertain=True,
         ancillaries=(*(row.name for row in limits), *ancillaries),
         lower_end=limits[0].name,
+        **more,
     )
-    return replace(value, **more), *limits
+    return value, *limits

@@ -132,14 +132,16 @@ class Row:
     """Description of one variable of a product, and of its errors."""
 
     name: str
-    dims: tuple[str, ...]
-    units: str | None
-    """``{signal}`` stands for mV in analog detection and MHz in photon counting."""
     long_name: str
-    coverage: Coverage = Coverage.PHYSICAL
     comment: str | None = None
     """Without standard name, `NO_STANDARD_NAME` is added; not to coordinates or an empty text."""
     _: KW_ONLY
+    dims: tuple[str, ...] = ("time", "{sampled}")
+    """By default the values of a kind of product: over time and `Layout.sampled`."""
+    units: str | None = "1"
+    """``{signal}`` stands for mV in analog detection and MHz in photon counting."""
+    coverage: Coverage | None = None
+    """By default that of a coordinate or, in `Layout.data`, of a measurement."""
     dtype: str = ""
     """numpy type code as stored, ``S1`` for text; by default ``f8`` of coordinates, else ``f4``."""
     standard_name: str | None = None
@@ -188,15 +190,18 @@ class Row:
         return self.states.index(state)
 
 
-def completed(row: Row) -> Row:
-    """Return a row with what follows from its other fields: type, cell methods, comment, error."""
-    coordinate = row.coverage is Coverage.COORDINATE
-    derived: dict[str, Any] = {"dtype": row.dtype or ("f8" if coordinate else "f4")}
+def completed(row: Row, coverage: Coverage = Coverage.PHYSICAL, sampled: str = "") -> Row:
+    """Return a row with what follows from its other fields and from its place in a layout."""
+    coverage = row.coverage or coverage
+    coordinate = coverage is Coverage.COORDINATE
+    dims = tuple(dim.format(sampled=sampled) for dim in row.dims)
+    dtype = row.dtype or ("f8" if coordinate else "f4")
+    derived: dict[str, Any] = {"coverage": coverage, "dims": dims, "dtype": dtype}
     known = row.standard_name or coordinate or row.comment == ""
     if row.units and not known and NO_STANDARD_NAME not in (row.comment or ""):
         derived["comment"] = f"{row.comment or ''} {NO_STANDARD_NAME}".strip()
-    if row.coverage is Coverage.PHYSICAL and row.cell_methods is None:
-        methods = (f"{dim}: mean" for dim in row.dims if dim in ("time", "range"))
+    if coverage is Coverage.PHYSICAL and row.cell_methods is None:
+        methods = (f"{dim}: mean" for dim in dims if dim in ("time", "range"))
         derived["cell_methods"] = " ".join(methods)
     if row.budget is not None and row.error_kind is None:
         derived["error_kind"] = ErrorKind.BOTH
@@ -232,11 +237,11 @@ def _error(row: Row, error: Error) -> Row:
     comment = f"{error.comment.format(quantity=row.name)} {NO_STANDARD_NAME}".strip()
     return Row(
         error.name(row.name),
-        row.dims,
-        row.units,
         error.long_name.format(quantity=row.name),
-        Coverage.QUALITY,
         comment,
+        dims=row.dims,
+        units=row.units,
+        coverage=Coverage.QUALITY,
         dtype=row.dtype,
         valid_min=None if error.part or error.signed else 0.0,
         bits=row.bits and _ERROR_BITS,
@@ -318,7 +323,8 @@ def layout_of(kind: str) -> Layout:
         If there is no such kind, or it has no ``variables``.
     """
     layout: Layout = kind_of(kind).part("variables", "LAYOUT")
-    coordinates, data = (tuple(map(completed, rows)) for rows in (layout.coordinates, layout.data))
+    coordinates = tuple(completed(row, Coverage.COORDINATE) for row in layout.coordinates)
+    data = tuple(completed(row, sampled=layout.sampled) for row in layout.data)
     return replace(layout, coordinates=coordinates, data=data)
 
 
@@ -334,13 +340,12 @@ def usable(dims: tuple[str, ...]) -> Row:
     """Return the row of ``usable``, which summarizes the bits of ``quality_flag``."""
     return Row(
         USABLE,
-        dims,
-        "1",
         "usability of the value, from the bits of quality_flag",
-        Coverage.QUALITY,
         "do_not_use: quality_flag has a bit of severity reject. use_with_care: it has bits of"
         " severity care only. good: no test failed. The comment of quality_flag states the severity"
         " of each bit.",
+        dims=dims,
+        coverage=Coverage.QUALITY,
         dtype="i1",
         standard_name="aggregate_quality_flag",
         summary=True,
@@ -381,7 +386,7 @@ def attributes(
         Names of the variable's auxiliary coordinates.
     """
     stored = np.dtype(row.dtype)
-    limit = stored.type if stored.kind in "if" else None
+    limits = {"valid_min": row.valid_min, "valid_max": row.valid_max}
     filled = stored.kind == "f" and row.coverage is not Coverage.COORDINATE
     attrs: dict[str, Any] = {
         "standard_name": row.standard_name,
@@ -391,9 +396,8 @@ def attributes(
         "positive": row.positive,
         "bounds": row.bounds,
         "cell_methods": row.cell_methods,
-        "valid_min": None if row.valid_min is None or limit is None else limit(row.valid_min),
-        "valid_max": None if row.valid_max is None or limit is None else limit(row.valid_max),
-        "coverage_content_type": row.coverage.value,
+        **{name: stored.type(limit) for name, limit in limits.items() if limit is not None},
+        "coverage_content_type": row.coverage and row.coverage.value,
         "ancillary_variables": " ".join(row.ancillaries) or None,
         "coordinates": " ".join(coordinates) or None,
         "cf_role": row.cf_role,
@@ -436,40 +440,36 @@ def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
 
 TIME: Final = Row(
     "time",
-    ("time",),
-    TIME_UNITS,
     "midpoint of the averaging interval, UTC",
-    Coverage.COORDINATE,
+    dims=("time",),
+    units=TIME_UNITS,
     standard_name="time",
     axis="T",
     bounds="time_bnds",
 )
 RANGE: Final = Row(
     "range",
-    ("range",),
-    "m",
     "distance from the lidar along the beam, centre of the range bin",
-    Coverage.COORDINATE,
+    dims=("range",),
+    units="m",
     bounds="range_bnds",
 )
 
 
 def numbered(name: str, long_name: str, comment: str | None = None, **more: Any) -> Row:
     """Return the row of the coordinate of a dimension whose places have numbers."""
-    coverage = Coverage.COORDINATE
-    return replace(Row(name, (name,), "1", long_name, coverage, comment, dtype="i4"), **more)
+    return replace(Row(name, long_name, comment, dims=(name,), dtype="i4"), **more)
 
 
 def altitude(along: str, bounds: str | None = None) -> Row:
     """Return the row of the altitude of values along a dimension."""
     return Row(
         "altitude",
-        (along,),
-        "m",
         "altitude of the sounded air above the geoid",
-        Coverage.COORDINATE,
-        "Station altitude + range x cos(zenith angle), for a straight beam over a flat Earth."
-        " Curvature of the Earth adds (range x sin(zenith angle))^2 / 12742 km.",
+        "Station altitude + range x cos(zenith angle), for a straight beam over a flat"
+        " Earth. Curvature of the Earth adds (range x sin(zenith angle))^2 / 12742 km.",
+        dims=(along,),
+        units="m",
         dtype="f4",
         standard_name="altitude",
         axis="Z",
@@ -482,10 +482,9 @@ def altitude(along: str, bounds: str | None = None) -> Row:
 PLACE: Final = (
     Row(
         "zenith_angle",
-        (),
-        "degree",
         "zenith angle of the beam, 0 = up",
-        Coverage.COORDINATE,
+        dims=(),
+        units="degree",
         standard_name="zenith_angle",
         valid_min=0.0,
         valid_max=180.0,
@@ -493,47 +492,42 @@ PLACE: Final = (
     ),
     Row(
         "azimuth",
-        (),
-        "degree",
         "azimuth of the beam, clockwise from north",
-        Coverage.COORDINATE,
+        dims=(),
+        units="degree",
         standard_name="direction_of_radial_vector_away_from_instrument",
         follows_beam=True,
     ),
     Row(
         "latitude",
-        (),
-        "degrees_north",
         "latitude of the station",
-        Coverage.COORDINATE,
+        dims=(),
+        units="degrees_north",
         standard_name="latitude",
         valid_min=-90.0,
         valid_max=90.0,
     ),
     Row(
         "longitude",
-        (),
-        "degrees_east",
         "longitude of the station",
-        Coverage.COORDINATE,
+        dims=(),
+        units="degrees_east",
         standard_name="longitude",
         valid_min=-180.0,
         valid_max=180.0,
     ),
     Row(
         "station_altitude",
-        (),
-        "m",
         "altitude of the station above the geoid",
-        Coverage.COORDINATE,
+        dims=(),
+        units="m",
         standard_name="surface_altitude",
     ),
     Row(
         "wavelength",
-        (),
-        "nm",
         "wavelength of the channel",
-        Coverage.COORDINATE,
+        dims=(),
+        units="nm",
         standard_name="radiation_wavelength",
         valid_min=0.0,
     ),
@@ -542,7 +536,8 @@ PLACE: Final = (
 
 def place(name: str, /, **changes: Any) -> Row:
     """Return the row of a part of `PLACE`, with some fields changed."""
-    return replace(completed(next(row for row in PLACE if row.name == name)), **changes)
+    row = next(row for row in PLACE if row.name == name)
+    return replace(row, **{"dtype": "f8", **changes})
 
 
 SOUNDED: Final = tuple(
@@ -586,29 +581,29 @@ def deployment(row: Row) -> Row:
 
 _STATION: Final = Row(
     "station",
-    ("station_strlen",),
-    None,
     "name of the station, or of the network of lidars",
-    Coverage.REFERENCE,
+    dims=("station_strlen",),
+    units=None,
+    coverage=Coverage.REFERENCE,
     dtype="S1",
     standard_name="platform_name",
 )
 QUANTIZATION: Final = Row(
     "quantization_info",
-    (),
-    None,
     "rounding of values to fewer significant bits",
-    Coverage.REFERENCE,
+    dims=(),
+    units=None,
+    coverage=Coverage.REFERENCE,
     dtype="i4",
     algorithm="bitround",
 )
 """Container variable of CF-1.12, section 8.4; its value has no meaning."""
 PROVENANCE: Final = Row(
     "provenance",
-    ("provenance_strlen",),
-    None,
     "inputs, plan, settings and software of this product as W3C PROV-JSON",
-    Coverage.REFERENCE,
+    dims=("provenance_strlen",),
+    units=None,
+    coverage=Coverage.REFERENCE,
     dtype="S1",
 )
 
@@ -618,45 +613,38 @@ def station(*, profiles: bool) -> Row:
     return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION
 
 
-def quality(dims: tuple[str, ...], flags: Flags) -> Row:
+def quality(flags: Flags) -> Row:
     """Return the row of the quality bits of a kind of product."""
-    words = "quality bits of the value, one for each failed test"
     return Row(
         QUALITY_FLAG,
-        dims,
-        "1",
-        words,
-        Coverage.QUALITY,
+        "quality bits of the value, one for each failed test",
+        coverage=Coverage.QUALITY,
         dtype="i4",
         standard_name="quality_flag",
         flags=flags,
     )
 
 
-def count(name: str, dims: tuple[str, ...], long_name: str, **more: Any) -> Row:
-    """Return the row of a number of things, such as of profiles in a mean."""
-    row = Row(
-        name,
-        dims,
-        "1",
-        long_name,
-        Coverage.AUXILIARY,
-        dtype="i4",
-        standard_name="number_of_observations",
-        valid_min=0.0,
-    )
+def per_profile(name: str, long_name: str, comment: str | None = None, **more: Any) -> Row:
+    """Return the row of a number of each profile, besides its values."""
+    row = Row(name, long_name, comment, dims=("time",), coverage=Coverage.AUXILIARY)
     return replace(row, **more)
+
+
+def count(name: str, long_name: str, **more: Any) -> Row:
+    """Return the row of a number of things in a profile, such as of those in a mean."""
+    number = {"dtype": "i4", "standard_name": "number_of_observations", "valid_min": 0.0}
+    return per_profile(name, long_name, **{**number, **more})
 
 
 def shots(*, of: str) -> Row:
     """Return the row of the number of laser shots."""
-    words = f"number of laser shots of {of}"
-    return count("shots", ("time",), words, cell_methods="time: sum")
+    return count("shots", f"number of laser shots of {of}", cell_methods="time: sum")
 
 
 def coded(name: str, long_name: str, states: tuple[str, ...], comment: str) -> Row:
     """Return the row of a number that stands for one of several states of the whole product."""
-    return Row(name, (), "1", long_name, Coverage.AUXILIARY, comment, dtype="i1", states=states)
+    return per_profile(name, long_name, comment, dims=(), dtype="i1", states=states)
 
 
 def retrieval_method(states: tuple[str, ...], comment: str) -> Row:
@@ -683,11 +671,10 @@ BACKGROUND_METHOD: Final = coded(
 )
 SUBTRACTED_BACKGROUND: Final = Row(
     "background",
-    ("time",),
-    "{signal}",
     "subtracted background: sky light, dark current and offset",
-    comment="Not calibrated. Missing where a glued signal is analog alone, less its unknown"
-    " offset.",
+    "Not calibrated. Missing where a glued signal is analog alone, less its unknown offset.",
+    dims=("time",),
+    units="{signal}",
     ancillaries=("shots",),
     uncertain=True,
 )
@@ -695,37 +682,30 @@ SUBTRACTED_BACKGROUND: Final = Row(
 
 ENDS: Final = (("bottom", "begins"), ("top", "ends"))
 GLUING: Final = (
-    Row(
+    per_profile(
         "glue_lag",
-        ("time",),
-        "1",
         "lag of the analog record behind the photon-counting record in range bins",
-        Coverage.AUXILIARY,
         "The analog signal is shifted by this lag before gluing. The standard error is missing"
         " where the lag is not estimated from the noise common to both records, or where their"
         " correlation is not significant.",
         optional=True,
         uncertain=True,
     ),
-    Row(
+    per_profile(
         "glue_slope",
-        ("time",),
-        "MHz mV-1",
         "slope of the photon-counting rate over the analog signal in the gluing window",
-        Coverage.AUXILIARY,
         "Of analog alone that of the scene. Missing where none is known or used.",
+        units="MHz mV-1",
         optional=True,
         uncertain=True,
     ),
     *(
-        Row(
+        per_profile(
             f"glue_{end}",
-            ("time",),
-            "m",
             f"range at which the gluing window {verb}",
-            Coverage.AUXILIARY,
             "The glued signal is analog at shorter and photon counting at longer ranges. Both ends"
             " are that of the bins for analog alone, and 0 for photon counting alone.",
+            units="m",
             optional=True,
         )
         for end, verb in ENDS

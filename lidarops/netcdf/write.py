@@ -11,9 +11,10 @@ import math
 import os
 import secrets
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.netcdf._chunks import Block, RowBlocks, deflate_chunks
+from lidarops.netcdf._chunks import RowBlocks, deflate_chunks
 from lidarops.system.files import sha256_of
 
 if TYPE_CHECKING:
@@ -323,7 +324,7 @@ class RowFile:
         self.settled: Written | None = None
         self._chunks = skeleton.chunks()
         self._columns = {
-            name: RowBlocks(name, variable.shape[0], self._chunks[name][0])
+            name: RowBlocks(variable.shape[0], self._chunks[name][0])
             for name, variable in skeleton.with_rows().items()
         }
         sizes = skeleton.sizes()
@@ -356,12 +357,9 @@ class RowFile:
 
     def write_fixed(self) -> None:
         """Write the variables that have no rows."""
-        with _disk_errors(self._path):
-            self._write(
-                Block(name, 0, self._variables[name].values)
-                for name in self._chunks
-                if name not in self._columns
-            )
+        for name in self._chunks:
+            if name not in self._columns:
+                self._write(name, 0, self._variables[name].values)
 
     def add(self, rows: Mapping[str, _Array]) -> None:
         """Write the next rows.
@@ -378,25 +376,27 @@ class RowFile:
             If they cannot be written.
         """
         blocks = [
-            block for name, column in self._columns.items() for block in column.take(rows[name])
+            (first + len(values), name, first, values)
+            for name, column in self._columns.items()
+            for first, values in column.take(rows[name])
         ]
         # Among blocks with the same last row, the order of variables stays.
-        blocks.sort(key=lambda block: block.end)
-        with _disk_errors(self._path):
-            self._write(blocks)
+        blocks.sort(key=itemgetter(0))
+        for _, name, first, values in blocks:
+            self._write(name, first, values)
         self._rows += len(next(iter(rows.values())))
 
-    def _write(self, blocks: Iterable[Block]) -> None:
-        for block in blocks:
-            variable = self._variables[block.name]
-            native = variable.dtype.newbyteorder("=")
-            fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
-            values = block.values.astype(native, copy=False)
+    def _write(self, name: str, begin: int, values: _Array) -> None:
+        """Write whole chunks of a variable, from a row on."""
+        variable = self._variables[name]
+        native = variable.dtype.newbyteorder("=")
+        fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
+        chunks = deflate_chunks(values.astype(native, copy=False), self._chunks[name], fill)
+        with _disk_errors(self._path):
             # Deflated without the lock, so that other threads go on.
-            for (first, *others), data in deflate_chunks(values, self._chunks[block.name], fill):
+            for (first, *others), data in chunks:
                 with NETCDF4_PYTHON_LOCK:
-                    target = self._targets[block.name]
-                    target.write_direct_chunk((block.first + first, *others), data)
+                    self._targets[name].write_direct_chunk((begin + first, *others), data)
                 self._stream.check()
 
     def complete(self) -> None:

@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -249,17 +249,9 @@ class _Work(ABC):
         place = self.job.place(context.kind, context.channel)
         with create_product(frame, context, target, place.sha256) as writer:
             yield writer
-        written = writer.written
-        stays = written.change is not None and written.change.grade is Grade.NONE
-        self.made.append(
-            ProductRecord(
-                product_path(context),
-                context.kind,
-                context.channel,
-                **{item.name: getattr(written, item.name) for item in fields(written)},
-                stamp=place.former if stays else context.stamp,
-            )
-        )
+        record = writer.record
+        stays = record.change is not None and record.change.grade is Grade.NONE
+        self.made.append(replace(record, stamp=place.former) if stays else record)
         self._clock.lap("write")
 
     def _write(self, context: Context, results: Iterator[xr.Dataset]) -> None:

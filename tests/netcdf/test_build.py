@@ -32,7 +32,7 @@ from support.products.made_products import (
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
-from lidarops.netcdf.context import _duration, product_path
+from lidarops.netcdf.context import duration, product_path
 from lidarops.netcdf.encoding import bitround
 from lidarops.netcdf.variables import layout_of
 from lidarops.records import DetectionMode, Stamp
@@ -239,7 +239,7 @@ def test_extents_are_those_of_the_data():
 @settings(deadline=None)
 @given(st.integers(0, 10**9))
 def test_durations_read_back(milliseconds: int):
-    assert pd.Timedelta(_duration(milliseconds / 1000)) == pd.Timedelta(milliseconds, "ms")
+    assert pd.Timedelta(duration(milliseconds / 1000)) == pd.Timedelta(milliseconds, "ms")
 
 
 def test_dates_are_those_of_writing_or_of_the_environment(monkeypatch: pytest.MonkeyPatch):

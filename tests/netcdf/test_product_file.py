@@ -21,9 +21,9 @@ from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.netcdf import context as contexts
 from lidarops.netcdf import write as writer
-from lidarops.netcdf.product_file import ProductWriter, WrittenProduct, create_product
+from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.netcdf.write import CHUNK_BYTES, write_product
-from lidarops.records import Stamp
+from lidarops.records import ProductRecord, Stamp
 
 PROFILES, BINS = 53, 9000
 """A signal has 29 profiles a chunk, and its last chunk is cut."""
@@ -36,12 +36,12 @@ def framed(data: xr.Dataset) -> xr.Dataset:
     return data.drop_vars(measured)
 
 
-def added(data: xr.Dataset, kind: str, path: Path, cuts: list[int]) -> WrittenProduct:
+def added(data: xr.Dataset, kind: str, path: Path, cuts: list[int]) -> ProductRecord:
     """Write a product, cut before some of its profiles."""
     with create_product(framed(data), context(kind), path) as product:
         for first, last in pairwise([0, *cuts, data.sizes["time"]]):
             product.add(data.isel(time=slice(first, last)))
-    return product.written
+    return product.record
 
 
 def whole(data: xr.Dataset, kind: str, path: Path) -> bytes:
@@ -148,7 +148,7 @@ def test_profiles_that_do_not_fit_leave_the_former_file(pieces, field, problem, 
     assert path.read_text() == "former"
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(ProductError, match=r"no profiles|not written"):
-        _ = product.written
+        _ = product.record
 
 
 def test_profiles_decide_on_optional_variables(tmp_path: Path):

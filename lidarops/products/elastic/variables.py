@@ -9,7 +9,6 @@ from lidarops.flags import SIGNAL_BITS, Flags
 from lidarops.netcdf.quantities import (
     AEROSOL_LIDAR_RATIO,
     AVERAGED,
-    BINS,
     CLOUDS,
     MOLECULAR_BACKSCATTER,
     SUM_OF_SQUARES,
@@ -42,10 +41,7 @@ FLAGS: Final = Flags(kind="elastic", version=3, bits=(*SIGNAL_BITS, *ElasticQual
 _BY_CAUSE: Final = {
     ErrorKind.RANDOM: {
         "noise": ("signal noise", "Random: independent from profile to profile."),
-        "background": (
-            "background",
-            "Random in time, but common to all ranges of a profile.",
-        ),
+        "background": ("background", "Random in time, but common to all ranges of a profile."),
     },
     ErrorKind.SYSTEMATIC: {
         "reference": (
@@ -146,30 +142,30 @@ LAYOUT: Final = Layout(
         ),
         Row(
             "vertical_resolution",
-            (),
-            "m",
             "effective resolution of all profiles along the beam",
-            Coverage.AUXILIARY,
             "The width of a range bin: profiles are not smoothed.",
+            dims=(),
+            units="m",
+            coverage=Coverage.AUXILIARY,
         ),
         MOLECULAR_SOURCE,
         MOLECULAR_BACKSCATTER,
         Row(
             "molecular_extinction",
-            ("range",),
-            "m-1",
             "extinction coefficient of molecules",
-            Coverage.REFERENCE,
+            dims=("range",),
+            units="m-1",
+            coverage=Coverage.REFERENCE,
         ),
         Row(
             "lidar_ratio",
-            ("range",),
-            "sr",
             "assumed ratio of extinction to backscatter of aerosol particles",
-            Coverage.REFERENCE,
             "Set by the campaign: a number, a profile, or the mean over time of a raman product"
             " without values in clouds, which the provenance names. Its errors at all ranges are"
             " one error.",
+            dims=("range",),
+            units="sr",
+            coverage=Coverage.REFERENCE,
             standard_name=AEROSOL_LIDAR_RATIO,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
@@ -184,7 +180,7 @@ LAYOUT: Final = Layout(
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
         *GLUING,
-        quality(BINS, FLAGS),
+        quality(FLAGS),
         *AVERAGED,
     ),
 )

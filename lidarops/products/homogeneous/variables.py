@@ -40,23 +40,14 @@ FLAGS: Final = Flags(
 )
 """Published places are in `tests/products/test_flags.py`."""
 
-_SECTIONS = ("time", "section")
 _OF_FIT = ("reduced_chi2", "valid_bins", "quality_flag", "shots")
 _ALONG = (
-    Row(
-        "section",
-        ("section",),
-        "1",
-        "number of the range section",
-        Coverage.COORDINATE,
-        dtype="i4",
-    ),
+    Row("section", "number of the range section", dims=("section",), dtype="i4"),
     Row(
         "section_range",
-        ("section",),
-        "m",
         "distance from the lidar along the beam, midpoint of the range section",
-        Coverage.COORDINATE,
+        dims=("section",),
+        units="m",
         bounds="section_bounds",
     ),
 )
@@ -94,7 +85,6 @@ LAYOUT: Final = Layout(
     coordinates=coordinates(_ALONG, altitude("section", "altitude_bnds")),
     data=(
         total_extinction(
-            _SECTIONS,
             cell_methods="time: mean section: mean",
             ancillaries=_OF_FIT,
             uncertain=True,
@@ -115,29 +105,22 @@ LAYOUT: Final = Layout(
                 ),
             ),
         ),
-        *visibility(
-            _SECTIONS,
-            "along the section",
-            ("total_extinction_model_error", *_OF_FIT),
-            optional=True,
-        ),
+        *visibility("along the section", ("total_extinction_model_error", *_OF_FIT), optional=True),
         Row(
             "amplitude",
-            _SECTIONS,
-            "{signal} m2",
             "range-corrected signal of the section extrapolated to range 0",
-            comment="System constant times backscatter coefficient, not calibrated.",
+            "System constant times backscatter coefficient, not calibrated.",
+            units="{signal} m2",
             ancillaries=_OF_FIT,
             uncertain=True,
         ),
         Row(
             "background",
-            _SECTIONS,
-            "{signal}",
             "background fitted in the section",
-            comment="Not calibrated. Where extinction plus 1 / mean range is known to 10 to 15"
+            "Not calibrated. Where extinction plus 1 / mean range is known to 10 to 15"
             " percent only, some simulated backgrounds deviate by more than 4 of their standard"
             " errors.",
+            units="{signal}",
             ancillaries=_OF_FIT,
             uncertain=True,
             errors=(
@@ -152,17 +135,15 @@ LAYOUT: Final = Layout(
         ),
         Row(
             "reduced_chi2",
-            _SECTIONS,
-            "1",
             "reduced chi-square of the fit",
-            Coverage.QUALITY,
             "Close to 1 where the model holds within the noise.",
+            coverage=Coverage.QUALITY,
             valid_min=0.0,
         ),
         count(
             "valid_bins",
-            _SECTIONS,
             "number of fitted range bins of the section",
+            dims=("time", "section"),
             coverage=Coverage.QUALITY,
         ),
         retrieval_method(
@@ -170,7 +151,7 @@ LAYOUT: Final = Layout(
             "The method that ran: auto of the settings is direct, least squares over the bins, or"
             " known_background. compressed stands in older files only, which direct made too.",
         ),
-        quality(_SECTIONS, FLAGS),
+        quality(FLAGS),
         shots(of="the profile"),
     ),
 )

@@ -21,6 +21,7 @@ from lidarops.netcdf.variables import (
     altitude,
     count,
     numbered,
+    per_profile,
     place,
     quality,
     retrieval_method,
@@ -31,13 +32,10 @@ from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 FLAGS: Final = Flags(
-    kind="multiangle",
-    version=3,
-    bits=(*sorted(SIGNAL_BITS + COMPARED_BITS), *MultiAngleQuality),
+    kind="multiangle", version=3, bits=(*sorted(SIGNAL_BITS + COMPARED_BITS), *MultiAngleQuality)
 )
 """Published places are in `tests/products/test_flags.py`."""
 
-_LEVELS: Final = ("time", "altitude")
 _OF_PENALTY: Final[dict[str, Any]] = {
     "coverage": Coverage.AUXILIARY,
     "bits": VALUE_BITS,
@@ -70,12 +68,11 @@ _ALONG: Final = (
     _direction("azimuth", "beam"),
     Row(
         "layer_altitude",
-        ("layer",),
-        "m",
         "altitude of the midpoint of the layer above the geoid",
-        Coverage.COORDINATE,
         "layer_bnds holds bottom and top, moved to the nearest altitude of the profile or to the"
         " station.",
+        dims=("layer",),
+        units="m",
         standard_name="altitude",
         positive="up",
         bounds="layer_bnds",
@@ -95,11 +92,10 @@ _ALONG: Final = (
     ),
     Row(
         "baseline_range",
-        ("baseline_range",),
-        "m",
         "range of the analog baseline",
-        Coverage.COORDINATE,
         f"Middles of the blocks over which it is averaged. {NO_STANDARD_NAME}",
+        dims=("baseline_range",),
+        units="m",
         optional=True,
     ),
 )
@@ -166,7 +162,7 @@ def _of_planes(row: Row) -> Row:
 
 def _diagnostic(name: str, long_name: str, comment: str, **changes: Any) -> Row:
     """Return the row of what tells how a value comes about and how well it is determined."""
-    row = Row(name, _LEVELS, "1", long_name, Coverage.QUALITY, comment, bits=8)
+    row = Row(name, long_name, comment, coverage=Coverage.QUALITY, bits=8)
     return replace(row, **changes)
 
 
@@ -179,16 +175,13 @@ _RETRIEVED: Final[dict[str, Any]] = {
 }
 _OPTICAL_DEPTH: Final = Row(
     "vertical_optical_depth",
-    _LEVELS,
-    "1",
     "optical depth of molecules and particles from the station to the altitude",
-    comment="Along the vertical, at the wavelength of the channel.",
+    "Along the vertical, at the wavelength of the channel.",
     cell_methods=_POINT,
     errors=_errors("optical depth"),
     **_RETRIEVED,
 )
 _EXTINCTION: Final = total_extinction(
-    _LEVELS,
     "Mean over the layer in altitude_bnds, at the wavelength of the channel. The error by smoothing"
     " is a mean over altitudes, too small in thin layers: within simulated layers of a few"
     f" altitudes, some values differ by more than 4 standard errors. {MEASURED_SHARES}",
@@ -231,10 +224,8 @@ LAYOUT: Final = Layout(
         _OPTICAL_DEPTH,
         Row(
             "monotone_vertical_optical_depth",
-            _LEVELS,
-            "1",
             "profile nearest to vertical_optical_depth that nowhere decreases with altitude",
-            comment="For figures of single profiles. Where the signal is weak, its means over many"
+            "For figures of single profiles. Where the signal is weak, its means over many"
             " profiles are biased high: average vertical_optical_depth instead.",
             cell_methods=_POINT,
             ancillaries=("quality_flag",),
@@ -244,10 +235,8 @@ LAYOUT: Final = Layout(
         _EXTINCTION,
         Row(
             "log_intercept",
-            _LEVELS,
-            "1",
             "natural logarithm of the range-corrected signal at zero optical depth",
-            comment="Logarithm of the signal in mV m2 (analog) or MHz m2 (photon counting): system"
+            "Logarithm of the signal in mV m2 (analog) or MHz m2 (photon counting): system"
             " constant times backscatter coefficient, not calibrated.",
             cell_methods=_POINT,
             ancillaries=("quality_flag", "beams", "shots"),
@@ -305,46 +294,46 @@ LAYOUT: Final = Layout(
         _of_planes(_EXTINCTION),
         Row(
             "beam_signal",
-            ("time", "beam", "altitude"),
-            "{signal} m2",
             "range-corrected signal of a beam in the altitude cell",
-            comment="Without background, divided by the overlap where one is given. Its noise is"
+            "Without background, divided by the overlap where one is given. Its noise is"
             " not stated; residual is missing where it is too large.",
+            dims=("time", "beam", "altitude"),
+            units="{signal} m2",
             cell_methods=_MEAN,
             bits=8,
             optional=True,
         ),
         Row(
             "beam_obstruction",
-            ("time", "beam"),
-            "m",
             "range from which the beam is blocked by an obstruction or a dense cloud",
-            Coverage.QUALITY,
             "Missing for a free beam. Farther bins are not used.",
+            dims=("time", "beam"),
+            units="m",
+            coverage=Coverage.QUALITY,
             valid_min=0.0,
             optional=True,
         ),
         Row(
             "analog_baseline",
-            ("baseline_range",),
-            "{signal}",
             "analog signal without light, minus its mean in the range of the background",
-            Coverage.AUXILIARY,
             "From profiles that a tree or building blocks, at least"
             f" {THRESHOLDS.baseline_guard:g} m behind it; subtracted from all profiles,"
             " interpolated between ranges. Its standard error is that of noise and of the scatter"
             " between profiles, and part of the error of the backgrounds; it grows before the first"
             " range.",
+            dims=("baseline_range",),
+            units="{signal}",
+            coverage=Coverage.AUXILIARY,
             uncertain=True,
             error_kind=ErrorKind.SYSTEMATIC,
             optional=True,
         ),
         Row(
             "blocked_range",
-            ("blocked",),
-            "m",
             "range from which a profile that shows the analog baseline is blocked",
-            Coverage.AUXILIARY,
+            dims=("blocked",),
+            units="m",
+            coverage=Coverage.AUXILIARY,
             valid_min=0.0,
             optional=True,
         ),
@@ -362,7 +351,7 @@ LAYOUT: Final = Layout(
             " from the data.",
         ),
         BACKGROUND_METHOD,
-        quality(_LEVELS, FLAGS),
+        quality(FLAGS),
         _diagnostic(
             "effective_degrees_of_freedom",
             "number of independent values of the profile that the data determine",
@@ -371,15 +360,13 @@ LAYOUT: Final = Layout(
             valid_min=0.0,
             bits=None,
         ),
-        Row(
+        per_profile(
             "reach",
-            ("time",),
-            "m",
             "highest altitude above the geoid with an estimate",
-            Coverage.AUXILIARY,
             "Missing where there is no estimate.",
+            units="m",
         ),
-        count("beams", ("time",), "number of beam directions with a signal in the scan cycle"),
+        count("beams", "number of beam directions with a signal in the scan cycle"),
         shots(of="all beams of the scan cycle"),
     ),
 )

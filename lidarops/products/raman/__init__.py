@@ -37,8 +37,7 @@ class RamanProductSettings(ChannelProduct):
     """The ``raman`` product: extinction, backscatter and lidar ratio without an assumed one."""
 
     channels: list[str] = Field(
-        min_length=1,
-        description="elastic channels, each with its Raman channel under nitrogen",
+        min_length=1, description="elastic channels, each with its Raman channel under nitrogen"
     )
     nitrogen: dict[str, str] = Field(
         description="elastic channel -> channel of the vibrational Raman lines of nitrogen, such as"

@@ -9,7 +9,6 @@ from lidarops.flags import RAW_BITS, Flags, Quality
 from lidarops.netcdf.quantities import (
     AEROSOL_LIDAR_RATIO,
     AVERAGED,
-    BINS,
     CLOUDS,
     MOLECULAR_BACKSCATTER,
     SUM_OF_SQUARES,
@@ -134,8 +133,7 @@ LAYOUT: Final = Layout(
             budget=divided("aerosol_extinction", _OF_EXTINCTION, _MEANS),
         ),
         aerosol_backscatter(
-            errors=_OF_BACKSCATTER,
-            budget=divided("aerosol_backscatter", _OF_BACKSCATTER, _MEANS),
+            errors=_OF_BACKSCATTER, budget=divided("aerosol_backscatter", _OF_BACKSCATTER, _MEANS)
         ),
         mean_value(
             "lidar_ratio",
@@ -152,11 +150,10 @@ LAYOUT: Final = Layout(
         ),
         Row(
             "vertical_resolution",
-            BINS,
-            "m",
             "effective resolution of extinction and lidar ratio along the beam",
-            Coverage.AUXILIARY,
             "Length over which a mean has the noise of the value.",
+            units="m",
+            coverage=Coverage.AUXILIARY,
             bits=8,
         ),
         mean_value(
@@ -171,12 +168,10 @@ LAYOUT: Final = Layout(
         ),
         Row(
             "overlap",
-            BINS,
-            "1",
             "overlap of laser beam and field of view of the Raman channel",
-            Coverage.AUXILIARY,
             "Below the range of full overlap, from the lidar ratio measured above it; beyond, as"
             " the campaign states it, and missing where it states none.",
+            coverage=Coverage.AUXILIARY,
             bits=VALUE_BITS,
             uncertain=True,
             error_kind=ErrorKind.BOTH,
@@ -190,7 +185,7 @@ LAYOUT: Final = Layout(
         *CLOUDS,
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
-        quality(BINS, FLAGS),
+        quality(FLAGS),
         *AVERAGED,
     ),
 )

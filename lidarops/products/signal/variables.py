@@ -11,10 +11,10 @@ from lidarops.netcdf.variables import (
     GLUING,
     MEASURED_SHARES,
     SUBTRACTED_BACKGROUND,
-    Coverage,
     Error,
     Layout,
     Row,
+    per_profile,
     quality,
     shots,
 )
@@ -51,10 +51,9 @@ LAYOUT: Final = Layout(
     data=(
         Row(
             "signal",
-            ("time", "range"),
-            "{signal} m2",
             "background-subtracted signal times range squared",
-            comment="Not calibrated.",
+            "Not calibrated.",
+            units="{signal} m2",
             ancillaries=("quality_flag", "shots"),
             bits=13,
             uncertain=True,
@@ -80,19 +79,16 @@ LAYOUT: Final = Layout(
         ),
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
-        Row(
+        per_profile(
             "noise_correlation_length",
-            ("time",),
-            "1",
             "integral correlation length of noise along range in range bins",
-            Coverage.AUXILIARY,
             "Of the far half of the profile; of glued channels at least that of the analog record."
             " 1 where bins are independent; missing where too few are complete, and standard errors"
             " then assume independent bins. The standard error by noise of a mean over many bins is"
             " that of a bin times the root of this number over their number.",
         ),
         *GLUING,
-        quality(("time", "range"), FLAGS),
+        quality(FLAGS),
         shots(of="the profile"),
     ),
 )

@@ -42,7 +42,6 @@ FLAGS: Final = Flags(
 )
 """Published places are in `tests/products/test_flags.py`."""
 
-_SERIES: Final = ("time", "crossing")
 _METHODS: Final = ("beams_with_prior", "beams_without_prior", "triangles")
 _OF_VALUE: Final = ("condition", "quality_flag", "path_optical_depth", "reduced_chi2", "shots")
 
@@ -109,7 +108,7 @@ _COORDINATES: Final = (
 def _tested(name: str, long_name: str, comment: str, **changes: Any) -> Row:
     """Return the row of what tells how well a network, or a value, is determined."""
     coverage = Coverage.QUALITY
-    row = Row(name, ("time",), "1", long_name, coverage, comment, valid_min=0.0, bits=8)
+    row = Row(name, long_name, comment, dims=("time",), coverage=coverage, valid_min=0.0, bits=8)
     return replace(row, **changes)
 
 
@@ -149,14 +148,12 @@ LAYOUT: Final = Layout(
     coordinates=_COORDINATES,
     data=(
         *visibility(
-            _SERIES,
             "at the crossing of beams",
             ("total_extinction_systematic_error", *_OF_VALUE),
             # Most of the error comes from the prior, which all profiles share.
             error_kind=ErrorKind.BOTH,
         ),
         total_extinction(
-            _SERIES,
             ancillaries=_OF_VALUE,
             bits=VALUE_BITS,
             uncertain=True,
@@ -177,17 +174,15 @@ LAYOUT: Final = Layout(
             "relative change of extinction over that of the signals at the near ends of the beams",
             "Root of the sum of squares over the beams. Larger values mean higher sensitivity to"
             " overlap errors.",
-            dims=_SERIES,
+            dims=("time", "crossing"),
         ),
         Row(
             "multiplier",
-            _SERIES,
-            "1",
             "multiplier lambda of the equations of a triangle of beams",
-            Coverage.AUXILIARY,
             "Row j of a cycle of three beams is multiplied by its power j - 1. 1 is exact; a"
             " smaller one limits noise, and its bias in homogeneous air is part of"
             " total_extinction_systematic_error.",
+            coverage=Coverage.AUXILIARY,
             valid_min=0.0,
             optional=True,
         ),
@@ -198,7 +193,7 @@ LAYOUT: Final = Layout(
             " crossing, with a multiplier.",
         ),
         replace(
-            quality(_SERIES, FLAGS),
+            quality(FLAGS),
             comment="In this kind of product, poorly_determined means that the standard error,"
             " without the uncertainty of the prior, exceeds a third of extinction, for the value or"
             " as the median of its block, or that there are too few beams to determine a field that"
@@ -233,11 +228,11 @@ LAYOUT: Final = Layout(
         ),
         Row(
             "beam_range",
-            ("beam", "crossing"),
-            "m",
             "distance of the crossing from the lidar along the beam",
-            Coverage.REFERENCE,
             "Missing where the crossing does not lie on the beam.",
+            dims=("beam", "crossing"),
+            units="m",
+            coverage=Coverage.REFERENCE,
             valid_min=0.0,
         ),
         shots(of="all beams of the interval"),

@@ -9,12 +9,12 @@ import numpy as np
 import xarray as xr
 
 from lidar_extras.averaged import AveragedSettings
-from lidar_extras.averaged.variables import BINS
 from lidarops.scene.case import REQUESTED, Entries, NoSettings, ProductCase
 from lidarops.scene.profiles import in_one_batch
 from lidarops.scene.retrieval import Derivation, InputProduct
 from lidarops.settings import SettingsModel
 
+BINS: Final = ("time", "range")
 GEOMETRY: Final = ("time", "time_bnds", "range", "zenith_angle", "azimuth")
 
 

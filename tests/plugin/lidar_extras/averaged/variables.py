@@ -8,8 +8,6 @@ from lidarops.flags import Flags
 from lidarops.kinds import flags_of
 from lidarops.netcdf.variables import ALONG_BEAM, Layout, Row, quality
 
-BINS: Final = ("time", "range")
-
 
 def layout_of_means(kind: str, title: str) -> Layout:
     """Return the layout of a kind of product of mean signals, with the bits of ``signal``."""
@@ -25,13 +23,12 @@ def layout_of_means(kind: str, title: str) -> Layout:
         data=(
             Row(
                 "mean_signal",
-                BINS,
-                "{signal} m2",
                 "mean over a scene of the background-subtracted signal times range squared",
-                comment="Not calibrated.",
+                "Not calibrated.",
+                units="{signal} m2",
                 ancillaries=("quality_flag",),
             ),
-            quality(BINS, Flags(kind=kind, version=1, bits=tuple(flags_of("signal")))),
+            quality(Flags(kind=kind, version=1, bits=tuple(flags_of("signal")))),
         ),
     )
 

@@ -75,7 +75,7 @@ LAYOUT: Final = Layout(
         ),
         SUBTRACTED_BACKGROUND,
         *GLUING,
-        quality(_WINDOWS, FLAGS),
+        quality(FLAGS),
         shots(of="the profile"),
     ),
 )
