@@ -291,11 +291,11 @@ def _data(table: Layout, year: _Year, frame: _Frame) -> Iterator[tuple[str, xr.V
     records = year.records
     flags = np.stack([record[rows.QUALITY_FLAG] for record in records]).astype(np.int32)
     # An optional variable may be in no product.
-    present = [row for row in table.variables if row.summary or row.name in records[0]]
+    present = [row for row in table.variables if row.name in (rows.USABLE, *records[0])]
     names = {row.name for row in present}
     for row in present:
         values: NDArray[Any]
-        if row.summary:
+        if row.name == rows.USABLE:
             values = rows.summarize_flags(flags, table.flags)
         elif row.name == rows.QUALITY_FLAG:
             values = flags

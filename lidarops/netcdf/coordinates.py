@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
@@ -159,7 +159,7 @@ def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles:
         )
     tops = np.append(station, values)
     by_name["altitude"] = _with_bounds(row, values, np.stack([tops[:-1], tops[1:]], axis=-1))
-    return by_name, _Vertical(values, _common_step([values]), profiles=False)
+    return by_name, _Vertical(values, _common_step(values, np.ones(1)), profiles=False)
 
 
 def _network_place(source: CheckedInput, layout: Layout, _station: float, _profiles: int) -> _Place:
@@ -267,7 +267,7 @@ def _altitude(
     # Rounding keeps the order, so the extremes lie at those of both factors.
     ends = np.multiply.outer([rise.min(), rise.max()], [ranges.min(), ranges.max()])
     extremes = (station + ends).astype(row.dtype)
-    step = _common_step(station + cosine * ranges for cosine in rise.flat)
+    step = _common_step(ranges, rise)
     if zenith.dims:
         # Cell bounds that also change with time would have to be polygons (CF, section 7.1).
         row = replace(row, bounds=None)
@@ -289,21 +289,25 @@ def _altitude(
     return altitude, _Vertical(extremes, step, profiles=bool(tilt <= NEAR_VERTICAL))
 
 
-def _common_step(profiles: Iterable[Values]) -> float | None:
+def _common_step(altitude: Values, rise: Values) -> float | None:
     """Return the distance of neighbouring altitudes of all profiles, m.
 
     0 where the altitude does not change; None where the distance varies.
+
+    Parameters
+    ----------
+    altitude : ndarray
+        Altitudes of a beam to the zenith, m.
+    rise : ndarray
+        Altitude of each profile over these.
     """
-    first, smallest, largest = None, np.inf, 0.0
-    for altitudes in profiles:
-        steps = np.abs(np.diff(altitudes))
-        if steps.size == 0:
-            return None
-        first = float(steps[0]) if first is None else first
-        smallest, largest = min(smallest, steps.min()), max(largest, steps.max())
-        if largest > _LEVEL and largest - smallest > _SAME_STEP * largest:
-            return None
-    return first if largest > _LEVEL else 0.0
+    steps, scales = np.abs(np.diff(altitude)), np.abs(rise)
+    if steps.size == 0:
+        return None
+    smallest, largest = scales.min() * steps.min(), scales.max() * steps.max()
+    if largest <= _LEVEL:
+        return 0.0
+    return None if largest - smallest > _SAME_STEP * largest else float(scales.flat[0] * steps[0])
 
 
 _SPREADS: Final = {"crossing": "irregular: crossings of beams"}

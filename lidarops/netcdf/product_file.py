@@ -189,7 +189,7 @@ class ProductWriter:
         for row in self._layout.variables:
             if not _over_time(row.dims) or (row.optional and row.name not in source):
                 continue
-            if row.summary:
+            if row.name == rows.USABLE:
                 encoded[row.name] = rows.summarize_flags(flags, self._flags)
                 continue
             # Bits refer to retrieved values; an optional derived or an auxiliary value may be

@@ -171,8 +171,6 @@ class Row:
     """Bits of a variable that states reasons, and judges no value."""
     states: tuple[str, ...] = ()
     """Words of a variable whose values are 0, 1, ..."""
-    summary: bool = False
-    """Whether it is `usable`, which is computed from the flags and never passed in."""
     error_kind: ErrorKind | None = None
     """Kind of the error that it holds, or of its standard error; both by default with a budget."""
     budget: ErrorBudget | None = None
@@ -337,7 +335,10 @@ def is_retrieved(kind: str) -> bool:
 
 
 def usable(dims: tuple[str, ...]) -> Row:
-    """Return the row of ``usable``, which summarizes the bits of ``quality_flag``."""
+    """Return the row of ``usable``, the severity of the worst bit of ``quality_flag``.
+
+    It is computed from the flags and never passed in, so that it cannot contradict them.
+    """
     return Row(
         USABLE,
         "usability of the value, from the bits of quality_flag",
@@ -348,7 +349,7 @@ def usable(dims: tuple[str, ...]) -> Row:
         coverage=Coverage.QUALITY,
         dtype="i1",
         standard_name="aggregate_quality_flag",
-        summary=True,
+        states=("good", "use_with_care", "do_not_use"),
     )
 
 
@@ -411,9 +412,6 @@ def attributes(
         attrs["quantization_nsb"] = np.int32(row.bits)
     if row.error_kind is not None and not row.uncertain:
         attrs["error_kind"] = row.error_kind.value
-    if row.summary:
-        attrs["flag_values"] = np.array([0, *Severity], dtype=stored)
-        attrs["flag_meanings"] = "good use_with_care do_not_use"
     if row.flags is not None:
         attrs |= _flag_attributes(row.flags, stored)
     if row.reasons is not None:
