@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -67,7 +67,7 @@ class Sums:
     squared (`gum2008`, section 5.2).
     """
 
-    totals: dict[Hashable, Any] = field(default_factory=dict)
+    totals: dict[str | int, Any] = field(default_factory=dict)
     """Sums of weights, and of values and errors times their weights; of shared errors by their
     number, of systematic ones by their variable."""
     count: Any = 0
@@ -139,14 +139,14 @@ def _used(sample: Sample) -> NDArray[np.bool_]:
     return used
 
 
-def _terms(sample: Sample, weights: Array) -> Iterator[tuple[Hashable, Array]]:
+def _terms(sample: Sample, weights: Array) -> Iterator[tuple[str | int, Array]]:
     """Yield what is summed, by its key in `Sums.totals`."""
     yield "weight", weights
     yield "value", weights * sample.values
     yield "random", weights**2 * sample.random**2
     # The error of a mean is unknown where that of one profile is.
-    for key, error in (*enumerate(sample.shared), *sample.systematic.items()):
-        yield key, weights * error
+    yield from ((number, weights * error) for number, error in enumerate(sample.shared))
+    yield from ((name, weights * error) for name, error in sample.systematic.items())
 
 
 @dataclass(frozen=True, slots=True)

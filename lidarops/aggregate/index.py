@@ -41,33 +41,19 @@ _ENCODINGS: Final = {
     "sha256_prefix": "PLAIN",
 }
 
-_COLUMNS: Final = {
-    "kind": "dictionary",
-    "campaign": "dictionary",
-    "station": "dictionary",
-    "instrument": "dictionary",
-    "channel": "dictionary",
-    "mode": "dictionary",
-    "recorder": "dictionary",
-    "wavelength": "float64",
-    "start": "time",
-    "stop": "time",
-    "latitude": "float64",
-    "longitude": "float64",
-    "altitude": "float64",
-    "path": "string",
-    "id": "bytes",
-    "sha256_prefix": "bytes",
-    "size": "int64",
-    "profiles": "int32",
-    "values": "int64",
-    "good": "int64",
-    "care": "int64",
-    "reject": "int64",
-    "grid": "dictionary",
-    "code_version": "dictionary",
-}
-"""Column -> type."""
+_COLUMNS: Final = (
+    ("dictionary", "kind campaign station instrument channel mode recorder"),
+    ("float64", "wavelength"),
+    ("time", "start stop"),
+    ("float64", "latitude longitude altitude"),
+    ("string", "path"),
+    ("bytes", "id sha256_prefix"),
+    ("int64", "size"),
+    ("int32", "profiles"),
+    ("int64", "values good care reject"),
+    ("dictionary", "grid code_version"),
+)
+"""Type and names of columns, in their order."""
 
 
 def write_index(root: Path, products: Iterable[Facts]) -> str:
@@ -97,7 +83,8 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     cells = [_cells(facts) for facts in rows]
     arrays = {
         name: arrow.array([row[name] for row in cells], types[kind])
-        for name, kind in _COLUMNS.items()
+        for kind, names in _COLUMNS
+        for name in names.split()
     }
     for name in _flag_names(rows):
         counts = [facts.flagged.get(name, 0) for facts in rows]

@@ -87,9 +87,9 @@ def open_products(
     >>> data.total_extinction.resample(time="1D").mean()  # doctest: +SKIP
     """
     selection = parse_selection(kind, channel, station, instrument, since, until)
-    store = _path_of(source)
-    if store is not None and is_store(Path(store)):
-        return _masked(open_store(Path(store), selection, version), usable)
+    store = Path(source) if isinstance(source, str | os.PathLike) else None
+    if store is not None and is_store(store):
+        return _masked(open_store(store, selection, version), usable)
     if version is not None:
         raise RetrievalInputError(
             "only stores have versions", field="version", remedy="give the folder of a store"
@@ -104,16 +104,12 @@ def open_products(
     return _masked(_opened(root, products), usable)
 
 
-def _remedy(folder: str | None) -> str:
+def _remedy(folder: Path | None) -> str:
     """Return what to do where a folder holds no products."""
-    stores = [] if folder is None else [path for path in Path(folder).glob("*") if is_store(path)]
+    stores = [] if folder is None else [path for path in folder.glob("*") if is_store(path)]
     if not stores:
         return "select less strictly"
     return f"open one of the stores in it: {', '.join(sorted(path.name for path in stores))}"
-
-
-def _path_of(source: Paths) -> str | None:
-    return os.fspath(source) if isinstance(source, str | os.PathLike) else None
 
 
 def _find(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]]:

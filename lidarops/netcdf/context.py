@@ -20,17 +20,7 @@ from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import product_id, writing_time
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
 from lidarops.raw.header import POLARISATIONS, label_of
-from lidarops.records import (
-    GLUED,
-    DetectionMode,
-    LeftOut,
-    PlannedStep,
-    Provenance,
-    Role,
-    Stamp,
-    UnusedFile,
-    is_glued,
-)
+from lidarops.records import GLUED, DetectionMode, Provenance, Role, Stamp, UnusedFile, is_glued
 
 RECORDERS: Final = "lidarops_recorder"
 UNUSED_INPUTS: Final = "lidarops_unused_inputs"
@@ -222,17 +212,8 @@ def _sentences(*texts: str) -> str:
 def _history(context: Context) -> str:
     """Return one line for each step, as CF requires: date, step, program."""
     program = f"lidarops {__version__} ({context.provenance.code_version})"
-    plan = context.provenance.plan
-
-    def name(entry: PlannedStep | LeftOut) -> str:
-        """Return the name of a step, with its channel where the product has another."""
-        other = entry.channel not in ("", context.channel)
-        return f"{entry.name} of {entry.channel}" if other else entry.name
-
     # The plan of a product holds what it depends on, such as the corrections of glued channels.
-    lines = [f"{name(step)}: {step.words}" for step in plan.steps]
-    lines += [f"left out {name(omission)}: {omission.reason}" for omission in plan.left_out]
-    lines.append(f"wrote the {context.kind} product")
+    lines = [*context.provenance.plan.lines(context.channel), f"wrote the {context.kind} product"]
     return "\n".join(
         f"{iso(context.written)} {' '.join(line.split())} [{program}]" for line in lines
     )

@@ -255,7 +255,7 @@ class Layout:
     title: str
     summary: str
     keywords: tuple[str, ...]
-    processing_level: str
+    processing_level: str = "L2: retrieved quantities"
     references: tuple[str, ...]
     comment: str
     sampled: str

@@ -154,48 +154,44 @@ def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Forma
     variables = {str(name): variable for name, variable in dataset.variables.items()}
     skeleton = Skeleton(variables, dataset.attrs, unlimited)
     with create_file(skeleton, path, model) as file:
-        rows = {name: variable.values for name, variable in skeleton.with_rows().items()}
+        rows = {name: variable.values for name, variable in skeleton.with_rows.items()}
         if rows:
             file.add(rows)
     return file.written
 
 
-@dataclass(frozen=True, slots=True)
 class Skeleton:
     """All of a file except the values of its rows, which may come later, some at a time.
 
     The rows are those along the unlimited dimension, of the variables that have it first.
+
+    Parameters
+    ----------
+    variables : mapping of str to xr.Variable
+        Encoded, in the order of the file. Of variables with rows, the values are not used.
+    attributes : mapping
+    unlimited : str or None
     """
 
-    variables: Mapping[str, xr.Variable]
-    """Encoded, in the order of the file. Of variables with rows, the values are not used."""
-    attributes: Mapping[str, Any]
-    unlimited: str | None
-
-    def sizes(self) -> dict[str, int]:
-        """Return the length of every dimension, in the order of the file."""
-        return {
-            str(dim): size
-            for variable in self.variables.values()
-            for dim, size in variable.sizes.items()
-        }
-
-    def with_rows(self) -> dict[str, xr.Variable]:
-        """Return the variables that have rows."""
-        return {
-            name: variable
-            for name, variable in self.variables.items()
-            if self.unlimited is not None and variable.dims[:1] == (self.unlimited,)
-        }
-
-    def chunks(self) -> dict[str, tuple[int, ...]]:
-        """Return the chunk shapes of the variables that are not stored as they are."""
-        return {
-            name: chunk_sizes(variable.shape, variable.dtype.itemsize)
-            for name, variable in self.variables.items()
-            if self.unlimited in variable.dims
-            or (variable.dims and variable.nbytes > CONTIGUOUS_BYTES)
-        }
+    def __init__(
+        self,
+        variables: Mapping[str, xr.Variable],
+        attributes: Mapping[str, Any],
+        unlimited: str | None,
+    ) -> None:
+        self.variables, self.attributes, self.unlimited = variables, attributes, unlimited
+        self.sizes: dict[str, int] = {}
+        """Length of every dimension, in the order of the file."""
+        self.with_rows: dict[str, xr.Variable] = {}
+        self.chunks: dict[str, tuple[int, ...]] = {}
+        """Chunk shapes of the variables that are not stored as they are."""
+        for name, variable in variables.items():
+            self.sizes |= {str(dim): size for dim, size in variable.sizes.items()}
+            if variable.dims and variable.dims[0] == unlimited:
+                self.with_rows[name] = variable
+            large = variable.dims and variable.nbytes > CONTIGUOUS_BYTES
+            if unlimited in variable.dims or large:
+                self.chunks[name] = chunk_sizes(variable.shape, variable.dtype.itemsize)
 
 
 class QuietFile(io.FileIO):
@@ -322,16 +318,22 @@ class RowFile:
         self._stream = stream
         self._rows = 0
         self.settled: Written | None = None
-        self._chunks = skeleton.chunks()
+        self._chunks = skeleton.chunks
         self._columns = {
             name: RowBlocks(variable.shape[0], self._chunks[name][0])
-            for name, variable in skeleton.with_rows().items()
+            for name, variable in skeleton.with_rows.items()
         }
-        sizes = skeleton.sizes()
-        self._total = sizes[str(skeleton.unlimited)] if self._columns else 0
+        self._total = skeleton.sizes[str(skeleton.unlimited)] if self._columns else 0
+        self._targets = {}
         with _disk_errors(path), NETCDF4_PYTHON_LOCK:
             self._file = h5py.File(stream, "r+")
-            self._targets = {name: self._open(name, sizes) for name in self._chunks}
+            for name in self._chunks:
+                variable = self._variables[name]
+                other = name in skeleton.sizes and variable.dims[0] != name
+                inside = unicodedata.normalize("NFC", f"{_OTHER_DIMENSION if other else ''}{name}")
+                self._targets[name] = h5py.h5d.open(self._file.id, inside.encode())
+                # Its final length.
+                self._targets[name].set_extent(variable.shape)
 
     @property
     def written(self) -> Written:
@@ -345,15 +347,6 @@ class RowFile:
         if self.settled is None:
             raise ProductError("is not written", file=self._path)
         return self.settled
-
-    def _open(self, name: str, sizes: Mapping[str, int]) -> Any:
-        """Return the HDF5 dataset of a variable, with its final length."""
-        variable = self._variables[name]
-        other = name in sizes and variable.dims[0] != name
-        inside = unicodedata.normalize("NFC", f"{_OTHER_DIMENSION if other else ''}{name}")
-        target = h5py.h5d.open(self._file.id, inside.encode())
-        target.set_extent(variable.shape)
-        return target
 
     def write_fixed(self) -> None:
         """Write the variables that have no rows."""
@@ -471,44 +464,30 @@ class _DefinedAtOnce(netCDF4.Dataset):
 
 def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
     """Write all definitions and the variables without chunks."""
-    chunks = skeleton.chunks()
     # In memory until the end, because HDF5 may crash on a full disk.
     with _DefinedAtOnce(
         path, "w", format=model, clobber=False, diskless=True, persist=True
     ) as file:
         file.setncatts(skeleton.attributes)
-        for name, size in skeleton.sizes().items():
+        for name, size in skeleton.sizes.items():
             file.createDimension(name, None if name == skeleton.unlimited else size)
-        targets = {
-            name: _define(file, name, variable, chunks.get(name))
-            for name, variable in skeleton.variables.items()
-        }
+        targets: dict[str, Any] = {}
+        for name, variable in skeleton.variables.items():
+            attributes, chunk = dict(variable.attrs), skeleton.chunks.get(name)
+            targets[name] = file.createVariable(
+                name,
+                variable.dtype.newbyteorder("="),
+                [str(dim) for dim in variable.dims],
+                fill_value=attributes.pop("_FillValue", None),
+                compression="zlib" if chunk else None,
+                complevel=COMPRESSION_LEVEL,
+                shuffle=True,
+                chunksizes=chunk,
+            )
+            targets[name].set_auto_maskandscale(False)
+            targets[name].set_auto_chartostring(False)
+            targets[name].setncatts(attributes)
         file.end_definitions()
         for name, target in targets.items():
-            if name not in chunks:
+            if name not in skeleton.chunks:
                 target[...] = skeleton.variables[name].values
-
-
-def _define(
-    file: netCDF4.Dataset, name: str, variable: xr.Variable, chunk: tuple[int, ...] | None
-) -> Any:
-    attributes = dict(variable.attrs)
-    storage: dict[str, Any] = {}
-    if chunk is not None:
-        storage = {
-            "compression": "zlib",
-            "complevel": COMPRESSION_LEVEL,
-            "shuffle": True,
-            "chunksizes": chunk,
-        }
-    target = file.createVariable(
-        name,
-        variable.dtype.newbyteorder("="),
-        [str(dim) for dim in variable.dims],
-        fill_value=attributes.pop("_FillValue", None),
-        **storage,
-    )
-    target.set_auto_maskandscale(False)
-    target.set_auto_chartostring(False)
-    target.setncatts(attributes)
-    return target

@@ -95,7 +95,6 @@ LAYOUT: Final = Layout(
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
         "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
     ),
-    processing_level="L2: retrieved quantities",
     references=(
         "Klett, J. D. (1981), Appl. Opt. 20, 211-220, doi:10.1364/AO.20.000211.",
         "Fernald, F. G. (1984), Appl. Opt. 23, 652-653, doi:10.1364/AO.23.000652.",

@@ -25,6 +25,10 @@ NonNegative = Annotated[float, Field(ge=0)]
 Method = Literal["auto", "direct", "cubic", "known_background", "linearized", "known_extinction"]
 _GIVEN_EXTINCTION: Final = ("linearized", "known_extinction")
 """Methods that start from a given extinction."""
+_OF_METHOD: Final = {
+    "background_range": "known_background", "background": "known_background", "lag": "cubic"
+}  # fmt: skip
+"""Key -> the only method that uses it."""
 
 
 class HomogeneousSettings(ChannelProduct):
@@ -82,29 +86,20 @@ class HomogeneousSettings(ChannelProduct):
         for near, far in self.sections:
             if far <= near:
                 raise ValueError(f"section [{near}, {far}] must end farther than it starts")
-        if self.background_range is not None and self.method != "known_background":
-            raise located_error("is used by the method known_background only", "background_range")
+        for key, method in _OF_METHOD.items():
+            if getattr(self, key) is not None and self.method != method:
+                raise located_error(f"is used by the method {method} only", key)
         if (self.extinction is not None) != (self.method in _GIVEN_EXTINCTION):
             raise located_error(
                 f"is required by {' and '.join(_GIVEN_EXTINCTION)}, and used by no other method",
                 "extinction",
             )
-        if self.lag is not None and self.method != "cubic":
-            raise located_error("is used by the method cubic only", "lag")
-        self._check_background()
-        return self
-
-    def _check_background(self) -> None:
-        """Refuse a given background that no channel, or not every channel, uses."""
-        if self.background is None:
-            return
-        if self.method != "known_background":
-            raise located_error("is used by the method known_background only", "background")
-        if self.background_range is not None:
+        if self.background is not None and self.background_range is not None:
             raise located_error("is given together with background; give one", "background_range")
-        if self.background.keys() != set(self.channels):
+        if self.background is not None and self.background.keys() != set(self.channels):
             named = ", ".join(self.channels)
             raise located_error(f"must state each of the channels: {named}", "background")
+        return self
 
 
 _LEVEL: Final = 1.9

@@ -74,7 +74,6 @@ LAYOUT: Final = Layout(
         "EARTH SCIENCE > ATMOSPHERE > AIR QUALITY > VISIBILITY",
         "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
     ),
-    processing_level="L2: retrieved quantities",
     references=(
         "Golub, G. and Pereyra, V. (1973), SIAM J. Numer. Anal. 10, 413-432, doi:10.1137/0710036.",
     ),

@@ -200,7 +200,6 @@ LAYOUT: Final = Layout(
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
         "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
     ),
-    processing_level="L2: retrieved quantities",
     references=(
         "Kano, M. (1968), Pap. Meteorol. Geophys. 19, 121-129.",
         "Hamilton, P. M. (1969), Atmos. Environ. 3, 221-223.",

@@ -95,7 +95,6 @@ LAYOUT: Final = Layout(
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
         "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
     ),
-    processing_level="L2: retrieved quantities",
     references=(
         "Ansmann, A. et al. (1990), Opt. Lett. 15, 746-748, doi:10.1364/OL.15.000746.",
         "Ansmann, A. et al. (1992), Appl. Opt. 31, 7113-7131, doi:10.1364/AO.31.007113.",

@@ -122,7 +122,6 @@ LAYOUT: Final = Layout(
         "EARTH SCIENCE > ATMOSPHERE > AEROSOLS > AEROSOL EXTINCTION",
         "EARTH SCIENCE > SPECTRAL/ENGINEERING > LIDAR > LIDAR BACKSCATTER",
     ),
-    processing_level="L2: retrieved quantities",
     references=(
         MULTIPOSITION_PAPER,
         "Yegorov, A. D. et al. (2008), Int. J. Remote Sensing 29, 2449-2468.",
