@@ -27,6 +27,7 @@ from lidarops.aggregate.means_variables import Period, Weights, layout
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.context import UNUSED_INPUTS, iso
+from lidarops.netcdf.coordinates import auxiliary_names
 from lidarops.netcdf.encoding import as_stored, as_text
 from lidarops.netcdf.provenance import identifier, package_versions, prov_document, prov_type
 from lidarops.netcdf.variables import QUANTIZATION, Layout, attributes, layout_of
@@ -95,7 +96,7 @@ def write_means(
                 if any(product[name].dims for name in _MOVING if name in product):
                     note = f"no means of {facts.kind}: profiles of several directions have none"
                     return MeansResult((), tuple(refused), f"{note} ({facts.path})")
-                averaging.frame = averaging.frame or _frame(product, facts)
+                averaging.frame = averaging.frame or _frame(product, facts.kind)
                 stated = dict(product.attrs)
         except ProductError as error:
             refused.append(Refused(facts.path, error.problem))
@@ -191,8 +192,8 @@ class _Averaging:
 
     period: Period
     weights: Weights
-    frame: _Frame | None = None
-    """Of the first product."""
+    frame: dict[str, xr.Variable] = field(default_factory=dict)
+    """Variables of the first product that its means take over."""
     _years: dict[int, _Year] = field(default_factory=dict)
     _open: dict[np.datetime64, PeriodSums] = field(default_factory=dict)
     _times: list[tuple[str, Array]] = field(default_factory=list)
@@ -230,7 +231,7 @@ class _Averaging:
         ProductError
             If two products have a profile at the same time, or a file cannot be written.
         """
-        if self.frame is None:
+        if not self.frame:
             return
         refuse_duplicates(self._times)
         self._close()
@@ -239,35 +240,18 @@ class _Averaging:
             yield MeansFile(year.path, done.sha256, done.size, len(year.keys), len(year.inputs))
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """What is equal in the means and all products of a group."""
-
-    variables: Mapping[str, xr.Variable]
-    """Coordinates that do not change with time, and the station; in memory."""
-    listed: Mapping[tuple[str, ...], tuple[str, ...]]
-    """Dimensions -> auxiliary coordinates of the data that have them."""
-
-
-def _frame(product: xr.Dataset, facts: Facts) -> _Frame:
-    """Read what means take over from a product."""
-    static = coordinate_names(facts.kind)
-    return _Frame(
-        {
-            str(name): variable.load()
-            for name, variable in product.variables.items()
-            if (name in static and "time" not in variable.dims)
-            or name in ("station", QUANTIZATION.name)
-        },
-        {
-            tuple(map(str, variable.dims)): tuple(variable.attrs["coordinates"].split())
-            for variable in product.variables.values()
-            if "coordinates" in variable.attrs
-        },
-    )
+def _frame(product: xr.Dataset, kind: str) -> dict[str, xr.Variable]:
+    """Read the coordinates of a product that do not change with time, and its station."""
+    static = coordinate_names(kind)
+    return {
+        str(name): variable.load()
+        for name, variable in product.variables.items()
+        if (name in static and "time" not in variable.dims)
+        or name in ("station", QUANTIZATION.name)
+    }
 
 
-def _encoded(frame: _Frame, year: _Year) -> xr.Dataset:
+def _encoded(frame: Mapping[str, xr.Variable], year: _Year) -> xr.Dataset:
     """Return the dataset of a file of means, for `lidarops.netcdf.write.write_product`."""
     mode = year.first.counting
     table = layout(year.first.kind, year.period, year.weights)
@@ -276,9 +260,9 @@ def _encoded(frame: _Frame, year: _Year) -> xr.Dataset:
     variables = {
         time.name: xr.Variable(time.dims, bounds.mean(axis=1), attributes(time, mode=mode)),
         f"{time.bounds}": xr.Variable((*time.dims, rows.BOUNDS_DIM), bounds),
-        **{name: values for name, values in frame.variables.items() if name != "station"},
+        **{name: values for name, values in frame.items() if name != "station"},
         **dict(_data(table, year, frame)),
-        "station": frame.variables["station"],
+        "station": frame["station"],
         rows.PROVENANCE.name: as_text(rows.PROVENANCE, _provenance(year), mode),
     }
     dataset = xr.Dataset(variables, attrs=_global_attributes(table, year))
@@ -286,13 +270,17 @@ def _encoded(frame: _Frame, year: _Year) -> xr.Dataset:
     return dataset
 
 
-def _data(table: Layout, year: _Year, frame: _Frame) -> Iterator[tuple[str, xr.Variable]]:
+def _data(
+    table: Layout, year: _Year, frame: Mapping[str, xr.Variable]
+) -> Iterator[tuple[str, xr.Variable]]:
     """Yield the variables of means, from their values in each period."""
     records = year.records
     flags = np.stack([record[rows.QUALITY_FLAG] for record in records]).astype(np.int32)
     # An optional variable may be in no product.
     present = [row for row in table.variables if row.name in (rows.USABLE, *records[0])]
     names = {row.name for row in present}
+    located = (row.name for row in table.coordinates if row.name in frame)
+    dims_of = {name: tuple(map(str, frame[name].dims)) for name in located}
     for row in present:
         values: NDArray[Any]
         if row.name == rows.USABLE:
@@ -302,7 +290,7 @@ def _data(table: Layout, year: _Year, frame: _Frame) -> Iterator[tuple[str, xr.V
         else:
             values = as_stored(row, np.stack([record[row.name] for record in records]))
         known = replace(row, ancillaries=tuple(name for name in row.ancillaries if name in names))
-        listed = frame.listed.get(row.dims, ())
+        listed = auxiliary_names(row, dims_of)
         attrs = attributes(known, mode=year.first.counting, coordinates=listed)
         if row.dtype == "f8":
             # A sum that is never missing; the fill value is for 4 bytes only.

@@ -12,7 +12,7 @@ import numpy as np
 from lidarops.errors import ProductError
 from lidarops.netcdf.context import Context, duration, iso
 from lidarops.netcdf.encoding import CheckedInput, Values, check_range, whole_numbers
-from lidarops.netcdf.variables import BOUNDS_DIM, Layout, Row, deployment
+from lidarops.netcdf.variables import BOUNDS_DIM, SOUNDED, Layout, Row, deployment
 
 NEAR_VERTICAL: Final = 10.0
 """degree. A beam within this angle of the vertical gives profiles in the sense of CF chapter 9."""
@@ -92,6 +92,27 @@ def locate_product(
         **_time_extent(moments, bounds),
     }
     return ordered, extents, vertical.profiles
+
+
+def auxiliary_names(row: Row, coordinates: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the names of the auxiliary coordinates of a variable.
+
+    Parameters
+    ----------
+    row : Row
+    coordinates : mapping of str to tuple of str
+        Name -> dimensions, of all coordinates of the file.
+    """
+    # CDO 2.1 cannot read a position that changes along a beam, nor a variable of three dimensions
+    # with a scalar position, nor one over beams beside another with a scalar position.
+    excluded = tuple(position.name for position in SOUNDED)
+    if len(row.dims) > 2 or row.dims == ("time", "beam"):
+        excluded += ("latitude", "longitude")
+    return tuple(
+        name
+        for name, dims in coordinates.items()
+        if dims != (name,) and set(dims) <= set(row.dims) and name not in excluded
+    )
 
 
 class _Vertical(NamedTuple):

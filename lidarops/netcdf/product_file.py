@@ -20,7 +20,7 @@ from lidarops.flags import FlagBit
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import Context, global_attributes, product_path
-from lidarops.netcdf.coordinates import locate_product
+from lidarops.netcdf.coordinates import auxiliary_names, locate_product
 from lidarops.netcdf.encoding import CheckedInput, Values, as_text, stored, whole_numbers
 from lidarops.netcdf.provenance import prov_json
 from lidarops.netcdf.stored_flags import places
@@ -30,7 +30,6 @@ from lidarops.records import Change, Grade, ProductRecord
 from lidarops.system.files import sha256_of
 
 _TIME: Final = rows.TIME.name
-_BEAMS: Final = ("time", "beam")
 
 
 @contextmanager
@@ -239,6 +238,7 @@ class ProductWriter:
     def _variables(self, encoded: Mapping[str, Values]) -> Iterator[tuple[str, xr.Variable]]:
         """Yield the variables in the order of the file."""
         mode = self._context.mode
+        dims_of = {coordinate.row.name: coordinate.dims for coordinate in self._coordinates}
         for coordinate in self._coordinates:
             row, dims = coordinate.row, coordinate.dims
             yield row.name, xr.Variable(dims, coordinate.values, attributes(row, mode=mode))
@@ -253,7 +253,7 @@ class ProductWriter:
                 values = self._fixed[row.name]
             else:
                 continue
-            attrs = attributes(row, mode=mode, coordinates=self._auxiliary_names(row))
+            attrs = attributes(row, mode=mode, coordinates=auxiliary_names(row, dims_of))
             yield row.name, xr.Variable(row.dims, values, attrs)
         station = rows.station(profiles=self._vertical)
         name = self._context.station.name or self._context.station_key
@@ -263,21 +263,6 @@ class ProductWriter:
         if any(row.bits for row in self._layout.variables):
             row = rows.QUANTIZATION
             yield row.name, xr.Variable((), np.int32(0), attributes(row, mode=mode))
-
-    def _auxiliary_names(self, row: Row) -> tuple[str, ...]:
-        """Return the names of the auxiliary coordinates of a variable."""
-        # CDO 2.1 cannot read a position that changes along a beam, nor a variable of three
-        # dimensions with a scalar position, nor one over beams beside another with a scalar
-        # position.
-        excluded = tuple(position.name for position in rows.SOUNDED)
-        excluded += ("latitude", "longitude") if len(row.dims) > 2 or row.dims == _BEAMS else ()
-        return tuple(
-            coordinate.row.name
-            for coordinate in self._coordinates
-            if coordinate.dims != (coordinate.row.name,)
-            and set(coordinate.dims) <= set(row.dims)
-            and coordinate.row.name not in excluded
-        )
 
     def _replaces(self, new: Path) -> bool:
         """Return whether the new file differs from the former one."""
