@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import UTC, date, datetime
 from enum import StrEnum
@@ -307,13 +307,14 @@ class Plan:
             "left_out": [omission.as_dict() for omission in self.left_out],
         }
 
-    def lines(self, channel: str) -> Iterator[str]:
-        """Yield what runs and what is left out, one line each, with channels other than this."""
+    def lines(self, channel: str) -> list[str]:
+        """Return what runs and what is left out, one line each, with channels other than this."""
         steps = ((step.name, step.channel, step.words) for step in self.steps)
         omitted = ((f"left out {o.name}", o.channel, o.reason) for o in self.left_out)
-        for name, owner, words in (*steps, *omitted):
-            other = f" of {owner}" if owner not in ("", channel) else ""
-            yield f"{name}{other}: {words}"
+        return [
+            f"{name}{f' of {owner}' if owner not in ('', channel) else ''}: {words}"
+            for name, owner, words in (*steps, *omitted)
+        ]
 
     @property
     def hash(self) -> str:

@@ -279,8 +279,7 @@ def _data(
     # An optional variable may be in no product.
     present = [row for row in table.variables if row.name in (rows.USABLE, *records[0])]
     names = {row.name for row in present}
-    located = (row.name for row in table.coordinates if row.name in frame)
-    dims_of = {name: tuple(map(str, frame[name].dims)) for name in located}
+    located = {row.name: frame[row.name] for row in table.coordinates if row.name in frame}
     for row in present:
         values: NDArray[Any]
         if row.name == rows.USABLE:
@@ -290,7 +289,7 @@ def _data(
         else:
             values = as_stored(row, np.stack([record[row.name] for record in records]))
         known = replace(row, ancillaries=tuple(name for name in row.ancillaries if name in names))
-        listed = auxiliary_names(row, dims_of)
+        listed = auxiliary_names(row, located)
         attrs = attributes(known, mode=year.first.counting, coordinates=listed)
         if row.dtype == "f8":
             # A sum that is never missing; the fill value is for 4 bytes only.

@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.netcdf.context import Context, duration, iso
 from lidarops.netcdf.encoding import CheckedInput, Values, check_range, whole_numbers
-from lidarops.netcdf.variables import BOUNDS_DIM, SOUNDED, Layout, Row, deployment
+from lidarops.netcdf.variables import BOUNDS_DIM, SOUNDED, Layout, Row, attributes, deployment
 
 NEAR_VERTICAL: Final = 10.0
 """degree. A beam within this angle of the vertical gives profiles in the sense of CF chapter 9."""
@@ -41,18 +42,22 @@ class Coordinate:
     """Where the beam moves: what gives the values of some profiles. Of these, `values` has only
     shape and type."""
 
-    def profiles(self, which: slice) -> Values:
-        """Return the values of some profiles, for a coordinate over time."""
-        return self.values[which] if self.moving is None else self.moving(which)
+
+class Located(NamedTuple):
+    """The coordinates of a product, and what follows from them."""
+
+    variables: dict[str, xr.Variable]
+    """In the order of the file, with cell bounds."""
+    moving: dict[str, Callable[[slice], Values]]
+    """See `Coordinate.moving`."""
+    extents: dict[str, Any]
+    """Global attributes on the extents in space and time."""
+    vertical: bool
+    """Whether the beam is fixed and near the vertical, as CF profiles require."""
 
 
-def locate_product(
-    source: CheckedInput, layout: Layout, context: Context
-) -> tuple[list[Coordinate], dict[str, Any], bool]:
+def locate_product(source: CheckedInput, layout: Layout, context: Context) -> Located:
     """Return the coordinates of a product in the order of its layout, and what follows from them.
-
-    These are global attributes on its extents, and whether the beam is fixed and near the vertical,
-    as CF profiles require.
 
     Raises
     ------
@@ -79,9 +84,16 @@ def locate_product(
             row = deployment(row) if f"bin_{name}" in bins else row
             by_name[name] = Coordinate(row, (), np.asarray(value, np.float64))
     by_name |= bins
-    ordered = [by_name[row.name] for row in layout.coordinates if row.name in by_name]
-    for coordinate in ordered:
-        check_range(coordinate.row, coordinate.values)
+    variables, moving = {}, {}
+    for coordinate in (by_name[row.name] for row in layout.coordinates if row.name in by_name):
+        row, dims = coordinate.row, coordinate.dims
+        check_range(row, coordinate.values)
+        attrs = attributes(row, mode=context.mode)
+        variables[row.name] = xr.Variable(dims, coordinate.values, attrs)
+        if coordinate.moving is not None:
+            moving[row.name] = coordinate.moving
+        if row.bounds and coordinate.bounds is not None:
+            variables[row.bounds] = xr.Variable((*dims, BOUNDS_DIM), coordinate.bounds)
     horizontal = [
         bins[f"bin_{name}"].values if bins else by_name[name].values
         for name in ("latitude", "longitude")
@@ -91,18 +103,11 @@ def locate_product(
         **_vertical_extent(vertical),
         **_time_extent(moments, bounds),
     }
-    return ordered, extents, vertical.profiles
+    return Located(variables, moving, extents, vertical.profiles)
 
 
-def auxiliary_names(row: Row, coordinates: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Return the names of the auxiliary coordinates of a variable.
-
-    Parameters
-    ----------
-    row : Row
-    coordinates : mapping of str to tuple of str
-        Name -> dimensions, of all coordinates of the file.
-    """
+def auxiliary_names(row: Row, coordinates: Mapping[str, xr.Variable]) -> tuple[str, ...]:
+    """Return the names of the auxiliary coordinates of a variable, among those of its file."""
     # CDO 2.1 cannot read a position that changes along a beam, nor a variable of three dimensions
     # with a scalar position, nor one over beams beside another with a scalar position.
     excluded = tuple(position.name for position in SOUNDED)
@@ -110,8 +115,10 @@ def auxiliary_names(row: Row, coordinates: Mapping[str, tuple[str, ...]]) -> tup
         excluded += ("latitude", "longitude")
     return tuple(
         name
-        for name, dims in coordinates.items()
-        if dims != (name,) and set(dims) <= set(row.dims) and name not in excluded
+        for name, coordinate in coordinates.items()
+        if coordinate.dims != (name,)
+        and set(coordinate.dims) <= set(row.dims)
+        and name not in excluded
     )
 
 

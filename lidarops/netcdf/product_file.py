@@ -7,7 +7,7 @@ Data that do not match the layout of the kind are refused.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -91,7 +91,7 @@ class ProductWriter:
         self._until_complete = until_complete
         self._former = former
         self._change: Change | None = None
-        self._coordinates, self._extents, self._vertical = locate_product(source, layout, context)
+        self._located = locate_product(source, layout, context)
         self._frame_texts = frame.attrs
         self._times = frame.variables[_TIME].values
         self._profiles = 0
@@ -101,13 +101,13 @@ class ProductWriter:
             for row in layout.variables
             if not _over_time(row.dims) and not (row.optional and row.name not in source)
         }
-        shapes = [(coordinate.dims, coordinate.values) for coordinate in self._coordinates]
-        shapes += [(layout.row(name).dims, values) for name, values in self._fixed.items()]
         self._sizes = {
-            dim: size
-            for dims, values in shapes
-            for dim, size in zip(dims, values.shape, strict=True)
+            str(dim): size
+            for variable in self._located.variables.values()
+            for dim, size in variable.sizes.items()
         }
+        for name, values in self._fixed.items():
+            self._sizes |= dict(zip(layout.row(name).dims, values.shape, strict=True))
         self._flags = layout.flags
         self._flagged: Counter[FlagBit] = Counter()
         self._verdicts = np.zeros(3, np.int64)
@@ -148,7 +148,13 @@ class ProductWriter:
         for name in sorted(self._names ^ measured.keys()):
             raise ProductError("is in some profiles, but not in others", field=name)
         self._profiles = span.stop
-        return dict(self._located(span)) | measured
+        moving = {name: values(span) for name, values in self._located.moving.items()}
+        located = {
+            name: variable.values[span]
+            for name, variable in self._located.variables.items()
+            if _over_time(variable.dims) and name not in moving
+        }
+        return {**located, **moving, **measured}
 
     def _span(self, profiles: xr.Dataset) -> slice:
         first = self._profiles
@@ -165,14 +171,6 @@ class ProductWriter:
                 remedy="add all profiles in the order of time",
             )
         return span
-
-    def _located(self, span: slice) -> Iterator[tuple[str, Values]]:
-        for coordinate in self._coordinates:
-            row = coordinate.row
-            if _over_time(coordinate.dims):
-                yield row.name, coordinate.profiles(span)
-                if row.bounds and coordinate.bounds is not None:
-                    yield row.bounds, coordinate.bounds[span]
 
     def _measured(self, source: CheckedInput) -> dict[str, Values]:
         judged = self._layout.row(rows.QUALITY_FLAG)
@@ -222,8 +220,9 @@ class ProductWriter:
         ProductError
             If an optional variable is present without its ancillary variables.
         """
-        feature_type = "timeSeriesProfile" if self._vertical else ""
-        attrs = global_attributes(self._context, self._layout, self._extents, feature_type)
+        located = self._located
+        feature_type = "timeSeriesProfile" if located.vertical else ""
+        attrs = global_attributes(self._context, self._layout, located.extents, feature_type)
         if self._frame_texts.get("steps"):
             attrs["lidarops_steps"] = str(self._frame_texts["steps"])
         if self._frame_texts.get("references"):
@@ -238,12 +237,8 @@ class ProductWriter:
     def _variables(self, encoded: Mapping[str, Values]) -> Iterator[tuple[str, xr.Variable]]:
         """Yield the variables in the order of the file."""
         mode = self._context.mode
-        dims_of = {coordinate.row.name: coordinate.dims for coordinate in self._coordinates}
-        for coordinate in self._coordinates:
-            row, dims = coordinate.row, coordinate.dims
-            yield row.name, xr.Variable(dims, coordinate.values, attributes(row, mode=mode))
-            if row.bounds and coordinate.bounds is not None:
-                yield row.bounds, xr.Variable((*dims, rows.BOUNDS_DIM), coordinate.bounds)
+        coordinates = self._located.variables
+        yield from coordinates.items()
         for row in self._layout.variables:
             if row.name in encoded:
                 first = encoded[row.name]
@@ -253,9 +248,9 @@ class ProductWriter:
                 values = self._fixed[row.name]
             else:
                 continue
-            attrs = attributes(row, mode=mode, coordinates=auxiliary_names(row, dims_of))
+            attrs = attributes(row, mode=mode, coordinates=auxiliary_names(row, coordinates))
             yield row.name, xr.Variable(row.dims, values, attrs)
-        station = rows.station(profiles=self._vertical)
+        station = rows.station(profiles=self._located.vertical)
         name = self._context.station.name or self._context.station_key
         yield station.name, as_text(station, name, mode)
         provenance = prov_json(self._context.provenance)
@@ -309,5 +304,5 @@ class ProductWriter:
         )
 
 
-def _over_time(dims: tuple[str, ...]) -> bool:
+def _over_time(dims: tuple[Hashable, ...]) -> bool:
     return dims[:1] == (_TIME,)
