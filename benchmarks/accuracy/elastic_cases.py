@@ -7,7 +7,6 @@ background. The files of the intercomparison are read if given.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -418,8 +417,7 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
     RawFormatError
         If a file cannot be read, or holds another number of bins.
     """
-    folder = Path(folder)
-    files = {_level(file): file for file in folder.glob("background_1e*.licel")}
+    files = sorted(Path(folder).glob("background_1e*.licel"))
     if not files:
         raise CampaignError(
             "holds no files background_1e*.licel",
@@ -427,52 +425,33 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
             field="data",
             remedy="give the folder of the intercomparison, or leave it out",
         )
-    sky = _published_sky(folder)
-    return sky, [_published(files[level], level, sky) for level in sorted(files)]
-
-
-def _level(file: Path) -> float:
-    match = re.fullmatch(r"background_1e(\d+)\.licel", file.name)
-    if match is None:
-        raise CampaignError(
-            "names no background", file=file, remedy="name it background_1eN.licel, N in decades"
-        )
-    return float(f"1e{match[1]}")
-
-
-def _published_sky(folder: Path) -> SimulatedSky:
+    published = []
     table = folder / "molecular_profile_hPa.csv"
     try:
-        columns = np.loadtxt(table, delimiter=",", unpack=True, ndmin=2)
+        levels = [float(file.stem.removeprefix("background_")) for file in files]
+        pressure, temperature, height = np.loadtxt(table, delimiter=",", unpack=True, ndmin=2)
     except (OSError, ValueError) as error:
-        raise CampaignError(f"cannot be read: {error}", file=table, field="data") from error
-    if len(columns) != 3:
         raise CampaignError(
-            f"has {len(columns)} columns", file=table, remedy="give pressure, temperature, height"
-        )
-    pressure, temperature, height = columns
+            f"cannot be read: {error}", file=table, field="data",
+            remedy="name files background_1eN.licel, and give pressure, temperature and height",
+        ) from error  # fmt: skip
     air = MolecularProfile.from_profile(height, pressure, temperature, pressure_unit="hPa")
     clean = _raw_counts(folder / "noise_free.licel")
     sky = _sky(air, clean, np.full(RANGE.size, np.nan))
     power = np.where(sky.inverted, sky.signal, np.nan)
-    return replace(sky, backscatter=invert_particles(power, sky, GIVEN_WINDOW).backscatter)
-
-
-def _published(file: Path, level: float, sky: SimulatedSky) -> Published:
-    counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
-    truth = known_shape.fit_known_shape(
-        counts,
-        sky.range,
-        sky.signal,
-        variance=(sky.signal + level) / SHOTS,
-        start=sky.range[_FIRST_TRUE_BIN],
-    )
-    return Published(
-        level,
-        counts[np.newaxis],
-        float(truth.background),
-        float(truth.background_standard_error),
-    )
+    sky = replace(sky, backscatter=invert_particles(power, sky, GIVEN_WINDOW).backscatter)
+    for level, file in sorted(zip(levels, files, strict=True)):
+        counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
+        truth = known_shape.fit_known_shape(
+            counts,
+            sky.range,
+            sky.signal,
+            variance=(sky.signal + level) / SHOTS,
+            start=sky.range[_FIRST_TRUE_BIN],
+        )
+        error = float(truth.background_standard_error)
+        published.append(Published(level, counts[np.newaxis], float(truth.background), error))
+    return sky, published
 
 
 def _raw_counts(file: Path) -> Array:

@@ -65,17 +65,8 @@ class Paths:
         return self.signal * air[:, :1] * relative_signal(self.range, self.extinction * air, air)
 
 
-@dataclass(frozen=True, slots=True)
-class ViolatedPaths:
-    """Signals of paths with a violation, and their true extinction."""
-
-    signal: Array
-    """(profile, bin) above the background."""
-    extinction: Array
-    """(profile,) m-1; the mean where it varies."""
-
-
-Violation = Callable[[Paths, Random], ViolatedPaths]
+Violation = Callable[[Paths, Random], Array]
+"""Returns (profile, bin) signals above the background of paths with a violation."""
 
 
 def between(rng: Random, low: float, high: float, count: int) -> Array:
@@ -100,71 +91,64 @@ def random_paths(cluster: int, profiles: int) -> tuple[Paths, Random]:
     return paths, rng
 
 
-def _none(paths: Paths, _: Random) -> ViolatedPaths:
-    return ViolatedPaths(paths.clean, paths.extinction[:, 0])
+def _none(paths: Paths, _: Random) -> Array:
+    return paths.clean
 
 
 def _sign(rng: Random, count: int) -> Array:
     return np.asarray(rng.choice([-1.0, 1.0], (count, 1)))
 
 
-def _slope(paths: Paths, rng: Random) -> ViolatedPaths:
+def _slope(paths: Paths, rng: Random) -> Array:
     count = len(paths.signal)
     scale = between(rng, 1e3, 1e5, count) * _sign(rng, count)
-    return ViolatedPaths(paths.clean * np.exp(-paths.depth / scale), paths.extinction[:, 0])
+    return paths.clean * np.exp(-paths.depth / scale)
 
 
-def _curved(paths: Paths, rng: Random) -> ViolatedPaths:
+def _curved(paths: Paths, rng: Random) -> Array:
     count = len(paths.signal)
     amount = between(rng, 1e-3, 1.0, count) * _sign(rng, count)
     position = paths.depth / paths.depth[:, -1:] - 0.5
-    return ViolatedPaths(paths.clean * np.exp(amount * position**2), paths.extinction[:, 0])
+    return paths.clean * np.exp(amount * position**2)
 
 
-def _plume(paths: Paths, rng: Random) -> ViolatedPaths:
-    """Add a cloud to the path: backscatter and extinction increase by the same factor."""
+def _excess(paths: Paths, rng: Random) -> Array:
+    """Return the excess of a cloud in the path, (profile, bin), over the path's own scattering."""
     count = len(paths.signal)
     middle = rng.random((count, 1)) * paths.depth[:, -1:]
     width = between(rng, 0.01, 0.5, count) * paths.depth[:, -1:]
-    plume = between(rng, 1e-2, 10.0, count) * np.exp(-0.5 * ((paths.depth - middle) / width) ** 2)
-    truth = paths.extinction * (1.0 + plume.mean(axis=1, keepdims=True))
-    return ViolatedPaths(paths.with_plume(plume), truth[:, 0])
+    shape = np.exp(-0.5 * ((paths.depth - middle) / width) ** 2)
+    return np.asarray(between(rng, 1e-2, 10.0, count) * shape)
 
 
-def _overlap(paths: Paths, rng: Random) -> ViolatedPaths:
+def _overlap(paths: Paths, rng: Random) -> Array:
     count = len(paths.signal)
     lost = rng.uniform(0.0, 0.3, (count, 1))
     scale = between(rng, 0.02, 1.0, count) * paths.depth[:, -1:]
-    return ViolatedPaths(
-        paths.clean * (1.0 - lost * np.exp(-paths.depth / scale)), paths.extinction[:, 0]
-    )
+    return paths.clean * (1.0 - lost * np.exp(-paths.depth / scale))
 
 
-def _turbulent(paths: Paths, rng: Random) -> ViolatedPaths:
+def _turbulent(paths: Paths, rng: Random) -> Array:
     amount = between(rng, 1e-3, 0.2, len(paths.signal))
-    eddies = correlated(rng, paths.clean.shape, rng.uniform(0.0, 0.95))
-    return ViolatedPaths(paths.clean * np.exp(amount * eddies), paths.extinction[:, 0])
+    return paths.clean * np.exp(amount * correlated(rng, paths.clean.shape, rng.uniform(0.0, 0.95)))
 
 
-def _afterpulse(paths: Paths, rng: Random) -> ViolatedPaths:
+def _afterpulse(paths: Paths, rng: Random) -> Array:
     count = len(paths.signal)
     share = between(rng, 1e-4, 0.1, count)
     scale = between(rng, 0.05, 1.0, count) * paths.depth[:, -1:]
-    afterpulse = share * paths.signal * np.exp(-paths.depth / scale)
-    return ViolatedPaths(paths.clean + afterpulse, paths.extinction[:, 0])
+    return paths.clean + share * paths.signal * np.exp(-paths.depth / scale)
 
 
-def _saturated(paths: Paths, rng: Random) -> ViolatedPaths:
+def _saturated(paths: Paths, rng: Random) -> Array:
     top = rng.uniform(0.3, 0.99, (len(paths.signal), 1)) * paths.signal
-    return ViolatedPaths(np.minimum(paths.clean, top), paths.extinction[:, 0])
+    return np.minimum(paths.clean, top)
 
 
-def _bent(paths: Paths, rng: Random) -> ViolatedPaths:
-    """Make the detector nonlinear: it loses a share proportional to the signal."""
+def _bent(paths: Paths, rng: Random) -> Array:
+    """Return signals of a detector that loses a share proportional to the signal."""
     lost = between(rng, 1e-3, 0.3, len(paths.signal))
-    return ViolatedPaths(
-        paths.clean * (1.0 - lost * paths.clean / paths.signal), paths.extinction[:, 0]
-    )
+    return paths.clean * (1.0 - lost * paths.clean / paths.signal)
 
 
 def _with_gaps(power: Array, rng: Random) -> Array:
@@ -191,6 +175,7 @@ _SHORT_SCALE: Final = (
 _WITH_GAPS: Final = Failure("gaps", satisfied=True)
 _NOISE_NOT_STATED: Final = Failure("none, noise not stated", satisfied=True)
 _OUTLIERS: Final = Failure("outliers")
+_PLUME: Final = Failure("plume")
 FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
     (Failure("none", satisfied=True), _none),
     (_NOISE_NOT_STATED, _none),
@@ -198,7 +183,7 @@ FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
     (_OUTLIERS, _none),
     (Failure("slope of the backscatter along the section", unseen=_SAME_SHAPE), _slope),
     (Failure("bent backscatter"), _curved),
-    (Failure("plume"), _plume),
+    (_PLUME, _none),
     (Failure("overlap error", unseen=_SHORT_SCALE), _overlap),
     (Failure("eddies"), _turbulent),
     (Failure("afterpulse", unseen=_SHORT_SCALE), _afterpulse),
@@ -250,9 +235,15 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     within = paths.extinction[:, 0] < 0.9 * highest
     within &= 2.0 * paths.extinction[:, 0] * paths.range[0] < _DEEPEST
     for failure, violate in FAILURES:
+        truth = paths.extinction[:, 0]
         with np.errstate(under="ignore"):
-            violated = violate(paths, rng)
-        power = paths.background + violated.signal + rng.standard_normal(violated.signal.shape)
+            signal = violate(paths, rng)
+            if failure is _PLUME:
+                # Backscatter and extinction increase by the same factor.
+                excess = _excess(paths, rng)
+                signal = paths.with_plume(excess)
+                truth = truth * (1.0 + excess.mean(axis=1))
+        power = paths.background + signal + rng.standard_normal(signal.shape)
         if failure is _WITH_GAPS:
             power = _with_gaps(power, rng)
         elif failure is _OUTLIERS:
@@ -262,11 +253,11 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[ScoredValues]:
         # Missing bins lose information.
         expected = failure.satisfied and failure is not _WITH_GAPS
         solvable = within & (wider * least <= _SOLVABLE) if expected else None
-        misfit = None if violate is _none else visible_misfit(paths.range, violated.signal)
+        known = violate is _none and failure is not _PLUME
+        misfit = None if known else visible_misfit(paths.range, signal)
         fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
-        truths = {"extinction": violated.extinction, "background": paths.background[:, 0]}
-        for quantity, truth in truths.items():
-            yield _scored(failure, quantity, truth, fit, solvable=solvable, misfit=misfit)
+        for quantity, true in (("extinction", truth), ("background", paths.background[:, 0])):
+            yield _scored(failure, quantity, true, fit, solvable=solvable, misfit=misfit)
 
 
 def _scored(

@@ -12,11 +12,12 @@ import random
 import re
 import sys
 import tempfile
-from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Final
+
+import pandas as pd
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.headers import HEADER_BYTES, Headers, UnreadFile, read_header
@@ -153,17 +154,15 @@ def fields_of(content: bytes) -> Iterator[tuple[int, str]]:
         start, number = end + 2, number + 1
 
 
-def measured(flips: Flips, number: int, seed: int) -> dict[str, Counter[str]]:
-    """Return outcomes by field of some random flips."""
+def measured(flips: Flips, number: int, seed: int) -> Iterator[tuple[str, str]]:
+    """Yield field and outcome of some random flips."""
     chance = random.Random(seed)
-    table: dict[str, Counter[str]] = defaultdict(Counter)
     for _ in range(number):
         due = chance.choice(flips.files)
         content = bytearray((flips.root / due.file.path).read_bytes())
         place, field = chance.choice(list(fields_of(bytes(content))))
         content[place] = chance.choice([d for d in b"0123456789" if d != content[place]])
-        table[field][flips.outcome(due, bytes(content))] += 1
-    return table
+        yield field, flips.outcome(due, bytes(content))
 
 
 def _archives(data: Path, folder: Path) -> Iterator[tuple[str, Campaign]]:
@@ -190,21 +189,17 @@ def main() -> None:
     arguments.add_argument("data", type=Path, help="folder of real raw files")
     arguments.add_argument("--flips", type=int, default=600, help="for each archive")
     options = arguments.parse_args()
-    table: dict[str, Counter[str]] = defaultdict(Counter)
+    rows: list[tuple[str, str]] = []
     with tempfile.TemporaryDirectory() as folder:
         for name, campaign in _archives(options.data, Path(folder)):
-            own = measured(Flips(campaign), options.flips, seed=31)
-            for field, outcomes in own.items():
-                table[field] += outcomes
-                table[f"all of {name}"] += outcomes
-                table["all"] += outcomes
-    columns = "".join(f"{outcome:>16}" for outcome in OUTCOMES)
-    lines = [f"{'field':<30}{columns}"]
-    order = sorted(table, key=lambda name: (name.startswith("all"), -table[name]["used"], name))
-    for field in order:
-        outcomes = table[field]
-        lines.append(f"{field:<30}" + "".join(f"{outcomes[name]:>16}" for name in OUTCOMES))
-    sys.stdout.write("\n".join(lines) + "\n")
+            for field, outcome in measured(Flips(campaign), options.flips, seed=31):
+                rows += [(place, outcome) for place in (field, f"all of {name}", "all")]
+    found = pd.DataFrame(rows, columns=["field", "outcome"])
+    table = pd.crosstab(found["field"], found["outcome"]).reindex(columns=OUTCOMES, fill_value=0)
+    order = sorted(
+        table.index, key=lambda name: (name.startswith("all"), -table["used"][name], name)
+    )
+    sys.stdout.write(table.loc[order].to_string() + "\n")
 
 
 if __name__ == "__main__":
