@@ -72,11 +72,13 @@ def run_benchmark(
         If "reader" gets no file, or one that cannot be read.
     """
     kind = _member(BenchmarkKind, what, "benchmark")
+    begin = cpu_seconds()
     if kind is BenchmarkKind.STABILITY:
-        for name, value in {"files": files, "data": data}.items():
+        options = {"files": files, "data": data, "repeats": effort.repeats}
+        for name, value in options.items():
             _refuse(name, value, "is no option of the benchmark 'stability'")
-        _refuse("repeats", effort.repeats, "is no option of the benchmark 'stability'")
-        return _timed(partial(study.measure_stability, case=case), effort)
+        result = study.measure_stability(effort, case=case)
+        return replace(result, cpu_seconds=cpu_seconds() - begin)
     default = Benchmark.ALL if kind is BenchmarkKind.ACCURACY else Benchmark.HOMOGENEOUS
     benchmark = _member(Benchmark, case or (Benchmark.READER if files else default), "case")
     if benchmark is not Benchmark.READER:
@@ -89,12 +91,7 @@ def run_benchmark(
             f"the case {benchmark.value!r} has no {kind.value}",
             remedy=f"choose: {' or '.join(studies)}",
         )
-    return _timed(studies[benchmark], effort)
-
-
-def _timed(measure: Callable[[Effort], Study], effort: Effort) -> Study:
-    begin = cpu_seconds()
-    return replace(measure(effort), cpu_seconds=cpu_seconds() - begin)
+    return replace(studies[benchmark](effort), cpu_seconds=cpu_seconds() - begin)
 
 
 _Studies = Mapping[Benchmark, Callable[[Effort], Study]]

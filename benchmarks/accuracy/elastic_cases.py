@@ -449,8 +449,8 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
             variance=(sky.signal + level) / SHOTS,
             start=sky.range[_FIRST_TRUE_BIN],
         )
-        error = float(truth.background_standard_error)
-        published.append(Published(level, counts[np.newaxis], float(truth.background), error))
+        values = (float(truth.background), float(truth.background_standard_error))
+        published.append(Published(level, counts[np.newaxis], *values))
     return sky, published
 
 

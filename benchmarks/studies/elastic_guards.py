@@ -13,6 +13,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
+import numba
 import numpy as np
 
 from benchmarks.stability import random_elastic
@@ -50,7 +51,10 @@ def _variant(old: str, new: str) -> types.ModuleType:
     assert old in source, old
     module = types.ModuleType("outlying_bins_variant")
     sys.modules[module.__name__] = module
-    text = source.replace(old, new).replace("cache=True", "cache=False")
+    # Numba keeps no compiled code of a module without a file.
+    uncached = "@numba.njit(nogil=True, error_model='numpy')"
+    text = source.replace(old, new).replace("@compiled", uncached)
+    module.__dict__["numba"] = numba
     exec(compile(text, "<variant>", "exec"), module.__dict__)
     return module
 

@@ -39,18 +39,6 @@ class Pass(StrEnum):
     NOTHING = "run, nothing to do"
 
 
-_ABOUT: Final[Mapping[Pass, str]] = {
-    Pass.FIRST: "read the headers of all files into the catalog",
-    Pass.PROCESS: "process files to products and ledger",
-    Pass.SETTLE: "first run with all products present: every scene is cut and checked",
-    Pass.AGAIN: "list the files and compare them with the catalog",
-    Pass.STALE: "find days that may hold stale scenes, from catalog and ledger",
-    Pass.NOTHING: "both, without anything to write",
-}
-_OF_FILES: Final = (Pass.FIRST, Pass.PROCESS, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
-_OF_ROWS: Final = (Pass.SETTLE, Pass.AGAIN, Pass.STALE, Pass.NOTHING)
-
-
 class ProcessCost(NamedTuple):
     """Cost of an operation in its own process, without imports and compilation."""
 
@@ -103,12 +91,12 @@ def measure_archives(
         with _folders() as (small, large):
             simulate_campaign(_TO_WARM, small)
             simulate_campaign(size, large)
-            measured.append(_measure(size.files, _OF_FILES, (small, large), read=True))
+            measured.append(_measure(size.files, (small, large), read=True))
         effort.progress(1)
     with _folders() as (small, large):
         stand_in_archives.write_stand_ins(StandIns(instruments=1, days=1), small / CAMPAIGN_FILE)
         stand_in_archives.write_stand_ins(stand_ins, large / CAMPAIGN_FILE)
-        measured.append(_measure(stand_ins.files, _OF_ROWS, (small, large), read=False))
+        measured.append(_measure(stand_ins.files, (small, large), read=False))
     effort.progress(1)
     return archives_study(effort.date, measured)
 
@@ -123,16 +111,19 @@ def _folders() -> Iterator[tuple[Path, Path]]:
         yield small, large
 
 
-def _measure(
-    files: int, passes: Sequence[Pass], folders: tuple[Path, Path], *, read: bool
-) -> ArchiveCost:
+def _measure(files: int, folders: tuple[Path, Path], *, read: bool) -> ArchiveCost:
     small, large = (folder / CAMPAIGN_FILE for folder in folders)
-    costs = {operation: in_fresh_process(_cost, operation, small, large) for operation in passes}
+    archives = "files" if read else "rows"
+    costs = {
+        operation: in_fresh_process(_cost, operation, small, large)
+        for operation, (_, of, _) in _PASSES.items()
+        if archives in of
+    }
     return ArchiveCost(files, read, costs)
 
 
 def _cost(operation: Pass, small: Path, large: Path) -> ProcessCost:
-    run = _OPERATIONS[operation]
+    run, *_ = _PASSES[operation]
     run(small)
     cpu, wall = time.process_time(), time.perf_counter()
     run(large)
@@ -162,14 +153,23 @@ def _check_up_to_date(file: Path) -> None:
         raise CampaignError("the simulated archive is not up to date", file=file)
 
 
-_OPERATIONS: Final[Mapping[Pass, Callable[[Path], None]]] = {
-    Pass.FIRST: _scan,
-    Pass.PROCESS: _process,
-    Pass.SETTLE: _check_up_to_date,
-    Pass.AGAIN: _scan,
-    Pass.STALE: _check_nothing_stale,
-    Pass.NOTHING: _check_up_to_date,
+_PASSES: Final[Mapping[Pass, tuple[Callable[[Path], None], str, str]]] = {
+    Pass.FIRST: (_scan, "files", "read the headers of all files into the catalog"),
+    Pass.PROCESS: (_process, "files", "process files to products and ledger"),
+    Pass.SETTLE: (
+        _check_up_to_date,
+        "rows",
+        "first run with all products present: every scene is cut and checked",
+    ),
+    Pass.AGAIN: (_scan, "files, rows", "list the files and compare them with the catalog"),
+    Pass.STALE: (
+        _check_nothing_stale,
+        "files, rows",
+        "find days that may hold stale scenes, from catalog and ledger",
+    ),
+    Pass.NOTHING: (_check_up_to_date, "files, rows", "both, without anything to write"),
 }
+"""What is called, in archives of files that can be read or of stand-ins, and what it does."""
 
 
 def archives_study(date: str, measured: Sequence[ArchiveCost]) -> Study:
@@ -181,7 +181,7 @@ def archives_study(date: str, measured: Sequence[ArchiveCost]) -> Study:
         "counted. TMPDIR selects the disk.",
         [
             Results(
-                f"{operation.value}: {_ABOUT[operation]}",
+                f"{operation.value}: {about}",
                 {
                     (f"{cost.files}" + ("" if cost.read else " rows"), operation.value): _score(
                         measured, cost, operation
@@ -192,7 +192,7 @@ def archives_study(date: str, measured: Sequence[ArchiveCost]) -> Study:
                 "Rows: empty files stand in for those of the catalog, and are not read.",
                 case="files",
             )
-            for operation in Pass
+            for operation, (_, _, about) in _PASSES.items()
         ],
     )
     return Study("Archives: cost per file", date, [chapter])
