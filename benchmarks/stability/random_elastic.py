@@ -285,7 +285,7 @@ def _negative_chi_square(solved: inversion.ElasticResult, power: Array, noise: A
         usable = solved.valid & (noise_error > 0.0) & np.isfinite(noise_error)
         y = np.where(usable, solved.backscatter / noise_error, 1.0)
     budget = solved.budget
-    causes = (budget.background, budget.reference, budget.lidar_ratio, budget.molecular)
+    causes = [budget[name] for name in ("background", "reference", "lidar_ratio", "molecular")]
     change = np.stack(
         [np.where(usable, c, 0.0) / np.where(usable, noise_error, 1.0) for c in causes], -1
     )
@@ -372,9 +372,9 @@ def _scored(
     )  # fmt: skip
 
 
-def _error(budget: inversion.ErrorBudget, causes: Iterable[str]) -> Array:
+def _error(budget: dict[str, Array], causes: Iterable[str]) -> Array:
     """Return the error by these causes together."""
-    return np.asarray(np.sqrt(sum(getattr(budget, cause) ** 2 for cause in causes)))
+    return np.asarray(np.sqrt(sum(budget[cause] ** 2 for cause in causes)))
 
 
 def _mean_variance(counts: Array) -> Array:

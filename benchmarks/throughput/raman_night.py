@@ -20,8 +20,7 @@ from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import condition
 from lidarops.retrieve.signal.labeled_averaging import (
     ClockAverage,
-    Record,
-    ScreenedAverage,
+    IntervalSums,
     Screening,
     joined,
 )
@@ -116,23 +115,20 @@ def night_signals(counts: xr.Dataset, names: Sequence[str]) -> list[xr.Dataset]:
     ]
 
 
-def screened_average(counts: xr.Dataset, names: Sequence[str]) -> ScreenedAverage:
+def screened_average(counts: xr.Dataset, names: Sequence[str]) -> ClockAverage:
     """Return the means over half an hour of the channels of a product, still without profiles."""
     distance, geometry = counts["range"].to_numpy(), counts[["time", "time_bnds"]]
     records = [
-        Record(
-            ClockAverage(
-                geometry,
-                distance,
-                seconds=1800.0,
-                shots=counts[f"photon_{name}_shots"],
-                parts=THRESHOLDS.most_parts,
-            ),
+        IntervalSums(
+            geometry,
             distance,
+            seconds=1800.0,
+            shots=counts[f"photon_{name}_shots"],
+            parts=THRESHOLDS.most_parts,
         )
         for name in names
     ]
-    return ScreenedAverage(records, Screening(cloud_contrast(CHANNELS[names[0]]), _HIGHEST))
+    return ClockAverage(records, Screening(cloud_contrast(CHANNELS[names[0]]), _HIGHEST))
 
 
 def retrieved(means: dict[str, xr.Dataset]) -> list[xr.Dataset]:

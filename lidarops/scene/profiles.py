@@ -18,12 +18,7 @@ from lidarops.constants import DEAD_TIME_UNCERTAINTY
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
-from lidarops.retrieve.signal.labeled_averaging import (
-    ClockAverage,
-    Record,
-    ScreenedAverage,
-    Screening,
-)
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Indices = npt.NDArray[np.int64]
@@ -104,26 +99,20 @@ class FileProfiles:
         """Return power, variance and quality of profiles."""
         return labeled.condition(counts, self._channel, **self._settings)
 
-    def means(
-        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int | None = None
-    ) -> ClockAverage:
-        """Return the empty mean over clock intervals."""
+    def sums(
+        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
+    ) -> IntervalSums:
+        """Return the sums over clock intervals, still without profiles."""
         dark = self._settings["dark"]
-        return ClockAverage(
+        return IntervalSums(
             geometry,
             self._range,
             seconds=seconds,
             shots=shots,
             shared_variance=None if dark is None else dark.variance,
             parts=parts,
+            lag=lag,
         )
-
-    def record(
-        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, lag: int = 0
-    ) -> Record:
-        """Return the record of an empty screened average."""
-        parts = THRESHOLDS.most_parts
-        return Record(self.means(geometry, shots, seconds, parts), self._range, lag)
 
     @property
     def recorded(self) -> tuple[tuple[FileProfiles, int], ...]:
@@ -193,48 +182,11 @@ Profiles = FileProfiles | GluedProfiles
 
 
 class Averages:
-    """Means of the profiles of a channel over clock intervals.
+    """Means of the profiles of channels over clock intervals.
 
-    Parameters
-    ----------
-    channel : Profiles
-    geometry : xr.Dataset
-        ``time`` and ``time_bnds`` of all profiles.
-    shots : xr.DataArray, (time,)
-        Of all profiles.
-    seconds : float
-        Length of an interval.
-    """
-
-    def __init__(
-        self, channel: Profiles, geometry: xr.Dataset, shots: xr.DataArray, seconds: float
-    ) -> None:
-        self._channel = channel
-        self._recorded = [record for record, _ in channel.recorded]
-        self._means = [record.means(geometry, shots, seconds) for record in self._recorded]
-
-    def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
-        """Add the next profiles: all of a chunk, or some of its rows."""
-        for record, means in zip(self._recorded, self._means, strict=True):
-            conditioned = chunk.profiles(record)
-            means.add(conditioned if rows is None else conditioned.isel(time=rows))
-
-    @property
-    def times(self) -> xr.Dataset:
-        """``time`` and ``time_bnds`` of all means."""
-        return self._means[-1].times
-
-    def completed(self) -> Iterator[xr.Dataset]:
-        """Yield the means that are complete, in batches, and forget them."""
-        for means in zip(*(means.completed() for means in self._means), strict=True):
-            yield self._channel.joined(*means)
-
-
-class ScreenedAverages:
-    """Means of the profiles of channels over clock intervals, without outlying parts.
-
-    A part that is outlying in any channel is left out of all. The means of a channel have the
-    variables of `lidarops.retrieve.signal.labeled_averaging.ScreenedAverage.completed`.
+    With a screening, a part of an interval that is outlying in any channel is left out of all. The
+    means of a channel have the variables of
+    `lidarops.retrieve.signal.labeled_averaging.ClockAverage.completed`.
 
     Parameters
     ----------
@@ -246,7 +198,7 @@ class ScreenedAverages:
         Of all profiles.
     seconds : float
         Length of an interval.
-    screening : Screening
+    screening : Screening, optional
     """
 
     def __init__(
@@ -255,27 +207,30 @@ class ScreenedAverages:
         geometry: xr.Dataset,
         shots: xr.DataArray,
         seconds: float,
-        screening: Screening,
+        screening: Screening | None = None,
     ) -> None:
-        self._channels = channels
+        self._channels, self._screened = channels, screening is not None
         self._recorded = [record for channel in channels for record, _ in channel.recorded]
         first = channels[-1].range
         width = float(np.median(np.diff(first))) if first.size > 1 else 1.0
+        parts = THRESHOLDS.most_parts if self._screened else 1
         records = [
-            record.record(
+            record.sums(
                 geometry,
                 shots,
                 seconds,
+                parts,
                 lag + round((first[0] - channel.range[0]) / width),
             )
             for channel in channels
             for record, lag in channel.recorded
         ]
-        self._means = ScreenedAverage(records, screening)
+        self._means = ClockAverage(records, screening)
 
-    def add(self, chunk: Chunk) -> None:
-        """Add the profiles of the next chunk."""
-        self._means.add([chunk.profiles(profiles) for profiles in self._recorded])
+    def add(self, chunk: Chunk, rows: Indices | None = None) -> None:
+        """Add the next profiles: all of a chunk, or some of its rows."""
+        profiles = (chunk.profiles(record) for record in self._recorded)
+        self._means.add([one if rows is None else one.isel(time=rows) for one in profiles])
 
     @property
     def times(self) -> xr.Dataset:
@@ -283,11 +238,13 @@ class ScreenedAverages:
         return self._means.times
 
     def completed(self) -> Iterator[tuple[xr.Dataset, ...]]:
-        """Yield the means that are complete, in batches, of each channel."""
+        """Yield the means that are complete, in batches, of each channel; and forget them."""
         for records in self._means.completed():
             means = iter(records)
             yield tuple(
-                channel.joined(*itertools.islice(means, len(channel.recorded)), cells=True)
+                channel.joined(
+                    *itertools.islice(means, len(channel.recorded)), cells=self._screened
+                )
                 for channel in self._channels
             )
 

@@ -43,7 +43,7 @@ RETRIEVAL = {
     "visibility": {
         "beams_with_prior": "network/_empirical_prior:solve_block",
         "beams_without_prior": "network/extinction_field:_solve_network",
-        "triangles": "network/extinction_field:_solve_triangles",
+        "triangles": "network/triangles:solve_triangles",
     },
 }
 

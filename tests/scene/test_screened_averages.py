@@ -8,7 +8,7 @@ import xarray as xr
 
 from lidarops.records import DetectionMode
 from lidarops.retrieve.signal.labeled_averaging import Screening
-from lidarops.scene.profiles import Chunk, FileProfiles, ScreenedAverages
+from lidarops.scene.profiles import Averages, Chunk, FileProfiles
 
 STEP, BINS, PROFILES = 7.5, 400, 12
 DISTANCE = STEP * (np.arange(BINS) + 0.5)
@@ -53,7 +53,7 @@ def means(archive: xr.Dataset) -> tuple[xr.Dataset, ...]:
         )
         for name, offset in OFFSETS.items()
     ]  # fmt: skip
-    averages = ScreenedAverages(
+    averages = Averages(
         channels, archive, archive["photon_355_shots"], 900.0, Screening(2.0, 2500.0)
     )
     averages.add(Chunk(archive, 0))

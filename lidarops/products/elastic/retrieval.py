@@ -35,10 +35,10 @@ from lidarops.scene.choices import (
     with_methods,
 )
 from lidarops.scene.profiles import (
+    Averages,
     ChannelSignal,
     Chunk,
     ProductStream,
-    ScreenedAverages,
     Source,
     gluing,
 )
@@ -164,7 +164,7 @@ class _Inversion(ProductStream):
         self._settings, self._signal = settings.elastic, signal
         self._known_shape = settings.known_shape is not None
         self._reference = Reference(**dict(settings.reference))
-        self._averages = ScreenedAverages(
+        self._averages = Averages(
             [signal.profiles],
             signal.source.geometry,
             signal.shots,

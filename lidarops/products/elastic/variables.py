@@ -60,7 +60,7 @@ _BY_CAUSE: Final = {
         ),
     },
 }
-"""In the order of `lidarops.retrieve.elastic.inversion.ErrorBudget`."""
+"""In the order of `lidarops.retrieve.elastic.inversion.CAUSES`."""
 _ERRORS: Final = tuple(
     Error(
         cause,

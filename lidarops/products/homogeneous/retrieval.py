@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Final
 
@@ -16,8 +16,7 @@ from lidarops.flags import Quality
 from lidarops.products.homogeneous import HomogeneousSettings, Method
 from lidarops.products.homogeneous.variables import LAYOUT
 from lidarops.records import DetectionMode, is_glued
-from lidarops.retrieve.air import labeled as labeled_visibility
-from lidarops.retrieve.air.labeled import VisibilityDefinition
+from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import (
@@ -47,21 +46,6 @@ LEVEL: Final = THRESHOLDS.level * (1.0 + 1e-6)
 """m, largest climb along a section. Headers and campaign files round angles differently."""
 
 
-def _inside(case: Case) -> list[Section]:
-    """Return the requested sections that lie within the bins."""
-    width = case.channel.bin_width
-    return [
-        (near, far)
-        for near, far in case.request.sections
-        if far <= case.last and (far - near) / width >= _fewest_bins(case.request)
-    ]
-
-
-def _fewest_bins(request: HomogeneousSettings) -> int:
-    """Return the fewest bins of a section: those that a fit needs, and a triple of the cubic."""
-    return FEWEST_BINS if request.lag is None else max(FEWEST_BINS, 2 * request.lag + 1)
-
-
 def _climbs(case: Case, near: float, far: float) -> list[float]:
     """Return the climb of the beam of each file of a scene along a section, m.
 
@@ -74,22 +58,7 @@ def _climbs(case: Case, near: float, far: float) -> list[float]:
     ]
 
 
-def _steep(case: Case, near: float, far: float) -> int:
-    """Return how many files of a scene have a beam that is not level along a section."""
-    return sum(height > LEVEL for height in _climbs(case, near, far))
-
-
-def _level(case: Case) -> list[Section]:
-    """Return the sections that are retrieved: within the bins, along a nearly level path."""
-    files = len(case.scene.granules)
-    return [
-        (near, far)
-        for near, far in _inside(case)
-        if case.all_steps or _steep(case, near, far) < files
-    ]
-
-
-def _method(case: Case) -> Method:
+def _method(case: Case, level: Sequence[Section]) -> Method:
     """Return the method that runs: `auto` is the direct fit, or of a moving beam the far range.
 
     A beam of a scan has few shots, and a section cannot tell its background from its extinction.
@@ -98,20 +67,19 @@ def _method(case: Case) -> Method:
     if case.request.method != "auto":
         return case.request.method
     start = tail(case, None)[0]
-    apart = all(far <= start for _, far in _level(case))
+    apart = all(far <= start for _, far in level)
     return "known_background" if apart and moves(case) else "direct"
 
 
-def _window(case: Case) -> Entry:
+def _window(case: Case, level: Sequence[Section], method: Method) -> Entry:
     """Read only the bins that the sections of a photon-counting channel need."""
     if case.channel.mode is not DetectionMode.PHOTON:
         return case.leave(WINDOW, ANALOG_NOISE)
     if case.all_steps:
         return case.leave(WINDOW, ALL_STEPS)
-    if _method(case) == "known_background" and not case.request.background:
+    if method == "known_background" and not case.request.background:
         return case.leave(WINDOW, "the background is that of the far range")
-    farthest = max(far for _, far in _level(case))
-    bins = bins_with_noise(0.0, farthest, case)[1]
+    bins = bins_with_noise(0.0, max(far for _, far in level), case)[1]
     if not 0 < bins < case.channel.bins:
         reason = "a section extends to the last bin"
         return case.leave(WINDOW, reason, number=float(case.channel.bins))
@@ -182,24 +150,35 @@ def _needs(case: Case) -> Entries:
         reason = "not made of glued channels: each record is fitted with its own background"
         yield case.leave("homogeneous", reason, rule="channel_present")
         return
-    inside, level = _inside(case), _level(case)
+    request, files = case.request, len(case.scene.granules)
+    # Those that a fit needs, and a triple of the cubic.
+    fewest = FEWEST_BINS if request.lag is None else max(FEWEST_BINS, 2 * request.lag + 1)
+    inside = [
+        (near, far)
+        for near, far in request.sections
+        if far <= case.last and (far - near) / case.channel.bin_width >= fewest
+    ]
+    climbs = {section: _climbs(case, *section) for section in inside}
+    steep = {section: sum(height > LEVEL for height in climbs[section]) for section in inside}
+    level = [section for section in inside if case.all_steps or steep[section] < files]
+    method = _method(case, level)
     if level:
-        yield _window(case)
+        yield _window(case, level, method)
         yield _along_path(case)
-    for near, far in case.request.sections:
-        if (near, far) not in inside:
-            yield _outside(case, near, far)
-    for near, far in inside:
-        if (near, far) not in level:
-            yield _slanted(case, near, far)
-        elif _steep(case, near, far):
-            yield _partly_slanted(case, near, far)
+    for section in request.sections:
+        if section not in inside:
+            yield _outside(case, *section, fewest)
+    for section in inside:
+        if section not in level:
+            yield _slanted(case, *section, min(climbs[section]))
+        elif steep[section]:
+            yield _partly_slanted(case, *section, steep[section])
     if level:
-        yield _retrieved(case, level)
+        yield _retrieved(case, level, method)
 
 
-def _retrieved(case: Case, level: list[Section]) -> Entry:
-    settings, method = case.request, _method(case)
+def _retrieved(case: Case, level: list[Section], method: Method) -> Entry:
+    settings = case.request
     definition = settings.visibility
     given = (settings.background or {}).get(case.channel.name)
     far = method == "known_background" and given is None
@@ -243,13 +222,12 @@ def _whence(settings: HomogeneousSettings, method: Method) -> str:
     return whence if settings.lag is None else f"{whence} with a lag of {settings.lag} bins"
 
 
-def _outside(case: Case, near: float, far: float) -> Entry:
+def _outside(case: Case, near: float, far: float, fewest: int) -> Entry:
     bins = (min(far, case.last) - near) / case.channel.bin_width
     reason = (
         f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
-        f" holds fewer than {_fewest_bins(case.request)} bins"
+        f" holds fewer than {fewest} bins"
     )
-    fewest = _fewest_bins(case.request)
     if fewest > FEWEST_BINS and far <= case.last:
         reason = (
             f"section {near:g}-{far:g} m holds {bins:.0f}, fewer than {fewest} bins, which the"
@@ -258,8 +236,7 @@ def _outside(case: Case, near: float, far: float) -> Entry:
     return case.leave("homogeneous", reason, number=bins, rule="section_inside")
 
 
-def _slanted(case: Case, near: float, far: float) -> Entry:
-    least = min(_climbs(case, near, far))
+def _slanted(case: Case, near: float, far: float, least: float) -> Entry:
     slope = (
         "neither headers nor campaign give the zenith angle"
         if math.isinf(least)
@@ -270,8 +247,7 @@ def _slanted(case: Case, near: float, far: float) -> Entry:
     return case.leave("homogeneous", reason, number=number, rule="section_level")
 
 
-def _partly_slanted(case: Case, near: float, far: float) -> Entry:
-    steep = _steep(case, near, far)
+def _partly_slanted(case: Case, near: float, far: float, steep: int) -> Entry:
     reason = (
         f"section {near:g}-{far:g} m: values of {steep} of {len(case.scene.granules)} files are"
         f" rejected, whose beams climb more than {THRESHOLDS.level:g} m; a vertical gradient would"
@@ -361,13 +337,14 @@ def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> 
     if "total_extinction_baseline_error" in sections:
         of_baseline = sections["total_extinction_baseline_error"].fillna(0.0)
         systematic = (systematic**2 + of_baseline**2) ** 0.5
-    visibility = labeled_visibility.visibility_of_extinction(
-        sections["total_extinction"],
-        sections["total_extinction_standard_error"],
-        systematic,
+    visibility = visibility_of_extinction(
+        sections["total_extinction"].to_numpy(),
+        sections["total_extinction_standard_error"].to_numpy(),
+        systematic.to_numpy(),
         definition,
     )
-    return sections.assign(visibility.data_vars).assign_attrs(steps=definition.words)
+    along = {name: (systematic.dims, values) for name, values in visibility.items()}
+    return sections.assign(along).assign_attrs(steps=definition.words)
 
 
 RETRIEVAL: Final = Retrieval(settings=HomogeneousPlan, needs=_needs, stream=_Sections, held=_held)

@@ -46,7 +46,6 @@ from lidarops.scene.profiles import (
     ChannelSignal,
     Chunk,
     ProductStream,
-    ScreenedAverages,
     in_one_batch,
 )
 from lidarops.scene.retrieval import Retrieval, Workload
@@ -254,7 +253,7 @@ class _Retrieval(ProductStream):
         self._settings, self._signal = settings.raman, signal
         self._begun = False
         names = [signal.channel, *settings.raman.channels]
-        self._averages = ScreenedAverages(
+        self._averages = Averages(
             [signal.channels[name].profiles for name in names],
             signal.source.geometry,
             signal.shots,
@@ -341,7 +340,7 @@ class _Dark(ProductStream):
         signal, settings = self._signal, self._settings
         geometry, seconds = signal.source.geometry, settings.average.seconds
         empty = labeled.without_signal(
-            Averages(signal.profiles, geometry, signal.shots, seconds).times,
+            Averages([signal.profiles], geometry, signal.shots, seconds).times,
             signal.shots.compute(),
             signal.profiles.range,
             signal.source.pointing,

@@ -27,7 +27,7 @@ from lidarops.products.visibility.network import (
 )
 from lidarops.products.visibility.variables import LAYOUT
 from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
-from lidarops.retrieve.air.labeled import VisibilityDefinition
+from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BeamAverages
@@ -387,7 +387,7 @@ class _Beam:
         if self._profiles.size:
             of_beam = geometry_of_all.isel(time=self._profiles)
             shots = signal.shots.isel(time=self._profiles)
-            self._averages = Averages(signal.profiles, of_beam, shots, seconds)
+            self._averages = Averages([signal.profiles], of_beam, shots, seconds)
             self._interval = _intervals(of_beam["time"].to_numpy(), seconds)
 
     def add(self, chunk: Chunk) -> None:
@@ -402,7 +402,7 @@ class _Beam:
         averages = (
             _no_averages(member.range)
             if self._averages is None
-            else joined(self._averages.completed())
+            else joined(means for (means,) in self._averages.completed())
         )
         distance = averages["range"].to_numpy().astype(np.float64)
         limits = (distance[0], np.inf) if signal is None else member.settings.background.range

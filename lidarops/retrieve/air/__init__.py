@@ -6,8 +6,7 @@ Atmosphere or a sounding (`MolecularProfile`). `visibility` converts extinction 
 
 `reference_window` selects the window in which a profile has the shape of clean air.
 
-`labeled.visibility_of_extinction` does the latter on `xarray` data; import it from its module, so
-that the numerics stay free of xarray.
+`visibility.visibility_of_extinction` does both, with a random and a systematic error.
 """
 
 from lidarops.retrieve.air.molecular import MolecularProfile

@@ -258,7 +258,7 @@ def choose_reference(
         frozen(rows),
         frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
         frozen(shape),
-        frozen(grid.values),
+        frozen(grid),
         frozen(excluded > 0.0),
         edges,
         statistics,
@@ -293,9 +293,7 @@ def choose_reference(
     )
 
 
-def _edges(
-    candidates: npt.ArrayLike, grid: inputs.RangeGrid
-) -> tuple[Array, npt.NDArray[np.int64]]:
+def _edges(candidates: npt.ArrayLike, grid: Array) -> tuple[Array, npt.NDArray[np.int64]]:
     windows = inputs.real_array(candidates, "candidates").astype(np.float64)
     if windows.ndim == 1:
         windows = windows[np.newaxis]
@@ -307,12 +305,11 @@ def _edges(
         raise RetrievalInputError(
             "holds windows that are not finite or end before they begin", field="candidates"
         )
-    first = np.searchsorted(grid.values, windows[:, 0], side="left")
-    stop = np.searchsorted(grid.values, windows[:, 1], side="right")
+    first = np.searchsorted(grid, windows[:, 0], side="left")
+    stop = np.searchsorted(grid, windows[:, 1], side="right")
     if not np.any(stop > first):
         raise RetrievalInputError(
-            f"hold no bin of the range, which reaches from {grid.values[0]:g} to"
-            f" {grid.values[-1]:g} m",
+            f"hold no bin of the range, which reaches from {grid[0]:g} to {grid[-1]:g} m",
             field="candidates",
         )
     return windows, np.stack([first, stop], axis=-1).astype(np.int64)

@@ -1,4 +1,7 @@
-"""Meteorological visibility from extinction: conversion to 550 nm and Koschmieder's law."""
+"""Meteorological visibility from extinction: conversion to 550 nm and Koschmieder's law.
+
+`visibility_of_extinction` does both, with a random and a systematic error.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.arrays import Array, Block
 
 MOR_CONTRAST: Final = 0.05
 """Contrast threshold of the meteorological optical range (`wmo8`): V = ln 20 / extinction."""
@@ -51,6 +54,30 @@ class WavelengthLaw(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class VisibilityDefinition:
+    """Definition of visibility: wavelength of extinction, contrast threshold, wavelength law."""
+
+    wavelength: float
+    """m, at which extinction is measured."""
+    contrast: float = MOR_CONTRAST
+    law: str = "none"
+    """Law that converts extinction to 550 nm."""
+    angstrom_exponent: float | None = None
+    exponent_standard_error: float = 0.0
+    """Standard error of the exponent of the law."""
+
+    @property
+    def words(self) -> str:
+        """The definition in words, for attributes."""
+        extinction = f"extinction at {self.wavelength * 1e9:g} nm"
+        if self.law != WavelengthLaw.NONE:
+            exponent = self.angstrom_exponent
+            detail = "" if exponent is None else f", exponent {exponent:g}"
+            extinction += f" converted to 550 nm (law {self.law}{detail})"
+        return f"visibility for contrast {self.contrast:.6g}, from {extinction}"
+
+
+@dataclass(frozen=True, slots=True)
 class VisibilityResult:
     """Visibility, with the shape of the extinction."""
 
@@ -62,6 +89,59 @@ class VisibilityResult:
     """m, of extinction plus its standard error."""
     visibility_upper: Array
     """m, of extinction minus its standard error; inf where that is not positive."""
+
+
+def visibility_of_extinction(
+    extinction: Block,
+    standard_error: Block,
+    systematic_error: Block,
+    definition: VisibilityDefinition,
+) -> dict[str, Array]:
+    """Return visibility, its random standard error, and its interval from both errors, by name.
+
+    Parameters
+    ----------
+    extinction, standard_error, systematic_error : (...) float
+        m-1.
+    definition : VisibilityDefinition
+
+    Returns
+    -------
+    dict of str to (...) float
+        ``visibility_in_air``, ``visibility_in_air_standard_error``, ``visibility_in_air_lower``
+        and ``visibility_in_air_upper``, m: NaN where extinction is missing or not positive. The
+        interval follows from extinction plus and minus the root of the sum of squares of both
+        errors; its upper end is inf where that reaches zero.
+
+    Raises
+    ------
+    RetrievalInputError
+        For an invalid contrast, law or wavelength.
+    """
+    total_error = np.hypot(standard_error.astype(np.float64), systematic_error)
+    spread = definition.exponent_standard_error
+    random, total = (
+        visibility_from_extinction(
+            *at_reference_wavelength(
+                extinction,
+                error,
+                wavelength=definition.wavelength,
+                law=definition.law,
+                exponent=definition.angstrom_exponent,
+                exponent_standard_error=of_exponent,
+            ),
+            contrast=definition.contrast,
+        )
+        for error, of_exponent in ((standard_error, 0.0), (total_error, spread))
+    )
+    # No limit without a visibility.
+    upper = np.where(np.isfinite(random.visibility), total.visibility_upper, np.nan)
+    return {
+        "visibility_in_air": random.visibility,
+        "visibility_in_air_standard_error": random.visibility_standard_error,
+        "visibility_in_air_lower": total.visibility_lower,
+        "visibility_in_air_upper": upper,
+    }
 
 
 def koschmieder_constant(contrast: float = MOR_CONTRAST) -> float:

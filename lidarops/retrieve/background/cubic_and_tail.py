@@ -99,7 +99,7 @@ def cubic(
     rows, leading = inputs.profiles(power, grid)
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     known = variance is not None
-    result, _ = solve_cubic(rows, grid.values, lag, noise, known_variance=known)
+    result, _ = solve_cubic(rows, grid, lag, noise, known_variance=known)
     return inputs.with_leading_axes(result, leading)
 
 
@@ -197,7 +197,7 @@ def tail_mean(
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
-    first = first_of_tail(grid.values, start)
+    first = first_of_tail(grid, start)
     values = np.ascontiguousarray(rows[:, first:], dtype=np.float64)
     noise = np.broadcast_to(noise[:, first:], values.shape)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):

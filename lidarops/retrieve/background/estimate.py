@@ -4,7 +4,7 @@
 hold, `from_known_shape` fits background and amplitude of clear air, `from_far_range` takes the
 better known of these two, and `from_cubic` solves the cubic of a homogeneous section, which
 `fit_section` judges. All return a `Background`: value, standard error, the most signal that may
-have been subtracted with it (`LeftSignal`), and quality bits. The result of a profile does not
+have been subtracted with it, and quality bits. The result of a profile does not
 depend on the other profiles, to the last bit.
 
 In front of the tail, the far range whose mean is the background, the signal without background is
@@ -35,9 +35,10 @@ class Background:
     background: Array
     """In the unit of the power; NaN where there is none."""
     standard_error: Array
-    left: LeftSignal
+    left: Array
     """The most signal that may have been subtracted with the background; of `from_bounded_tail`
-    the standard deviation of what it holds too much or too little."""
+    the standard deviation of what it holds too much or too little. NaN where it is not known."""
+    left_standard_error: Array
     unjudged: Booleans
     """The far range does not fit the method, or `left` cannot be estimated."""
     uncertain: Booleans
@@ -45,6 +46,13 @@ class Background:
     quality: Flags
     """BACKGROUND_UNCERTAIN where `uncertain`; INPUT_MISSING, or for the cubic NO_REAL_SOLUTION,
     where there is no background."""
+
+    def where(self, chosen: Booleans, other: Background) -> Background:
+        """Return this background for the profiles that are chosen, else the other one."""
+        names = self.__slots__
+        return Background(
+            *(np.where(chosen, getattr(self, name), getattr(other, name)) for name in names)
+        )
 
 
 def from_tail(
@@ -87,7 +95,7 @@ def from_tail(
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
     known = np.isfinite(power[..., tail]) & np.isfinite(variance[..., tail])
     selected = _selected(known.sum(axis=-1), np.asarray(known.shape[-1]))
-    return _judged(value, error, left, np.isnan(left.most) | selected, missing)
+    return _judged(value, error, left, np.isnan(left[0]) | selected, missing)
 
 
 def _selected(known: Indices, bins: Indices) -> Booleans:
@@ -138,19 +146,18 @@ def from_known_shape(
     known = (fitted & np.isfinite(power) & np.isfinite(variance)).sum(axis=-1)
     bins = fitted.sum(axis=-1)
     usable &= known >= THRESHOLDS.least_known * bins
-    value = np.where(usable, fit.background, tail.background)
-    error = np.where(usable, fit.background_standard_error, tail.standard_error)
-    in_tail = THRESHOLDS.shape_error * np.abs(tail.background - value)
-    in_tail_error = THRESHOLDS.shape_error * np.hypot(tail.standard_error, error)
-    left = LeftSignal(
-        np.where(usable, in_tail, tail.left.most),
-        np.where(usable, in_tail_error, tail.left.standard_error),
-    )
     doubtful = fit.poor_fit | _selected(known, bins)
-    unjudged = np.where(usable, doubtful, tail.unjudged)
-    uncertain = np.where(usable, doubtful, tail.uncertain)
-    missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
-    return Background(value, error, left, unjudged, uncertain, _bits(uncertain, missing))
+    fitted_sky = Background(
+        background=fit.background,
+        standard_error=fit.background_standard_error,
+        left=THRESHOLDS.shape_error * np.abs(tail.background - fit.background),
+        left_standard_error=THRESHOLDS.shape_error
+        * np.hypot(tail.standard_error, fit.background_standard_error),
+        unjudged=doubtful,
+        uncertain=doubtful,
+        quality=_bits(doubtful, np.zeros(doubtful.shape, np.int32)),
+    )
+    return fitted_sky.where(usable, tail)
 
 
 def from_bounded_tail(
@@ -172,12 +179,12 @@ def from_bounded_tail(
     Parameters and errors are those of `from_known_shape`.
     """
     tail = from_tail(power, range, variance, span, shape=shape)
-    most, spread = np.maximum(np.nan_to_num(tail.left.most), 0.0), tail.left.standard_error
-    left = LeftSignal((most + spread) / np.sqrt(12.0), np.zeros_like(most))
+    most, spread = np.maximum(np.nan_to_num(tail.left), 0.0), tail.left_standard_error
     return Background(
         background=tail.background - 0.5 * most,
         standard_error=np.hypot(tail.standard_error, 0.5 * np.nan_to_num(spread)),
-        left=left,
+        left=(most + spread) / np.sqrt(12.0),
+        left_standard_error=np.zeros_like(most),
         unjudged=tail.unjudged,
         uncertain=tail.unjudged,
         quality=_bits(tail.unjudged, tail.quality & np.int32(Quality.INPUT_MISSING)),
@@ -200,23 +207,9 @@ def from_far_range(
     """
     tail = from_bounded_tail(power, range, variance, shape, span)
     fit = from_known_shape(power, range, variance, shape, span, mask=mask)
-    of_tail, of_fit = (np.hypot(sky.standard_error, sky.left.most) for sky in (tail, fit))
+    of_tail, of_fit = (np.hypot(sky.standard_error, sky.left) for sky in (tail, fit))
     fitted = np.isfinite(fit.background) & ~fit.unjudged & ~(of_tail <= of_fit)
-
-    def better(of_fit: Array, of_tail: Array) -> Array:
-        return np.asarray(np.where(fitted, of_fit, of_tail))
-
-    return Background(
-        background=better(fit.background, tail.background),
-        standard_error=better(fit.standard_error, tail.standard_error),
-        left=LeftSignal(
-            better(fit.left.most, tail.left.most),
-            better(fit.left.standard_error, tail.left.standard_error),
-        ),
-        unjudged=~fitted & tail.unjudged,
-        uncertain=np.where(fitted, fit.uncertain, tail.uncertain),
-        quality=np.where(fitted, fit.quality, tail.quality),
-    )
+    return fit.where(fitted, tail)
 
 
 def from_cubic(
@@ -255,14 +248,14 @@ def from_cubic(
     grid = inputs.range_grid(range[section])
     rows, leading = inputs.profiles(power[..., section], grid)
     noise = inputs.noise_rows(variance[..., section], "variance", grid, leading, negative=False)
-    root, _ = cubic_and_tail.solve_cubic(rows, grid.values, None, noise, known_variance=True)
+    root, _ = cubic_and_tail.solve_cubic(rows, grid, None, noise, known_variance=True)
     error = root.background_standard_error
     usable = np.isfinite(error)
     value = np.where(usable, root.background, np.nan)
-    fit = fit_section(rows.astype(np.float64, copy=False), grid.values, noise, value)
+    fit = fit_section(rows.astype(np.float64, copy=False), grid, noise, value)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.maximum(error**2 - fit.variance, 0.0))
-    left = LeftSignal(np.abs(value - fit.background), spread)
+    left = np.abs(value - fit.background)
     doubts = np.int32(Quality.LOW_SIGNAL | Quality.TOO_FEW_BINS)
     absent = np.where(
         (root.quality & np.int32(Quality.INPUT_MISSING)) != 0,
@@ -270,23 +263,18 @@ def from_cubic(
         np.int32(Quality.NO_REAL_SOLUTION),
     )
     calm = fit.waves <= special.chdtri(groups(grid.size) - 3.0, THRESHOLDS.false_alarm)
-    unjudged = np.isnan(left.most) | ~calm | ((root.quality & doubts) != 0)
-    return _judged(
-        value.reshape(leading),
-        error.reshape(leading),
-        LeftSignal(left.most.reshape(leading), left.standard_error.reshape(leading)),
-        unjudged.reshape(leading),
-        np.where(usable, np.int32(0), absent).reshape(leading),
-    )
+    unjudged = np.isnan(left) | ~calm | ((root.quality & doubts) != 0)
+    absent = np.where(usable, np.int32(0), absent)
+    sky = _judged(value, error, (left, spread), unjudged, absent)
+    return inputs.with_leading_axes(sky, leading)
 
 
 def _judged(
-    value: Array, error: Array, left: LeftSignal, unjudged: Booleans, absent: Flags
+    value: Array, error: Array, left: tuple[Array, Array], unjudged: Booleans, absent: Flags
 ) -> Background:
     unjudged = unjudged & np.isfinite(value)
-    uncertain = unjudged | shifts(left.detected, error)
-    bits = _bits(uncertain, absent)
-    return Background(value, error, left, unjudged, uncertain, bits)
+    uncertain = unjudged | shifts(detected(*left), error)
+    return Background(value, error, *left, unjudged, uncertain, _bits(uncertain, absent))
 
 
 def _bits(uncertain: Booleans, absent: Flags) -> Flags:
@@ -407,20 +395,10 @@ def _along(direction: Array, column: Array) -> Array:
     return np.asarray((direction * column).sum(axis=-1))
 
 
-@dataclass(frozen=True, slots=True)
-class LeftSignal:
-    """Signal that may have been subtracted with the background, one value a profile."""
-
-    most: Array
-    """In the unit of the power; NaN where no bin before the tail is known."""
-    standard_error: Array
-
-    @property
-    def detected(self) -> Array:
-        """`most` where the signal before the tail exceeds its noise, else 0."""
-        with np.errstate(invalid="ignore"):
-            beyond_noise = self.most > THRESHOLDS.detected * self.standard_error
-        return np.where(beyond_noise, self.most, 0.0)
+def detected(left: Array, standard_error: Array) -> Array:
+    """Return the signal left in a tail where that before it exceeds its noise, else 0."""
+    with np.errstate(invalid="ignore"):
+        return np.where(left > THRESHOLDS.detected * standard_error, left, 0.0)
 
 
 def window_before(start: float) -> tuple[float, float]:
@@ -454,8 +432,8 @@ def left_in_tail(
     background: Array,
     background_standard_error: Array,
     shape: Array | None = None,
-) -> LeftSignal:
-    """Return the most signal that the mean of a tail may contain.
+) -> tuple[Array, Array]:
+    """Return the most signal that the mean of a tail may contain, and its standard error.
 
     Parameters
     ----------
@@ -473,13 +451,13 @@ def left_in_tail(
 
     Returns
     -------
-    LeftSignal
-        With the leading axes of `power`.
+    (...) float, (...) float
+        In the unit of the power; NaN where no bin before the tail is known.
     """
     before = slice(*np.searchsorted(range, window_before(float(range[tail][0]))))
     if before.start == before.stop:
         unknown = np.full(power.shape[:-1], np.nan)
-        return LeftSignal(unknown, unknown)
+        return unknown, unknown
     slowest = range**-2.0 if shape is None else shape
     fall = slowest[..., tail].mean(axis=-1) / slowest[..., before].mean(axis=-1)
     net, noise = power[..., before] - background[..., np.newaxis], variance[..., before]
@@ -489,4 +467,4 @@ def left_in_tail(
         mean = np.where(known, net, 0.0).sum(axis=-1) / count
         error = np.sqrt(np.where(known, noise, 0.0).sum(axis=-1)) / count
         spread = np.hypot(error, background_standard_error)
-    return LeftSignal(mean * fall / (1.0 - fall), spread * fall / (1.0 - fall))
+    return mean * fall / (1.0 - fall), spread * fall / (1.0 - fall)

@@ -87,13 +87,11 @@ def molecular_shape(
     beta = inputs.real_array(backscatter, "backscatter").astype(np.float64)
     alpha = inputs.real_array(extinction, "extinction").astype(np.float64)
     grid = inputs.range_grid(range)
-    alpha, beta = grid.turn(alpha), grid.turn(beta)
     depth = np.empty(alpha.shape)
-    depth[..., :1] = alpha[..., :1] * grid.values[0]
-    slices = 0.5 * (alpha[..., 1:] + alpha[..., :-1]) * np.diff(grid.values)
+    depth[..., :1] = alpha[..., :1] * grid[0]
+    slices = 0.5 * (alpha[..., 1:] + alpha[..., :-1]) * np.diff(grid)
     depth[..., 1:] = depth[..., :1] + np.cumsum(slices, axis=-1)
-    shape: Array = grid.turn(beta * np.exp(-2.0 * depth) / grid.values**2)
-    return shape
+    return np.asarray(beta * np.exp(-2.0 * depth) / grid**2)
 
 
 def fit_known_shape(
@@ -170,13 +168,11 @@ def fit_known_shape(
     shapes = frozen(inputs.noise_rows(shape, "shape", grid, leading))
     allowed = _mask_rows(mask, grid, leading)
     noise = _noise(variance, exposure, grid, leading)
-    pasts = _pasts(rows, allowed, stop, grid.values, leading)
-    firsts = _firsts(start, pasts, grid.values, leading)
+    pasts = _pasts(rows, allowed, stop, grid, leading)
+    firsts = _firsts(start, pasts, grid, leading)
     out = np.full((len(rows), _shape_fit.COLUMNS), np.nan)
     limits = _limits(THRESHOLDS.rejection)
-    _shape_fit.fit_shape(
-        rows, shapes, frozen(grid.values), allowed, noise, firsts, pasts, limits, out
-    )
+    _shape_fit.fit_shape(rows, shapes, frozen(grid), allowed, noise, firsts, pasts, limits, out)
     window = np.nan_to_num(out[:, _shape_fit.WINDOW]).astype(np.intp)
     first = np.take_along_axis(
         np.broadcast_to(firsts, (len(rows), firsts.shape[1])), window[:, np.newaxis], axis=1
@@ -184,13 +180,13 @@ def fit_known_shape(
     if exposure is not None:
         # In the dark, a whole window may be without a count.
         out[:, _shape_fit.CONSTANT] = 0.0
-    return _result(out, grid.values, first, pasts, leading)
+    return _result(out, grid, first, pasts, leading)
 
 
 def _noise(
     variance: npt.ArrayLike | None,
     exposure: npt.ArrayLike | None,
-    grid: inputs.RangeGrid,
+    grid: Array,
     leading: tuple[int, ...],
 ) -> _shape_fit.ShapeNoise:
     if (variance is None) == (exposure is None):
@@ -210,9 +206,7 @@ def _noise(
     )
 
 
-def _mask_rows(
-    mask: npt.ArrayLike | None, grid: inputs.RangeGrid, leading: tuple[int, ...]
-) -> Array:
+def _mask_rows(mask: npt.ArrayLike | None, grid: Array, leading: tuple[int, ...]) -> Array:
     if mask is None:
         return frozen(np.ones((1, grid.size)))
     allowed = np.asarray(mask)

@@ -311,6 +311,21 @@ def cloud_heights(
     }
 
 
+def window_variables(
+    window: _reference.ReferenceWindow, reference: Reference, station_altitude: float, climb: float
+) -> dict[str, Any]:
+    """Return the variables of the reference windows, and of what is assumed in them."""
+    return {
+        **window.variables,
+        "reference_bottom_altitude": ("time", station_altitude + climb * window.bottom),
+        "reference_top_altitude": ("time", station_altitude + climb * window.top),
+        "reference_scattering_ratio": reference.scattering_ratio,
+        "reference_scattering_ratio_standard_error": (
+            reference.scattering_ratio * reference.relative_error
+        ),
+    }
+
+
 def _signal_beyond_overlap(
     means: MeanProfiles, reference: Reference, *, known_shape: bool, overlap_is_stated: bool
 ) -> tuple[MeanSignal, Booleans, Booleans]:

@@ -114,7 +114,7 @@ def find_layers(
         frozen(tests.margins),
         mask,
     )
-    return tests.grid.turn(mask.reshape(*tests.leading, tests.grid.size))
+    return mask.reshape(*tests.leading, -1)
 
 
 def find_visible_air(
@@ -154,7 +154,7 @@ def find_visible_air(
     tests = _tests(power, range, variance, molecular_attenuated, contrast, rate, quantum)
     bins = max(round(THRESHOLDS.visible_depth / tests.step), 2)
     of_depth = int(np.searchsorted(tests.lengths, bins))
-    marked = tests.grid.turn(np.asarray(cloudy)).reshape(tests.power.shape)
+    marked = np.reshape(cloudy, tests.power.shape)
     known = np.isfinite(tests.power) & np.isfinite(tests.variance) & ~marked
     signal, air, noise = (
         _sums_around(np.where(known, values, 0.0), bins)
@@ -168,7 +168,7 @@ def find_visible_air(
         tests.certainty * limit * math.hypot(1.0, contrast) * error
     )
     visible = (air > 0.0) & (signal > 0.0) & rises & exceeds
-    return tests.grid.turn(visible.reshape(*tests.leading, tests.grid.size))
+    return visible.reshape(*tests.leading, -1)
 
 
 def _sums_around(values: Array, bins: int) -> Array:
@@ -183,9 +183,8 @@ def _sums_around(values: Array, bins: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Tests:
-    """Profiles in ascending range, and what a rise is compared with."""
+    """Profiles, and what a rise is compared with."""
 
-    grid: inputs.RangeGrid
     leading: tuple[int, ...]
     step: float
     """m."""
@@ -220,14 +219,14 @@ def _tests(
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     if not 1.0 <= contrast < np.inf:
         raise RetrievalInputError(f"is {contrast}", field="contrast", remedy="give 1 or more")
-    step = float(np.median(np.diff(grid.values))) if grid.size > 1 else 1.0
+    step = float(np.median(np.diff(grid))) if grid.size > 1 else 1.0
     # A window has at least two bins.
     lengths = np.unique(np.maximum(np.rint(np.array(THRESHOLDS.window_lengths) / step), 2.0))
     anywhere, at_an_edge = -ndtri(false_alarm / lengths.size / np.array([grid.size, 2.0]))
     limits = anywhere * _excess_noise(values, noise, lengths)
     margins = skewness_margin(limits) * np.reshape(quantum, (-1, 1))
     return _Tests(
-        grid, leading, step, values, noise, shape, lengths.astype(np.int64),
+        leading, step, values, noise, shape, lengths.astype(np.int64),
         float(at_an_edge / anywhere), limits, np.broadcast_to(margins, limits.shape),
     )  # fmt: skip
 

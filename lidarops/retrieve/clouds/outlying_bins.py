@@ -72,7 +72,6 @@ def bridge_outliers(
     Returns
     -------
     BridgedProfiles
-        In the order of `range`.
 
     Raises
     ------
@@ -88,14 +87,13 @@ def bridge_outliers(
     signal = rows - level[:, np.newaxis]
     outlying = np.zeros(rows.shape, dtype=np.bool_)
     work = np.empty((5, grid.size))
-    _mark_outliers(frozen(signal), frozen(noise), frozen(grid.values), work, outlying)
+    _mark_outliers(frozen(signal), frozen(noise), frozen(grid), work, outlying)
     noise = np.broadcast_to(noise, rows.shape)
     if outlying.any():
         noise = noise.copy()
-        _fill(signal, noise, frozen(grid.values), outlying)
+        _fill(signal, noise, frozen(grid), outlying)
         rows = np.where(outlying, signal + level[:, np.newaxis], rows)
-    shape = (*leading, grid.size)
-    return BridgedProfiles(*(grid.turn(a.reshape(shape)) for a in (rows, noise, outlying)))
+    return inputs.with_leading_axes(BridgedProfiles(rows, noise, outlying), leading)
 
 
 @compiled

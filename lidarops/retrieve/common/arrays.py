@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -40,6 +41,11 @@ def frozen(values: _Array) -> _Array:
 def usable(power: float, variance: float) -> bool:
     """Return whether a power and its variance are finite, and the variance not negative."""
     return abs(power) < HUGE and 0.0 <= variance < HUGE
+
+
+def root_sum_square(parts: Iterable[Array]) -> Array:
+    """Return the root of the sum of squares; NaN where any part is NaN."""
+    return np.asarray(np.sqrt(sum(part**2 for part in parts)))
 
 
 def widest_azimuth_gap(azimuth: Array) -> float:

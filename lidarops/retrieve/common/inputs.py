@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from enum import StrEnum
 from typing import Any, TypeVar
 
@@ -18,24 +18,6 @@ _Result = TypeVar("_Result", bound=Any)
 
 SHORTEST_REACH = 100.0
 """m. No lidar section ends nearer, but every section in km does: detects wrong units."""
-
-
-@dataclass(frozen=True, slots=True)
-class RangeGrid:
-    """An ascending range grid, and whether the original was descending."""
-
-    values: Array
-    """m."""
-    descending: bool
-
-    @property
-    def size(self) -> int:
-        """Number of bins."""
-        return int(self.values.size)
-
-    def turn(self, values: Block) -> Block:
-        """Return `values` with the last axis ascending in range."""
-        return values[..., ::-1] if self.descending and values.shape[-1] > 1 else values
 
 
 def real_array(values: npt.ArrayLike, name: str) -> Floats:
@@ -73,13 +55,13 @@ def broadcast(array: _Array, shape: tuple[int, ...], name: str) -> _Array:
         raise RetrievalInputError(problem, field=name) from None
 
 
-def range_grid(values: npt.ArrayLike) -> RangeGrid:
-    """Return the checked range axis, m.
+def range_grid(values: npt.ArrayLike) -> Array:
+    """Return the checked range axis, (bin,) m.
 
     Raises
     ------
     RetrievalInputError
-        Where it is not one-dimensional, finite, positive and strictly monotonic, or ends below
+        Where it is not one-dimensional, finite, positive and strictly ascending, or ends below
         100 m, as ranges in km do.
     """
     grid = real_array(values, "range").astype(np.float64)
@@ -87,11 +69,8 @@ def range_grid(values: npt.ArrayLike) -> RangeGrid:
         raise RetrievalInputError(
             f"has the shape {grid.shape}", field="range", remedy="give one value in m per bin"
         )
-    steps = np.diff(grid)
-    if not np.all(np.isfinite(grid)) or not (np.all(steps > 0) or np.all(steps < 0)):
-        raise RetrievalInputError("is not finite and strictly monotonic", field="range")
-    descending = bool(grid[0] > grid[-1])
-    grid = np.ascontiguousarray(grid[::-1] if descending else grid)
+    if not np.all(np.isfinite(grid)) or not np.all(np.diff(grid) > 0):
+        raise RetrievalInputError("is not finite and strictly ascending", field="range")
     if grid[0] <= 0:
         raise RetrievalInputError(
             f"starts at {grid[0]:g} m",
@@ -104,11 +83,11 @@ def range_grid(values: npt.ArrayLike) -> RangeGrid:
             field="range",
             remedy="multiply by 1000",
         )
-    return RangeGrid(grid, descending)
+    return np.ascontiguousarray(grid)
 
 
 def profiles(
-    power: npt.ArrayLike, grid: RangeGrid, name: str = "power"
+    power: npt.ArrayLike, grid: Array, name: str = "power"
 ) -> tuple[Floats, tuple[int, ...]]:
     """Return powers as contiguous (profile, bin), and the shape of their leading axes.
 
@@ -125,12 +104,12 @@ def profiles(
             remedy="the last axis is range",
         )
     leading = array.shape[:-1]
-    rows = int(np.prod(leading, dtype=np.int64))
-    return np.ascontiguousarray(grid.turn(array).reshape(rows, grid.size)), leading
+    rows: Block = array.reshape(int(np.prod(leading, dtype=np.int64)), grid.size)
+    return np.ascontiguousarray(rows), leading
 
 
 def profiles_and_air(
-    power: npt.ArrayLike, molecular_attenuated: npt.ArrayLike, grid: RangeGrid
+    power: npt.ArrayLike, molecular_attenuated: npt.ArrayLike, grid: Array
 ) -> tuple[Array, tuple[int, ...], Array]:
     """Return `profiles` as float64, and the shape of the signal of air, (profile or 1, bin).
 
@@ -159,7 +138,7 @@ def with_leading_axes(result: _Result, leading: tuple[int, ...]) -> _Result:
 def noise_rows(
     noise: npt.ArrayLike | None,
     name: str,
-    grid: RangeGrid,
+    grid: Array,
     leading: tuple[int, ...],
     *,
     negative: bool = True,
@@ -174,8 +153,6 @@ def noise_rows(
     if noise is None:
         return np.ones((1, grid.size))
     array = real_array(noise, name).astype(np.float64, copy=False)
-    if array.ndim > 0:
-        array = grid.turn(array)
     shared = array.size == 1 or all(length == 1 for length in array.shape[:-1])
     target = (*((1,) * len(leading) if shared else leading), grid.size)
     rows = broadcast(array.reshape(array.shape[-1:]) if shared else array, target, name)

@@ -10,14 +10,6 @@
 it from its module, so that the numerics stay free of xarray.
 """
 
-from lidarops.retrieve.elastic.inversion import (
-    ElasticResult,
-    ErrorBudget,
-    invert_elastic,
-)
+from lidarops.retrieve.elastic.inversion import ElasticResult, invert_elastic
 
-__all__ = [
-    "ElasticResult",
-    "ErrorBudget",
-    "invert_elastic",
-]
+__all__ = ["ElasticResult", "invert_elastic"]

@@ -8,7 +8,7 @@ window towards the lidar and away from it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
@@ -16,10 +16,15 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, frozen, root_sum_square
 from lidarops.retrieve.elastic import _fernald
 
 Reference = tuple[npt.ArrayLike, npt.ArrayLike]
+
+CAUSES: Final = (
+    "noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline"
+)  # fmt: skip
+"""Causes of error; see `ElasticResult.budget`."""
 
 
 class Thresholds(NamedTuple):
@@ -59,46 +64,26 @@ _LIMITS: Final = np.array(
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorBudget:
-    """Contribution of each cause to the error of a quantity, with the shape of the quantity.
-
-    Except for noise, the errors of one cause are fully correlated along range and keep their
-    signs: they are the change of the quantity where the cause is one standard error too large.
-    Sum them along range before squaring.
-    """
-
-    noise: Array
-    """Standard error by the noise of the power; NaN where no variance was given."""
-    background: Array
-    """Error by residual background."""
-    reference: Array
-    """Error by the scattering ratio of the reference window."""
-    lidar_ratio: Array
-    """Error by the lidar ratio."""
-    molecular: Array
-    """Error by the density of the air."""
-    dead_time: Array
-    """Error by the dead time of photon counting."""
-    baseline: Array
-    """Error by the baseline of analog signals, without sign."""
-
-    @property
-    def total(self) -> Array:
-        """Standard error by all causes, which are independent; NaN where one is unknown."""
-        variance = np.zeros_like(self.noise)
-        for cause in fields(self):
-            variance += getattr(self, cause.name) ** 2
-        return np.asarray(np.sqrt(variance))
-
-
-@dataclass(frozen=True, slots=True)
 class ElasticResult:
     """Particle optical properties with the shape of the power, and one calibration a profile."""
 
     backscatter: Array
     """m-1 sr-1, of the particles; NaN where not `valid`."""
-    budget: ErrorBudget
-    """Errors of `backscatter`, m-1 sr-1."""
+    budget: dict[str, Array]
+    """Errors of `backscatter`, m-1 sr-1, by each of these causes:
+
+    - ``noise``: standard error by the noise of the power; NaN where no variance was given,
+    - ``background``: error by residual background,
+    - ``reference``: by the scattering ratio of the reference window,
+    - ``lidar_ratio``: by the lidar ratio,
+    - ``molecular``: by the density of the air,
+    - ``dead_time``: by the dead time of photon counting,
+    - ``baseline``: by the baseline of analog signals, without sign.
+
+    Except for noise, the errors of one cause are fully correlated along range and keep their
+    signs: they are the change of the quantity where the cause is one standard error too large.
+    Sum them along range before squaring. Causes are independent.
+    """
     attenuated_backscatter: Array
     """m-1 sr-1, total backscatter times the two-way transmission of particles and air."""
     attenuated_backscatter_standard_error: Array
@@ -122,7 +107,7 @@ class ElasticResult:
     @property
     def backscatter_standard_error(self) -> Array:
         """Standard error of `backscatter` by all causes, m-1 sr-1."""
-        return self.budget.total
+        return root_sum_square(self.budget.values())
 
     @property
     def extinction(self) -> Array:
@@ -130,18 +115,11 @@ class ElasticResult:
         return np.asarray(self.lidar_ratio * self.backscatter)
 
     @property
-    def extinction_budget(self) -> ErrorBudget:
+    def extinction_budget(self) -> dict[str, Array]:
         """Errors of `extinction`, m-1."""
-        ratio, budget = self.lidar_ratio, self.budget
-        return ErrorBudget(
-            ratio * budget.noise,
-            ratio * budget.background,
-            ratio * budget.reference,
-            ratio * budget.lidar_ratio + self.lidar_ratio_standard_error * self.backscatter,
-            ratio * budget.molecular,
-            ratio * budget.dead_time,
-            ratio * budget.baseline,
-        )
+        errors = {cause: self.lidar_ratio * error for cause, error in self.budget.items()}
+        own = self.lidar_ratio_standard_error * self.backscatter
+        return errors | {"lidar_ratio": errors["lidar_ratio"] + own}
 
     @property
     def scattering_ratio(self) -> Array:
@@ -149,18 +127,11 @@ class ElasticResult:
         return 1.0 + self.backscatter * self._inverse_molecular()
 
     @property
-    def scattering_ratio_budget(self) -> ErrorBudget:
+    def scattering_ratio_budget(self) -> dict[str, Array]:
         """Errors of `scattering_ratio`."""
-        inverse, budget = self._inverse_molecular(), self.budget
-        return ErrorBudget(
-            inverse * budget.noise,
-            inverse * budget.background,
-            inverse * budget.reference,
-            inverse * budget.lidar_ratio,
-            inverse * (budget.molecular - self.molecular_relative_error * self.backscatter),
-            inverse * budget.dead_time,
-            inverse * budget.baseline,
-        )
+        own = self.molecular_relative_error * self.backscatter
+        errors = self.budget | {"molecular": self.budget["molecular"] - own}
+        return {cause: self._inverse_molecular() * error for cause, error in errors.items()}
 
     def _inverse_molecular(self) -> Array:
         return 1.0 / np.where(self.molecular_backscatter > 0.0, self.molecular_backscatter, np.nan)
@@ -292,7 +263,7 @@ def invert_elastic(
             frozen(power_rows),
             frozen(noise),
             frozen(window),
-            frozen(grid.values),
+            frozen(grid),
             (frozen(air[0]), frozen(air[1]), frozen(air[2])),
             frozen(ratio),
             (frozen(ratio_error), frozen(air_error)),
@@ -343,18 +314,16 @@ def invert_elastic(
 
     def profiles(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
         shape = (*leading, grid.size)
-        values = rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
-        return grid.turn(values)
+        return rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
 
     values = [profiles(rows) for rows in out]
+    errors = (
+        *values[_fernald.NOISE : _fernald.MOLECULAR + 1],
+        *map(profiles, (dead_time, baseline)),
+    )
     return ElasticResult(
         backscatter=values[_fernald.BACKSCATTER],
-        budget=ErrorBudget(
-            *(
-                *values[_fernald.NOISE : _fernald.MOLECULAR + 1],
-                *map(profiles, (dead_time, baseline)),
-            )
-        ),
+        budget=dict(zip(CAUSES, errors, strict=True)),
         attenuated_backscatter=values[_fernald.ATTENUATED],
         attenuated_backscatter_standard_error=values[_fernald.ATTENUATED_ERROR],
         lidar_constant=scalars[:, _fernald.CONSTANT].reshape(leading),
@@ -373,7 +342,7 @@ def _air(
     molecular_backscatter: npt.ArrayLike,
     molecular_extinction: npt.ArrayLike,
     lidar_ratio: npt.ArrayLike,
-    grid: inputs.RangeGrid,
+    grid: Array,
     leading: tuple[int, ...],
 ) -> tuple[Array, Array, Array]:
     """Return backscatter and extinction of the air, and the lidar ratio, (profile or 1, bin)."""
@@ -404,9 +373,7 @@ def _causes(causes: dict[str, npt.ArrayLike], leading: tuple[int, ...]) -> Array
     return np.ascontiguousarray(np.stack(np.broadcast_arrays(*columns), axis=-1))
 
 
-def _errors(
-    values: npt.ArrayLike, name: str, grid: inputs.RangeGrid, leading: tuple[int, ...]
-) -> Array:
+def _errors(values: npt.ArrayLike, name: str, grid: Array, leading: tuple[int, ...]) -> Array:
     rows = inputs.noise_rows(values, name, grid, leading)
     _require(rows >= 0.0, rows, name, "give finite standard errors, 0 for none")
     return rows
@@ -424,7 +391,7 @@ def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) 
     return cast("Array", inputs.profile_values(values, name, leading, finite=False))
 
 
-def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ...]) -> Booleans:
+def _window(reference: Reference, grid: Array, leading: tuple[int, ...]) -> Booleans:
     """Return the bins of the reference window as (profile or 1, bin)."""
     if not isinstance(reference, tuple) or len(reference) != 2:
         raise RetrievalInputError(
@@ -435,11 +402,11 @@ def _window(reference: Reference, grid: inputs.RangeGrid, leading: tuple[int, ..
         raise RetrievalInputError(
             "ends before it begins", field="reference", remedy="give (bottom, top) in m"
         )
-    inside = (grid.values >= bottom[:, np.newaxis]) & (grid.values <= top[:, np.newaxis])
+    inside = (grid >= bottom[:, np.newaxis]) & (grid <= top[:, np.newaxis])
     if inside.shape[0] == 1 and not np.any(inside) and np.isfinite(bottom[0] + top[0]):
         raise RetrievalInputError(
             f"{bottom[0]:g} to {top[0]:g} m holds no bin of the range, which reaches from"
-            f" {grid.values[0]:g} to {grid.values[-1]:g} m",
+            f" {grid[0]:g} to {grid[-1]:g} m",
             field="reference",
         )
     return np.asarray(inside)

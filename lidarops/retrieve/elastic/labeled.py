@@ -23,9 +23,10 @@ from lidarops.retrieve.clouds.labeled import (
     cloud_heights,
     reference_window,
     signal_and_clouds,
+    window_variables,
     with_margin,
 )
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, root_sum_square
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.inversion import THRESHOLDS
@@ -66,8 +67,8 @@ def invert_elastic(
         ``power``, ``variance``, ``quality`` over (time, range) and ``shots``, ``profiles`` over
         time, with the scalar coordinate ``zenith_angle`` (degree), from
         `lidarops.retrieve.signal.labeled_averaging.ClockAverage`; in memory. With the signals of
-        their parts, from `lidarops.retrieve.signal.labeled_averaging.ScreenedAverage`, clouds are
-        sought in these too, else in the mean only. For the errors of
+        their parts, of a screened average, clouds are sought in these too, else in the mean only.
+        For the errors of
         dead time and baseline, see `lidarops.retrieve.signal.labeled.systematic_changes`.
     molecules : MolecularProfile
     wavelength : float
@@ -153,13 +154,7 @@ def invert_elastic(
             "lidar_ratio": ("range", ratio),
             "lidar_ratio_standard_error": ("range", ratio_error),
             "vertical_resolution": float(np.median(np.diff(distance))),
-            **window.variables,
-            "reference_bottom_altitude": ("time", station_altitude + climb * window.bottom),
-            "reference_top_altitude": ("time", station_altitude + climb * window.top),
-            "reference_scattering_ratio": reference.scattering_ratio,
-            "reference_scattering_ratio_standard_error": (
-                reference.scattering_ratio * reference.relative_error
-            ),
+            **window_variables(window, reference, station_altitude, climb),
             "cloud_mask": (("time", "range"), clouds.state),
             "cloud_fraction": (("time", "range"), clouds.fraction),
             **cloud_heights(clouds, distance, station_altitude, climb),
@@ -205,7 +200,7 @@ def _solution_flags(
 
 def _negative(solution: _elastic.ElasticResult) -> Booleans:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
-    error: Array = solution.budget.total
+    error = solution.backscatter_standard_error
     low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
     length = THRESHOLDS.negative_bins
     if low.shape[-1] < length:
@@ -231,26 +226,16 @@ def _with_beyond(mask: Booleans, distance: Array, window: _reference.ReferenceWi
 
 
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
-    budget: Any = solution.budget
     return {
         "aerosol_backscatter": solution.backscatter,
-        "aerosol_backscatter_standard_error": budget.total,
-        **{
-            f"aerosol_backscatter_error_{cause}": getattr(budget, cause)
-            for cause in (
-                "noise",
-                "background",
-                "reference",
-                "lidar_ratio",
-                "molecular",
-                "dead_time",
-                "baseline",
-            )
-        },
+        "aerosol_backscatter_standard_error": solution.backscatter_standard_error,
+        **{f"aerosol_backscatter_error_{cause}": error for cause, error in solution.budget.items()},
         "aerosol_extinction": solution.extinction,
-        "aerosol_extinction_standard_error": solution.extinction_budget.total,
+        "aerosol_extinction_standard_error": root_sum_square(solution.extinction_budget.values()),
         "scattering_ratio": solution.scattering_ratio,
-        "scattering_ratio_standard_error": solution.scattering_ratio_budget.total,
+        "scattering_ratio_standard_error": root_sum_square(
+            solution.scattering_ratio_budget.values()
+        ),
         "attenuated_backscatter": solution.attenuated_backscatter,
         "attenuated_backscatter_standard_error": solution.attenuated_backscatter_standard_error,
     }

@@ -3,7 +3,7 @@
 The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
 evaluated at fixed nodes, mostly on sums over groups of bins. Newton steps over all bins improve the
 best node until they are negligible. Every sum runs over the bins of one profile in a fixed order: a
-result does not depend on the rest of the batch. `solve_from` fits from a given extinction instead.
+result does not depend on the rest of the batch. From a given extinction there is no search.
 """
 
 # ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
@@ -49,6 +49,8 @@ the last step left at most 1.4e-5."""
 _DETERMINED: Final = 0.3
 """Standard error of the extinction over its scale, above which only a step of `_SMALL` is the last:
 twice the limit of `POORLY_DETERMINED`."""
+BACKGROUND, EXTINCTION, PRIOR = 0, 1, 2
+"""What is given to a fit."""
 TINY: Final = 1e-280
 _FLAT: Final = 1e-13
 """Squared share of a shape besides its mean, below which it is flat within rounding."""
@@ -325,65 +327,6 @@ def begin(
 
 
 @inlined
-def _solve(
-    power: Any,
-    noise: Array,
-    is_variance: bool,
-    rounding: float,
-    background: Array,
-    g: Grid,
-    s: ProjectionScratch,
-    out: Any,
-) -> None:
-    unit = 1.0
-    for k in range(power.shape[0]):
-        # A row of noise for each profile, or one for all.
-        if k < noise.shape[0]:
-            unit = weigh(noise[k], is_variance, s)
-        row = out[k]
-        mode = (unit, rounding, background[k % background.size])
-        reference, scale, sums = begin(power[k], mode, s, row)
-        if row.status == FITTED:
-            tau, p = find_extinction(g, s, sums)
-            describe(g, s, p, tau, sums, row)
-            spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
-            left = judge_residuals(g, s, p, tau, sums, spacing, row)
-            if sums.free > 0.0 and row.bounded == 0.0:
-                _polish(p, sums.weight, left, row)
-            unscale(g, reference, scale, unit, row)
-
-
-@compiled
-def solve_direct(
-    power: Any,
-    noise: Array,
-    is_variance: bool,
-    rounding: float,
-    background: Array,
-    g: Grid,
-    out: Any,
-) -> None:
-    """Fit every profile of a batch.
-
-    Parameters
-    ----------
-    power : (profile, bin) float32 or float64
-    noise : (profile or 1, bin) float64
-        Variances or weights; a bin is left out where its weight is not positive and finite.
-    is_variance : bool
-    rounding : float
-        Relative rounding error of the power.
-    background : (profile or 1,) float64
-        Given ones, or NaN where they are to be fitted.
-    g : Grid
-        Of `make_grid`.
-    out : (profile,) `ROW`
-        Filled with NaN; receives the fields of `PathEstimate`.
-    """
-    _solve(power, noise, is_variance, rounding, background, g, make_scratch(g), out)
-
-
-@inlined
 def _describe_given(p: Point, w0: float, row: Any) -> None:
     """Overwrite the variances for a given extinction, whose variance is 0."""
     row.extinction_variance = 0.0
@@ -429,54 +372,76 @@ def _moved(p: Point, row: Any) -> Point:
 
 
 @inlined
-def _solve_from(
+def _solve(
     power: Any,
     noise: Array,
     is_variance: bool,
     rounding: float,
-    extinction: Array,
+    given: Array,
+    kind: int,
     g: Grid,
     s: ProjectionScratch,
     out: Any,
-    is_prior: bool,
 ) -> None:
     unit = 1.0
     for k in range(power.shape[0]):
+        # A row of noise for each profile, or one for all.
         if k < noise.shape[0]:
             unit = weigh(noise[k], is_variance, s)
-        row = out[k]
-        reference, scale, sums = begin(power[k], (unit, rounding, math.nan), s, row)
+        row, value = out[k], given[k % given.size]
+        mode = (unit, rounding, value if kind == BACKGROUND else math.nan)
+        reference, scale, sums = begin(power[k], mode, s, row)
         if row.status == FITTED:
-            tau = g.length * extinction[k % extinction.size]
-            p = evaluate(tau, g, s, sums)
+            if kind == BACKGROUND:
+                tau, p = find_extinction(g, s, sums)
+            else:
+                tau = g.length * value
+                p = evaluate(tau, g, s, sums)
             describe(g, s, p, tau, sums, row)
-            if is_prior:
+            if kind == PRIOR:
                 _step(g, p, tau, row)
                 tau = row.extinction
                 row.bounded = tau <= g.nodes[0] or tau >= g.nodes[-1]
                 p = _moved(evaluate(tau, g, s, sums), row)
             spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
-            judge_residuals(g, s, p, tau, sums, spacing, row)
-            if not is_prior:
+            left = judge_residuals(g, s, p, tau, sums, spacing, row)
+            if kind == EXTINCTION:
                 _describe_given(p, sums.weight, row)
                 describe_bend_given(p, row)
+            elif kind == BACKGROUND and sums.free > 0.0 and row.bounded == 0.0:
+                _polish(p, sums.weight, left, row)
             unscale(g, reference, scale, unit, row)
 
 
 @compiled
-def solve_from(
+def solve_path(
     power: Any,
     noise: Array,
     is_variance: bool,
     rounding: float,
-    extinction: Array,
+    given: Array,
+    kind: int,
     g: Grid,
     out: Any,
-    is_prior: bool,
 ) -> None:
-    """Fit background and amplitude at extinctions, (profile or 1,), m-1: given ones, or priors.
+    """Fit every profile of a batch.
 
-    From a prior, one linear step leads to the extinction. The other parameters are those of
-    `_direct.solve_direct`.
+    Parameters
+    ----------
+    power : (profile, bin) float32 or float64
+    noise : (profile or 1, bin) float64
+        Variances or weights; a bin is left out where its weight is not positive and finite.
+    is_variance : bool
+    rounding : float
+        Relative rounding error of the power.
+    given : (profile or 1,) float64
+        Backgrounds, NaN where they are to be fitted; or extinctions, m-1.
+    kind : int
+        What is given: `BACKGROUND`, `EXTINCTION`, or `PRIOR`, an extinction from which one linear
+        step leads to that of the profile.
+    g : Grid
+        Of `make_grid`.
+    out : (profile,) `ROW`
+        Filled with NaN; receives the fields of `PathEstimate`.
     """
-    _solve_from(power, noise, is_variance, rounding, extinction, g, make_scratch(g), out, is_prior)
+    _solve(power, noise, is_variance, rounding, given, kind, g, make_scratch(g), out)

@@ -7,6 +7,7 @@ hardly affects; the tests allow for the scatter of that estimate.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -15,7 +16,13 @@ from scipy import special
 
 from lidarops.flags import Quality
 from lidarops.retrieve.common.arrays import Array, Flags
-from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, PathEstimate
+from lidarops.retrieve.homogeneous._problem import (
+    CONSTANT,
+    EMPTY,
+    FITTED,
+    PathEstimate,
+    PathProblem,
+)
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -23,8 +30,6 @@ _SECOND_DIFFERENCE: Final = 6.0
 """Variance of a second difference of white noise over that of the noise."""
 _DIFFERENCE_DOF: Final = 18.0 / 35.0
 """Degrees of freedom per second difference: 2 / (2 sum of their squared correlations)."""
-_INDEPENDENT: Final = np.ones(1)
-_NOTHING: Final = np.zeros(1)
 _OUTSIDE: Final = 0.025
 """Probability beyond either end of an interval of 95 percent."""
 _FAR: Final = 4.0
@@ -76,39 +81,28 @@ class CountMoments:
 
 
 def judge_fit(
-    fit: PathEstimate,
-    *,
-    bin_width: float,
-    known_variance: bool,
-    counts: CountMoments | None = None,
-    unknowns: int = 3,
-    correlation_length: Array = _INDEPENDENT,
-    added_variance: Array = _NOTHING,
+    fit: PathEstimate, problem: PathProblem, *, unknowns: int, added_variance: Array
 ) -> Verdict:
     """Judge a batch of fits.
 
     Parameters
     ----------
     fit : PathEstimate
-    bin_width : float
-        m.
-    known_variance : bool
-        Whether the weights are inverse variances.
-    counts : CountMoments, optional
-        Where the noise is that of few counts.
+    problem : PathProblem
     unknowns : int
         Number of fitted parameters.
-    correlation_length : (profile or 1,) float
-        Bins, of the noise.
     added_variance : (profile or 1,) float
         m-2, of the extinction, from sources other than the noise of the fit.
     """
+    known_variance, bins = problem.known_variance, problem.range.size
+    bin_width = np.ptp(problem.range) / (bins - 1) if bins > 1 else 1.0
+    counts = _count_moments(problem)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         noise = np.ones_like(fit.status)
         if not known_variance:
             noise = _estimated_noise(fit, unknowns)
         # Of means over many bins.
-        mean_noise = noise * correlation_length
+        mean_noise = noise * problem.correlation_length
         reduced = fit.misfit / _residual_dof(fit.bins, unknowns) / noise
         limits = _limits(fit, unknowns, known_variance=known_variance)
         if counts is not None:
@@ -140,6 +134,21 @@ def judge_fit(
     quality[fit.status == EMPTY] |= np.int32(Quality.INPUT_MISSING)
     quality[(fit.bins > 0) & (fit.bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
     return Verdict(noise, limits.widening, relative_error, reduced, quality)
+
+
+def _count_moments(problem: PathProblem) -> CountMoments | None:
+    """Return the moments of the counts of the used bins; None where the noise is normal."""
+    if problem.exposure is None:
+        return None
+    expected = problem.noise * problem.exposure[:, np.newaxis] ** 2
+    counts = np.where(np.isfinite(problem.power), expected, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        # Profiles without bins have no moments.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        counts[~(counts > 0.0)] = np.nan
+        return CountMoments(
+            np.nanmin(counts, axis=1), np.nanmean(1.0 / counts, 1), np.nanmean(counts**-2.0, 1)
+        )
 
 
 def _residual_dof(bins: Array, unknowns: int) -> Array:

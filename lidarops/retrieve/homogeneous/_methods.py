@@ -7,8 +7,6 @@ Where a background comes from elsewhere, `propagate` carries its noise into the 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final, cast
 
@@ -18,11 +16,7 @@ from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_
 from lidarops.retrieve.common.arrays import HUGE, Array, Block, Flags, frozen
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.homogeneous import _direct
-from lidarops.retrieve.homogeneous._fit_quality import (
-    CountMoments,
-    curved_widening,
-    judge_fit,
-)
+from lidarops.retrieve.homogeneous._fit_quality import curved_widening, judge_fit
 from lidarops.retrieve.homogeneous._problem import (
     COLUMNS,
     CONSTANT,
@@ -42,13 +36,13 @@ _FITTED_BACKGROUND: Final = np.full(1, np.nan)
 
 def solve_by_direct_fit(problem: PathProblem) -> HomogeneousResult:
     """Solve by least squares for all three unknowns."""
-    return _solution(_estimate(problem, _direct.solve_direct, _FITTED_BACKGROUND), problem)
+    return _solution(_estimate(problem, _FITTED_BACKGROUND), problem)
 
 
 def solve_by_linearization(problem: PathProblem) -> HomogeneousResult:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
-    fit = _estimate(problem, _direct.solve_from, prior, is_prior=True)
+    fit = _estimate(problem, prior, _direct.PRIOR)
     shifts = _neglected_shifts(problem, prior, fit.extinction, fit.amplitude)
     with np.errstate(over="ignore", invalid="ignore"):
         added = tuple(shift**2 for shift in shifts)
@@ -59,7 +53,7 @@ def solve_with_known_extinction(problem: PathProblem) -> HomogeneousResult:
     """Solve for background and amplitude at the given extinction."""
     # `fit_homogeneous_path` has checked that it is given.
     extinction = cast("Array", problem.extinction)
-    fit = _estimate(problem, _direct.solve_from, extinction, is_prior=False)
+    fit = _estimate(problem, extinction, _direct.EXTINCTION)
     return _solution(fit, problem, unknowns=2)
 
 
@@ -67,7 +61,7 @@ def solve_with_known_background(problem: PathProblem) -> HomogeneousResult:
     """Solve for amplitude and extinction above the given background."""
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
-    fit = _estimate(problem, _direct.solve_direct, background)
+    fit = _estimate(problem, background)
     spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
         by_slopes = (spread[f"{name}_slope"] for name in ("amplitude", "extinction"))
@@ -95,7 +89,7 @@ def _fit_above(
 ) -> HomogeneousResult:
     """Fit amplitude and extinction above a background that depends on the same power."""
     background = estimate.background
-    fit = _estimate(problem, _direct.solve_direct, background)
+    fit = _estimate(problem, background)
     spread = _propagated(problem, fit, gradients)
     fit = replace(
         fit,
@@ -127,34 +121,18 @@ def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Bl
     return out
 
 
-def _estimate(
-    problem: PathProblem, solve: Callable[..., None], *given: Array, **choice: bool
-) -> PathEstimate:
-    """Run a kernel with what is given beside the profiles."""
+def _estimate(problem: PathProblem, given: Array, kind: int = _direct.BACKGROUND) -> PathEstimate:
+    """Fit the profiles with what is given beside them."""
     table = np.full(problem.power.shape[0], np.nan, ROW)
     # Second differences over more than a twentieth of a section would hold its misfit.
     widest = min(SIGNAL.most_correlated_bins, problem.range.size // 20)
-    length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
-    spacing = np.where(length > 1.0, max(widest, 1), 1).astype(np.int64)
+    spacing = np.where(problem.correlation_length > 1.0, max(widest, 1), 1).astype(np.int64)
     grid = make_grid(problem.range, problem.bounds, spacing)
-    noise = (frozen(problem.noise), problem.known_variance, problem.rounding)
-    solve(frozen(problem.power), *noise, *map(frozen, given), grid, table, **choice)
+    # Relative rounding of the power and of the kernels, as a standard deviation.
+    rounding = 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(float).eps)
+    noise = (frozen(problem.noise), problem.known_variance, rounding)
+    _direct.solve_path(frozen(problem.power), *noise, frozen(given), kind, grid, table)
     return PathEstimate(**{name: table[name] for name in COLUMNS})
-
-
-def _count_moments(problem: PathProblem) -> CountMoments | None:
-    """Return the moments of the counts of the used bins; None where the noise is normal."""
-    if problem.exposure is None:
-        return None
-    expected = problem.noise * problem.exposure[:, np.newaxis] ** 2
-    counts = np.where(np.isfinite(problem.power), expected, np.nan)
-    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
-        # Profiles without bins have no moments.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        counts[~(counts > 0.0)] = np.nan
-        return CountMoments(
-            np.nanmin(counts, axis=1), np.nanmean(1.0 / counts, 1), np.nanmean(counts**-2.0, 1)
-        )
 
 
 def _solution(
@@ -171,16 +149,8 @@ def _solution(
     logarithm of the amplitude, and of the extinction.
     """
     of_background, of_amplitude, of_extinction = added
-    length = np.ones(1) if problem.correlation_length is None else problem.correlation_length
-    verdict = judge_fit(
-        fit,
-        bin_width=problem.bin_width,
-        known_variance=problem.known_variance,
-        counts=_count_moments(problem),
-        unknowns=unknowns,
-        correlation_length=length,
-        added_variance=of_extinction,
-    )
+    verdict = judge_fit(fit, problem, unknowns=unknowns, added_variance=of_extinction)
+    length = problem.correlation_length
     fitted, constant = fit.status == FITTED, fit.status == CONSTANT
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         level = verdict.noise * verdict.widening**2 * length

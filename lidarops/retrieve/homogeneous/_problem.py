@@ -86,8 +86,8 @@ class PathProblem:
     """Whether `noise` holds variances, else weights up to a common factor."""
     bounds: tuple[float, float]
     """Lowest and highest extinction, m-1."""
-    correlation_length: Array | None = None
-    """(profile or 1,), bins, of the noise; None for independent bins."""
+    correlation_length: Array
+    """(profile or 1,), bins, of the noise; 1 for independent bins."""
     extinction: Array | None = None
     """(profile or 1,), m-1: the prior of the linearised method, or the known extinction."""
     background: Array | None = None
@@ -98,18 +98,6 @@ class PathProblem:
     """(profile or 1,): counts per unit of power; None where the noise is not that of counts."""
     lag: int | None = None
     """Bins between those of a triple of the cubic; chosen by the number of bins if None."""
-
-    @property
-    def rounding(self) -> float:
-        """Relative rounding error of the power and the kernels, as a standard deviation."""
-        return 0.3 * float(np.finfo(self.power.dtype).eps) + 8.0 * float(np.finfo(np.float64).eps)
-
-    @property
-    def bin_width(self) -> float:
-        """Mean spacing of the bins, those without data included, m; 1 for a single bin."""
-        if self.range.size < 2:
-            return 1.0
-        return float(self.range[-1] - self.range[0]) / (self.range.size - 1)
 
 
 @dataclass(frozen=True, slots=True)

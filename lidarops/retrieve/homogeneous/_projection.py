@@ -129,14 +129,7 @@ class Point(NamedTuple):
     """Of the residuals, by differences: no better than the rounding of the squared values."""
 
 
-_NEIGHBOURS: Final = np.ones(1, np.int64)
-
-
-def make_grid(
-    range_: Array,
-    bounds: tuple[float, float],
-    noise_spacing: Integers = _NEIGHBOURS,
-) -> Grid:
+def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integers) -> Grid:
     """Return the tables common to the profiles of a call.
 
     Parameters

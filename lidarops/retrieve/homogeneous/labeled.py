@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.background.estimate import from_bounded_tail
-from lidarops.retrieve.common.arrays import Array, Block
+from lidarops.retrieve.background.estimate import Background, from_bounded_tail
+from lidarops.retrieve.common.arrays import Array, Block, Flags
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -34,15 +34,8 @@ _UNITS: Final = {
 }
 """Variables and their units, in terms of the unit of the power."""
 _VARIABLES: Final = (*_UNITS, "valid_bins", "quality_flag")
-_BACKGROUND: Final = ("background", "background_error", "background_bits")
-_OF_PROFILES: Final = {
-    "correlation_length": "noise_correlation_length",
-    "background": "background",
-    "background_error": "background_standard_error",
-    "extinction": "extinction",
-    "exposure": "exposure",
-}
-"""Values of whole profiles, and the arguments of the fit that they are."""
+_OF_BINS: Final = ("power", "variance", "quality")
+"""Values of bins; all others are of whole profiles."""
 
 
 def fit_homogeneous_path(
@@ -101,25 +94,39 @@ def fit_homogeneous_path(
     """
     distance, edges = _distance(power), _edges(sections)
     power = power.transpose(..., "range")
-    inputs = {
+    given = {
         "power": power,
         "variance": variance,
         "quality": quality,
-        "correlation_length": noise_correlation_length,
+        "noise_correlation_length": noise_correlation_length,
         "extinction": extinction,
         "exposure": exposure,
     }
     arrays = {
         name: _along(xr.DataArray(values), power, name)
-        for name, values in inputs.items()
+        for name, values in given.items()
         if values is not None
     }
+    bins: dict[str, Block] = {name: arrays.pop(name) for name in _OF_BINS if name in arrays}
+    known: dict[str, Any] = {name: values[..., 0] for name, values in arrays.items()}
+    known |= {"method": method, "lag": lag}
+    doubt: Any = np.int32(0)
     if background is not None:
-        arrays |= _given_background(background, background_range)
+        if background_range is not None:
+            raise RetrievalInputError(
+                "is given together with background_range",
+                field="background",
+                remedy="give one of them",
+            )
+        known["background"], known["background_standard_error"] = background
     elif background_range is not None:
-        arrays |= _far_background(arrays, distance, background_range)
+        length = arrays.get("noise_correlation_length", 1.0)
+        sky = _far_background(bins, length, distance, background_range)
+        known["background"] = sky.background
+        known["background_standard_error"] = np.hypot(sky.standard_error, sky.left)
+        doubt = sky.quality & np.int32(Quality.BACKGROUND_UNCERTAIN)
     solutions = [
-        _solve(arrays, distance, _bins(distance, *edge), method, lag, relative=relative_variance)
+        _solve(bins, distance, _bins(distance, *edge), known, doubt, relative=relative_variance)
         for edge in edges
     ]
     dims = (*power.dims[:-1], "section")
@@ -150,9 +157,8 @@ def _along(values: xr.DataArray, power: xr.DataArray, name: str) -> Block:
         xr.align(power, values, join="exact", copy=False)
     except ValueError as error:
         raise RetrievalInputError(f"does not fit power: {error}", field=name) from error
-    own = [dim for dim in power.dims if dim in values.dims]
-    sizes = [values.sizes.get(dim, 1) for dim in power.dims]
-    return np.asarray(values.transpose(*own).to_numpy()).reshape(sizes)
+    missing = [dim for dim in power.dims if dim not in values.dims]
+    return values.expand_dims(missing).transpose(*power.dims).to_numpy()
 
 
 def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
@@ -181,32 +187,20 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
     return bits.drop_vars(bits.coords)
 
 
-def _given_background(
-    background: tuple[float, float], background_range: tuple[float, float] | None
-) -> dict[str, Block]:
-    """Return a background that is given for all profiles, and its standard error."""
-    if background_range is not None:
-        raise RetrievalInputError(
-            "is given together with background_range", field="background", remedy="give one of them"
-        )
-    return dict(zip(_BACKGROUND, (np.full(1, value) for value in background), strict=False))
-
-
 def _far_background(
-    arrays: Mapping[str, Block], distance: Array, background_range: tuple[float, float]
-) -> dict[str, Block]:
-    """Return the mean of the far range, its standard error, and whether that is uncertain."""
-    if "variance" not in arrays:
+    bins: Mapping[str, Block],
+    length: Block | float,
+    distance: Array,
+    background_range: tuple[float, float],
+) -> Background:
+    """Return the background of the far range, of noise with a correlation length."""
+    if "variance" not in bins:
         raise RetrievalInputError("is needed for a background of the far range", field="variance")
-    power, front = arrays["power"], slice(int(np.searchsorted(distance, 0.0, side="right")), None)
-    used = _usable(arrays)[..., front]
-    noise = arrays["variance"] * arrays.get("correlation_length", 1.0)
-    noise = np.broadcast_to(noise, power.shape)[..., front]
-    sky = from_bounded_tail(used, distance[front], noise, None, background_range)
-    bits = sky.quality & np.int32(Quality.BACKGROUND_UNCERTAIN)
-    error = np.hypot(sky.standard_error, sky.left.most)
-    found = (sky.background, error, bits)
-    return {name: part[..., np.newaxis] for name, part in zip(_BACKGROUND, found, strict=True)}
+    power, front = _usable(bins), slice(int(np.searchsorted(distance, 0.0, side="right")), None)
+    noise = np.broadcast_to(bins["variance"] * length, power.shape)
+    return from_bounded_tail(
+        power[..., front], distance[front], noise[..., front], None, background_range
+    )
 
 
 def _usable(arrays: Mapping[str, Block]) -> Block:
@@ -233,27 +227,22 @@ def _solve(
     arrays: Mapping[str, Block],
     distance: Array,
     bins: slice,
-    method: str,
-    lag: int | None,
+    known: Mapping[str, Any],
+    doubt: Flags | np.int32,
     *,
     relative: bool,
 ) -> tuple[Block, ...]:
-    """Return `_VARIABLES` of a section, over the leading dimensions of the power."""
+    """Return `_VARIABLES` of a section, over the leading dimensions of the power.
+
+    `known` are the other arguments of the fit, and `doubt` the bits of the background.
+    """
     inside = {n: a[..., bins] if a.shape[-1] > 1 else a for n, a in arrays.items()}
-    noise = {"variance": inside.get("variance")}
+    noise: dict[str, Any] = {"variance": inside.get("variance")}
     if relative and "variance" in inside:
         with np.errstate(divide="ignore"):
             noise = {"weights": 1.0 / inside["variance"]}
-    of_profile = {name: array[..., 0] for name, array in inside.items() if name in _OF_PROFILES}
-    fit = _homogeneous.fit_homogeneous_path(
-        _usable(inside),
-        distance[bins],
-        method=method,
-        lag=lag,
-        **noise,
-        **{_OF_PROFILES[name]: values for name, values in of_profile.items()},
-    )
-    bits = fit.quality | inside.get("background_bits", np.zeros(1, np.int32))[..., 0]
+    fit = _homogeneous.fit_homogeneous_path(_usable(inside), distance[bins], **noise, **known)
+    bits = fit.quality | doubt
     if "quality" in inside:
         bits = bits | np.bitwise_or.reduce(inside["quality"] & CARRIED, axis=-1).astype(np.int32)
     values = (getattr(fit, name.removeprefix("total_")) for name in _UNITS)

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.homogeneous import _methods
 from lidarops.retrieve.homogeneous._problem import HomogeneousResult, PathProblem
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -72,7 +71,7 @@ def fit_homogeneous_path(
     power : (..., range) float
         Any unit. Bins that are not finite are excluded.
     range : (range,) float
-        m, positive, in any strict order and spacing.
+        m, positive and ascending, in any spacing.
     variance : (..., range) float, optional
         Noise variance in the square of the power's unit, broadcast against `power`; a scalar
         holds for every bin. Bins whose variance is zero or not finite are excluded. For counts,
@@ -206,39 +205,33 @@ def fit_homogeneous_path(
             field="exposure",
             remedy="give counts per unit of power with the variance of the counts",
         )
-    length = float(grid.values[-1] - grid.values[0]) if grid.size > 1 else 1.0
+    length = float(grid[-1] - grid[0]) if grid.size > 1 else 1.0
+    prior = inputs.profile_values(extinction, "extinction", leading)
+    limit = THRESHOLDS.largest_optical_depth / length
+    if prior is not None and np.any(np.abs(prior) > limit):
+        raise RetrievalInputError(
+            f"holds values up to {np.max(np.abs(prior)):g} m-1: it must be in m-1",
+            field="extinction",
+            remedy=f"stay within +-{limit:g} m-1"
+            f" ({THRESHOLDS.largest_optical_depth:g} over the length)",
+        )
     problem = PathProblem(
         power=rows,
-        range=grid.values,
+        range=grid,
         noise=noise,
         known_variance=known_variance,
         bounds=(
-            THRESHOLDS.lowest_extinction / float(grid.values[-1]),
+            THRESHOLDS.lowest_extinction / float(grid[-1]),
             THRESHOLDS.highest_optical_depth / length,
         ),
-        correlation_length=correlated,
-        extinction=_prior(extinction, length, leading),
+        correlation_length=np.ones(1) if correlated is None else correlated,
+        extinction=prior,
         background=inputs.profile_values(background, "background", leading),
         background_variance=None if error is None else error**2,
         exposure=counted,
         lag=lag,
     )
     return inputs.with_leading_axes(_SOLVERS[chosen_method](problem), leading)
-
-
-def _prior(
-    extinction: npt.ArrayLike | None, length: float, leading: tuple[int, ...]
-) -> Array | None:
-    values = inputs.profile_values(extinction, "extinction", leading)
-    limit = THRESHOLDS.largest_optical_depth / length
-    if values is not None and np.any(np.abs(values) > limit):
-        raise RetrievalInputError(
-            f"holds values up to {np.max(np.abs(values)):g} m-1: it must be in m-1",
-            field="extinction",
-            remedy=f"stay within +-{limit:g} m-1"
-            f" ({THRESHOLDS.largest_optical_depth:g} over the length)",
-        )
-    return values
 
 
 def _check_arguments(method: HomogeneousMethod, given: Mapping[str, object]) -> None:

@@ -341,7 +341,7 @@ class AltitudeCycles:
         bits = bits[:, near] | uncertain[:, np.newaxis]
         unexplained = ~np.isfinite(net) & ((bits & int(WITHHELD)) == 0)
         bits |= np.where(unexplained, np.int32(Quality.INPUT_MISSING), np.int32(0))
-        left = np.maximum(np.nan_to_num(sky.left.most), 0.0)
+        left = np.maximum(np.nan_to_num(sky.left), 0.0)
         distance, variance = self._distance[near], of_means[:, near]
         blocked = obstruction_range(net, variance, distance)
         net = np.where(distance >= blocked[:, np.newaxis], np.nan, net)

@@ -42,6 +42,50 @@ class BeamSignals:
     """Shape of the axes before beam and range."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """What the blocks give, before flags are set; NaN where there is none."""
+
+    extinction: Array
+    """(profile, crossing) m-1."""
+    variance: Array
+    """(profile, crossing) m-2."""
+    prior_true_variance: Array
+    """(profile, crossing) m-2, without the errors that the block shows."""
+    prior_contradicted: Booleans
+    """(profile,) True where the beams contradict the prior but cannot replace it."""
+    settled: Booleans
+    """(profile,)."""
+    left_out: Booleans
+    """(profile, beam) True where the covariance of a beam is singular or missing."""
+    chi_square: Array
+    """(profile, 2) of the beams alone, and of beams and prior together."""
+    degrees_of_freedom: Array
+    """(profile, 2) of these."""
+    deviation: Array
+    """(profile,) standard deviation of the prior; inf without one."""
+    multiplier: Array
+    """(profile, crossing)."""
+    multiplier_error: Array
+    """(profile, crossing) m-1."""
+    open: Booleans
+    """(crossing,) True where no triangle leads away, with a multiplier."""
+
+    @classmethod
+    def missing(cls, beams: BeamSignals) -> Estimates:
+        """Return estimates without values, of all beams together; solvers fill the arrays."""
+        profiles = beams.block.size
+        shape = (profiles, beams.layout.crossings)
+        return cls(
+            np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
+            np.zeros(profiles, dtype=np.bool_), np.zeros(profiles, dtype=np.bool_),
+            np.zeros((profiles, beams.exponent.size), dtype=np.bool_),
+            np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan),
+            np.full(profiles, np.inf), np.full(shape, np.nan), np.zeros(shape),
+            np.zeros(shape[1], dtype=np.bool_),
+        )  # fmt: skip
+
+
 def prepare_signals(
     power: npt.ArrayLike,
     range_: npt.ArrayLike,
@@ -108,8 +152,7 @@ def _ranges(values: npt.ArrayLike, beams: int) -> Array:
                 field="range",
                 remedy="give the bins of each beam first, and NaN only after the last bin",
             )
-        if inputs.range_grid(row[known]).descending:
-            raise RetrievalInputError("descends", field="range", remedy="reverse range and power")
+        inputs.range_grid(row[known])
     return np.ascontiguousarray(array)
 
 

@@ -33,7 +33,7 @@ from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
 from lidarops.retrieve.network import _beam_signals, _block_errors
-from lidarops.retrieve.network._beam_signals import BeamSignals
+from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
 from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Problem, solve_block
 from lidarops.retrieve.network.flags import NetworkQuality
@@ -166,56 +166,12 @@ def retrieve_network(
     )  # fmt: skip
     if multiplier is None:
         return _flag_result(beams, _solve_network(beams, network.crossing, field_prior))
-    return _flag_result(beams, _solve_triangles(beams, _multipliers(multiplier, beams)))
+    return _flag_result(beams, solve_triangles(beams, _multipliers(multiplier, beams)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Estimates:
-    """What the blocks give, before flags are set; NaN where there is none."""
-
-    extinction: Array
-    """(profile, crossing) m-1."""
-    variance: Array
-    """(profile, crossing) m-2."""
-    prior_true_variance: Array
-    """(profile, crossing) m-2, without the errors that the block shows."""
-    prior_contradicted: Booleans
-    """(profile,) True where the beams contradict the prior but cannot replace it."""
-    settled: Booleans
-    """(profile,)."""
-    left_out: Booleans
-    """(profile, beam) True where the covariance of a beam is singular or missing."""
-    chi_square: Array
-    """(profile, 2) of the beams alone, and of beams and prior together."""
-    degrees_of_freedom: Array
-    """(profile, 2) of these."""
-    deviation: Array
-    """(profile,) standard deviation of the prior; inf without one."""
-    multiplier: Array
-    """(profile, crossing)."""
-    multiplier_error: Array
-    """(profile, crossing) m-1."""
-    open: Booleans
-    """(crossing,) True where no triangle leads away, with a multiplier."""
-
-    @classmethod
-    def missing(cls, beams: BeamSignals) -> _Estimates:
-        """Return estimates without values, of all beams together; solvers fill the arrays."""
-        profiles = beams.block.size
-        shape = (profiles, beams.layout.crossings)
-        return cls(
-            np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
-            np.zeros(profiles, dtype=np.bool_), np.zeros(profiles, dtype=np.bool_),
-            np.zeros((profiles, beams.exponent.size), dtype=np.bool_),
-            np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan),
-            np.full(profiles, np.inf), np.full(shape, np.nan), np.zeros(shape),
-            np.zeros(shape[1], dtype=np.bool_),
-        )  # fmt: skip
-
-
-def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> _Estimates:
+def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> Estimates:
     """Solve each block, and return its values with all their errors."""
-    layout, out = beams.layout, _Estimates.missing(beams)
+    layout, out = beams.layout, Estimates.missing(beams)
     number = np.cumsum(layout.measured) - 1
     crossing = number[layout.passages.crossing].astype(np.intp)
     for block in np.unique(beams.block) if crossing.size else ():
@@ -267,22 +223,7 @@ def _multipliers(multiplier: npt.ArrayLike | str, beams: BeamSignals) -> Array |
     return np.broadcast_to(array, shape).reshape(beams.block.size, -1)
 
 
-def _solve_triangles(beams: BeamSignals, multiplier: Array | None) -> _Estimates:
-    """Solve one triangle at each crossing, and return its values with their errors."""
-    out, solution = _Estimates.missing(beams), solve_triangles(beams, multiplier)
-    variance = solution.variance
-    for block in np.unique(beams.block):
-        rows = np.flatnonzero(beams.block == block)
-        carried = solution.carried[rows]
-        variance[rows] += _block_errors.curvature_variance(beams.data.take(rows), carried)
-    out.extinction[:] = solution.extinction
-    out.variance[:] = out.prior_true_variance[:] = solution.extinction**2 * variance
-    out.multiplier[:], out.multiplier_error[:] = solution.multiplier, solution.multiplier_error
-    out.open[:] = solution.open
-    return out
-
-
-def _flag_result(beams: BeamSignals, estimate: _Estimates) -> NetworkResult:
+def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
     shape, passages = estimate.extinction.shape, beams.layout.passages
     near = beams.layout.near_crossing

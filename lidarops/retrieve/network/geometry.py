@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Final
 
@@ -278,13 +278,7 @@ def _network_of_beams(
     network = _find_crossings(origin, direction, tolerance, (nearest, farthest), smallest_angle)
     axes = local_axes(beams[0].latitude, beams[0].longitude)
     first = to_earth_centred(beams[0].latitude, beams[0].longitude, beams[0].altitude)
-    geodetic = to_geodetic(first + network.crossing @ axes)
-    return _freeze(
-        Network(
-            network.origin, network.direction, network.crossing, network.passages,
-            network.near_crossing, geodetic,
-        )
-    )  # fmt: skip
+    return _freeze(replace(network, geodetic=to_geodetic(first + network.crossing @ axes)))
 
 
 def _find_crossings(
@@ -325,15 +319,7 @@ def _find_crossings(
     near = np.zeros(len(groups), dtype=np.bool_)
     goes_on = passages.beam[:-1] == passages.beam[1:]
     near[passages.crossing[:-1][goes_on]] = True
-    return _freeze(
-        Network(
-            origin,
-            direction,
-            crossing[order],
-            passages,
-            near,
-        )
-    )
+    return _freeze(Network(origin, direction, crossing[order], passages, near))
 
 
 def _beam_groups(

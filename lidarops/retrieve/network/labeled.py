@@ -12,10 +12,9 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.air import labeled
-from lidarops.retrieve.air.labeled import VisibilityDefinition
-from lidarops.retrieve.background.estimate import from_tail, shifts
-from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers
+from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
+from lidarops.retrieve.background.estimate import detected, from_tail, shifts
+from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers, root_sum_square
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
@@ -137,19 +136,14 @@ def retrieve_network(
     random, systematic = errors.random[:, near], errors.systematic[:, near]
     freedom, deviation = result.degrees_of_freedom, result.prior_deviation
     dimensions = ("time", "crossing")
-    visibility = labeled.visibility_of_extinction(
-        xr.DataArray(extinction, dims=dimensions),
-        xr.DataArray(random, dims=dimensions),
-        xr.DataArray(systematic, dims=dimensions),
-        settings.visibility,
-    )
+    visibility = visibility_of_extinction(extinction, random, systematic, settings.visibility)
     flags = _quality_flags(result, errors, signals, network)[:, near]
     multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
     if settings.multiplier is None:
         multiplier = {}
     return xr.Dataset(
         {
-            **visibility.data_vars,
+            **{name: (dimensions, values) for name, values in visibility.items()},
             "total_extinction": (dimensions, extinction),
             "total_extinction_standard_error": (dimensions, random),
             "total_extinction_systematic_error": (dimensions, systematic),
@@ -196,7 +190,7 @@ def _gather_signals(
         if off is not None:
             baseline[rows, index, beam_bins] = off.transpose("time", "range").to_numpy()
         error[rows, index] = sky.standard_error
-        tail_signal[rows, index] = sky.left.detected
+        tail_signal[rows, index] = detected(sky.left, sky.left_standard_error)
         ranges = network.on_beam(index)[1]
         used = (distance >= ranges[0]) & (distance <= ranges[-1])
         warnings[rows, index] = np.bitwise_or.reduce(quality[:, used] & np.int32(_WARNINGS), axis=1)
@@ -317,13 +311,13 @@ class _Errors:
             np.nan_to_num(signals.background_error)[..., np.newaxis], shape
         )
         by_background = solver.extinction_changes(result, background)
-        random = _root_sum_square([result.extinction_standard_error, *by_background])
+        random = root_sum_square([result.extinction_standard_error, *by_background])
         overlap = THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
-        overlap_change = _root_sum_square([*solver.extinction_changes(result, overlap)])
+        overlap_change = root_sum_square(solver.extinction_changes(result, overlap))
         with np.errstate(invalid="ignore", divide="ignore"):
             condition = overlap_change / THRESHOLDS.relative_change / result.extinction
         tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], shape)
-        tail_signal = _root_sum_square([*solver.extinction_changes(result, tail)])
+        tail_signal = root_sum_square(solver.extinction_changes(result, tail))
         exponent = _changed_exponents(solver.exponent, settings.exponent_relative_error)
         by_exponent = solver.solve(signals.power, exponent).extinction - result.extinction
         by_lidar_ratio = _lidar_ratio_error(solver, result, settings.lidar_ratio_relative_error)
@@ -335,7 +329,7 @@ class _Errors:
             condition * result.extinction * settings.overlap_relative_error,
             result.multiplier_error,
         ]
-        return _Errors(random, _root_sum_square(contributions), tail_signal, condition)
+        return _Errors(random, root_sum_square(contributions), tail_signal, condition)
 
 
 def _lidar_ratio_error(solver: _Solver, result: NetworkResult, relative_error: float) -> Array:
@@ -353,14 +347,6 @@ def _changed_exponents(exponent: Array, relative_error: float) -> Array:
     larger = exponent * (1.0 + relative_error)
     smaller = exponent / (1.0 + relative_error)
     return np.where(larger <= THRESHOLDS.exponents[1], larger, smaller)
-
-
-def _root_sum_square(contributions: Sequence[Array]) -> Array:
-    """Return the root of the sum of squares; NaN where any contribution is NaN."""
-    total = np.zeros(contributions[0].shape)
-    for contribution in contributions:
-        total += contribution**2
-    return np.sqrt(total)
 
 
 def _quality_flags(

@@ -25,7 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
-from lidarops.retrieve.network._beam_signals import BeamSignals
+from lidarops.retrieve.network import _block_errors
+from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
 from lidarops.retrieve.network._condensed_signals import FitLayout
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
@@ -86,48 +87,34 @@ class Triangle:
     """(3,) m, exponent times length, negative towards the lidar."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TriangleSolution:
-    """Extinction at the first crossings of triangles; NaN where there is none."""
-
-    extinction: Array
-    """(profile, crossing) m-1."""
-    variance: Array
-    """(profile, crossing) of its logarithm, by noise."""
-    carried: Array
-    """(profile, crossing, passage) change of its logarithm with that of the signals."""
-    multiplier: Array
-    """(profile, crossing)."""
-    multiplier_error: Array
-    """(profile, crossing) m-1, what the multiplier adds to extinction in homogeneous air."""
-    open: Booleans
-    """(crossing,) True where no triangle leads away."""
-
-
-def solve_triangles(beams: BeamSignals, multiplier: npt.ArrayLike | None) -> TriangleSolution:
-    """Solve the triangle of each crossing.
+def solve_triangles(beams: BeamSignals, multiplier: Array | None) -> Estimates:
+    """Solve the triangle of each crossing, and return its values with their errors.
 
     Parameters
     ----------
     beams : BeamSignals
-    multiplier : float or (profile, crossing) float, optional
+    multiplier : (profile, crossing) float, optional
         Chosen for each block and crossing where not given.
     """
-    profiles, passages = beams.data.log_value.shape
-    shape = (profiles, beams.layout.crossings)
-    out = TriangleSolution(
-        np.full(shape, np.nan), np.full(shape, np.nan), np.zeros((*shape, passages)),
-        np.full(shape, np.nan), np.full(shape, np.nan), np.ones(shape[1], dtype=np.bool_),
-    )  # fmt: skip
-    fixed = None if multiplier is None else np.broadcast_to(multiplier, shape)
+    out = Estimates.missing(beams)
+    out.multiplier_error[:], out.open[:] = np.nan, True
+    # Change of the logarithm of extinction with that of the signals, (profile, crossing, passage).
+    carried = np.zeros((*out.extinction.shape, beams.layout.passages.beam.size))
     for crossing, triangle in find_triangles(beams.layout, beams.exponent).items():
         rows = _Rows.of(beams, triangle)
         out.open[crossing] = False
         for block in np.unique(beams.block):
             members = np.flatnonzero((beams.block == block) & rows.usable)
             if members.size:
-                given = None if fixed is None else fixed[members, crossing]
-                _solve_block(rows.take(members), triangle, given, out, (members, crossing))
+                given = None if multiplier is None else multiplier[members, crossing]
+                place = members, crossing
+                _solve_block(rows.take(members), triangle, given, out, carried, place)
+    for block in np.unique(beams.block):
+        members = np.flatnonzero(beams.block == block)
+        signals = beams.data.take(members)
+        out.variance[members] += _block_errors.curvature_variance(signals, carried[members])
+    out.variance[:] *= out.extinction**2
+    out.prior_true_variance[:] = out.variance
     return out
 
 
@@ -231,10 +218,11 @@ def _solve_block(
     rows: _Rows,
     triangle: Triangle,
     multiplier: Array | None,
-    out: TriangleSolution,
+    out: Estimates,
+    carried: Array,
     place: tuple[Indices, int],
 ) -> None:
-    """Solve the profiles of one block, in place."""
+    """Solve the profiles of one block, in place; the variance is that of the logarithm."""
     with np.errstate(all="ignore"):
         # The extinction of homogeneous air that the first beam shows.
         level = float(np.median((rows.start[:, 0] - rows.end[:, 0]) / rows.integral[:, 0]))
@@ -253,9 +241,7 @@ def _solve_block(
     members, crossing = place
     for values, ends in enumerate((triangle.first, triangle.last)):
         for row, passage in enumerate(ends):
-            out.carried[members, crossing, passage] -= np.where(
-                solved, derivative[:, values, row], 0.0
-            )
+            carried[members, crossing, passage] -= np.where(solved, derivative[:, values, row], 0.0)
 
 
 def _choose(rows: _Rows, depth: Array, level: float) -> float:

@@ -214,10 +214,17 @@ def retrieve(
     result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
     stated = seen if overlap_is_stated or overlap is not None else np.full_like(seen, np.nan)
     sky = _Sky(molecules, station_altitude, climb, seen, overlap_is_stated)
+    reference = _clouds.Reference(
+        settings.lowest,
+        settings.highest,
+        settings.width,
+        settings.scattering_ratio,
+        settings.reference_relative_error,
+    )
     variables = {
         **_variables(result, cells, air, of_raman, settings, stated),
-        **_reference_variables(result, settings, sky),
-        **_cloud_variables(channels[0].averages, settings, cells, result, sky),
+        **_clouds.window_variables(result.reference, reference, station_altitude, climb),
+        **_cloud_variables(channels[0].averages, settings, reference, cells, result, sky),
         "background": ("time", of_elastic.background),
         "background_standard_error": ("time", of_elastic.background_standard_error),
         "profiles": elastic["profiles"],
@@ -417,20 +424,13 @@ class _Sky:
         return np.asarray(self.station_altitude + self.climb * distance)
 
 
-def _reference_variables(result: RamanResult, settings: RamanSettings, sky: _Sky) -> dict[str, Any]:
-    """Return the reference windows, and what is assumed in them."""
-    ratio = settings.scattering_ratio
-    return {
-        **result.reference.variables,
-        "reference_bottom_altitude": ("time", sky.altitude(result.reference.bottom)),
-        "reference_top_altitude": ("time", sky.altitude(result.reference.top)),
-        "reference_scattering_ratio": ratio,
-        "reference_scattering_ratio_standard_error": ratio * settings.reference_relative_error,
-    }
-
-
 def _cloud_variables(
-    averages: xr.Dataset, settings: RamanSettings, cells: Cells, result: RamanResult, sky: _Sky
+    averages: xr.Dataset,
+    settings: RamanSettings,
+    reference: _clouds.Reference,
+    cells: Cells,
+    result: RamanResult,
+    sky: _Sky,
 ) -> dict[str, Any]:
     """Return the clouds of the elastic signal, and the quality with their bits."""
     both = ("time", "range")
@@ -438,13 +438,6 @@ def _cloud_variables(
     air = _clouds.air_along(sky.molecules, sky.altitude(distance), distance, settings.wavelength)
     contrast = cloud_contrast(settings.wavelength)
     means = _clouds.MeanProfiles(averages, distance, air, sky.overlap, contrast)
-    reference = _clouds.Reference(
-        settings.lowest,
-        settings.highest,
-        settings.width,
-        settings.scattering_ratio,
-        settings.reference_relative_error,
-    )
     _, clouds = _clouds.signal_and_clouds(
         means,
         averages,

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Integers
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Integers, root_sum_square
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.raman import backscatter as _backscatter
 from lidarops.retrieve.raman.backscatter import Backscatter, inverse_of_weak
@@ -78,22 +78,17 @@ class RamanResult:
     @property
     def extinction_standard_error(self) -> Array:
         """Root of the sum of squares of the budget, m-1."""
-        return total_error(self.extinction_budget)
+        return root_sum_square(self.extinction_budget.values())
 
     @property
     def backscatter_standard_error(self) -> Array:
         """Root of the sum of squares of the budget, m-1 sr-1."""
-        return total_error(self.backscatter_budget)
+        return root_sum_square(self.backscatter_budget.values())
 
     @property
     def lidar_ratio_standard_error(self) -> Array:
         """Random and systematic errors together, sr."""
         return np.hypot(self.lidar_ratio_random, self.lidar_ratio_systematic)
-
-
-def total_error(budget: dict[str, Array]) -> Array:
-    """Return the root of the sum of squares of the errors of all causes."""
-    return np.asarray(np.sqrt(sum(error**2 for error in budget.values())))
 
 
 def retrieve_raman(

@@ -158,14 +158,14 @@ def glue(
     with np.errstate(invalid="ignore"):
         poor_fit = misfit | ~(line["slope"] >= THRESHOLDS.least_slope * error)
     result = GluedSignal(
-        power=grid.turn(power),
-        variance=grid.turn(variance),
-        systematic_variance=grid.turn(systematic),
-        change=grid.turn(change),
+        power=power,
+        variance=variance,
+        systematic_variance=systematic,
+        change=change,
         slope=line["slope"],
         slope_standard_error=error,
-        start=np.where(empty, np.nan, grid.values[first]),
-        stop=np.where(empty, np.nan, grid.values[np.maximum(past - 1, 0)]),
+        start=np.where(empty, np.nan, grid[first]),
+        stop=np.where(empty, np.nan, grid[np.maximum(past - 1, 0)]),
         no_window=empty,
         poor_fit=poor_fit & ~empty,
         misfit=common,
@@ -202,9 +202,7 @@ def _joined(
     return power, variance, systematic
 
 
-def _rows(
-    values: npt.ArrayLike, name: str, grid: inputs.RangeGrid
-) -> tuple[Array, tuple[int, ...]]:
+def _rows(values: npt.ArrayLike, name: str, grid: Array) -> tuple[Array, tuple[int, ...]]:
     rows, leading = inputs.profiles(values, grid, name)
     return frozen(rows.astype(np.float64, copy=False)), leading
 

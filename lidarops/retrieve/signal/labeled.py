@@ -359,10 +359,14 @@ def actual_noise(profiles: xr.Dataset) -> ActualNoise:
     """
     power, variance = profiles["power"].to_numpy(), profiles["variance"].to_numpy()
     distance = profiles["range"].to_numpy().astype(np.float64)
-    glued_until, stated = (part(profiles).to_numpy() for part in (_glued_until, _stated_length))
-    rows = (-1, distance.size)
+    rows, leading = (-1, distance.size), power.shape[:-1]
+    glued_until, stated = np.full(leading, -np.inf), np.ones(leading)
+    if "glue_top" in profiles:
+        stated = profiles[CORRELATION_LENGTH].to_numpy()
+        bottom, top = profiles["glue_bottom"].to_numpy(), profiles["glue_top"].to_numpy()
+        # Of a single record, the far half tells the noise of all.
+        glued_until = np.where(bottom != top, 0.5 * (bottom + top), -np.inf)
     noise = estimate_noise_correlation(power.reshape(rows), variance.reshape(rows))
-    leading = power.shape[:-1]
     excess = noise.excess.reshape(leading)
     beyond = distance > glued_until[..., np.newaxis]
     raised = variance * np.where(beyond, excess[..., np.newaxis], 1.0)
@@ -409,23 +413,6 @@ def without_analog_background(product: xr.Dataset, profiles: xr.Dataset) -> xr.D
     known = ~analog_alone(profiles)
     names = ("background", "background_standard_error")
     return product.assign({name: product[name].where(known) for name in names})
-
-
-def _glued_until(profiles: xr.Dataset) -> xr.DataArray:
-    """Return the range in m to which profiles are glued; below all ranges where they are not."""
-    if "glue_top" in profiles:
-        bottom, top = profiles["glue_bottom"], profiles["glue_top"]
-        # Of a single record, the far half tells the noise of all.
-        middle: xr.DataArray = (0.5 * (bottom + top)).where(bottom != top, -np.inf)
-        return middle
-    return xr.full_like(profiles["power"].isel(range=0, drop=True), -np.inf)
-
-
-def _stated_length(profiles: xr.Dataset) -> xr.DataArray:
-    """Return the correlation length of the analog part of glued profiles, else 1."""
-    if "glue_top" in profiles:
-        return profiles[CORRELATION_LENGTH]
-    return xr.ones_like(profiles["power"].isel(range=0, drop=True))
 
 
 def background_words(method: str, background_range: tuple[float, float]) -> str:

@@ -1,6 +1,7 @@
 """Averages of profiles in xarray over intervals of the clock, for profiles that come in chunks.
 
-`ClockAverage` averages all profiles, `ScreenedAverage` leaves out outlying parts of the intervals.
+`IntervalSums` sums the profiles of one record of the light, `ClockAverage` makes means of them, and
+leaves out outlying parts of the intervals where it is to screen them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, frozen
 from lidarops.retrieve.signal.averaging import (
-    Averages,
     PartCells,
     RunningMean,
     cells_of_parts,
@@ -35,7 +35,6 @@ MEANS_TOGETHER: Final = 16
 """Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 
-_AVERAGES: Final = ("values", "variance", "shared_variance")
 Shared = Callable[[npt.NDArray[np.datetime64]], Array]
 Units = dict[str, dict[str, Any]]
 
@@ -55,11 +54,10 @@ class PartSums:
     """Attributes of power, variance and range."""
 
 
-class ClockAverage:
-    """Means of profiles over intervals of the clock (UTC), weighted by their shots.
+class IntervalSums:
+    """Sums of the profiles of a record over intervals of the clock (UTC), weighted by their shots.
 
-    Profiles come in chunks, which do not change a bit of the result. Means are held until they are
-    taken.
+    Profiles come in chunks, which do not change a bit of the result.
 
     Parameters
     ----------
@@ -74,9 +72,11 @@ class ClockAverage:
     shared_variance : callable, optional
         Returns the part of ``variance`` that neighbouring profiles have in common at given
         times, (time, range), such as that of a dark signal. It does not average down.
-    parts : int, optional
-        Greatest number of parts of an interval. It is then cut into parts of consecutive profiles,
-        as equal in number as can be, and `completed_parts` gives their sums.
+    parts : int
+        Greatest number of parts of consecutive profiles, as equal in number as can be, into which
+        an interval is cut. Means of a single part are those of the profiles to the last bit.
+    lag : int
+        Bins by which the record lags behind the last one of its channels.
 
     Raises
     ------
@@ -92,7 +92,8 @@ class ClockAverage:
         seconds: float,
         shots: xr.DataArray,
         shared_variance: Shared | None = None,
-        parts: int | None = None,
+        parts: int = 1,
+        lag: int = 0,
     ) -> None:
         if not 0 < seconds <= 86400 or 86400 % seconds:
             raise RetrievalInputError(
@@ -107,7 +108,7 @@ class ClockAverage:
         self._starts, self._stops = bounds[first, 0], np.maximum.reduceat(bounds[:, 1], first)
         self._middles = self._starts + (self._stops - self._starts) // 2
         counts = np.diff(first, append=interval.size)
-        pieces = np.minimum(parts or 1, counts)
+        pieces = np.minimum(parts, counts)
         within = np.arange(interval.size) - np.repeat(first, counts)
         part = within * np.repeat(pieces, counts) // np.repeat(counts, counts)
         self._groups = np.append(0, np.cumsum(pieces))
@@ -117,12 +118,10 @@ class ClockAverage:
         self._profiles = np.diff(begins, append=interval.size).astype(np.int32)
         self._shots = np.add.reduceat(shots.to_numpy(), begins).astype(np.int32)
         self._shared_variance = shared_variance
-        self._distance = distance
+        self.range, self.lag = distance, lag
         self._added = 0
-        self._together = 1 if parts else MEANS_TOGETHER
-        self._edges = np.append(first[:: self._together], interval.size)
-        self._completed: list[xr.Dataset] = []
-        self._parts: list[PartSums] | None = [] if parts else None
+        self._edges = np.append(first, interval.size)
+        self._complete: list[PartSums] = []
         self._begin(0)
 
     @property
@@ -132,7 +131,7 @@ class ClockAverage:
 
     @property
     def left(self) -> int:
-        """Number of profiles to the end of the means that are completed next; 0 after the last."""
+        """Number of profiles to the end of the open interval; 0 after the last."""
         following = np.searchsorted(self._edges, self._added, side="right")
         return 0 if following == self._edges.size else int(self._edges[following]) - self._added
 
@@ -142,14 +141,12 @@ class ClockAverage:
         return {"time": self._middles[means], "time_bnds": (("time", "nv"), bounds)}
 
     def _begin(self, number: int) -> None:
-        """Begin the means that are completed together."""
-        self._open = slice(number, min(number + self._together, self._middles.size))
-        first, past = self._groups[[self._open.start, self._open.stop]]
-        self._first_group = int(first)
-        shape = int(past - first), self._distance.size
+        """Begin an interval."""
+        self._open, groups = number, self._groups[number : number + 2]
+        self._first_group, shape = int(groups[0]), (int(np.ptp(groups)), self.range.size)
         self._sums, self._bits = RunningMean(shape), np.zeros(shape, dtype=np.int32)
         self._lengths = RunningMean((shape[0], 1))
-        shared, times = self._shared_variance, self._middles[self._open]
+        shared, times = self._shared_variance, self._middles[number : number + 1]
         self._shared = None if shared is None or not times.size else shared(times)
 
     def add(self, conditioned: xr.Dataset, rows: slice = slice(None)) -> None:
@@ -163,128 +160,44 @@ class ClockAverage:
             past = min(first + _PROFILES_IN_CACHE, count, first + left)
             self._add(*(array[first:past] for array in arrays))
             if past - first == left:
-                self._complete(units)
-                self._begin(self._open.stop)
+                groups = slice(self._first_group, self._first_group + len(self._bits))
+                numbers = self._profiles[groups], self._shots[groups]
+                self._complete.append(
+                    PartSums(self._sums, self._lengths, self._bits, *numbers, units)
+                )
+                self._begin(self._open + 1)
             first = past
 
     def _add(
         self, power: Array, variance: Array, quality: npt.NDArray[np.int32], length: Array
     ) -> None:
         profiles = slice(self._added, self._added + len(power))
-        group = self._group[profiles] - self._first_group
+        group, weights = self._group[profiles] - self._first_group, self._weights[profiles]
         # Parts share the variance of their mean.
-        mean = group if self._parts is None else np.zeros_like(group)
-        common = None if self._shared is None else self._shared[mean]
+        common = self._shared
         self._sums.add(
             power,
             variance if common is None else np.maximum(variance - common, 0.0),
             groups=group,
-            weights=self._weights[profiles],
+            weights=weights,
             shared_variance=0.0 if common is None else common,
         )
-        weights = self._weights[profiles]
         self._lengths.add(length[:, np.newaxis], 0.0, groups=group, weights=weights)
         join_bits(frozen(quality), frozen(group), int(~_MISSING), self._bits)
         self._added += len(power)
 
-    def _complete(self, units: Units) -> None:
-        """Keep what is complete."""
-        groups = slice(self._first_group, self._first_group + len(self._bits))
-        profiles, shots = self._profiles[groups], self._shots[groups]
-        if self._parts is not None:
-            self._parts.append(
-                PartSums(self._sums, self._lengths, self._bits, profiles, shots, units)
-            )
-            return
-        length = self._lengths.averages().values[:, 0]
-        means = self._sums.averages(), self._bits, length, profiles, shots
-        self._completed.append(self.labeled(self._open, *means, units))
-
-    def completed_parts(self) -> Iterator[PartSums]:
-        """Yield the sums of the parts of the intervals that are complete, and forget them."""
-        sums = list(self._parts or ())
-        if self._parts is not None:
-            self._parts.clear()
+    def completed(self) -> Iterator[PartSums]:
+        """Yield the sums of the intervals that are complete, and forget them."""
+        sums, self._complete = self._complete, []
         yield from sums
-
-    def completed(self) -> Iterator[xr.Dataset]:
-        """Yield the means that all their profiles were added to, in batches, and forget them.
-
-        Yields
-        ------
-        xr.Dataset
-            ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
-            range), ``noise_correlation_length`` (mean), ``shots`` (sum), ``profiles`` (number) over
-            time. ``time`` is the middle of
-            ``time_bnds``, which span the profiles of the interval. Intervals without a profile are
-            omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
-            profile has data.
-        """
-        batches, self._completed = self._completed, []
-        yield from batches
-
-    def result(self) -> xr.Dataset:
-        """Return the means of all profiles, as `completed` yields them."""
-        return joined(self.completed())
-
-    def labeled(
-        self,
-        means: slice,
-        values: Averages,
-        quality: Flags,
-        length: Array,
-        profiles: Flags,
-        shots: Flags,
-        units: Units,
-    ) -> xr.Dataset:
-        """Return means with their coordinates, as `completed` yields them.
-
-        Parameters
-        ----------
-        means : slice
-            Their numbers.
-        values : Averages
-        quality : (time, range) int32
-            Without INPUT_MISSING.
-        length, profiles, shots : (time,)
-        units : dict of dict
-            Attributes of power, variance and range.
-        """
-        missing = np.where(np.isfinite(values.values), np.int32(0), _MISSING)
-        plane = ("time", "range")
-        return xr.Dataset(
-            {
-                # A copy, because these are part of the sums, which are four times as large.
-                "power": (plane, values.values.copy(), units["power"]),
-                "variance": (plane, values.variance + values.shared_variance, units["variance"]),
-                "quality": (plane, quality | missing),
-                # Without a shot it is not known, and neither is the mean.
-                CORRELATION_LENGTH: ("time", np.nan_to_num(length, nan=1.0), {"units": "1"}),
-                "profiles": ("time", profiles),
-                "shots": ("time", shots),
-            },
-            coords={**self.times_of(means), "range": ("range", self._distance, units["range"])},
-        )
 
 
 def joined(batches: Iterator[xr.Dataset]) -> xr.Dataset:
-    """Return the batches of `ClockAverage.completed` as one Dataset."""
+    """Return batches of means as one Dataset."""
     whole: xr.Dataset = xr.concat(
         list(batches), dim="time", data_vars="minimal", coords="minimal", join="override"
     )
     return whole
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """Means of one record of the light, in the making."""
-
-    means: ClockAverage
-    """With `THRESHOLDS.most_parts` parts."""
-    range: Array
-    """m."""
-    lag: int = 0
-    """Bins by which the record lags behind the last of its channels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,21 +211,21 @@ class Screening:
     night files have some, would cost a part of the mean and change nothing that is retrieved."""
 
 
-class ScreenedAverage:
-    """Means of profiles over intervals of the clock, without outlying parts.
+class ClockAverage:
+    """Means of profiles over intervals of the clock.
 
-    The profiles of an interval are divided into at most `THRESHOLDS.most_parts` parts, and those
-    that are outlying in any record are left out of all (`lidarops.retrieve.signal.averaging`).
-    Chunks of profiles do not change a bit of the result.
+    With a screening, the parts that are outlying in any record are left out of all
+    (`lidarops.retrieve.signal.averaging`). Chunks of profiles do not change a bit of the result.
 
     Parameters
     ----------
-    records : sequence of Record
-        Of one channel or several, two of each that is glued, with bins of equal width.
-    screening : Screening
+    records : sequence of IntervalSums
+        Of one channel or several, two of each that is glued, with bins of equal width; with a
+        screening, of `THRESHOLDS.most_parts` parts.
+    screening : Screening, optional
     """
 
-    def __init__(self, records: Sequence[Record], screening: Screening) -> None:
+    def __init__(self, records: Sequence[IntervalSums], screening: Screening | None = None) -> None:
         self._records, self._screening = records, screening
         distance = records[0].range
         self._step = float(np.median(np.diff(distance))) if distance.size > 1 else 1.0
@@ -321,66 +234,76 @@ class ScreenedAverage:
         self._first_range = float(records[-1].range[0]) + self._first * self._step
         self._past = min(record.range.size for record in records)
         self._open: list[tuple[dict[str, Any], ...]] = []
-        self._units: tuple[dict[str, Any], ...] = ()
         self._number, self._total = 0, self.times.sizes["time"]
         self._completed: list[tuple[xr.Dataset, ...]] = []
 
     @property
     def times(self) -> xr.Dataset:
         """``time`` and ``time_bnds`` of all means."""
-        return self._records[-1].means.times
+        return self._records[-1].times
 
     def add(self, conditioned: Sequence[xr.Dataset]) -> None:
-        """Add the next profiles of each record (`ClockAverage.add`)."""
+        """Add the next profiles of each record (`IntervalSums.add`)."""
         first, count = 0, conditioned[0].sizes["time"]
         while first < count:
             # One interval at a time, because the sums of its parts are large.
-            past = min(first + self._records[0].means.left, count)
+            past = min(first + self._records[0].left, count)
             for record, profiles in zip(self._records, conditioned, strict=True):
-                record.means.add(profiles, slice(first, past))
-            sums = (record.means.completed_parts() for record in self._records)
-            for parts in zip(*sums, strict=True):
+                record.add(profiles, slice(first, past))
+            for parts in zip(*(record.completed() for record in self._records), strict=True):
                 self._complete(parts)
             first = past
 
     def completed(self) -> Iterator[tuple[xr.Dataset, ...]]:
-        """Yield the means that are complete, in batches, of each record; and forget them.
+        """Yield the means that all their profiles were added to, in batches; and forget them.
 
-        They are as those of `ClockAverage.completed`, with these variables more: ``part_power``
-        (background subtracted) and ``part_variance`` over (time, part, cell) of parts that are in
-        the mean, means over cells of ``bins`` (attribute) bins from the first range above zero of
-        the last record on (``first_range``), NaN where missing; ``part_quantum`` (the power of a
-        count in a cell, 0 for analog records) and ``part_profiles`` over (time, part), the numbers
-        of their profiles, and ``profiles_left_out`` over time. ``profiles`` and ``shots`` are those
-        in the mean.
+        Yields
+        ------
+        xr.Dataset of each record
+            ``power``, ``variance`` (of the mean, with the shared part) and ``quality`` over (time,
+            range), ``noise_correlation_length`` (mean), ``shots`` (sum), ``profiles`` (number) over
+            time. ``time`` is the middle of
+            ``time_bnds``, which span the profiles of the interval. Intervals without a profile are
+            omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
+            profile has data.
+
+            With a screening also ``part_power`` (background subtracted) and ``part_variance`` over
+            (time, part, cell) of parts that are in the mean, means over cells of ``bins``
+            (attribute) bins from the first range above zero of the last record on
+            (``first_range``), NaN where missing; ``part_quantum`` (the power of a count in a cell,
+            0 for analog records) and ``part_profiles`` over (time, part), the numbers of their
+            profiles, and ``profiles_left_out`` over time. ``profiles`` and ``shots`` are those in
+            the mean.
         """
         batches, self._completed = self._completed, []
         yield from batches
 
     def _complete(self, parts: tuple[PartSums, ...]) -> None:
-        cells = [
-            self._cells(record, sums) for record, sums in zip(self._records, parts, strict=True)
-        ]
-        compared = slice(int(self._screening.highest / (self._bins * self._step)))
-        left_out = np.logical_or.reduce(
-            [
-                outlying_parts(of_record, compared, contrast=self._screening.contrast)
-                for of_record in cells
+        if self._screening is None:
+            means = (_mean(sums, np.ones(len(sums.quality), np.bool_)) for sums in parts)
+        else:
+            cells = [
+                self._cells(record, sums) for record, sums in zip(self._records, parts, strict=True)
             ]
-        )
-        means = (_mean(sums, c, ~left_out) for sums, c in zip(parts, cells, strict=True))
+            compared = slice(int(self._screening.highest / (self._bins * self._step)))
+            contrast = self._screening.contrast
+            outlying = [outlying_parts(one, compared, contrast=contrast) for one in cells]
+            kept = ~np.logical_or.reduce(outlying)
+            means = (
+                _mean(sums, kept) | _parts(sums, of_cells, kept)
+                for sums, of_cells in zip(parts, cells, strict=True)
+            )
         self._open.append(tuple(means))
-        self._units = tuple(sums.units for sums in parts)
         done = self._number + len(self._open)
         if len(self._open) == MEANS_TOGETHER or done == self._total:
             numbers = slice(self._number, done)
-            batch = zip(self._records, zip(*self._open, strict=True), self._units, strict=True)
+            batch = zip(self._records, zip(*self._open, strict=True), parts, strict=True)
             self._completed.append(
-                tuple(self._labeled(record, numbers, of, units) for record, of, units in batch)
+                tuple(self._labeled(record, numbers, of, sums.units) for record, of, sums in batch)
             )
             self._number, self._open = done, []
 
-    def _cells(self, record: Record, sums: PartSums) -> PartCells:
+    def _cells(self, record: IntervalSums, sums: PartSums) -> PartCells:
         """Return the signal of parts without background, (part, cell), and its variance."""
         usable = (sums.quality & np.int32(WITHHELD)) == 0
         lag = record.lag
@@ -401,30 +324,53 @@ class ScreenedAverage:
         return LICEL_RANGE_PER_MICROSECOND / (np.maximum(sums.shots, 1) * self._step)
 
     def _labeled(
-        self,
-        record: Record,
-        numbers: slice,
-        means: Sequence[dict[str, Any]],
-        units: dict[str, Any],
+        self, record: IntervalSums, numbers: slice, means: Sequence[dict[str, Any]], units: Units
     ) -> xr.Dataset:
+        """Return means of a record with their coordinates, as `completed` yields them."""
         of = {name: np.stack([mean[name] for mean in means]) for name in means[0]}
-        averages = Averages(*(of[name][:, 0] for name in _AVERAGES))
-        labeled = record.means.labeled(
-            numbers, averages, of["quality"], of["length"], of["profiles"], of["shots"], units
+        missing = np.where(np.isfinite(of["power"]), np.int32(0), _MISSING)
+        plane, cells = ("time", "range"), ("time", "part", "cell")
+        labeled = xr.Dataset(
+            {
+                "power": (plane, of["power"], units["power"]),
+                "variance": (plane, of["variance"], units["variance"]),
+                "quality": (plane, of["quality"] | missing),
+                # Without a shot it is not known, and neither is the mean.
+                CORRELATION_LENGTH: ("time", np.nan_to_num(of["length"], nan=1.0), {"units": "1"}),
+                "profiles": ("time", of["profiles"]),
+                "shots": ("time", of["shots"]),
+            },
+            coords={**record.times_of(numbers), "range": ("range", record.range, units["range"])},
         )
-        along = ("time", "part", "cell")
-        cells = {"bins": self._bins, "first_range": self._first_range}
+        if self._screening is None:
+            return labeled
         return labeled.assign(
-            part_power=(along, of["part_power"], cells),
-            part_variance=(along, of["part_variance"]),
-            part_quantum=(along[:2], of["part_quantum"]),
-            part_profiles=(along[:2], of["part_profiles"]),
+            part_power=(
+                cells, of["part_power"], {"bins": self._bins, "first_range": self._first_range}
+            ),
+            part_variance=(cells, of["part_variance"]),
+            part_quantum=(cells[:2], of["part_quantum"]),
+            part_profiles=(cells[:2], of["part_profiles"]),
             profiles_left_out=("time", of["left_out"]),
-        )
+        )  # fmt: skip
 
 
-def _mean(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
-    """Return the mean of the parts that are kept, and their cells: NaN in those that are not."""
+def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:
+    """Return the mean of the parts that are kept."""
+    averages = sums.sums.joined(kept)
+    quality = sums.quality if kept.all() else sums.quality[kept]
+    return {
+        "power": averages.values[0],
+        "variance": (averages.variance + averages.shared_variance)[0],
+        "quality": np.bitwise_or.reduce(quality, axis=0),
+        "length": float(sums.lengths.joined(kept).values[0, 0]),
+        "profiles": np.int32(sums.profiles[kept].sum()),
+        "shots": np.int32(sums.shots[kept].sum()),
+    }
+
+
+def _parts(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
+    """Return the cells of the parts of a mean: NaN in those that are not kept."""
     parts = THRESHOLDS.most_parts
     shape = parts, cells.power.shape[1]
     power, variance = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -432,14 +378,7 @@ def _mean(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
     places = np.flatnonzero(kept)
     power[places], variance[places] = cells.power[places], cells.variance[places]
     quantum[places], of_parts[places] = cells.quantum[places], sums.profiles[places]
-    averages = sums.sums.joined(kept)
-    quality = sums.quality if kept.all() else sums.quality[kept]
     return {
-        **{name: getattr(averages, name) for name in _AVERAGES},
-        "quality": np.bitwise_or.reduce(quality, axis=0),
-        "length": float(sums.lengths.joined(kept).values[0, 0]),
-        "profiles": np.int32(sums.profiles[kept].sum()),
-        "shots": np.int32(sums.shots[kept].sum()),
         "left_out": np.int32(sums.profiles[~kept].sum()),
         "part_power": power,
         "part_variance": variance,

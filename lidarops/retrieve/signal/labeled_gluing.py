@@ -176,7 +176,8 @@ def glue_cells(analog: xr.Dataset, photon: xr.Dataset, glued: xr.Dataset) -> dic
     Parameters
     ----------
     analog, photon : xr.Dataset
-        From `lidarops.retrieve.signal.labeled_averaging.ScreenedAverage`, the lag corrected.
+        From `lidarops.retrieve.signal.labeled_averaging.ClockAverage` with a screening, the lag
+        corrected.
     glued : xr.Dataset
         From `glue`.
     """

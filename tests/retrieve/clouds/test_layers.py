@@ -506,13 +506,10 @@ def test_profiles_are_tested_independently_in_any_layout():
     power, variance = counted(1e17 * true, 5.0, rng)
     whole = detect(power, variance)
     cube = detect(power.reshape(3, 4, -1).astype(np.float32), variance.reshape(3, 4, -1))
-    turned = detected(
-        power[:, ::-1], RANGE[::-1], variance[:, ::-1], molecular_attenuated=SHAPE[::-1]
-    )
+    swapped = detect(np.asfortranarray(power.astype(">f8")), variance)
     assert cube.mask.shape == (3, 4, RANGE.size)
     np.testing.assert_array_equal(cube.cloud_base_range.ravel(), whole.cloud_base_range)
-    np.testing.assert_array_equal(turned.cloud_base_range, whole.cloud_base_range)
-    np.testing.assert_array_equal(turned.mask[:, ::-1], whole.mask)
+    np.testing.assert_array_equal(swapped.mask, whole.mask)
     alone = detect(power[5], variance[5])
     assert alone.cloud_base_range == whole.cloud_base_range[5]
     np.testing.assert_array_equal(alone.mask, whole.mask[5])

@@ -33,7 +33,7 @@ def test_an_uncertain_lidar_ratio_does_not_withhold_clean_air(wavelength, ratio_
     )
     near = RANGE < 8e3
     assert result.valid[near].all()
-    assert np.abs(result.budget.lidar_ratio[near] / backscatter[near]).max() < 0.01
+    assert np.abs(result.budget["lidar_ratio"][near] / backscatter[near]).max() < 0.01
 
 
 def test_bins_beyond_a_thick_layer_of_uncertain_lidar_ratio_are_withheld():

@@ -214,8 +214,8 @@ def test_noise_propagates_with_the_jacobian(setup, spoil):
     bins = np.flatnonzero(np.isfinite(power))
     jacobian = np.stack([derivative_to_bin(i, "backscatter") for i in bins], axis=-1)
     exact = np.sqrt(np.sum(jacobian**2 * variance[bins], axis=-1))
-    np.testing.assert_allclose(result.budget.noise, exact, rtol=1e-6)
-    np.testing.assert_array_equal(np.isnan(result.budget.noise), np.isnan(power))
+    np.testing.assert_allclose(result.budget["noise"], exact, rtol=1e-6)
+    np.testing.assert_array_equal(np.isnan(result.budget["noise"]), np.isnan(power))
 
     gradient = np.array([derivative_to_bin(i, "lidar_constant") for i in bins])
     exact = np.sqrt(np.sum(gradient**2 * variance[bins]))
@@ -262,7 +262,7 @@ def test_each_cause_propagates_as_finite_differences(setup, name):
         exact = slopes(lambda step, field=field: perturbed(step, field), [1e-4])[0]
         size = np.max(np.abs(exact))
         np.testing.assert_allclose(
-            getattr(getattr(result, budget), name), exact, rtol=1e-5, atol=1e-8 * size
+            getattr(result, budget)[name], exact, rtol=1e-5, atol=1e-8 * size
         )
 
 
@@ -273,7 +273,7 @@ def test_the_error_of_the_dead_time_is_the_effect_of_its_change_of_power(setup):
     for field in ("backscatter", "extinction", "scattering_ratio"):
         budget = "budget" if field == "backscatter" else f"{field}_budget"
         np.testing.assert_allclose(
-            getattr(stated, budget).dead_time,
+            getattr(stated, budget)["dead_time"],
             getattr(moved, field) - getattr(still, field),
             rtol=1e-9,
             atol=1e-12 * np.nanmax(getattr(still, field)),
@@ -281,7 +281,7 @@ def test_the_error_of_the_dead_time_is_the_effect_of_its_change_of_power(setup):
     shift = moved.lidar_constant - still.lidar_constant
     expected = np.hypot(still.lidar_constant_standard_error, shift)
     assert stated.lidar_constant_standard_error == pytest.approx(float(expected), rel=1e-9)
-    assert (stated.budget.total >= still.budget.total).all()
+    assert (stated.backscatter_standard_error >= still.backscatter_standard_error).all()
 
 
 def test_errors_of_the_lidar_constant_add_up_to_those_of_its_causes(setup):
@@ -318,21 +318,15 @@ def test_attenuated_backscatter_has_the_errors_of_its_factors():
 def test_total_is_the_quadrature_of_the_budget_and_unknown_noise_stays_unknown():
     result = changed(noisy_setup(COARSE_POWER, COARSE) | ERRORS)
     budget = result.budget
-    errors = [
-        budget.noise,
-        budget.background,
-        budget.reference,
-        budget.lidar_ratio,
-        budget.molecular,
-        budget.dead_time,
-    ]
-    np.testing.assert_allclose(budget.total, np.sqrt(np.sum(np.square(errors), axis=0)), rtol=1e-14)
-    np.testing.assert_array_equal(result.backscatter_standard_error, budget.total)
+    errors = list(budget.values())
+    np.testing.assert_allclose(
+        result.backscatter_standard_error, np.sqrt(np.sum(np.square(errors), axis=0)), rtol=1e-14
+    )
     unknown = changed({**noisy_setup(COARSE_POWER, COARSE), "variance": None} | ERRORS)
-    assert np.all(np.isnan(unknown.budget.total))
+    assert np.all(np.isnan(unknown.backscatter_standard_error))
     assert np.isnan(unknown.lidar_constant_standard_error)
     assert np.all(np.isnan(unknown.attenuated_backscatter_standard_error))
-    np.testing.assert_array_equal(unknown.budget.reference, budget.reference)
+    np.testing.assert_array_equal(unknown.budget["reference"], budget["reference"])
     np.testing.assert_array_equal(unknown.backscatter, result.backscatter)
 
 
@@ -446,8 +440,8 @@ def test_profiles_without_data_or_reference_stay_empty():
     assert np.all(result.valid[0])
     assert not np.any(result.valid[1:])
     for values in (
-        result.backscatter, result.attenuated_backscatter, result.budget.total, result.extinction,
-        result.attenuated_backscatter_standard_error, result.budget.molecular,
+        result.backscatter, result.attenuated_backscatter, result.backscatter_standard_error,
+        result.extinction, result.attenuated_backscatter_standard_error, result.budget["molecular"],
     ):  # fmt: skip
         assert np.all(np.isnan(values[1:]))
         assert np.all(np.isfinite(values[0]))
@@ -503,8 +497,8 @@ def test_negative_powers_are_neither_clipped_nor_refused():
 def fields(result):
     budget = result.budget
     return [
-        result.backscatter, result.attenuated_backscatter, budget.noise, budget.background,
-        budget.lidar_ratio, budget.molecular, budget.reference, result.lidar_constant,
+        result.backscatter, result.attenuated_backscatter, budget["noise"], budget["background"],
+        budget["lidar_ratio"], budget["molecular"], budget["reference"], result.lidar_constant,
         result.lidar_constant_standard_error, result.valid, result.unstable,
         result.attenuated_backscatter_standard_error,
     ]  # fmt: skip
@@ -529,20 +523,14 @@ def test_batches_do_not_change_a_bit():
                 np.testing.assert_array_equal(values, expected[cut])
 
 
-def test_layout_and_order_of_the_arrays_do_not_matter():
+def test_layout_of_the_arrays_does_not_matter():
     measured, r, _, setup = campaign(6, 16)
     whole = fields(invert_elastic(measured, r, **setup))
     cube = fields(invert_elastic(measured.reshape(2, 3, -1), r, **setup))
-    turned = {
-        name: value[..., ::-1] if np.shape(value)[-1:] == r.shape else value
-        for name, value in setup.items()
-    }
-    descending = fields(
-        invert_elastic(np.asfortranarray(measured[:, ::-1]).astype(">f8"), r[::-1], **turned)
-    )
-    for values, in_cube, in_back in zip(whole, cube, descending, strict=True):
+    swapped = fields(invert_elastic(np.asfortranarray(measured).astype(">f8"), r, **setup))
+    for values, in_cube, in_columns in zip(whole, cube, swapped, strict=True):
         np.testing.assert_array_equal(in_cube.reshape(values.shape), values)
-        np.testing.assert_array_equal(in_back[..., ::-1] if values.ndim == 2 else in_back, values)
+        np.testing.assert_array_equal(in_columns, values)
     single = invert_elastic(measured[0], r, **setup)
     np.testing.assert_array_equal(single.backscatter, whole[0][0])
     assert single.lidar_constant.shape == ()
@@ -577,7 +565,9 @@ def test_the_unit_of_the_power_does_not_matter(scale):
     setup["background_standard_error"] *= scale
     scaled = invert_elastic(COARSE_POWER * scale, COARSE, **setup)
     np.testing.assert_allclose(scaled.backscatter, original.backscatter, rtol=1e-9, atol=1e-18)
-    np.testing.assert_allclose(scaled.budget.total, original.budget.total, rtol=1e-9)
+    np.testing.assert_allclose(
+        scaled.backscatter_standard_error, original.backscatter_standard_error, rtol=1e-9
+    )
     assert scaled.lidar_constant == pytest.approx(scale * original.lidar_constant, rel=1e-9)
 
 

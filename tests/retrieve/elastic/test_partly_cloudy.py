@@ -19,8 +19,7 @@ from lidarops.retrieve.elastic.labeled import (
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import (
     ClockAverage,
-    Record,
-    ScreenedAverage,
+    IntervalSums,
     Screening,
 )
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
@@ -83,7 +82,7 @@ def averages(conditioned, edges=(), contrast=None):
     """Return screened means over half an hour; profiles come in chunks that end at `edges`."""
     count = conditioned.sizes["time"]
     shots = xr.DataArray(np.full(count, 2560), dims="time")
-    means = ClockAverage(
+    means = IntervalSums(
         conditioned[["time", "time_bnds"]],
         DISTANCE,
         seconds=1800,
@@ -91,7 +90,7 @@ def averages(conditioned, edges=(), contrast=None):
         parts=THRESHOLDS.most_parts,
     )
     screening = Screening(contrast or cloud_contrast(GREEN), 12_000.0)
-    average = ScreenedAverage([Record(means, DISTANCE)], screening)
+    average = ClockAverage([means], screening)
     for first, past in itertools.pairwise([0, *edges, count]):
         average.add([conditioned.isel(time=slice(first, past))])
     return xr.concat([batch for (batch,) in average.completed()], dim="time", data_vars="minimal")
@@ -295,9 +294,11 @@ def test_without_outliers_the_mean_is_that_of_all_profiles():
     conditioned = profiles(cirrus_of(6))
     means = averages(conditioned)
     shots = xr.DataArray(np.full(PROFILES, 2560), dims="time")
-    plain = ClockAverage(conditioned[["time", "time_bnds"]], DISTANCE, seconds=1800, shots=shots)
-    plain.add(conditioned)
-    for name, values in plain.result().items():
+    sums = IntervalSums(conditioned[["time", "time_bnds"]], DISTANCE, seconds=1800, shots=shots)
+    plain = ClockAverage([sums])
+    plain.add([conditioned])
+    ((whole,),) = plain.completed()
+    for name, values in whole.items():
         np.testing.assert_allclose(means[name], values, rtol=1e-12, err_msg=str(name))
 
 

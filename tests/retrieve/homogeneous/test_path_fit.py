@@ -84,14 +84,13 @@ def test_extinction_is_exact_without_noise(start, length, ratio, kind):
         assert np.max(np.abs(fit.amplitude / expected - 1.0)) < 1e-8
 
 
-def test_spacing_and_order_of_bins_do_not_matter_without_noise():
+def test_spacing_of_bins_does_not_matter_without_noise():
     rng = np.random.default_rng(1)
     r = np.sort(rng.uniform(2500.0, 10500.0, 225))
     extinction = np.geomspace(0.01 * KM, 5.0 * KM, 100)
     power = 10.0 + signal(r, 1.0, extinction)
     fit = fit_homogeneous_path(power, r)
     assert np.max(np.abs(fit.extinction / extinction - 1.0)) < 1e-9
-    same(fit_homogeneous_path(power[:, ::-1], r[::-1]), fit)
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-12, 1e12, 1e30])
@@ -479,7 +478,6 @@ def test_forms_of_input():
     alike(fit_homogeneous_path(power.astype(np.float32), LONG, variance=1.0), expected)
     alike(fit_homogeneous_path(power, LONG, variance=np.ones((1, 225), np.float32)), expected)
     alike(fit_homogeneous_path(power, LONG, variance=np.ones((4, 1))), expected)
-    same(fit_homogeneous_path(power[:, ::-1], LONG[::-1], variance=np.ones(225)[::-1]), expected)
     assert np.array_equal(frozen, power)
     assert fit_homogeneous_path(power[:0], LONG).extinction.shape == (0,)
 
@@ -497,12 +495,6 @@ def test_masked_bins_are_excluded():
     same(fit_homogeneous_path(power, LONG, variance=np.where(holes, np.nan, 1.0)), expected)
 
 
-def test_descending_range_reverses_variance_too():
-    power, variance = clean(3), np.linspace(0.5, 2.0, 225)
-    expected = fit_homogeneous_path(power, LONG, variance=variance)
-    same(fit_homogeneous_path(power[:, ::-1], LONG[::-1], variance=variance[::-1]), expected)
-
-
 @pytest.mark.parametrize(
     ("arguments", "field", "words"),
     [
@@ -513,7 +505,7 @@ def test_descending_range_reverses_variance_too():
         ({"power": np.ones(225, bool)}, "power", "bool"),
         ({"range": LONG / 1000.0}, "range", "must be in m"),
         ({"range": LONG - 2500.0}, "range", "starts at 0 m"),
-        ({"range": LONG[[1, 0, *range(2, 225)]]}, "range", "monotonic"),
+        ({"range": LONG[[1, 0, *range(2, 225)]]}, "range", "ascending"),
         ({"range": np.where(LONG > 9000, np.nan, LONG)}, "range", "finite"),
         ({"range": LONG[np.newaxis]}, "range", "one value"),
         ({"range": []}, "range", "one value"),

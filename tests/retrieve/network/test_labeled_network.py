@@ -12,7 +12,7 @@ from support.products.made_network import EXTINCTION, beam, network, product, wi
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
-from lidarops.retrieve.air.labeled import VisibilityDefinition
+from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.network import labeled
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.labeled import NetworkSettings, retrieve_network

@@ -16,8 +16,7 @@ from lidarops.retrieve.raman.signals import largest_of_cells, make_cells, state_
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import (
     ClockAverage,
-    Record,
-    ScreenedAverage,
+    IntervalSums,
     Screening,
 )
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
@@ -60,11 +59,11 @@ def averages(profiles):
     shots = xr.DataArray(np.full(PROFILES, 10_000), dims="time")
     times = profiles[0][["time", "time_bnds"]]
     means = (
-        ClockAverage(times, R, seconds=1800, shots=shots, parts=THRESHOLDS.most_parts)
+        IntervalSums(times, R, seconds=1800, shots=shots, parts=THRESHOLDS.most_parts)
         for _ in profiles
     )
     screening = Screening(cloud_contrast(LASER), 12_000.0)
-    average = ScreenedAverage([Record(of_channel, R) for of_channel in means], screening)
+    average = ClockAverage(means, screening)
     average.add(profiles)
     ((elastic, raman),) = average.completed()
     return elastic, raman

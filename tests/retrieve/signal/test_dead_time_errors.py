@@ -10,7 +10,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.products.signal.variables import FLAGS
 from lidarops.retrieve.signal.labeled import condition, correct_for_range
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums
 from lidarops.retrieve.signal.labeled_gluing import glue
 from lidarops.simulate.counting import count_photons, release
 
@@ -129,9 +129,11 @@ def test_the_error_of_the_dead_time_does_not_average_down():
         condition(data, "analog"),
         condition(data, "photon", dead_time=DEAD_TIME),
     ):
-        means = ClockAverage(geometry, RANGE, seconds=600.0, shots=data["photon_shots"])
-        means.add(part)
-        parts.append(means.result())
+        sums = IntervalSums(geometry, RANGE, seconds=600.0, shots=data["photon_shots"])
+        means = ClockAverage([sums])
+        means.add([part])
+        ((whole,),) = means.completed()
+        parts.append(whole)
     mean = correct_for_range(glue(*parts), TAIL)
     inside = (RANGE > 300.0) & (RANGE < 3000.0)
     assert conditioned.sizes["time"] == 20

@@ -13,7 +13,11 @@ from hypothesis import strategies as st
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.signal.dark import DarkSignals
-from lidarops.retrieve.signal.labeled_averaging import ClockAverage
+from lidarops.retrieve.signal.labeled_averaging import (
+    ClockAverage,
+    IntervalSums,
+    joined,
+)
 
 BINS = 16
 MIDNIGHT = np.datetime64("2026-03-01T00:00:00", "ns")
@@ -22,10 +26,17 @@ SECOND = np.timedelta64(1_000_000_000, "ns")
 
 def clock_average(conditioned, **settings):
     """Return the means of profiles that come in one chunk."""
+    return chunked([conditioned], conditioned, **settings)
+
+
+def chunked(chunks, conditioned, **settings):
+    """Return the means of conditioned profiles that come in chunks."""
     distance = conditioned["range"].to_numpy()
-    average = ClockAverage(conditioned[["time", "time_bnds"]], distance, **settings)
-    average.add(conditioned)
-    return average.result()
+    sums = IntervalSums(conditioned[["time", "time_bnds"]], distance, **settings)
+    average = ClockAverage([sums])
+    for chunk in chunks:
+        average.add([chunk])
+    return joined(means for (means,) in average.completed())
 
 
 def made(minutes, *, seed=0, length=60):
@@ -195,10 +206,8 @@ def test_chunks_do_not_change_a_bit(edges, dark):
         return np.full((times.size, BINS), 0.25)
 
     common = {"seconds": 600, "shots": LONG_SHOTS, "shared_variance": shared if dark else None}
-    average = ClockAverage(LONG[["time", "time_bnds"]], LONG["range"].to_numpy(), **common)
-    for first, past in itertools.pairwise([0, *edges, 700]):
-        average.add(LONG.isel(time=slice(first, past)))
-    xr.testing.assert_identical(average.result(), clock_average(LONG, **common))
+    chunks = [LONG.isel(time=slice(*ends)) for ends in itertools.pairwise([0, *edges, 700])]
+    xr.testing.assert_identical(chunked(chunks, LONG, **common), clock_average(LONG, **common))
 
 
 def test_a_mean_may_hold_more_profiles_than_are_averaged_together():

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.retrieve.air.labeled import VisibilityDefinition
+from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.labeled import (
     BeamAverages,
