@@ -58,10 +58,10 @@ def averages(profiles):
     """Return the screened means over half an hour of both channels."""
     shots = xr.DataArray(np.full(PROFILES, 10_000), dims="time")
     times = profiles[0][["time", "time_bnds"]]
-    means = (
+    means = [
         IntervalSums(times, R, seconds=1800, shots=shots, parts=THRESHOLDS.most_parts)
         for _ in profiles
-    )
+    ]
     screening = Screening(cloud_contrast(LASER), 12_000.0)
     average = ClockAverage(means, screening)
     average.add(profiles)
