@@ -54,7 +54,7 @@ from lidarops.catalog.store import RunStatus, Store
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
-from lidarops.reports import run_page
+from lidarops.reports import run_tables
 from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
 from lidarops.run.archive import (
@@ -185,7 +185,7 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     built = report_run(campaign, record, workers=workers)
     key = campaign.name.lower()
     create_table_artifact(
-        key=f"{key}-products", table=run_page.summary_rows(record), description=f"Run {record.id}"
+        key=f"{key}-products", table=run_tables.instruments(record), description=f"Run {record.id}"
     )
     create_link_artifact(built.page.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
     if built.quicklook is not None:

@@ -37,36 +37,6 @@ _SHOWN: Final = 9
 
 
 @dataclass(frozen=True, slots=True)
-class ProductLink:
-    """A product in the table of scenes."""
-
-    label: str
-    href: str
-    """Empty where the file is missing."""
-    quality: str
-    empty: bool
-    """Whether no value is usable."""
-    size: str
-    sha256: str
-    path: str
-
-
-@dataclass(frozen=True, slots=True)
-class SceneRow:
-    """A row of the table of scenes."""
-
-    scene: str
-    instrument: str
-    start: str
-    granules: int
-    outcome: str
-    products: tuple[ProductLink, ...]
-    seconds: tuple[str, ...]
-    """Time by stage, in the order of the table's columns."""
-    plan_hash: str
-
-
-@dataclass(frozen=True, slots=True)
 class RunReport:
     """Files of a report."""
 
@@ -118,26 +88,6 @@ def build_report(
     return RunReport(target, folder / pictures[0].file if pictures else None)
 
 
-def summary_rows(record: RunRecord) -> list[dict[str, str | int]]:
-    """Return one row of plain values per instrument, for tables outside the report."""
-    return [
-        {
-            "station": row.station,
-            "instrument": row.instrument,
-            "scenes": row.scenes,
-            "failed": row.failed,
-            "internal errors": row.internal,
-            "granules": row.granules,
-            "refused": row.refused,
-            "products": row.products,
-            "retrieved values": row.values,
-            "quality": row.quality,
-            "time": duration(row.seconds),
-        }
-        for row in run_tables.instruments(record)
-    ]
-
-
 def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
     missing = gallery.missing_products(record)
     problems = {problem.path: problem.reason for problem in filled.problems}
@@ -162,7 +112,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         instruments=run_tables.instruments(record),
         stages=stages,
         scenes=[
-            _scene_row(scene, record, folder, missing, [stage.stage for stage in stages])
+            _scene_row(scene, record, folder, missing, [row["stage"] for row in stages])
             for scene in record.scenes[:ROWS]
         ],
         left_out=run_tables.left_out(record),
@@ -206,31 +156,32 @@ def _scene_row(
     folder: Path,
     missing: frozenset[str],
     stages: Sequence[str],
-) -> SceneRow:
+) -> run_tables.Row:
+    """Return the row of a scene, with times in the order of stages."""
     quality = run_tables.quality_words(scene)
-    return SceneRow(
-        scene=scene.scene,
-        instrument=scene.instrument,
-        start=run_tables.moment(scene.start).removesuffix(":00 UTC").removesuffix(" UTC"),
-        granules=scene.granules,
-        outcome=run_tables.outcome_word(scene),
-        products=tuple(
-            ProductLink(
-                label=f"{product.kind} {product.channel}",
-                href="" if product.path in missing else _href(record, product.path, folder),
-                quality=quality[product.path],
-                empty=product.usable == 0,
-                size=size(product.size),
-                sha256=product.sha256,
-                path=product.path,
-            )
+    return {
+        "scene": scene.scene,
+        "instrument": scene.instrument,
+        "start": run_tables.moment(scene.start).removesuffix(":00 UTC").removesuffix(" UTC"),
+        "granules": scene.granules,
+        "outcome": run_tables.outcome_word(scene),
+        "products": [
+            {
+                "label": f"{product.kind} {product.channel}",
+                "href": "" if product.path in missing else _href(record, product.path, folder),
+                "quality": quality[product.path],
+                "empty": product.usable == 0,
+                "size": size(product.size),
+                "sha256": product.sha256,
+                "path": product.path,
+            }
             for product in scene.products
-        ),
-        seconds=tuple(
+        ],
+        "seconds": [
             duration(scene.seconds[stage]) if stage in scene.seconds else "" for stage in stages
-        ),
-        plan_hash=scene.plan.hash if scene.plan else "",
-    )
+        ],
+        "plan_hash": scene.plan.hash if scene.plan else "",
+    }
 
 
 def _href(record: RunRecord, product: str, folder: Path) -> str:

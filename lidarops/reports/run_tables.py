@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Final, NamedTuple
+from typing import Any, Final, TypeVar
 
 from lidarops.figures.wording import (
     change_in_words,
@@ -33,133 +33,41 @@ from lidarops.records import (
 from lidarops.reports.findings import disagreement_rows, finding_rows, scene_note_rows, unmade_words
 from lidarops.scene.choices import idle_window
 
+_T = TypeVar("_T")
 _MOST_NAMES: Final = 8
 """Most names listed in one cell."""
 _LAST: Final = 1 << PLACES
 """Place of unknown bits in a table."""
 
-
-@dataclass(frozen=True, slots=True)
-class DecisionRow:
-    """A step that was carried out or left out for one reason, over all scenes where it was."""
-
-    step: str
-    reason: str
-    rule: str
-    """Name of the rule that decided."""
-    number: str
-    """Number that the rule decided on: a value, or the range over these scenes."""
-    channels: str
-    instruments: str
-    scenes: int
+Row = dict[str, Any]
+"""Values of a row of a table, by column."""
 
 
-@dataclass(frozen=True, slots=True)
-class FlagRow:
-    """Counts of one quality bit over all products of a kind."""
-
-    kind: str
-    bit: str
-    severity: str
-    description: str
-    count: int
-    share: str
-    products: int
-
-
-@dataclass(frozen=True, slots=True)
-class RefusedRow:
-    """Files that were refused for the same reason."""
-
-    reason: str
-    when: str
-    """``while cataloguing`` or ``while processing``."""
-    files: tuple[str, ...]
-    days: str
-    """UTC days on which they start, as far as their headers tell."""
-
-
-@dataclass(frozen=True, slots=True)
-class NoProductRow:
-    """Scenes without product for the same reason."""
-
-    reason: str
-    scenes: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class StageRow:
-    """Time of one stage over all scenes."""
-
-    stage: str
-    total: str
-    share: str
-    longest: str
-    longest_scene: str
-
-
-@dataclass(frozen=True, slots=True)
-class InstrumentRow:
-    """Counts over the scenes of one instrument."""
-
-    station: str
-    instrument: str
-    scenes: int
-    failed: int
-    """Without those that ended with an internal error."""
-    internal: int
-    granules: int
-    refused: int
-    products: int
-    values: int
-    verdicts: Verdicts
-    """Of the retrieved values."""
-    seconds: float
-
-    @property
-    def quality(self) -> str:
-        """Shares of good values, of those to be used with care, and of rejected ones."""
-        return verdicts_in_words(self.verdicts)
-
-
-class ChangeRow(NamedTuple):
-    """How a product differs from the one that it replaces."""
-
-    scene: str
-    label: str
-    version: int
-    grade: str
-    difference: str
-    cause: str
-
-
-def changes(record: RunRecord) -> list[ChangeRow]:
-    """Return the products that were made again, the largest changes first."""
+def changes(record: RunRecord) -> list[Row]:
+    """Return how products differ from those that they replace, the largest changes first."""
     rows = [
-        (
-            change.grade,
-            ChangeRow(
-                scene.scene,
-                f"{product.kind} {product.channel}",
-                product.stamp.version,
-                change.grade.value,
-                change_in_words(change),
-                "; ".join(change.causes),
-            ),
-        )
+        {
+            "scene": scene.scene,
+            "label": f"{product.kind} {product.channel}",
+            "version": product.stamp.version,
+            "grade": change.grade.value,
+            "difference": change_in_words(change),
+            "cause": "; ".join(change.causes),
+        }
         for scene in record.scenes
         for product in scene.products
         for change in [product.change]
         if change is not None
     ]
     order = list(Grade)
-    return [row for _, row in sorted(rows, key=lambda pair: -order.index(pair[0]))]
+    return sorted(rows, key=lambda row: -order.index(Grade(row["grade"])))
 
 
 def summary(record: RunRecord) -> list[tuple[str, str]]:
     """Return the terms and values at the head of the report."""
     done = [scene for scene in record.scenes if not scene.error]
     failed, internal = len(failed_scenes(record)), len(internal_errors(record))
+    took = sum(scene.cpu_seconds for scene in record.scenes)
     ended_internally = f", {internal:,} with an internal error" if internal else ""
     processed = sum(
         scene.granules - sum(file.role is Role.SIGNAL for file in scene.refused) for scene in done
@@ -172,7 +80,7 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
         ("Version", record.version),
         ("Started", moment(record.started)),
         ("Duration", duration((record.finished - record.started).total_seconds())),
-        *_cpu_time(record),
+        *([("CPU time of scenes", duration(took))] if took else []),
         (
             "Scenes",
             counted(len(record.scenes), "scene") + f", {failed:,} failed{ended_internally}",
@@ -197,12 +105,6 @@ def failed_scenes(record: RunRecord) -> list[SceneOutcome]:
 def internal_errors(record: RunRecord) -> list[SceneOutcome]:
     """Return the scenes that ended with an internal error, a bug of lidarops."""
     return [scene for scene in record.scenes if scene.internal]
-
-
-def _cpu_time(record: RunRecord) -> list[tuple[str, str]]:
-    """Return the CPU time of scenes, if it was measured."""
-    took = sum(scene.cpu_seconds for scene in record.scenes)
-    return [("CPU time of scenes", duration(took))] if took else []
 
 
 def verdict(record: RunRecord) -> str:
@@ -232,9 +134,9 @@ def _problems(record: RunRecord) -> Iterator[str]:
         yield f"{counted(internal, 'scene')} ended with an internal error"
     if failed:
         yield f"{counted(failed, 'scene')} failed"
-    refused = _refused_granules(record)
+    refused = _number_refused(record)
     if refused:
-        yield refused
+        yield f"{counted(refused, 'granule')} refused"
     unusable = [scene.scene for scene in record.scenes if scene.unusable]
     if unusable:
         yield f"{counted(len(unusable), 'scene')} without a usable value: {listed(unusable)}"
@@ -267,37 +169,29 @@ def _cautions(record: RunRecord) -> Iterator[str]:
         yield f"Requested, but made in no scene: {listed(unmade)}"
 
 
-def _refused_granules(record: RunRecord) -> str:
-    refused = _number_refused(record)
-    return f"{counted(refused, 'granule')} refused" if refused else ""
-
-
 def _number_refused(record: RunRecord) -> int:
     """Return the number of refused files; several scenes may have refused a dark file."""
     of_scenes = (scene.refused for scene in record.scenes)
     return len({granule.path for granule in itertools.chain(record.refused, *of_scenes)})
 
 
-def instruments(record: RunRecord) -> list[InstrumentRow]:
+def instruments(record: RunRecord) -> list[Row]:
     """Return one row per instrument with a scene or a refused granule."""
-    stations: dict[str, str] = {}
     scenes: dict[str, list[SceneOutcome]] = defaultdict(list)
     for scene in record.scenes:
-        stations.setdefault(scene.instrument, scene.station)
         scenes[scene.instrument].append(scene)
     refused = Counter(granule.instrument for granule in record.refused)
     return [
-        _instrument_row(stations.get(name, ""), name, scenes[name], refused[name])
-        for name in sorted({*scenes, *refused})
+        _instrument_row(name, scenes[name], refused[name]) for name in sorted({*scenes, *refused})
     ]
 
 
-def left_out(record: RunRecord) -> list[DecisionRow]:
+def left_out(record: RunRecord) -> list[Row]:
     """Group steps that were left out by step and reason, the most frequent of a step first."""
     return _decisions(record, _left_out)
 
 
-def carried_out(record: RunRecord) -> list[DecisionRow]:
+def carried_out(record: RunRecord) -> list[Row]:
     """Group steps that were carried out by step and reason, the most frequent of a step first."""
     return _decisions(record, _carried_out)
 
@@ -317,70 +211,62 @@ def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:
 
 def _decisions(
     record: RunRecord, items_of: Callable[[SceneOutcome], Iterable[PlannedStep | LeftOut]]
-) -> list[DecisionRow]:
-    scenes: dict[tuple[str, str, str], set[str]] = defaultdict(set)
-    channels: dict[tuple[str, str, str], set[str]] = defaultdict(set)
-    names: dict[tuple[str, str, str], set[str]] = defaultdict(set)
-    numbers: dict[tuple[str, str, str], set[float]] = defaultdict(set)
+) -> list[Row]:
+    groups = defaultdict[tuple[str, str, str], list[tuple[SceneOutcome, PlannedStep | LeftOut]]](
+        list
+    )
     for scene in record.scenes:
         for item in items_of(scene):
-            key = (item.name, item.reason, item.rule)
-            scenes[key].add(scene.scene)
-            channels[key].add(item.channel)
-            names[key].add(scene.instrument)
-            if item.number is not None:
-                numbers[key].add(item.number)
-    return [
-        DecisionRow(
-            step=key[0],
-            reason=key[1],
-            rule=key[2],
-            number=" to ".join(dict.fromkeys(decided_on(end(numbers[key])) for end in (min, max)))
-            if numbers[key]
-            else "",
-            channels=listed(channels[key]),
-            instruments=listed(names[key]),
-            scenes=len(scenes[key]),
-        )
-        for key in sorted(scenes, key=lambda key: (key[0], -len(scenes[key]), key[1]))
-    ]
-
-
-def flags(record: RunRecord) -> list[FlagRow]:
-    """Return one row per product kind and quality bit that its values carry."""
-    values: Counter[str] = Counter()
-    counts: dict[str, Counter[str]] = defaultdict(Counter)
-    products: Counter[tuple[str, str]] = Counter()
-    for scene in record.scenes:
-        for product in scene.products:
-            values[product.kind] += product.values
-            for name, count in product.flagged.items():
-                if count:
-                    counts[product.kind][name.lower()] += count
-                    products[product.kind, name.lower()] += 1
+            groups[item.name, item.reason, item.rule].append((scene, item))
     rows = []
-    for kind in sorted(counts):
-        known = flags_of(kind) if kind in kinds() else ()
-        bits = {bit.word: bit for bit in known}
-        for name in sorted(counts[kind], key=lambda name: (bits.get(name, _LAST), name)):
-            count = counts[kind][name]
+    for (step, reason, rule), alike in groups.items():
+        numbers = [item.number for _, item in alike if item.number is not None]
+        # One value, or the range over these scenes.
+        ends = [decided_on(end(numbers)) for end in (min, max) if numbers]
+        rows.append(
+            {
+                "step": step,
+                "reason": reason,
+                "rule": rule,
+                "number": " to ".join(dict.fromkeys(ends)),
+                "channels": listed({item.channel for _, item in alike}),
+                "instruments": listed({scene.instrument for scene, _ in alike}),
+                "scenes": len({scene.scene for scene, _ in alike}),
+            }
+        )
+    return sorted(rows, key=lambda row: (row["step"], -row["scenes"], row["reason"]))
+
+
+def flags(record: RunRecord) -> list[Row]:
+    """Return one row per product kind and quality bit that its values carry."""
+    products = [product for scene in record.scenes for product in scene.products]
+    rows = []
+    for kind in sorted({product.kind for product in products}):
+        own = [product for product in products if product.kind == kind]
+        values = sum(product.values for product in own)
+        bits = {bit.word: bit for bit in (flags_of(kind) if kind in kinds() else ())}
+        counts: dict[str, list[int]] = defaultdict(list)
+        for name, count in (item for product in own for item in product.flagged.items()):
+            if count:
+                counts[name.lower()].append(count)
+        for name in sorted(counts, key=lambda name: (bits.get(name, _LAST), name)):
             severity, description = _about(bits.get(name))
             rows.append(
-                FlagRow(
-                    kind=kind,
-                    bit=name,
-                    severity=severity,
-                    description=description,
-                    count=count,
-                    share=percent(count / values[kind]) if values[kind] else "no value",
-                    products=products[kind, name],
-                )
+                {
+                    "kind": kind,
+                    "bit": name,
+                    "severity": severity,
+                    "description": description,
+                    "count": sum(counts[name]),
+                    "share": percent(sum(counts[name]) / values) if values else "no value",
+                    "products": len(counts[name]),
+                }
             )
     return rows
 
 
-def refused(record: RunRecord) -> list[RefusedRow]:
-    """Group refused granules by reason, the most frequent first."""
+def refused(record: RunRecord) -> list[Row]:
+    """Group refused granules by reason, the most frequent first, with the UTC days of starts."""
     granules: dict[tuple[str, str], list[Granule]] = defaultdict(list)
     for granule in record.refused:
         granules[granule.reason, "while cataloguing"].append(granule)
@@ -388,50 +274,50 @@ def refused(record: RunRecord) -> list[RefusedRow]:
         for granule in scene.refused:
             granules[granule.reason, "while processing"].append(granule)
     return [
-        RefusedRow(
-            reason or "no reason was recorded",
-            when,
-            tuple(sorted({granule.path for granule in alike})),
-            listed({f"{granule.start:%Y-%m-%d}" for granule in alike if granule.start}),
-        )
-        for (reason, when), alike in sorted(
-            granules.items(), key=lambda item: (-len(item[1]), item[0])
-        )
+        {
+            "reason": reason or "no reason was recorded",
+            "when": when,
+            "files": sorted({granule.path for granule in alike}),
+            "days": listed({f"{granule.start:%Y-%m-%d}" for granule in alike if granule.start}),
+        }
+        for (reason, when), alike in _most_frequent_first(granules)
     ]
 
 
-def scenes_without_product(record: RunRecord) -> list[NoProductRow]:
+def scenes_without_product(record: RunRecord) -> list[Row]:
     """Group scenes without product by reason, the most frequent first."""
     scenes: dict[str, list[str]] = defaultdict(list)
     for scene, reason in record.empty_scenes.items():
         scenes[reason].append(scene)
     return [
-        NoProductRow(reason, tuple(sorted(names)))
-        for reason, names in sorted(scenes.items(), key=lambda item: (-len(item[1]), item[0]))
+        {"reason": reason, "scenes": sorted(names)}
+        for reason, names in _most_frequent_first(scenes)
     ]
 
 
-def stages(record: RunRecord) -> list[StageRow]:
+def _most_frequent_first(groups: Mapping[Any, list[_T]]) -> list[tuple[Any, list[_T]]]:
+    return sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
+
+
+def stages(record: RunRecord) -> list[Row]:
     """Return the time of each stage, in the order in which scenes list them."""
     times: dict[str, list[tuple[float, str]]] = defaultdict(list)
     for scene in record.scenes:
         for stage, seconds in scene.seconds.items():
             times[stage].append((seconds, scene.scene))
-    all_seconds = sum(seconds for rows in times.values() for seconds, _ in rows)
-    rows = []
-    for stage, spent in times.items():
-        total = sum(seconds for seconds, _ in spent)
-        longest, scene_id = max(spent, key=lambda row: row[0])
-        rows.append(
-            StageRow(
-                stage=stage,
-                total=duration(total),
-                share=percent(total / all_seconds) if all_seconds > 0 else "0 %",
-                longest=duration(longest),
-                longest_scene=scene_id,
-            )
-        )
-    return rows
+    totals = {stage: sum(seconds for seconds, _ in spent) for stage, spent in times.items()}
+    whole = sum(totals.values())
+    longest = {stage: max(spent, key=lambda row: row[0]) for stage, spent in times.items()}
+    return [
+        {
+            "stage": stage,
+            "total": duration(total),
+            "share": percent(total / whole) if whole > 0 else "0 %",
+            "longest": duration(longest[stage][0]),
+            "longest_scene": longest[stage][1],
+        }
+        for stage, total in totals.items()
+    ]
 
 
 def listed(names: Iterable[str]) -> str:
@@ -474,25 +360,23 @@ def _sum(several: Iterable[Verdicts]) -> Verdicts:
     return Verdicts(*(sum(counts) for counts in zip((0, 0, 0), *several, strict=True)))
 
 
-def _instrument_row(
-    station: str, name: str, scenes: Sequence[SceneOutcome], refused_before: int
-) -> InstrumentRow:
-    retrieved = [
-        product for scene in scenes for product in scene.products if is_retrieved(product.kind)
-    ]
-    return InstrumentRow(
-        station=station,
-        instrument=name,
-        scenes=len(scenes),
-        failed=sum(bool(scene.error) and not scene.internal for scene in scenes),
-        internal=sum(bool(scene.internal) for scene in scenes),
-        granules=sum(scene.granules for scene in scenes),
-        refused=refused_before + sum(len(scene.refused) for scene in scenes),
-        products=sum(len(scene.products) for scene in scenes),
-        values=sum(product.values for product in retrieved),
-        verdicts=_sum(product.verdicts for product in retrieved),
-        seconds=sum(sum(scene.seconds.values()) for scene in scenes),
-    )
+def _instrument_row(name: str, scenes: Sequence[SceneOutcome], refused_before: int) -> Row:
+    """Return counts of an instrument; failed scenes are those without an internal error."""
+    products = [product for scene in scenes for product in scene.products]
+    retrieved = [product for product in products if is_retrieved(product.kind)]
+    return {
+        "station": scenes[0].station if scenes else "",
+        "instrument": name,
+        "scenes": len(scenes),
+        "failed": sum(bool(scene.error) and not scene.internal for scene in scenes),
+        "internal errors": sum(bool(scene.internal) for scene in scenes),
+        "granules": sum(scene.granules for scene in scenes),
+        "refused": refused_before + sum(len(scene.refused) for scene in scenes),
+        "products": len(products),
+        "retrieved values": sum(product.values for product in retrieved),
+        "quality": verdicts_in_words(_sum(product.verdicts for product in retrieved)),
+        "time": duration(sum(sum(scene.seconds.values()) for scene in scenes)),
+    }
 
 
 def _about(bit: FlagBit | None) -> tuple[str, str]:

@@ -12,7 +12,7 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -140,6 +140,7 @@ def process_jobs(
     stop: StopRequest | None = None,
     taken: Callable[[Job], None] | None = None,
     memory: int | None = None,
+    alone: bool = False,
 ) -> Iterator[EndedScene]:
     """Process jobs and yield the scenes in the order in which they end.
 
@@ -155,22 +156,35 @@ def process_jobs(
         Called with a job before it starts.
     memory : int, optional
         Bytes that this process may use; workers have limits of their own.
+    alone : bool, optional
+        Whether scenes may kill their worker: on a cluster only one runs at a time, to know which
+        one does. A scene that kills its worker every time ends as failed.
 
     Yields
     ------
     EndedScene
     """
     stop = StopRequest() if stop is None else stop
+    started = _started(jobs, stop, taken)
     if client is not None:
-        yield from _ClusterQueue(client, stop, taken).run(jobs)
+        cluster = _ClusterQueue(client, stop)
+        yield from cluster.one_by_one(started) if alone else cluster.all_at_once(started)
         return
     keep_memory()
+    for job in started:
+        yield EndedScene(*_attempt(job, memory))
+
+
+def _started(
+    jobs: Iterable[Job], stop: StopRequest, taken: Callable[[Job], None] | None
+) -> Iterator[Job]:
+    """Yield the jobs that start, each once, however often it is tried."""
     for job in jobs:
         if stop:
             return
         if taken:
             taken(job)
-        yield EndedScene(*_attempt(job, memory))
+        yield job
 
 
 def fitted(job: Job, limit: int | None) -> Job:
@@ -233,41 +247,6 @@ def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:
     return *attempt(fit), False
 
 
-def process_one_by_one(
-    jobs: Sequence[Job], *, client: Client, stop: StopRequest
-) -> Iterator[EndedScene]:
-    """Process scenes that may kill their worker, one at a time, to know which one does.
-
-    Parameters
-    ----------
-    jobs : sequence of Job
-    client : distributed.Client
-    stop : StopRequest
-
-    Yields
-    ------
-    EndedScene
-        A scene that kills its worker every time ends as failed.
-    """
-    workers = _Workers(client)
-    for job in jobs:
-        for tries in range(MOST_TRIES):
-            workers.ready(stop)
-            if stop:
-                return
-            future = _submit(client, job)
-            _wait(future, workers)
-            ended = _outcome_of(future, job)
-            future.release()
-            if ended is not None:
-                yield replace(ended, lost_worker=tries > 0)
-                break
-        else:
-            reason = f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
-            failed = EndedScene.failed(Failure(reason), job.scene, job.plan)
-            yield replace(failed, lost_worker=True)
-
-
 def _submit(client: Client, job: Job) -> Future:
     # As bytes: the scheduler would unpickle and pickle a job.
     return client.submit(_on_worker, pickle.dumps(job), joint_code_version(), pure=False)
@@ -282,19 +261,6 @@ def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool, bool] | s
         return f"the worker has other code of lidarops: {joint_code_version()}, not {code}"
     job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
     return _attempt(job, get_worker().memory_manager.memory_limit)
-
-
-def _wait(future: Future, workers: _Workers) -> None:
-    """Wait for a scene to end; raise SceneError if the workers are lost."""
-    done: queue.SimpleQueue[Future] = queue.SimpleQueue()
-    future.add_done_callback(done.put)
-    while True:
-        workers.count()
-        try:
-            done.get(timeout=RECOUNT_INTERVAL)
-        except queue.Empty:
-            continue
-        return
 
 
 class _Workers:
@@ -346,19 +312,37 @@ class _Workers:
 class _ClusterQueue:
     """Keeps a cluster busy with a few scenes per worker, whatever the number of scenes."""
 
-    def __init__(
-        self, client: Client, stop: StopRequest, taken: Callable[[Job], None] | None
-    ) -> None:
+    def __init__(self, client: Client, stop: StopRequest) -> None:
         self._client = client
         self._stop = stop
-        self._taken = taken
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._running: dict[Future, Job] = {}
         self._suspects: list[Job] = []
         self._workers = _Workers(client)
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[EndedScene]:
-        source = iter(jobs)
+    def all_at_once(self, jobs: Iterable[Job]) -> Iterator[EndedScene]:
+        yield from self._ended(iter(jobs))
+        # Those whose worker died: another scene on it may be the cause.
+        suspects, self._suspects = self._suspects, []
+        for ended in self.one_by_one(suspects):
+            yield replace(ended, lost_worker=True)
+
+    def one_by_one(self, jobs: Iterable[Job]) -> Iterator[EndedScene]:
+        for job in jobs:
+            for tries in range(MOST_TRIES):
+                self._workers.ready(self._stop)
+                ended = list(self._ended(iter([job])))
+                if self._stop and not ended:
+                    return
+                if ended:
+                    yield replace(ended[0], lost_worker=tries > 0)
+                    break
+            else:
+                reason = f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
+                failed = EndedScene.failed(Failure(reason), job.scene, job.plan)
+                yield replace(failed, lost_worker=True)
+
+    def _ended(self, source: Iterator[Job]) -> Iterator[EndedScene]:
         self._fill(source)
         stop_requested = None
         while self._running:
@@ -383,8 +367,6 @@ class _ClusterQueue:
                 self._suspects.append(job)
             else:
                 yield ended
-        for ended in process_one_by_one(self._suspects, client=self._client, stop=self._stop):
-            yield replace(ended, lost_worker=True)
 
     def _fill(self, source: Iterator[Job]) -> None:
         room = max(LEAST_SCENES_AHEAD, SCENES_PER_THREAD * self._workers.count())
@@ -392,8 +374,6 @@ class _ClusterQueue:
             job = next(source, None)
             if job is None:
                 return
-            if self._taken:
-                self._taken(job)
             future = _submit(self._client, job)
             self._running[future] = job
             future.add_done_callback(self._done.put)

@@ -25,7 +25,6 @@ from lidarops.run.executor import (
     EndedScene,
     StopRequest,
     process_jobs,
-    process_one_by_one,
     read_bytes,
 )
 from lidarops.run.findings import find
@@ -186,9 +185,9 @@ class Pass:
                     own = partial(local_client, 1, memory=options.memory)
                     used_client = self._reached(own, stack, stop)
                 if used_client is not None:
-                    for job in self.suspects:
-                        self._take(job)
-                    ended = process_one_by_one(self.suspects, client=used_client, stop=stop)
+                    ended = process_jobs(
+                        self.suspects, client=used_client, stop=stop, taken=self._take, alone=True
+                    )
                     self._enter(ended, stop)
 
     def _process_reduced(

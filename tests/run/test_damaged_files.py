@@ -93,9 +93,9 @@ def test_a_damaged_line_end_between_datasets_costs_its_file_only(
     assert not result.failures
     assert result.record is not None
     [row] = run_tables.refused(result.record)
-    assert row.files == (f"rich/{name}",)
+    assert row["files"] == [f"rich/{name}"]
     assert "1 granule refused" in run_tables.verdict(result.record)
-    assert "no CRLF follows the counts" in row.reason
+    assert "no CRLF follows the counts" in row["reason"]
     assert len(made(result.record)) == 4
     stated = _stated(campaign)
     dark = name == "d000"
@@ -151,7 +151,7 @@ def test_what_random_damage_leaves_is_made_and_what_it_takes_is_stated(
     assert result.has_failures is bool(refused)
     assert result.record is not None
     rows = run_tables.refused(result.record)
-    assert sorted(path for row in rows for path in row.files) == sorted(refused)
+    assert sorted(path for row in rows for path in row["files"]) == sorted(refused)
     stated = _stated(campaign)
     for product in campaign.products_root.rglob("*.nc"):
         missing = {path for path in refused if f"{path}: " in stated[product.name]}

@@ -28,7 +28,6 @@ from lidarops.run.executor import (
     EndedScene,
     StopRequest,
     process_jobs,
-    process_one_by_one,
 )
 from lidarops.run.session import Session
 from lidarops.run.staleness import Judge
@@ -195,7 +194,7 @@ def test_lost_local_workers_are_not_waited_for(
         with pytest.raises(SceneError, match="workers on this machine are gone"):
             list(process_jobs(jobs, client=client))
         with pytest.raises(SceneError, match="workers on this machine are gone"):
-            list(process_one_by_one(jobs, client=client, stop=StopRequest()))
+            list(process_jobs(jobs, client=client, alone=True))
 
 
 class GrowingCluster:
