@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
-import xarray as xr
 
 from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.store import Store
@@ -293,54 +292,49 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
 
 def _compared(before: Path, after: Path) -> list[Difference]:
     """Return the differences between two NetCDF files whose bytes differ."""
-    whole = [opened_product(file, decode_cf=False) for file in (after, before)]
-    with whole[0] as new, whole[1] as old:
-        differences = [*_attributes("", old.attrs, new.attrs), *_variables(old, new)]
+    old, new = (_content(file) for file in (before, after))
+    found = [
+        Difference(what, name, _words(old.get((what, name)), new.get((what, name))))
+        for what, name in sorted({*old, *new})
+    ]
     same = Difference("bytes", before.name, "the same content, stored in other bytes")
-    return differences or [same]
+    return [difference for difference in found if difference.problem] or [same]
 
 
-def _attributes(owner: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[Difference]:
-    for name in sorted({*old, *new}):
-        before: Any = old.get(name)
-        after: Any = new.get(name)
-        if not np.array_equal(before, after):
-            problem = f"{_short(after)}, was {_short(before)}"
-            yield Difference("attribute", f"{owner}:{name}", problem)
+def _content(file: Path) -> dict[tuple[str, str], Any]:
+    """Return the attributes and the values of a file by what they are, and name."""
+    with opened_product(file, decode_cf=False) as product:
+        owners = {"": product.attrs, **{str(n): v.attrs for n, v in product.variables.items()}}
+        attributes = {
+            ("attribute", f"{owner}:{name}"): value
+            for owner, own in owners.items()
+            for name, value in own.items()
+        }
+        return attributes | {("variable", str(n)): v.values for n, v in product.variables.items()}
 
 
-def _short(value: Any) -> str:
-    text = "absent" if value is None else str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _variables(old: xr.Dataset, new: xr.Dataset) -> Iterator[Difference]:
-    for name in sorted({str(variable) for variable in (*old.variables, *new.variables)}):
-        if name not in old.variables or name not in new.variables:
-            state = "is new" if name in new.variables else "no longer exists"
-            yield Difference("variable", name, state)
-            continue
-        before, after = old.variables[name], new.variables[name]
-        yield from _attributes(name, before.attrs, after.attrs)
-        problem = _values(before.values, after.values)
-        if problem:
-            yield Difference("variable", name, problem)
-
-
-def _values(before: np.ndarray[Any, Any], after: np.ndarray[Any, Any]) -> str:
-    if before.shape != after.shape or before.dtype != after.dtype:
-        return f"has {after.dtype}{after.shape}, had {before.dtype}{before.shape}"
+def _words(before: Any, after: Any) -> str:
+    """Return how a value or an array of a file differs from what it was; empty if it does not."""
+    both = isinstance(before, np.ndarray) and isinstance(after, np.ndarray)
+    if not both or (before.shape, before.dtype) != (after.shape, after.dtype):
+        same = not both and np.array_equal(before, after)
+        return "" if same else f"{_short(after)}, was {_short(before)}"
     # As bytes: NaN equals itself, and the sign of zero counts.
     differs = before.view(np.uint8) != after.view(np.uint8) if before.ndim else before != after
     if before.ndim:
         differs = differs.reshape(*before.shape, -1).any(axis=-1)
     count = int(np.count_nonzero(differs))
-    if not count:
-        return ""
-    if before.dtype.kind != "f":
-        return f"{count} of {before.size} values differ"
+    if not count or before.dtype.kind != "f":
+        return f"{count} of {before.size} values differ" if count else ""
     most = float(np.max(np.abs(np.float64(after) - np.float64(before))[differs]))
     return f"{count} of {before.size} values differ, by {most:.3g} at most"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"{value.dtype}{value.shape}"
+    text = "absent" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def explain_difference(result: Reproduction) -> str:

@@ -12,6 +12,7 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec, resolve_name
+from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
@@ -96,9 +97,8 @@ def joint_code_version(names: Iterable[str] | None = None, *others: str) -> str:
     str
         16 hexadecimal digits.
     """
-    chosen = kinds() if names is None else names
-    versions = {name: code_version(name, *others) for name in chosen}
-    text = "\n".join(f"{name}={versions[name]}" for name in sorted(versions))
+    chosen = sorted(kinds() if names is None else names)
+    text = "\n".join(f"{name}={code_version(name, *others)}" for name in chosen)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -113,8 +113,7 @@ def version_of(kind: Kind, sources: Sources, *others: str) -> str:
     *others : str
         Further modules that count.
     """
-    own = (f"{kind.package}.{name}" for name in _OF_KIND)
-    modules = (name for name in own if sources.path(name))
+    modules = filter(sources.path, (f"{kind.package}.{name}" for name in _OF_KIND))
     return sources.digest((*_EVERY_PRODUCT, *_formats(), kind.package, *modules, *others))
 
 
@@ -145,8 +144,7 @@ def pages_version(sources: Sources | None = None) -> str:
     sources = sources or _installed()
     packages = [kind.package for kind in kinds().values()]
     of_kinds = (f"{package}.{name}" for package in packages for name in _ON_PAGES)
-    starts = (_PAGES, *packages, *of_kinds)
-    return sources.digest(name for name in starts if sources.path(name))
+    return sources.digest(filter(sources.path, (_PAGES, *packages, *of_kinds)))
 
 
 @cache
@@ -201,16 +199,12 @@ def imported_modules(source: str) -> tuple[str, ...]:
     statements = _FOR_TYPES.sub("", _NO_STATEMENT.sub(" ", source))
     found: set[str] = set()
     for module, names, modules in _IMPORT.findall(statements):
-        dot = "" if module.endswith(".") else "."
-        found |= {module} if module else set()
-        found |= {f"{module}{dot}{name}" for name in _listed(names)}
-        found |= set(_listed(modules))
+        # ``a as b, c``, with or without parentheses.
+        parts = (names or modules).strip("() \t\n").split(",")
+        listed = [words[0] for words in map(str.split, parts) if words]
+        dot = "." if module.strip(".") else ""
+        found |= {module, *(f"{module}{dot}{name}" for name in listed)} - {""}
     return tuple(sorted(found))
-
-
-def _listed(names: str) -> list[str]:
-    """Return the names in ``a as b, c``, with or without parentheses."""
-    return [words[0] for part in names.strip("() \t\n").split(",") if (words := part.split())]
 
 
 class Sources:
@@ -232,10 +226,10 @@ class Sources:
         apart: Collection[str] = _APART,
     ) -> None:
         self._roots = roots
-        self._apart = apart
         self.path = cache(self._find)
         """Module -> its file; None where there is no such module."""
-        self._text = cache(_read)
+        self._content = cache(_read)
+        self._apart = frozenset(apart)
         self._imports = cache(self._imported)
 
     def digest(self, starts: Iterable[str]) -> str:
@@ -256,8 +250,10 @@ class Sources:
             if path.name == "__init__.py":
                 data = ((file.relative_to(path.parent), file) for file in _data(path.parent))
                 files |= {f"{name}:{place.as_posix()}": file for place, file in data}
-        digests = sorted(f"{name}={_digest(self._text(path))}" for name, path in files.items())
-        return hashlib.sha256("\n".join(digests).encode()).hexdigest()[:16]
+        whole = "\n".join(
+            sorted(f"{name}={self._content(path)[1]}" for name, path in files.items())
+        )
+        return hashlib.sha256(whole.encode()).hexdigest()[:16]
 
     def closure(self, starts: Iterable[str]) -> dict[str, Path]:
         """Return the files of some modules and of all modules that these import.
@@ -290,7 +286,7 @@ class Sources:
         """Return the modules that the import of a module runs, but for indirect ones."""
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
         names: dict[str, None] = {}
-        for target in imported_modules(self._text(path)):
+        for target in imported_modules(self._content(path)[0]):
             # A text that only reads like an import may have too many dots.
             with suppress(ImportError):
                 names |= dict.fromkeys(self._run_by(resolve_name(target, package)))
@@ -298,21 +294,15 @@ class Sources:
 
     def _run_by(self, target: str) -> Iterator[str]:
         """Yield the packages around a target of an import and, unless it is a function, itself."""
-        if _within(target, self._roots) and not _within(target, self._apart):
-            parts = target.split(".")
-            names = (".".join(parts[:count]) for count in range(1, len(parts) + 1))
-            yield from (name for name in names if self.path(name) is not None)
+        names = list(accumulate(target.split("."), "{}.{}".format))
+        if names[0] in self._roots and self._apart.isdisjoint(names):
+            yield from filter(self.path, names)
 
     def _find(self, module: str) -> Path | None:
         root, *names = module.split(".")
         places = [folder.joinpath(*names) for folder in self._roots.get(root, ())]
         paths = ((place / "__init__.py", place.with_suffix(".py")) for place in places)
         return next((path for both in paths for path in both if path.is_file()), None)
-
-
-def _within(name: str, packages: Collection[str]) -> bool:
-    """Return whether a module is one of some packages or modules, or lies in one."""
-    return name in packages or any(name.startswith(f"{package}.") for package in packages)
 
 
 def _data(folder: Path) -> Iterator[Path]:
@@ -326,17 +316,14 @@ def _data(folder: Path) -> Iterator[Path]:
             yield from _data(path)
 
 
-def _read(path: Path) -> str:
-    """Return the bytes of a file as text; line ends depend on the checkout."""
+def _read(path: Path) -> tuple[str, str]:
+    """Return a file as text, whose line ends depend on the checkout, and its digest."""
     try:
-        return path.read_bytes().decode("latin-1").replace("\r\n", "\n")
+        content = path.read_bytes().replace(b"\r\n", b"\n")
     except OSError as error:
         raise LidarOpsError(
             f"cannot be read: {error.strerror}",
             file=path,
             remedy="mend it, or install its package again",
         ) from error
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode("latin-1")).hexdigest()
+    return content.decode("latin-1"), hashlib.sha256(content).hexdigest()
