@@ -59,16 +59,25 @@ class DayStates:
     store : Store
     selection : Selection, optional
         What to process; default everything.
+    known : DayStates, optional
+        Earlier states, since which the catalog has not changed.
     """
 
     def __init__(
-        self, campaign: Campaign, store: Store, selection: Selection | None = None
+        self,
+        campaign: Campaign,
+        store: Store,
+        selection: Selection | None = None,
+        *,
+        known: DayStates | None = None,
     ) -> None:
         self.campaign = campaign
         self.store = store
         self.selection = selection or Selection()
         self._ancillaries: dict[str, str] = {}
         self._problems: dict[tuple[str, Role], str] = {}
+        if known is not None:
+            self.base, self.names = known.base, known.names
 
     def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
         """Return the state of every day.

@@ -184,6 +184,8 @@ class Judge(DayStates):
         Whether every selected product counts as stale.
     thaw : bool
         Whether products of frozen periods are replaced, too.
+    known : DayStates, optional
+        Earlier states, since which the catalog has not changed.
     """
 
     def __init__(
@@ -194,8 +196,9 @@ class Judge(DayStates):
         selection: Selection | None = None,
         force: bool = False,
         thaw: bool = False,
+        known: DayStates | None = None,
     ) -> None:
-        super().__init__(campaign, store, selection)
+        super().__init__(campaign, store, selection, known=known)
         self._force = force
         self._thaw = thaw
         self._source = Source.of(campaign.archive)

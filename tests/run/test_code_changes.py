@@ -47,7 +47,7 @@ def installed(
         ("retrieve/network/geometry.py", set()),
         ("netcdf/write.py", {"elastic", "homogeneous", "signal"}),
         ("plan/scenes.py", set()),
-        ("run/session.py", set()),
+        ("run/processing.py", set()),
         ("site/pages.py", set()),
     ],
 )

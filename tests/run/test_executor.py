@@ -29,7 +29,7 @@ from lidarops.run.executor import (
     StopRequest,
     process_jobs,
 )
-from lidarops.run.session import Session
+from lidarops.run.processing import new_run
 from lidarops.run.staleness import Judge
 from lidarops.scene.guard import Failure
 from lidarops.scene.job import Job
@@ -126,11 +126,11 @@ def test_scenes_that_killed_their_process_are_tried_in_another(
     with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
         lock.acquire()
         judge = Judge(campaign, store)
-        session = Session(campaign, store, lock, judge)
-        session.begin()
+        run = new_run(campaign)
+        store.begin_run(run, lock.token)
         for judged in judge.days(sorted(judge.signatures())).judgements:
             if judged.scene.id in scenes:
-                session.take(judged, note=True)
+                store.begin_scene(judged.scene.id, judged.day, run.id, lock.token)
     with Store(campaign.catalog_url, campaign.name) as store:
         again = Judge(campaign, store)
         judgements = again.days(sorted(again.signatures())).judgements

@@ -23,7 +23,7 @@ from lidarops.cli import app
 from lidarops.errors import CatalogError
 from lidarops.reports import gallery, run_journal, run_record
 from lidarops.run import archive as pipeline
-from lidarops.run import session, staleness
+from lidarops.run import processing, staleness
 from lidarops.run.archive import (
     Options,
     Selection,
@@ -32,7 +32,7 @@ from lidarops.run.archive import (
     report_run,
     reprocess,
 )
-from lidarops.run.session import Session
+from lidarops.run.processing import Pass
 from lidarops.scene.dependence import plan_closure, planned_products
 from lidarops.system.files import only_one
 
@@ -108,7 +108,7 @@ def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
 
 
 def test_a_report_names_empty_scenes(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "MOST_EMPTY_SCENES", 3)
+    monkeypatch.setattr(processing, "MOST_EMPTY_SCENES", 3)
     archive.tree["instruments"]["poor"]["products"] = {
         "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
     }
@@ -563,7 +563,7 @@ def _killed(archive: Archive) -> None:
 def test_a_killed_run_is_reported_by_the_next_one(archive: Archive) -> None:
     archive.raw("poor/h09", 630, seed=9)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Session, "finish", _stopped)
+        patch.setattr(Pass, "_conclude", _stopped)
         with pytest.raises(KeyboardInterrupt):
             bring_up_to_date(archive.write(), options=Options(journal=True))
     assert not list((archive.folder / "out/report").glob("*/index.html"))
