@@ -170,7 +170,8 @@ class Lock(AbstractContextManager["Lock"]):
 
     def holder(self) -> Holder | None:
         """Return the present holder of the lock."""
-        return next(iter(self._holders(_L.campaign == self._database.campaign)), None)
+        own = self._holders(_L.campaign == self._database.campaign)
+        return own[0] if own else None
 
     def others_at_work(self) -> bool:
         """Return whether a living process holds the lock of another campaign of the database."""
@@ -197,20 +198,15 @@ class Lock(AbstractContextManager["Lock"]):
             "machine": _machine(),
             "process": os.getpid(),
             "process_started": process_start(os.getpid()),
+            "acquired": clock,
+            "heartbeat": clock,
         }
-        statement = database.insert(LOCK).values(**values, acquired=clock, heartbeat=clock)
-        if current is None:
-            statement = statement.on_conflict_do_nothing()
-        else:
-            # Only if the dead holder still has it: another process may have been faster.
-            changes = {
-                column.name: statement.excluded[column.name]
-                for column in LOCK.columns
-                if column.name != "campaign"
-            }
-            statement = statement.on_conflict_do_update(
-                index_elements=["campaign"], set_=changes, where=_L.token == current.token
-            )
+        # Only if a dead holder still has it: another process may have been faster.
+        known = "" if current is None else current.token
+        statement = database.insert(LOCK).values(values)
+        statement = statement.on_conflict_do_update(
+            index_elements=["campaign"], set_=values, where=_L.token == known
+        )
         with database.transaction() as connection:
             connection.execute(statement)
             own = sa.select(sa.func.count()).select_from(LOCK).where(*self._row)

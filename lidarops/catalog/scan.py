@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import heapq
 import json
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import groupby
+from operator import itemgetter
 from typing import Final
 from urllib.parse import unquote
 
@@ -129,25 +132,15 @@ def _joined(
     files: Iterator[RawFile], known: Iterator[Fingerprint]
 ) -> Iterator[tuple[RawFile | None, Fingerprint | None]]:
     """Pair the files of the archive with those of the catalog; both are sorted by path."""
-    before = next(known, None)
-    last = None
-    for file in files:
-        path = printable(file.path)
-        if path == last:
+    listed = ((printable(file.path), file) for file in files)
+    stored = ((before.path, before) for before in known)
+    for _, alike in groupby(heapq.merge(listed, stored, key=itemgetter(0)), itemgetter(0)):
+        found = [each for _, each in alike]
+        yield (
             # The printable form of a name that is not UTF-8 may equal another path.
-            continue
-        last = path
-        while before is not None and before.path < path:
-            yield None, before
-            before = next(known, None)
-        if before is not None and before.path == path:
-            yield file, before
-            before = next(known, None)
-        else:
-            yield file, None
-    while before is not None:
-        yield None, before
-        before = next(known, None)
+            next((each for each in found if isinstance(each, RawFile)), None),
+            next((each for each in found if isinstance(each, Fingerprint)), None),
+        )
 
 
 class _Scan:

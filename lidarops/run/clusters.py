@@ -12,7 +12,7 @@ import logging
 import signal
 import ssl
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from ipaddress import ip_address
@@ -255,24 +255,18 @@ def choose_cluster(
 def _read_description(cluster: str) -> dict[str, Any]:
     if cluster in _KINDS:
         return {"kind": cluster}
+    raw = None
     try:
         text = Path(cluster).read_text(encoding="utf-8")
-        duplicates = duplicate_keys(yaml.compose(text, Loader=yaml.SafeLoader))
+        problem = "; ".join(duplicate_keys(yaml.compose(text, Loader=yaml.SafeLoader)))
         raw = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        problem = f"cannot be read: {error}"
+    if problem or not isinstance(raw, dict):
         raise ClusterError(
-            f"cannot be read: {error}",
+            problem or "is not a mapping",
             file=cluster,
-            remedy="give slurm, kubernetes, or the path of a YAML file",
-            wrong_use=True,
-        ) from error
-    if duplicates:
-        raise ClusterError("; ".join(duplicates), file=cluster, wrong_use=True)
-    if not isinstance(raw, dict):
-        raise ClusterError(
-            "is not a mapping",
-            file=cluster,
-            remedy="see deploy/slurm/cluster.yaml",
+            remedy="give slurm, kubernetes, or a YAML file such as deploy/slurm/cluster.yaml",
             wrong_use=True,
         )
     return raw
@@ -334,8 +328,11 @@ def _connect(cluster: Cluster, stack: ExitStack) -> Client:
 
     if isinstance(cluster, Local):
         return stack.enter_context(local_client(cluster.workers, memory=cluster.memory))
+    options: dict[str, Any] = {}
+    if not isinstance(cluster, Slurm):
+        options = {"security": _security(cluster.tls), "timeout": cluster.wait}
     address = stack.enter_context(_address(cluster))
-    client: Client = stack.enter_context(Client(address, **_connection(cluster)))
+    client: Client = stack.enter_context(Client(address, **options))
     client.wait_for_workers(1, timeout=cluster.wait)
     return client
 
@@ -395,12 +392,6 @@ def _slurm(cluster: Slurm) -> Any:
     # Keep this number, also after a job is cancelled or a node is lost.
     jobs.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)
     return jobs
-
-
-def _connection(cluster: Cluster) -> dict[str, Any]:
-    if isinstance(cluster, Scheduler | Kubernetes):
-        return {"security": _security(cluster.tls), "timeout": cluster.wait}
-    return {}
 
 
 def _security(tls: Tls | None) -> Security | None:
@@ -481,22 +472,21 @@ def _await_workers(client: Client, workers: int) -> None:
 def _quiet() -> Iterator[None]:
     """Silence the loggers of dask that repeat what lidarops reports."""
     before = {name: logging.getLogger(name).level for name in _SILENCED}
-    _silence()
+    _set_levels(dict.fromkeys(before, logging.CRITICAL))
     try:
         yield
     finally:
-        for name, level in before.items():
-            logging.getLogger(name).setLevel(level)
+        _set_levels(before)
 
 
-def _silence() -> None:
-    for name in _SILENCED:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+def _set_levels(levels: Mapping[str, int]) -> None:
+    for name, level in levels.items():
+        logging.getLogger(name).setLevel(level)
 
 
 def dask_setup(_worker: object) -> None:
     """Prepare a worker; dask calls a function of this name."""
-    _silence()
+    _set_levels(dict.fromkeys(_SILENCED, logging.CRITICAL))
     keep_memory()
     # Ctrl-C reaches all processes of a terminal, but workers should finish their scenes.
     if threading.current_thread() is threading.main_thread():

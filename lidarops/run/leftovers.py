@@ -110,40 +110,24 @@ def _networks_of_member(scene: Scene, campaign: Campaign) -> list[str]:
     return [name for name, net in campaign.networks.items() if scene.instrument in net.instruments]
 
 
+@dataclass(frozen=True)
 class Leftovers:
-    """Finds the products of some days that would not be made again, and why.
+    """Finds the products of some days that would not be made again, and why."""
 
-    Parameters
-    ----------
-    campaign : Campaign
-    store : Store
-    planned : sequence of (Scene, Plan)
-        All scenes of these days.
-    cut : Cut
-        The same scenes, and the good granules that belong to none.
-    content : callable
-        Returns the SHA-256 of a granule.
-    """
-
-    def __init__(
-        self,
-        campaign: Campaign,
-        store: Store,
-        planned: Sequence[Planned],
-        cut: Cut,
-        content: Callable[[Granule], str],
-    ) -> None:
-        self._campaign = campaign
-        self._store = store
-        self._planned = {scene.id: (scene, plan) for scene, plan in planned}
-        self._cut = cut
-        self._content = content
+    campaign: Campaign
+    store: Store
+    planned: Mapping[str, Planned]
+    """All scenes of these days, by id."""
+    cut: Cut
+    """The same scenes, and the good granules that belong to none."""
+    content: Callable[[Granule], str]
+    """Returns the SHA-256 of a granule."""
 
     def orphans(self, made: Iterable[RecordedProduct]) -> list[tuple[RecordedProduct, Orphan]]:
         """Return those of the products of these days that no scene would give."""
         wanted = {
             product_file(scene, product)
-            for scene, plan in self._planned.values()
+            for scene, plan in self.planned.values()
             for product in dependence.planned_products(plan)
         }
         return [
@@ -155,9 +139,9 @@ class Leftovers:
 
     def _fate(self, product: RecordedProduct) -> tuple[str, bool, bool]:
         """Return why no scene gives a product, whether it is kept, and whether it is lost."""
-        if not _requests(self._campaign, product):
+        if not _requests(self.campaign, product):
             return "the campaign no longer requests it", False, False
-        if product.scene in self._planned:
+        if product.scene in self.planned:
             return *self._left_out(product), False
         missing = self._missing_members(product)
         if missing:
@@ -172,7 +156,7 @@ class Leftovers:
 
     def _left_out(self, product: RecordedProduct) -> tuple[str, bool]:
         """Return why the plan of its scene gives a product no more, and whether it is kept."""
-        scene, plan = self._planned[product.scene]
+        scene, plan = self.planned[product.scene]
         if (product.kind, product.channel) in dependence.planned_products(plan):
             return "it has another name now", False
         omissions = [
@@ -185,17 +169,17 @@ class Leftovers:
         mending = (dependence.UNUSABLE_FILE, NO_PRODUCT)
         unusable = any(left.rule in mending for left in omissions)
         kept = unusable or set(self._signals(product).values()) != {
-            self._content(granule) for granule in scene.granules
+            self.content(granule) for granule in scene.granules
         }
         return reason or "its plan leaves it out", kept
 
     def _missing_members(self, product: RecordedProduct) -> str:
         """Return which instruments of a network have no files left; empty if not the cause."""
         name, start = parse_scene_id(product.scene)
-        if name not in self._campaign.networks:
+        if name not in self.campaign.networks:
             return ""
-        members = self._campaign.networks[name].instruments
-        scenes = (scene for scene, _ in self._planned.values())
+        members = self.campaign.networks[name].instruments
+        scenes = (scene for scene, _ in self.planned.values())
         present = {scene.instrument for scene in scenes if scene.start <= start < scene.stop}
         missing = [member for member in members if member not in present]
         # If the network has a scene at that time, it replaces the one that is gone.
@@ -205,17 +189,17 @@ class Leftovers:
 
     def _signals(self, product: RecordedProduct) -> dict[str, str]:
         """Return path -> SHA-256 of the signal files that a product was made from."""
-        inputs = self._store.inputs_of(product.path)
+        inputs = self.store.inputs_of(product.path)
         return {used.path: used.sha256 for used in inputs if used.role is Role.SIGNAL}
 
     @cached_property
     def _in_scenes(self) -> set[str | None]:
-        granules = (granule for scene in self._cut.scenes for granule in scene.granules)
+        granules = (granule for scene in self.cut.scenes for granule in scene.granules)
         return {name for granule in granules for name in (granule.path, granule.sha256)}
 
     @cached_property
     def _idle(self) -> set[str]:
-        return {granule.path for granule in (*self._store.refused(), *self._cut.set_aside)}
+        return {granule.path for granule in (*self.store.refused(), *self.cut.set_aside)}
 
 
 def product_file(scene: Scene, product: ProductKey) -> str:
@@ -263,29 +247,27 @@ def find_lost(campaign: Campaign, store: Store) -> Lost:
     }
     inputs = store.lost_inputs()
     owners = {path: name for _, path in inputs for name, has in claims.items() if has(path)}
-    known: set[str] = set()
-    idle = []
-    for entry in campaign.acknowledged:
-        matched = set(filter(_matcher(entry.what), owners)) if entry.holds else set()
-        known |= matched
-        if not matched:
-            reason = _IDLE if entry.holds else _OVER
-            idle.append(FactsNote("all", f"acknowledged: {', '.join(entry.what)}", reason))
+    known, idle = _acknowledged(campaign, owners)
     if not owners:
-        return Lost(idle=tuple(idle))
+        return Lost(idle=idle)
     sets = store.raw_sets()
     size, lost, gone = Counter[str](), Counter[str](), Counter[str]()
     excused, products_of = set[str](), defaultdict[str, set[str]](set)
+    unused = defaultdict[str, set[UnusedFile]](set)
+    is_dark = {name: _matcher(each.dark_files) for name, each in campaign.instruments.items()}
     for raw in sets.values():
         size.update(dict.fromkeys(raw.products, raw.files))
     for name, path in inputs:
-        products = sets[name].products
+        products, owner = sets[name].products, owners.get(path)
         gone[name] += path in owners
         if path in known:
             excused.update(products)
-        elif path in owners:
+        elif owner is not None:
             lost.update(products)
-            products_of[owners[path]].update(products)
+            products_of[owner].update(products)
+            file = UnusedFile.lost(path, Role.DARK if is_dark[owner](path) else Role.SIGNAL)
+            for product in products:
+                unused[product].add(file)
     unknown = sorted(owners.keys() - known)
     concerned = {name for name, raw in sets.items() if not lost.keys().isdisjoint(raw.products)}
     total = store.count_raw(concerned, known) if concerned else 0
@@ -311,23 +293,22 @@ def find_lost(campaign: Campaign, store: Store) -> Lost:
         paths = tuple(path for path in unknown if owners[path] == owner)
         kept = len(products_with & protected)
         findings.append(LostFiles(owner, len(paths), total, paths[:_NAMES_SHOWN], kept))
-    gone_of = ((path, sets[name].products) for name, path in inputs if path not in known)
-    unused = _unused(campaign, owners, gone_of)
-    return Lost(tuple(findings), protected, frozenset(excused), tuple(idle), unused)
+    return Lost(tuple(findings), protected, frozenset(excused), idle, unused)
 
 
-def _unused(
-    campaign: Campaign, owners: Mapping[str, str], lost: Iterable[tuple[str, Iterable[str]]]
-) -> dict[str, set[UnusedFile]]:
-    """Return the lost files of each product, by their owners."""
-    is_dark = {name: _matcher(each.dark_files) for name, each in campaign.instruments.items()}
-    unused = defaultdict[str, set[UnusedFile]](set)
-    for path, products in lost:
-        if path in owners:
-            role = Role.DARK if is_dark[owners[path]](path) else Role.SIGNAL
-            for product in products:
-                unused[product].add(UnusedFile.lost(path, role))
-    return unused
+def _acknowledged(
+    campaign: Campaign, lost: Iterable[str]
+) -> tuple[set[str], tuple[FactsNote, ...]]:
+    """Return the lost files that the campaign acknowledges, and its entries that match none."""
+    known: set[str] = set()
+    idle = []
+    for entry in campaign.acknowledged:
+        matched = set(filter(_matcher(entry.what), lost)) if entry.holds else set()
+        known |= matched
+        if not matched:
+            reason = _IDLE if entry.holds else _OVER
+            idle.append(FactsNote("all", f"acknowledged: {', '.join(entry.what)}", reason))
+    return known, tuple(idle)
 
 
 def _matcher(patterns: Iterable[str]) -> Callable[[str], bool]:

@@ -129,19 +129,19 @@ class Result:
     @property
     def failed_scenes(self) -> Mapping[str, str]:
         """Scene -> error, now or since an earlier run, without internal errors."""
-        return self._errors(internal=False)
+        errors = self._errors
+        return {scene: errors[scene] for scene in errors if scene not in self.internal}
 
     @property
     def internal_errors(self) -> Mapping[str, str]:
         """Scene -> internal error, now or since an earlier run."""
-        return self._errors(internal=True)
+        errors = self._errors
+        return {scene: errors[scene] for scene in errors if scene in self.internal}
 
-    def _errors(self, *, internal: bool) -> Mapping[str, str]:
+    @property
+    def _errors(self) -> dict[str, str]:
         scenes = () if self.record is None else self.record.scenes
-        errors = {**self.failures, **{scene.scene: scene.error for scene in scenes if scene.error}}
-        return {
-            scene: error for scene, error in errors.items() if (scene in self.internal) is internal
-        }
+        return {**self.failures, **{scene.scene: scene.error for scene in scenes if scene.error}}
 
     @property
     def unusable_scenes(self) -> tuple[str, ...]:

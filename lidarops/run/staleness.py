@@ -252,7 +252,8 @@ class Judge(DayStates):
             for judged in judgements
         ]
         unplanned = {judged.scene.id for judged in judgements if not judged.planned}
-        leftovers = Leftovers(self.campaign, self.store, planned, cut, self._content)
+        plans = {scene.id: (scene, plan) for scene, plan in planned}
+        leftovers = Leftovers(self.campaign, self.store, plans, cut, self._content)
         orphans = [
             (product, self._kept_orphan(orphan))
             for product, orphan in leftovers.orphans(made.values())
