@@ -112,6 +112,12 @@ class Database:
         with self.transaction() as connection:
             return list(self.decoded(map(make, connection.execute(query))))
 
+    def execute(self, statement: Any, rows: list[dict[str, Any]]) -> None:
+        """Carry out a statement for each of some rows, in one transaction."""
+        if rows:
+            with self.transaction() as connection:
+                connection.execute(statement, rows)
+
     def read_batches(self, names: Collection[str], query: Callable[[list[str]], Any]) -> list[Any]:
         """Return the rows of a query on many names, some of which make a statement."""
         ordered = sorted(names)

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -30,17 +30,6 @@ from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_r
 _HEADER_BYTES: Final = 16384
 _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
-
-
-class FileBeam(NamedTuple):
-    """Interval and pointing of one raw file."""
-
-    start: datetime
-    stop: datetime
-    zenith_angle: float
-    """degree; NaN where the header states none, or a doubtful one."""
-    azimuth: float
-    """degree; NaN where the header states none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +62,7 @@ class FileGroup:
     """Why pointings are doubtful, in words."""
     notes: tuple[str, ...]
     """Oddities of the headers, in words."""
-    beams: tuple[FileBeam, ...]
+    headers: tuple[RawHeader, ...]
     """By file."""
     header_pointing: HeaderPointing = "stated"
     """As what doubtful angles are read."""
@@ -335,15 +324,7 @@ def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -
         without_zenith=len(headers) - len(angles),
         doubts=doubts,
         notes=tuple(sorted({note for header in headers for note in header.notes})),
-        beams=tuple(
-            FileBeam(
-                header.start,
-                header.stop,
-                math.nan if header.doubt or header.zenith_angle is None else header.zenith_angle,
-                math.nan if header.azimuth is None else header.azimuth,
-            )
-            for header in headers
-        ),
+        headers=tuple(headers),
         header_pointing=pointing,
     )
 
@@ -353,23 +334,32 @@ def lone_beams(headers: InstrumentHeaders) -> tuple[FileGroup, ...]:
 
     Of cycles of one beam, a scan has no value.
     """
-    beams = sorted(
-        (beam, number) for number, group in enumerate(headers.signal) for beam in group.beams
+    rows = sorted(
+        (header.start.timestamp(), header.stop.timestamp(), *_beam(header), number)
+        for number, group in enumerate(headers.signal)
+        for header in group.headers
     )
-    bounds = [(beam.start.timestamp(), beam.stop.timestamp()) for beam, _ in beams]
-    zenith_angle, azimuth = np.array([(beam.zenith_angle, beam.azimuth) for beam, _ in beams]).T
+    beams = np.array(rows)
+    zenith_angle, azimuth, group = beams.T[2:]
     try:
-        cycle = scan_cycles.cycles(zenith_angle, azimuth, bounds)
+        cycle = scan_cycles.cycles(zenith_angle, azimuth, beams[:, :2])
         direction = scan_cycles.directions(zenith_angle, azimuth).index
     except RetrievalInputError:
         # Without times that rise, nothing is known of cycles; the plan says it.
         return ()
     known = direction >= 0
     counts = np.bincount(np.unique([cycle[known], direction[known]], axis=1)[0])
-    group = np.array([number for _, number in beams])[known]
+    group = group[known].astype(int)
     scanned = set(group[counts[cycle[known]] > 1].tolist())
     lone = set(group.tolist()) - scanned
     return tuple(headers.signal[number] for number in sorted(lone)) if scanned else ()
+
+
+def _beam(header: RawHeader) -> tuple[float, ...]:
+    """Return zenith angle and azimuth in degree; NaN where none, or a doubtful one, is stated."""
+    zenith_angle = None if header.doubt else header.zenith_angle
+    stated = (zenith_angle, header.azimuth)
+    return tuple(math.nan if angle is None else angle for angle in stated)
 
 
 def instruments_of(

@@ -110,8 +110,6 @@ class Granules(Database):
 
     def replace(self, rows: Sequence[GranuleRow]) -> None:
         """Insert granules, replacing rows of the same path."""
-        if not rows:
-            return
         layouts = {row.values["layout"]: row.layout for row in rows}
         with self.transaction() as connection:
             connection.execute(
@@ -125,23 +123,20 @@ class Granules(Database):
         gone = sa.delete(GRANULE).where(
             _C.campaign == self.campaign, _C.path == sa.bindparam("gone")
         )
-        if paths:
-            with self.transaction() as connection:
-                connection.execute(gone, [{"gone": path} for path in paths])
+        self.execute(gone, [{"gone": path} for path in paths])
 
     def store_digests(self, digests: Mapping[str, str]) -> None:
         """Enter the SHA-256 of files, by path."""
-        with self.transaction() as connection:
-            self._enter_digests(connection, digests)
+        self.execute(*self._digests(digests))
 
-    def _enter_digests(self, connection: sa.Connection, digests: Mapping[str, str]) -> None:
-        if digests:
-            connection.execute(
-                sa.update(GRANULE)
-                .where(_C.campaign == self.campaign, _C.path == sa.bindparam("file"))
-                .values(sha256=sa.bindparam("digest")),
-                [{"file": path, "digest": digest} for path, digest in digests.items()],
-            )
+    def _digests(self, digests: Mapping[str, str]) -> tuple[sa.Update, list[dict[str, Any]]]:
+        """Return the statement that enters digests, and its rows."""
+        statement = (
+            sa.update(GRANULE)
+            .where(_C.campaign == self.campaign, _C.path == sa.bindparam("file"))
+            .values(sha256=sa.bindparam("digest"))
+        )
+        return statement, [{"file": path, "digest": digest} for path, digest in digests.items()]
 
     def granules(self, *, status: Status | None = None) -> list[Granule]:
         """Return the granules of the campaign, ordered by instrument, start time and path."""
@@ -214,14 +209,9 @@ class Granules(Database):
 
     def day_sums(self) -> list[DaySum]:
         """Return the sums of the stamps of good granules by day and role."""
+        sums = sa.func.count(), sa.func.sum(_C.stamp_low), sa.func.sum(_C.stamp_high)
         query = (
-            sa.select(
-                _C.day,
-                _C.role,
-                sa.func.count(),
-                sa.func.sum(_C.stamp_low),
-                sa.func.sum(_C.stamp_high),
-            )
+            sa.select(_C.day, _C.role, *sums)
             .where(_C.campaign == self.campaign, _C.status == Status.GOOD.value)
             .group_by(_C.day, _C.role)
             .order_by(_C.day, _C.role)
@@ -292,9 +282,7 @@ class Granules(Database):
             for instrument, files in held.items()
             for recorder, name in recorder_names(files, bound=bound.get(instrument)).items()
         ]
-        if rows:
-            with self.transaction() as connection:
-                connection.execute(self.upsert(CHANNEL_NAME, replacing=False), rows)
+        self.execute(self.upsert(CHANNEL_NAME, replacing=False), rows)
 
     def days_of_instruments(
         self, first: int | None = None, last: int | None = None
@@ -306,16 +294,11 @@ class Granules(Database):
         first, last : int, optional
             Days outside of these do not count.
         """
-        query = (
-            sa.select(_C.instrument, sa.func.min(_C.day), sa.func.max(_C.day))
-            .where(*self._signals())
-            .group_by(_C.instrument)
-        )
-        if first is not None:
-            query = query.where(_C.day >= first)
-        if last is not None:
-            query = query.where(_C.day <= last)
-        return {name: (begin, end) for name, begin, end in self.read(query, tuple)}
+        query = sa.select(_C.instrument, sa.func.min(_C.day), sa.func.max(_C.day))
+        query = query.where(*self._signals()).group_by(_C.instrument)
+        limits = [] if first is None else [_C.day >= first]
+        limits += [] if last is None else [_C.day <= last]
+        return {name: (begin, end) for name, begin, end in self.read(query.where(*limits), tuple)}
 
     def file_notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
         """Return the notes on good signal granules, contradictions first, then by frequency.

@@ -290,7 +290,8 @@ class Store(Granules):
             if outcome.error:
                 day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == entry.day
                 connection.execute(sa.delete(VERDICT).where(*day))
-            self._enter_digests(connection, entry.digests)
+            if entry.digests:
+                connection.execute(*self._digests(entry.digests))
             self._refuse(connection, outcome.refused)
             connection.execute(
                 sa.update(RUN)
@@ -487,14 +488,12 @@ class Store(Granules):
 
     def touch_products(self, stamps: Mapping[str, int]) -> None:
         """Enter new modification times (ns) of products whose content is unchanged."""
-        if stamps:
-            with self.transaction() as connection:
-                connection.execute(
-                    sa.update(PRODUCT)
-                    .where(_P.campaign == self.campaign, _P.path == sa.bindparam("file"))
-                    .values(mtime_ns=sa.bindparam("stamp")),
-                    [{"file": path, "stamp": stamp} for path, stamp in stamps.items()],
-                )
+        statement = (
+            sa.update(PRODUCT)
+            .where(_P.campaign == self.campaign, _P.path == sa.bindparam("file"))
+            .values(mtime_ns=sa.bindparam("stamp"))
+        )
+        self.execute(statement, [{"file": path, "stamp": stamp} for path, stamp in stamps.items()])
 
     def forget_products(self, paths: Collection[str], token: str) -> None:
         """Remove products, and their inputs that no other product uses."""
@@ -576,10 +575,7 @@ class Store(Granules):
     def forget_scenes(self, scenes: Collection[str]) -> None:
         """Remove the entries of scenes that no longer exist."""
         own = SCENE.c.campaign == self.campaign, SCENE.c.scene == sa.bindparam("gone")
-        if scenes:
-            with self.transaction() as connection:
-                gone = [{"gone": scene} for scene in sorted(scenes)]
-                connection.execute(sa.delete(SCENE).where(*own), gone)
+        self.execute(sa.delete(SCENE).where(*own), [{"gone": scene} for scene in sorted(scenes)])
 
     def verdicts(self) -> dict[int, Verdict]:
         """Return the verdicts on settled days."""
@@ -595,9 +591,7 @@ class Store(Granules):
             facts = verdict._asdict()
             row = {"campaign": self.campaign, "day": day, "signature": facts.pop("signature")}
             rows.append({**row, "facts": json.dumps(facts)})
-        if rows:
-            with self.transaction() as connection:
-                connection.execute(self.upsert(VERDICT), rows)
+        self.execute(self.upsert(VERDICT), rows)
 
 
 def _set_id(files: Sequence[InputRecord]) -> str:
