@@ -100,6 +100,8 @@ class Pass:
     """To be judged."""
     signatures: Mapping[int, Signature]
     """Of all days."""
+    known: Mapping[int, Verdict]
+    """Verdicts before the pass."""
     judge: Judge = field(init=False)
     orphans: dict[str, Orphan] = field(default_factory=dict)
     """By path; this and what follows as it was judged last."""
@@ -151,7 +153,7 @@ class Pass:
         self.judge = self._new_judge()
         days, signatures = self.days, self.signatures
         workers = self.options.workers
-        clean = unused(self.store.verdicts(), signatures.keys() - set(days))
+        clean = unused(self.known, signatures.keys() - set(days))
         self._forget(self.store.scenes_of_other_days(signatures))
         status, caught = RunStatus.FINISHED, 0
         if days:
@@ -488,6 +490,7 @@ class Pass:
                 # its day, and forgets the failure.
                 due = (one.day for one in judged.judgements if one.due)
                 settled |= _signed(after, judged.verdicts, {*due, *judged.gone.values()})
+        # Failures have removed some.
         known = self.store.verdicts()
         new = {day: verdict for day, verdict in settled.items() if known.get(day) != verdict}
         if new:
@@ -497,8 +500,9 @@ class Pass:
     def _clear_up(self) -> None:
         """Remove what a killed run left, if this one has not; another run may be at work."""
         output = Path(self.campaign.output)
-        littered = self.store.has_dead_run() or product_files.is_littered(output, self.store)
-        if self.run is None and littered:
+        if self.run is not None:
+            return
+        if self.store.has_dead_run() or product_files.is_littered(output, self.store):
             self.lock.acquire_unchanged()
             if product_files.sweep(output, self.store):
                 self.store.close_runs(self.lock.token)

@@ -102,6 +102,8 @@ class Judgement:
     """Plan of all products that the campaign requests."""
     requested: Plan
     """Part of the plan that the selection requests."""
+    day: int
+    """Day of the start, in days since 1970-01-01."""
     ancillaries: tuple[InputRecord, ...]
     """Present ancillary files that the steps of the plan read."""
     stale: tuple[Stale, ...]
@@ -124,11 +126,6 @@ class Judgement:
     """Whether an earlier try killed its process."""
     empty_reason: str = ""
     """Why the scene gives no product of its own and is used by no network; else empty."""
-
-    @property
-    def day(self) -> int:
-        """Day of the start, in days since 1970-01-01."""
-        return day_of(self.scene.start)
 
     @property
     def due(self) -> bool:
@@ -201,7 +198,6 @@ class Judge(DayStates):
         super().__init__(campaign, store, selection, known=known)
         self._force = force
         self._thaw = thaw
-        self._source = Source.of(campaign.archive)
         self._digests: dict[str, str] = {}
         self._touched: dict[str, int] = {}
         self._to_be_made: dict[str, str] = {}
@@ -214,17 +210,14 @@ class Judge(DayStates):
 
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
-        counts: dict[int, int] = defaultdict(int)
-        for day_sum in self.store.day_sums():
-            counts[day_sum.day] += day_sum.good
         group: list[int] = []
         held = 0
         for day in sorted(days):
-            if group and held + counts[day] > MOST_GRANULES:
+            if group and held + self._counts[day] > MOST_GRANULES:
                 yield tuple(group)
                 group, held = [], 0
             group.append(day)
-            held += counts[day]
+            held += self._counts[day]
         if group:
             yield tuple(group)
 
@@ -319,6 +312,18 @@ class Judge(DayStates):
             else:
                 gone[judged.scene.id] = judged.day
         return gone
+
+    @cached_property
+    def _source(self) -> Source:
+        return Source.of(self.campaign.archive)
+
+    @cached_property
+    def _counts(self) -> dict[int, int]:
+        """Number of good granules of each day."""
+        counts: dict[int, int] = defaultdict(int)
+        for day_sum in self.store.day_sums():
+            counts[day_sum.day] += day_sum.good
+        return counts
 
     @cached_property
     def lost(self) -> Lost:
@@ -482,7 +487,8 @@ class Judge(DayStates):
         """Return a judgement by which every product of a scene is stale."""
         products = dependence.planned_products(whole)
         stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
-        return Judgement(scene, whole, whole, self._ancillary_records(whole), stale)
+        day, files = day_of(scene.start), self._ancillary_records(whole)
+        return Judgement(scene, whole, whole, day, files, stale)
 
     def _ancillary_records(self, plan: Plan) -> tuple[InputRecord, ...]:
         return tuple(
