@@ -173,22 +173,7 @@ _MADE: Final = (
 
 
 class Store(Granules):
-    """Catalog and ledger of one campaign: granules, runs and products.
-
-    Parameters
-    ----------
-    url : str
-        SQLAlchemy URL, such as ``sqlite:///catalog.sqlite`` or ``postgresql+psycopg://...``.
-    campaign : str
-        Name of the campaign; several may share a database.
-    create : bool
-        Whether to make the catalog if there is none.
-
-    Raises
-    ------
-    CatalogError
-        If the database does not exist, cannot be opened, or has another schema version.
-    """
+    """Catalog and ledger of one campaign: granules, runs and products; opened as `Database`."""
 
     @contextmanager
     def _writing(self, token: str) -> Iterator[sa.Connection]:

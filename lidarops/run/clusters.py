@@ -328,10 +328,18 @@ def _connect(cluster: Cluster, stack: ExitStack) -> Client:
 
     if isinstance(cluster, Local):
         return stack.enter_context(local_client(cluster.workers, memory=cluster.memory))
+    address: Any
     options: dict[str, Any] = {}
-    if not isinstance(cluster, Slurm):
+    if isinstance(cluster, Slurm):
+        # The executor counts the deaths of workers, per scene.
+        stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
+        address = stack.enter_context(_slurm(cluster))
+    else:
+        address = cluster.address
         options = {"security": _security(cluster.tls), "timeout": cluster.wait}
-    address = stack.enter_context(_address(cluster))
+    if isinstance(cluster, Kubernetes):
+        place = (cluster.api, cluster.namespace, cluster.deployment)
+        stack.enter_context(scaled_deployment(*place, replicas=cluster.workers))
     client: Client = stack.enter_context(Client(address, **options))
     client.wait_for_workers(1, timeout=cluster.wait)
     return client
@@ -343,25 +351,6 @@ _REMEDIES = {
     "slurm": "see squeue, and the logs in the folder of the cluster",
     "kubernetes": "see kubectl get pods, and check that the role of deploy/kubernetes is bound",
 }
-
-
-@contextmanager
-def _address(cluster: Scheduler | Slurm | Kubernetes) -> Iterator[Any]:
-    """Yield what a `Client` connects to; stop at the end of the context what was started."""
-    if isinstance(cluster, Scheduler):
-        yield cluster.address
-    elif isinstance(cluster, Kubernetes):
-        with scaled_deployment(
-            cluster.api, cluster.namespace, cluster.deployment, replicas=cluster.workers
-        ):
-            yield cluster.address
-    else:
-        # The executor counts the deaths of workers, per scene.
-        with (
-            dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-            _slurm(cluster) as jobs,
-        ):
-            yield jobs
 
 
 def _slurm(cluster: Slurm) -> Any:

@@ -191,19 +191,13 @@ def _counts(file: Path, kind: str) -> tuple[int, int, int]:
 def _entry(day: int, products: tuple[_ProductFile, ...]) -> SceneEntry:
     recipe = products[0].recipe
     keys, scene = recipe.settings["keys"], recipe.plan.scene
+    inputs = [used for product in products for used in product.recipe.inputs]
     outcome = SceneOutcome(
         scene=scene,
         station=keys["station"],
         instrument=keys["instrument"],
         start=parse_scene_id(scene)[1],
-        granules=len(
-            {
-                used.path
-                for product in products
-                for used in product.recipe.inputs
-                if used.role is Role.SIGNAL
-            }
-        ),
+        granules=len({used.path for used in inputs if used.role is Role.SIGNAL}),
         plan=None,
         products=tuple(product.record for product in products),
     )
@@ -211,19 +205,14 @@ def _entry(day: int, products: tuple[_ProductFile, ...]) -> SceneEntry:
         NewProduct(
             product.record,
             product.mtime_ns,
-            _dependence(product.recipe),
+            Dependence(
+                plan_hash=product.recipe.plan.hash,
+                settings_hash=settings_digest(product.recipe.settings),
+                inputs_hash=dependence.inputs_digest(product.recipe.inputs),
+                code_version=product.recipe.code_version,
+            ),
             (*product.recipe.inputs, *dependence.unused_inputs(product.recipe.unused)),
         )
         for product in products
     )
     return SceneEntry(outcome=outcome, day=day, key="", final=False, products=new)
-
-
-def _dependence(recipe: Recipe) -> Dependence:
-    """Return what a product depends on, as it states it."""
-    return Dependence(
-        plan_hash=recipe.plan.hash,
-        settings_hash=settings_digest(recipe.settings),
-        inputs_hash=dependence.inputs_digest(recipe.inputs),
-        code_version=recipe.code_version,
-    )

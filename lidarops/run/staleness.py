@@ -174,15 +174,12 @@ class Judge(DayStates):
 
     Parameters
     ----------
-    campaign : Campaign
-    store : Store
-    selection : Selection
+    campaign, store, selection, known
+        As of `DayStates`.
     force : bool
         Whether every selected product counts as stale.
     thaw : bool
         Whether products of frozen periods are replaced, too.
-    known : DayStates, optional
-        Earlier states, since which the catalog has not changed.
     """
 
     def __init__(
