@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -43,7 +43,6 @@ from lidarops.kinds import kinds
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
     from lidarops.records import LeftOut, Plan, PlannedStep
-    from lidarops.run.archive import EarlierProblems
     from lidarops.run.options import Selection
     from lidarops.run.staleness import Judgement
 
@@ -157,9 +156,14 @@ def _plan(
         if settings.metadata.lacking:
             names = ", ".join(settings.metadata.lacking)
             say_wrapped(f"metadata of the campaign: products will lack {names}", "")
-        _show_earlier(earlier)
+        unchanged = "not tried again, because nothing has changed"
+        show_rows(f"Failed before; {unchanged}", ("scene", "error"), earlier.failed.items())
+        unusable = earlier.unusable.items()
+        show_rows(f"Without a usable value; {unchanged}", ("scene", "problem"), unusable)
         # With --stale, fresh scenes are not judged.
-        _show_count(to_be_made, None if stale else count)
+        whole = "" if stale else f" of {count}"
+        say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
+        say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
     exit_with_status(failed=failed or bool(refused) or any(earlier) or findings.failed)
 
 
@@ -230,15 +234,6 @@ def _settings(step: PlannedStep) -> Iterator[str]:
         number = f"{value:.6g}" if isinstance(value, float) else f"{value}"
         unit = "" if value is None else unit_of(model, key)
         yield f"{key} {number} {unit}".rstrip()
-
-
-def _show_earlier(earlier: EarlierProblems) -> None:
-    """Print the scenes that failed or gave nothing in earlier runs and are not due."""
-    unchanged = "not tried again, because nothing has changed"
-    show_rows(f"Failed before; {unchanged}", ("scene", "error"), earlier.failed.items())
-    show_rows(
-        f"Without a usable value; {unchanged}", ("scene", "problem"), earlier.unusable.items()
-    )
 
 
 def _show_stale(title: str, judged: Judgement) -> None:
@@ -329,38 +324,25 @@ def _say_steps(plan: Plan) -> None:
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
         say_wrapped(f"steps: {', '.join(names)}", "  ")
-    missed = [left for left in plan.left_out if left.name in kinds() and left.rule != REQUEST]
-    for name, channels, reason in _grouped(
-        (left.name, left.reason, left.channel) for left in missed
-    ):
-        say_wrapped(f"requested, but left out: {name} {channels}: {reason}", "  ")
-    for channels, reason in _unread(plan, {left.channel for left in missed}):
-        say_wrapped(f"without product: {channels}: {reason}", "  ")
+    requested = [left for left in plan.left_out if left.rule != REQUEST]
+    missed = [left for left in requested if left.name in kinds()]
+    told = {left.channel for left in missed}
+    unread = [left for left in requested if left.name == READ_STEP and left.channel not in told]
     warned = [step for step in plan.steps if step.warning]
-    for name, channels, warning in _grouped(
-        (step.name, step.warning, step.channel) for step in warned
+    for words, lines in (
+        (
+            "requested, but left out: {0} {1}: {2}",
+            [(left.name, left.reason, left.channel) for left in missed],
+        ),
+        ("without product: {1}: {2}", [(left.name, left.reason, left.channel) for left in unread]),
+        ("warning: {0} {1}: {2}", [(step.name, step.warning, step.channel) for step in warned]),
     ):
-        say_wrapped(f"warning: {name} {channels}: {warning}", "  ")
+        for row in _grouped(lines):
+            say_wrapped(words.format(*row), "  ")
     shown = {*kinds(), READ_STEP}
     others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:
         say_wrapped(f"left out, of some channels: {', '.join(others)}", "  ")
-
-
-def _unread(plan: Plan, told: Container[str]) -> Iterator[tuple[str, str]]:
-    """Yield channels that the campaign names and that are not read, with the reason.
-
-    Without those of which a product is shown as left out.
-    """
-    from lidarops.scene.case import READ_STEP, REQUEST
-
-    unread = (
-        left
-        for left in plan.left_out
-        if left.name == READ_STEP and left.rule != REQUEST and left.channel not in told
-    )
-    for _, channels, reason in _grouped((left.name, left.reason, left.channel) for left in unread):
-        yield channels, reason
 
 
 def _show_refused(reasons: Sequence[str]) -> None:
@@ -374,12 +356,6 @@ def _show_refused(reasons: Sequence[str]) -> None:
     rest = len(reasons) - sum(count for _, count in frequent)
     if rest:
         say_wrapped(f"{counted(rest, 'file')}: other reasons", "  ")
-
-
-def _show_count(stale: int, scenes: int | None) -> None:
-    """Print how many scenes are stale, of how many if all were judged, and how to see more."""
-    say_wrapped(f"{counted(stale, 'stale scene')}{'' if scenes is None else f' of {scenes}'}", "")
-    say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
 
 
 def _grouped(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:

@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from lidarops.campaign.model import Campaign, InstrumentFacts
+from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Verdict
 from lidarops.kinds import Scope, kind_of
 from lidarops.plan import channels
-from lidarops.records import FactsNote, Findings, Holding, IdlePattern, Role, Unmade, UnusableFile
+from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, UnusableFile
 from lidarops.run.day_states import DayStates
 from lidarops.run.options import requested_products, station_of
 
@@ -58,6 +58,7 @@ def find(
     instruments = {member for name in owners for member in _members(campaign, name)}
     usable = {name for verdict in settled.values() for name in verdict.files}
     exchanged = channels.exchanged_recorders(states.names.holdings)
+    incomplete, idle = _facts_notes(states, sorted(instruments))
     return Findings(
         unmet=channels.unavailable_channels(
             campaign,
@@ -68,17 +69,14 @@ def find(
             until=selection.until,
         ),
         file_notes=(*store.file_notes(instruments), *states.names.notes(instruments)),
-        idle_patterns=tuple(idle for idle in idle_patterns if idle.instrument in instruments),
+        idle_patterns=tuple(one for one in idle_patterns if one.instrument in instruments),
         unusable_files=tuple(_unusable_files(states, sorted(instruments), usable)),
         unmade=tuple(_unmade(states, owners, orphans, settled)),
         incomplete_facts=(
-            *_incomplete_facts(states, sorted(instruments)),
+            *incomplete,
             *(note for note in exchanged if note.instrument in instruments),
         ),
-        idle_facts=(
-            *_idle_facts(states, sorted(instruments)),
-            *(lost.idle if lost else ()),
-        ),
+        idle_facts=(*idle, *(lost.idle if lost else ())),
         lost_files=tuple(
             found for found in (lost.findings if lost else ()) if found.instrument in instruments
         ),
@@ -91,33 +89,27 @@ def _members(campaign: Campaign, owner: str) -> Collection[str]:
     return (owner,) if network is None else network.instruments
 
 
-def _incomplete_facts(states: DayStates, instruments: Iterable[str]) -> Iterator[FactsNote]:
-    """Yield the facts of instruments with files that state no overlap."""
+def _facts_notes(
+    states: DayStates, instruments: Iterable[str]
+) -> tuple[list[FactsNote], list[FactsNote]]:
+    """Return the facts that state no overlap, and those that no file or product uses.
+
+    Of instruments with files only.
+    """
+    incomplete, idle = [], []
     for name in instruments:
-        for facts in states.campaign.instruments[name].facts:
-            stated = facts.full_overlap_range or facts.overlap_profile
-            if not stated and _hold_for_files(facts, states.names.holdings, name):
-                yield FactsNote(name, channels.period_of(facts), _NO_OVERLAP)
-
-
-def _idle_facts(states: DayStates, instruments: Iterable[str]) -> Iterator[FactsNote]:
-    """Yield the facts that no file or product uses, of instruments with files."""
-    holdings = states.names.holdings
-    for name in {held.instrument: None for held in holdings if held.instrument in instruments}:
         instrument = states.campaign.instruments[name]
-        for facts in instrument.facts:
-            if _hold_for_files(facts, holdings, name):
-                yield from channels.unused_lidar_ratios(name, facts, instrument)
-            else:
+        times = [held.since for held in states.names.holdings if held.instrument == name]
+        for facts in instrument.facts if times else ():
+            period = channels.period_of(facts)
+            if not any(facts.valid_from <= time < facts.valid_to for time in times):
                 reason = "hold for no file: their period and the times of the files do not overlap"
-                yield FactsNote(name, channels.period_of(facts), reason)
-
-
-def _hold_for_files(facts: InstrumentFacts, holdings: Iterable[Holding], instrument: str) -> bool:
-    return any(
-        held.instrument == instrument and facts.valid_from <= held.since < facts.valid_to
-        for held in holdings
-    )
+                idle.append(FactsNote(name, period, reason))
+                continue
+            idle += channels.unused_lidar_ratios(name, facts, instrument)
+            if not (facts.full_overlap_range or facts.overlap_profile):
+                incomplete.append(FactsNote(name, period, _NO_OVERLAP))
+    return incomplete, idle
 
 
 def _unusable_files(

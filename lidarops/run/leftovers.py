@@ -48,6 +48,22 @@ class Orphan:
     """Whether the campaign still requests it, but no raw file of its scene is left."""
 
 
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The lost raw files of a campaign."""
+
+    findings: tuple[LostFiles, ...] = ()
+    """What a report says of those that the campaign does not acknowledge, by instrument."""
+    protected: frozenset[str] = frozenset()
+    """Products that are neither replaced nor removed."""
+    excused: frozenset[str] = frozenset()
+    """Products of which the campaign acknowledges lost files."""
+    idle: tuple[FactsNote, ...] = ()
+    """Entries of `acknowledged` that match no lost file, or have expired."""
+    unused: Mapping[str, Collection[UnusedFile]] = field(default_factory=dict)
+    """Lost files of each product, without acknowledged ones: a product made again states them."""
+
+
 def scenes_without_product(planned: Sequence[Planned], campaign: Campaign) -> dict[str, str]:
     """Return the scenes that give no product and are used by no network, and why.
 
@@ -122,20 +138,29 @@ class Leftovers:
     """The same scenes, and the good granules that belong to none."""
     content: Callable[[Granule], str]
     """Returns the SHA-256 of a granule."""
+    lost: Lost
 
     def orphans(self, made: Iterable[RecordedProduct]) -> list[tuple[RecordedProduct, Orphan]]:
-        """Return those of the products of these days that no scene would give."""
+        """Return those of the products of these days that no scene would give.
+
+        Without those whose raw files the campaign acknowledges as lost. Products whose raw files
+        may come back are kept.
+        """
         wanted = {
             product_file(scene, product)
             for scene, plan in self.planned.values()
             for product in dependence.planned_products(plan)
         }
-        return [
-            (product, Orphan(product.path, reason, product.run, kept, lost))
-            for product in made
-            if product.path not in wanted
-            for reason, kept, lost in [self._fate(product)]
-        ]
+        orphans = []
+        for product in made:
+            if product.path in wanted:
+                continue
+            reason, kept, lost = self._fate(product)
+            stays = product.path in self.lost.protected
+            if stays or not (lost and product.path in self.lost.excused):
+                one = Orphan(product.path, reason, product.run, kept or stays, lost and not stays)
+                orphans.append((product, one))
+        return orphans
 
     def _fate(self, product: RecordedProduct) -> tuple[str, bool, bool]:
         """Return why no scene gives a product, whether it is kept, and whether it is lost."""
@@ -217,22 +242,6 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
     settings = None if owner is None else owner.products.requested().get(product.kind)
     of_files = not product.channel.startswith(GLUED)
     return settings is not None and settings.covers(product.channel, of_files=of_files)
-
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """The lost raw files of a campaign."""
-
-    findings: tuple[LostFiles, ...] = ()
-    """What a report says of those that the campaign does not acknowledge, by instrument."""
-    protected: frozenset[str] = frozenset()
-    """Products that are neither replaced nor removed."""
-    excused: frozenset[str] = frozenset()
-    """Products of which the campaign acknowledges lost files."""
-    idle: tuple[FactsNote, ...] = ()
-    """Entries of `acknowledged` that match no lost file, or have expired."""
-    unused: Mapping[str, Collection[UnusedFile]] = field(default_factory=dict)
-    """Lost files of each product, without acknowledged ones: a product made again states them."""
 
 
 def find_lost(campaign: Campaign, store: Store) -> Lost:

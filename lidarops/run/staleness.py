@@ -243,12 +243,11 @@ class Judge(DayStates):
         ]
         unplanned = {judged.scene.id for judged in judgements if not judged.planned}
         plans = {scene.id: (scene, plan) for scene, plan in planned}
-        leftovers = Leftovers(self.campaign, self.store, plans, cut, self._content)
+        leftovers = Leftovers(self.campaign, self.store, plans, cut, self._content, self.lost)
         orphans = [
-            (product, self._kept_orphan(orphan))
+            (product, orphan)
             for product, orphan in leftovers.orphans(made.values())
-            # What the archive lost on purpose is no finding.
-            if product.scene not in unplanned and not (orphan.lost and self._is_excused(product))
+            if product.scene not in unplanned
         ]
         # What is not replaced and files that cannot be used are reported by every run; a signature
         # does not hold all that may end an internal error.
@@ -326,14 +325,6 @@ class Judge(DayStates):
     def lost(self) -> Lost:
         """Raw files of products that the archive no longer gives; looked up once."""
         return find_lost(self.campaign, self.store)
-
-    def _is_excused(self, made: RecordedProduct) -> bool:
-        return made.path in self.lost.excused - self.lost.protected
-
-    def _kept_orphan(self, orphan: Orphan) -> Orphan:
-        """Return an orphan that is not removed if its raw files may come back."""
-        stays = orphan.path in self.lost.protected
-        return replace(orphan, requested=True, lost=False) if stays else orphan
 
     def _cut(
         self, first: int, last: int, days: set[int], products: Sequence[RecordedProduct]
