@@ -18,7 +18,6 @@ from typing import Final
 
 import sqlalchemy as sa
 
-from lidarops.campaign.model import Campaign
 from lidarops.catalog.database import Database
 from lidarops.catalog.schema import LOCK
 from lidarops.errors import CatalogError
@@ -147,7 +146,7 @@ class Lock(AbstractContextManager["Lock"]):
         waited = False
         while not attempt():
             if time.monotonic() >= until:
-                raise self.refusal()
+                raise self._refusal()
             waited = True
             time.sleep(_POLL)
         return waited
@@ -223,12 +222,11 @@ class Lock(AbstractContextManager["Lock"]):
                 # The disk is busy or full: the next write reports it; the next beat may succeed.
                 continue
 
-    def refusal(self) -> CatalogError:
+    def _refusal(self) -> CatalogError:
         """Return the error of a process that does not get the lock; it names the holder."""
         current = self.holder()
-        if current is None:
-            problem = "another run holds the catalog"
-        else:
+        problem = "another run holds the catalog"
+        if current is not None:
             since = datetime.fromtimestamp(current.acquired, UTC)
             problem = f"held by {current.name} since {since:%Y-%m-%d %H:%M:%S} UTC"
         return CatalogError(
@@ -236,25 +234,6 @@ class Lock(AbstractContextManager["Lock"]):
             file=self._database.place,
             remedy="wait for it with --wait SECONDS, or stop it",
         )
-
-
-def refuse_held_catalog(campaign: Campaign) -> None:
-    """Refuse a catalog that a living process holds.
-
-    Raises
-    ------
-    CatalogError
-        Names the holder.
-    """
-    try:
-        database = Database(campaign.catalog_url, campaign.name, create=False)
-    except CatalogError:
-        # There is none yet, or the run says what is wrong with it.
-        return
-    with database:
-        lock = Lock(database)
-        if lock.is_taken():
-            raise lock.refusal()
 
 
 def _machine() -> str:

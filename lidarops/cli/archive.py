@@ -214,16 +214,11 @@ def reprocess(
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
-    from lidarops.catalog.lock import refuse_held_catalog
-
-    set_up_log(log_level, as_json=log_json, file=log_file)
-    settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
-    if not wait:
-        # Before what follows loads modules for seconds.
-        refuse_held_catalog(settings)
     from lidarops.run import archive as pipeline
     from lidarops.run.options import missing_report, selects_no_scene
 
+    set_up_log(log_level, as_json=log_json, file=log_file)
+    settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with progress_bar("reprocess", None, "granules") as bar:
