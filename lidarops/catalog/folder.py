@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from lidarops.catalog.headers import HEADER_BYTES
 from lidarops.catalog.sources import (
     RawFile,
     Source,
@@ -27,7 +28,6 @@ from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 
-_HEADER_BYTES: Final = 16384
 _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
 
@@ -265,7 +265,7 @@ def _is_copy(source: Source, file: RawFile, files: Sequence[RawFile]) -> bool:
 def _header(source: Source, file: RawFile) -> RawHeader:
     if printable(file.path) != file.path:
         raise RawFormatError("has a name that is not UTF-8", remedy="rename it")
-    return parse_raw_header(source.head(file.path, _HEADER_BYTES), file=file.path, size=file.size)
+    return parse_raw_header(source.head(file.path, HEADER_BYTES), file=file.path, size=file.size)
 
 
 def _label(channel: str) -> str:

@@ -32,15 +32,8 @@ class Journal:
         self._folder = folder
         self._refused = False
 
-    def begin(self, record: RunRecord) -> None:
-        """Write the record of a run that has no scenes yet."""
-        self._write(record)
-
-    def add(self, outcome: SceneOutcome) -> None:
-        """Write a scene that has ended."""
-        self._write(outcome)
-
-    def _write(self, entry: RunRecord | SceneOutcome) -> None:
+    def write(self, entry: RunRecord | SceneOutcome) -> None:
+        """Write the record of a run that has no scenes yet, or a scene that has ended."""
         if self._refused:
             return
         try:

@@ -378,7 +378,7 @@ class Pass:
             self.store.begin_run(self.run, self.lock.token, swept=swept)
             if self.options.journal:
                 self.journal = Journal(self.campaign.report_root / self.run.id)
-                self.journal.begin(self._record(self.run))
+                self.journal.write(self._record(self.run))
         return self.run
 
     def take(self, job: Job, *, note: bool = False) -> None:
@@ -420,7 +420,7 @@ class Pass:
             brief = _joined(self.outcomes[outcome.scene], brief)
         # First, so that whatever the ledger knows is in the report, also of a run that is killed.
         if self.journal:
-            self.journal.add(brief)
+            self.journal.write(brief)
         self.store.record(entry, run.id, self.lock.token)
         if _went_as_planned(judged, outcome):
             self.fresh.add(judged.scene.id)

@@ -425,14 +425,15 @@ class Judge(DayStates):
         for kind, channel in products:
             path = product_file(scene, (kind, channel))
             known = made.get(path)
-            read = self._products_read(judged, (kind, channel), made)
-            judged = replace(judged, products=tuple(dict.fromkeys((*judged.products, *read))))
+            if reads_of(kind):
+                read = self._products_read(judged, (kind, channel), made)
+                judged = replace(judged, products=tuple(dict.fromkeys((*judged.products, *read))))
             reason, restored = self._reason(judged, (kind, channel), known)
             if reason:
                 one = Stale(kind, channel, reason, known, restored)
                 if known and known.path in self.lost.protected:
                     kept.append(one)
-                elif self._stays_frozen(scene, one):
+                elif known and not restored and self._is_frozen(scene):
                     frozen.append(self._with_remedy(one))
                 else:
                     stale.append(one)
@@ -452,17 +453,13 @@ class Judge(DayStates):
     ) -> tuple[InputRecord, ...]:
         """Return the products that are there or to be made, and of which a product is made."""
         scene = judged.scene
-        if not reads_of(product[0]):
-            return ()
         closure, _ = self.plan_and_settings(scene, judged.plan, product)
         keys = [key for step in closure.steps for key in dependence.read_products(step)]
         of_scene = (self._read(product_file(scene, key), made) for key in keys)
         return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)
 
-    def _stays_frozen(self, scene: Scene, stale: Stale) -> bool:
-        """Return whether a product would be replaced, and its period forbids it."""
-        replaced = stale.before is not None and not stale.restored
-        return replaced and not self._thaw and self.campaign.is_frozen(scene.start)
+    def _is_frozen(self, scene: Scene) -> bool:
+        return not self._thaw and self.campaign.is_frozen(scene.start)
 
     def _with_remedy(self, frozen: Stale) -> Stale:
         """Return a frozen product whose reason says, if its file is missing, what restores it."""
