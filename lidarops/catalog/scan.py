@@ -25,7 +25,7 @@ from lidarops.errors import CatalogError
 from lidarops.records import UNREADABLE, IdlePattern, Role, Status
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import Processes
-from lidarops.system.stores import without_keys
+from lidarops.system.stores import Stored, without_keys
 
 _BATCH = 2000
 _TOGETHER = 250
@@ -138,7 +138,7 @@ def _joined(
         found = [each for _, each in alike]
         yield (
             # The printable form of a name that is not UTF-8 may equal another path.
-            next((each for each in found if isinstance(each, RawFile)), None),
+            next((each for each in found if isinstance(each, Stored)), None),
             next((each for each in found if isinstance(each, Fingerprint)), None),
         )
 

@@ -9,18 +9,12 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from lidarops.errors import CatalogError
-from lidarops.system.stores import RemoteStore
+from lidarops.system.stores import RemoteStore, Stored
 
-
-class RawFile(NamedTuple):
-    """A file of the archive, as the file system lists it."""
-
-    path: str
-    size: int
-    mtime_ns: int
+RawFile = Stored
+"""A file of the archive, as the file system lists it."""
 
 
 def printable(path: str) -> str:
@@ -82,7 +76,7 @@ class Source:
     ) -> Iterator[RawFile]:
         """List files, sorted by path; those that are not used may have no size."""
         self.refuse_absent()
-        yield from self._walk(str(self._root), "")
+        yield from self._below(str(self._root), "")
 
     def refuse_absent(self) -> None:
         """Raise an error if the folder does not exist.
@@ -98,7 +92,7 @@ class Source:
                 remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
             )
 
-    def _walk(self, folder: str, prefix: str) -> Iterator[RawFile]:
+    def _below(self, folder: str, prefix: str) -> Iterator[RawFile]:
         try:
             with os.scandir(folder) as listing:
                 entries = sorted(listing, key=_rank)
@@ -109,7 +103,7 @@ class Source:
         for entry in entries:
             path = f"{prefix}{entry.name}"
             if entry.is_dir(follow_symlinks=False):
-                yield from self._walk(entry.path, f"{path}/")
+                yield from self._below(entry.path, f"{path}/")
             else:
                 yield _listed(entry, path)
 
@@ -134,24 +128,8 @@ class Source:
         return os.open(file, os.O_RDONLY | os.O_CLOEXEC)
 
 
-class RemoteSource(Source):
+class RemoteSource(RemoteStore, Source):
     """An archive behind an fsspec URL."""
-
-    def __init__(self, url: str) -> None:
-        self._store = RemoteStore(url)
-
-    def files(self, is_used: Callable[[str], bool] = lambda _: True) -> Iterator[RawFile]:
-        """List files, sorted by path; those that are not used may have no size."""
-        for stored in self._store.files(is_used):
-            yield RawFile(stored.path, stored.size, stored.stamp)
 
     def refuse_absent(self) -> None:
         """Do nothing: checking a store may take as long as listing it."""
-
-    def head(self, path: str, size: int) -> bytes:
-        """Return the first bytes of a file."""
-        return self._store.head(path, size)
-
-    def digest(self, path: str) -> str:
-        """Return the SHA-256 of a file."""
-        return self._store.digest(path)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import unquote
 
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
@@ -69,16 +69,15 @@ _DRIVER_ERRORS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
-    """An object in the listing of a store."""
+class Stored(NamedTuple):
+    """A file in the listing of a store, or of a folder."""
 
     path: str
-    """Path relative to the URL, as the store states it; see `is_confined`."""
+    """Path relative to the URL or folder, as this states it; see `is_confined`."""
     size: int
     """Size in bytes."""
-    stamp: int
-    """Changes with the object: its modification time in ns, or a number derived from its tag."""
+    mtime_ns: int
+    """Changes with the file: its modification time in ns, or a number derived from its tag."""
 
 
 @dataclass(frozen=True, slots=True)
