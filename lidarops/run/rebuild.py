@@ -112,17 +112,12 @@ def rebuild_ledger(
     return rebuilt
 
 
-@dataclass(frozen=True, slots=True)
-class _ProductFile:
-    """What a product file says of itself."""
-
-    recipe: Recipe
-    record: ProductRecord
-    mtime_ns: int
+_Product = tuple[Recipe, NewProduct]
+"""What a product file says of itself, and its entry."""
 
 
-def _scene(product: _ProductFile) -> str:
-    return product.recipe.plan.scene
+def _scene(product: _Product) -> str:
+    return product[0].plan.scene
 
 
 def _day_in(path: str) -> int | None:
@@ -135,7 +130,7 @@ def _day_in(path: str) -> int | None:
 
 def _read_products(
     campaign: Campaign, rebuilt: Rebuilt, progress: Callable[[int], None], paths: Iterable[str]
-) -> list[_ProductFile]:
+) -> list[_Product]:
     """Return the products among some files, by scene and path, and note what the others are."""
     products = []
     for path in paths:
@@ -145,10 +140,10 @@ def _read_products(
         except LidarOpsError as error:
             problem = str(error).removeprefix(f"{campaign.products_root}/")
             rebuilt.problems[path] = problem
-    return sorted(products, key=lambda product: (_scene(product), product.record.path))
+    return sorted(products, key=lambda product: (_scene(product), product[1].record.path))
 
 
-def _read_product(campaign: Campaign, path: str) -> _ProductFile:
+def _read_product(campaign: Campaign, path: str) -> _Product:
     file = campaign.products_root / path
     with reading(file):
         recipe = Recipe.of(file)
@@ -168,7 +163,14 @@ def _read_product(campaign: Campaign, path: str) -> _ProductFile:
             path, kind, channel, sha256_of(file), status.st_size, values, {}, unflagged, usable,
             stamp=recipe.stamp,
         )  # fmt: skip
-        return _ProductFile(recipe, record, status.st_mtime_ns)
+        depends_on = Dependence(
+            plan_hash=recipe.plan.hash,
+            settings_hash=settings_digest(recipe.settings),
+            inputs_hash=dependence.inputs_digest(recipe.inputs),
+            code_version=recipe.code_version,
+        )
+        inputs = (*recipe.inputs, *dependence.unused_inputs(recipe.unused))
+        return recipe, NewProduct(record, status.st_mtime_ns, depends_on, inputs)
 
 
 def _counts(file: Path, kind: str) -> tuple[int, int, int]:
@@ -188,10 +190,11 @@ def _counts(file: Path, kind: str) -> tuple[int, int, int]:
     return flags.size, unflagged, usable
 
 
-def _entry(day: int, products: tuple[_ProductFile, ...]) -> SceneEntry:
-    recipe = products[0].recipe
+def _entry(day: int, products: tuple[_Product, ...]) -> SceneEntry:
+    recipe = products[0][0]
     keys, scene = recipe.settings["keys"], recipe.plan.scene
-    inputs = [used for product in products for used in product.recipe.inputs]
+    inputs = [used for stated, _ in products for used in stated.inputs]
+    new = tuple(entry for _, entry in products)
     outcome = SceneOutcome(
         scene=scene,
         station=keys["station"],
@@ -199,20 +202,6 @@ def _entry(day: int, products: tuple[_ProductFile, ...]) -> SceneEntry:
         start=parse_scene_id(scene)[1],
         granules=len({used.path for used in inputs if used.role is Role.SIGNAL}),
         plan=None,
-        products=tuple(product.record for product in products),
-    )
-    new = tuple(
-        NewProduct(
-            product.record,
-            product.mtime_ns,
-            Dependence(
-                plan_hash=product.recipe.plan.hash,
-                settings_hash=settings_digest(product.recipe.settings),
-                inputs_hash=dependence.inputs_digest(product.recipe.inputs),
-                code_version=product.recipe.code_version,
-            ),
-            (*product.recipe.inputs, *dependence.unused_inputs(product.recipe.unused)),
-        )
-        for product in products
+        products=tuple(entry.record for entry in new),
     )
     return SceneEntry(outcome=outcome, day=day, key="", final=False, products=new)
