@@ -183,9 +183,7 @@ def _unfinished(result: Result) -> LidarOpsError:
     remedy = "run again: finished scenes are kept"
     if result.status is not RunStatus.STOPPED:
         return SceneError(f"the run is {result.status}", remedy=remedy)
-    errors = [
-        scene.error for scene in (result.record.scenes if result.record else ()) if scene.error
-    ]
+    errors = [scene.error for scene in result.scenes if scene.error]
     last_error = f": {errors[-1]}" if errors else ""
     # A run stops if products cannot be written, which a retry may cure; see `_may_pass`.
     return ProductError(
@@ -363,11 +361,7 @@ def _refused(campaign: Campaign, result: Result) -> Mapping[str, str]:
     """Return file -> reason of the files refused by the catalog or by a scene of the run."""
     with Store(campaign.catalog_url, campaign.name) as store:
         early = store.refused()
-    late = (
-        []
-        if result.record is None
-        else [granule for scene in result.record.scenes for granule in scene.refused]
-    )
+    late = [granule for scene in result.scenes for granule in scene.refused]
     return {granule.path: granule.reason for granule in (*early, *late)}
 
 

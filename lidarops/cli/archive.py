@@ -310,7 +310,7 @@ def _show_refused(refused: list[Granule]) -> None:
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
-    record, scenes = result.record, _scenes(result)
+    record, scenes = result.record, result.scenes
     return {
         "run": None if record is None else record.id,
         "status": result.status.value,
@@ -364,7 +364,9 @@ def _print_places(result: Result, page: Path | None) -> None:
     if page is not None:
         say(f"report:   {from_here(page)}")
     if result.internal:
-        on_page = page is not None and set(result.internal) <= _processed_scenes(result)
+        on_page = page is not None and set(result.internal) <= {
+            scene.scene for scene in result.scenes
+        }
         scenes = counted(len(result.internal), "scene")
         place = page if on_page else "the output of the same command with --json"
         say(
@@ -387,7 +389,7 @@ def _refused(campaign: Campaign, result: Result) -> list[Granule]:
 def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removing: bool) -> None:
     from lidarops.reports.findings import disagreement_rows, scene_note_rows
 
-    scenes = _scenes(result)
+    scenes = result.scenes
     columns: tuple[str, ...] = (
         "scene",
         "kind",
@@ -447,7 +449,7 @@ def _show_changes(result: Result) -> None:
 
     rows = (
         (product.path, change.grade.value, change_in_words(change), "; ".join(change.causes))
-        for scene in _scenes(result)
+        for scene in result.scenes
         for product in scene.products
         for change in [product.change]
         if change is not None
@@ -473,7 +475,7 @@ def _show_orphans(result: Result, removed: int | None) -> None:
 def _show_scenes_with_problems(result: Result) -> None:
     from lidarops.run.options import NO_USABLE_VALUE
 
-    processed = _processed_scenes(result)
+    processed = {scene.scene for scene in result.scenes}
     unusable = dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE)
     columns = ("scene", "problem")
     now = ((scene, problem) for scene, problem in unusable.items() if scene in processed)
@@ -484,11 +486,3 @@ def _show_scenes_with_problems(result: Result) -> None:
         columns,
         ((scene, problem) for scene, problem in earlier if scene not in processed),
     )
-
-
-def _scenes(result: Result) -> tuple[SceneOutcome, ...]:
-    return () if result.record is None else result.record.scenes
-
-
-def _processed_scenes(result: Result) -> set[str]:
-    return {scene.scene for scene in _scenes(result)}

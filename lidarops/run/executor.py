@@ -48,7 +48,6 @@ MOST_TRIES: Final = 3
 """A scene that kills its worker this often is refused."""
 USABLE: Final = 0.9
 """Share of a limit that a scene may use; dask ends a worker at 0.95."""
-_MEGABYTE: Final = 1e6
 
 _LOG = logging.getLogger(__name__)
 
@@ -209,25 +208,20 @@ def fitted(job: Job, limit: int | None) -> Job:
         return job
     profiles = memory.profiles_within(USABLE * limit)
     if not profiles:
-        megabytes = {
-            name: f"{size / _MEGABYTE:.0f} MB"
-            for name, size in {
-                "all": memory.of(1),
-                "process": memory.process,
-                "held": memory.held,
-                "limit": limit,
-                "least": memory.of(1) / USABLE,
-            }.items()
-        }
         raise SceneError(
-            f"needs about {megabytes['all']} of memory even with one profile in a chunk"
-            f" ({megabytes['process']} for the process, {megabytes['held']} held for the whole"
-            f" scene); {USABLE:.0%} of the limit of {megabytes['limit']} may be used",
-            remedy=f"raise --memory-limit, or the limit of the workers, to {megabytes['least']};"
-            " or give a shorter window of scenes or longer averaging intervals in the campaign"
-            " file; --profiles-per-chunk 1 tries it nevertheless",
+            f"needs about {_size(memory.of(1))} of memory even with one profile in a chunk"
+            f" ({_size(memory.process)} for the process, {_size(memory.held)} held for the whole"
+            f" scene); {USABLE:.0%} of the limit of {_size(limit)} may be used",
+            remedy="raise --memory-limit, or the limit of the workers, to"
+            f" {_size(memory.of(1) / USABLE)}; or give a shorter window of scenes or longer"
+            " averaging intervals in the campaign file; --profiles-per-chunk 1 tries it"
+            " nevertheless",
         )
     return replace(job, profiles_per_chunk=profiles)
+
+
+def _size(memory: float) -> str:
+    return f"{memory / 1e6:.0f} MB"
 
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:

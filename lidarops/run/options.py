@@ -127,6 +127,11 @@ class Result:
     """The signal that stopped the run."""
 
     @property
+    def scenes(self) -> tuple[SceneOutcome, ...]:
+        """Scenes of the run."""
+        return () if self.record is None else self.record.scenes
+
+    @property
     def failed_scenes(self) -> Mapping[str, str]:
         """Scene -> error, now or since an earlier run, without internal errors."""
         errors = self._errors
@@ -140,16 +145,14 @@ class Result:
 
     @property
     def _errors(self) -> dict[str, str]:
-        scenes = () if self.record is None else self.record.scenes
-        return {**self.failures, **{scene.scene: scene.error for scene in scenes if scene.error}}
+        now = {scene.scene: scene.error for scene in self.scenes if scene.error}
+        return {**self.failures, **now}
 
     @property
     def unusable_scenes(self) -> tuple[str, ...]:
         """Scenes whose retrievals gave no usable value: of the archive, and of this run."""
-        scenes = () if self.record is None else self.record.scenes
-        return tuple(
-            dict.fromkeys((*self.unusable, *(scene.scene for scene in scenes if scene.unusable)))
-        )
+        now = (scene.scene for scene in self.scenes if scene.unusable)
+        return tuple(dict.fromkeys((*self.unusable, *now)))
 
     @property
     def lost(self) -> Mapping[str, str]:

@@ -673,25 +673,21 @@ def _verdicts(
 
 def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> str:
     """Describe how the inputs of a product changed; name the first file of each change."""
-    files_before = {used.sha256: used for used in before}
-    files_now = {used.sha256: used for used in now}
-    lost = [files_before[sha256] for sha256 in files_before.keys() - files_now.keys()]
-    fresh = [files_now[sha256] for sha256 in files_now.keys() - files_before.keys()]
+    old, new = ({used.sha256: used for used in files} for files in (before, now))
+    lost = [old[sha256] for sha256 in old.keys() - new.keys()]
+    fresh = [new[sha256] for sha256 in new.keys() - old.keys()]
     changed = {used.path for used in lost} & {used.path for used in fresh}
-    changes = [
-        _named("changed", [used for used in fresh if used.path in changed]),
-        _named("new", [used for used in fresh if used.path not in changed]),
-        _named("gone", [used for used in lost if used.path not in changed]),
-    ]
-    return "; ".join(change for change in changes if change) or "its inputs changed"
-
-
-def _named(word: str, files: Sequence[InputRecord]) -> str:
-    if not files:
-        return ""
-    first = min(files, key=lambda used: used.path)
-    others = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return f"{word}: {first.role.value} {first.path}{others}"
+    changes = []
+    for word, files in (
+        ("changed", [used for used in fresh if used.path in changed]),
+        ("new", [used for used in fresh if used.path not in changed]),
+        ("gone", [used for used in lost if used.path not in changed]),
+    ):
+        if files:
+            first = min(files, key=lambda used: used.path)
+            others = f" and {len(files) - 1} more" if len(files) > 1 else ""
+            changes.append(f"{word}: {first.role.value} {first.path}{others}")
+    return "; ".join(changes) or "its inputs changed"
 
 
 def _moment(granule: Granule) -> datetime:
