@@ -279,23 +279,12 @@ def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> Non
     ------
     CatalogError
     """
-    refuse_wrong_url(campaign.catalog_url)
+    _engine(_parsed(campaign.catalog_url)).dispose()
     try:
         Source.of(campaign.archive).refuse_absent()
     except CatalogError as error:
         error.wrong_use = error.wrong_use or bool(archive)
         raise
-
-
-def refuse_wrong_url(url: str) -> None:
-    """Refuse an invalid database URL, without connecting.
-
-    Raises
-    ------
-    CatalogError
-        If the URL is invalid or its driver is not installed.
-    """
-    _engine(_parsed(url)).dispose()
 
 
 @contextmanager

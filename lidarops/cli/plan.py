@@ -113,7 +113,7 @@ def _plan(
     scenes = []
     count = to_be_made = 0
     failed = False
-    earlier = earlier_problems(settings, selection)
+    earlier = failed_before, unusable = earlier_problems(settings, selection)
     for judged in judgements:
         count += 1
         to_be_made += bool(judged.stale)
@@ -141,8 +141,8 @@ def _plan(
         document = {
             "scenes": scenes,
             **no_scene_found,
-            "failed_before": earlier.failed,
-            "without_a_usable_value": list(earlier.unusable),
+            "failed_before": failed_before,
+            "without_a_usable_value": list(unusable),
             "refused_files": {granule.path: granule.reason for granule in refused},
             **findings_document(findings),
             "lacking_metadata": list(settings.metadata.lacking),
@@ -157,9 +157,9 @@ def _plan(
             names = ", ".join(settings.metadata.lacking)
             say_wrapped(f"metadata of the campaign: products will lack {names}", "")
         unchanged = "not tried again, because nothing has changed"
-        show_rows(f"Failed before; {unchanged}", ("scene", "error"), earlier.failed.items())
-        unusable = earlier.unusable.items()
-        show_rows(f"Without a usable value; {unchanged}", ("scene", "problem"), unusable)
+        show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed_before.items())
+        title = f"Without a usable value; {unchanged}"
+        show_rows(title, ("scene", "problem"), unusable.items())
         # With --stale, fresh scenes are not judged.
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import product_files
@@ -193,23 +193,20 @@ def survey(
         return find(states, summary.idle_patterns, lost=find_lost(campaign, store))
 
 
-class EarlierProblems(NamedTuple):
-    """Scenes that gave nothing when they were last processed, with the reasons."""
+def earlier_problems(
+    campaign: Campaign, selection: Selection
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the selected scenes that failed, and those that gave no usable value, with reasons.
 
-    failed: dict[str, str]
-    unusable: dict[str, str]
-
-
-def earlier_problems(campaign: Campaign, selection: Selection) -> EarlierProblems:
-    """Return the selected scenes that failed or gave no usable value; a catalog must exist."""
+    As they were last processed; a catalog must exist.
+    """
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        unusable = dict.fromkeys(store.unusable_scenes(), NO_USABLE_VALUE)
-        return EarlierProblems(
-            *(
-                {scene: why for scene, why in found.items() if selection.scene(scene, campaign)}
-                for found in (store.failures(), unusable)
-            )
-        )
+        found = store.failures(), dict.fromkeys(store.unusable_scenes(), NO_USABLE_VALUE)
+    failed, unusable = (
+        {scene: why for scene, why in scenes.items() if selection.scene(scene, campaign)}
+        for scenes in found
+    )
+    return failed, unusable
 
 
 def update_catalog(
