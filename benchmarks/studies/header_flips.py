@@ -66,7 +66,7 @@ class Flips:
         self.campaign = campaign
         self.root = Path(campaign.archive)
         self.source = Memory(self.root)
-        self.headers = Headers.of(campaign, self.source, campaign.name)
+        self.headers = Headers(self.source, campaign, campaign.name)
         self.files = [file for file in _files(campaign) if self._is_good(file)]
         self.granules = {due.file.path: read_header(self.headers, due) for due in self.files}
 

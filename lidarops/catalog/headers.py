@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, date, datetime, timedelta
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from lidarops.catalog.sources import RawFile, Source, printable
 from lidarops.errors import RawFormatError
@@ -98,30 +98,24 @@ class _Lidar:
 
 @dataclass(frozen=True, slots=True)
 class Headers:
-    """The source of raw files and the settings with which their headers are read."""
+    """The source of raw files and the campaign with which their headers are read."""
 
     source: Source
-    campaign: str
-    lidars: Mapping[str, _Lidar]
+    campaign: Campaign
+    entered_as: str
+    """Name by which the catalog knows the campaign."""
 
-    @classmethod
-    def of(cls, campaign: Campaign, source: Source, entered_as: str) -> Self:
-        """Return the settings of a campaign for headers.
-
-        Rows get the name `entered_as`, by which the catalog knows the campaign.
-        """
-        lidars = {
-            name: _Lidar(instrument, campaign.stations[instrument.station])
-            for name, instrument in campaign.instruments.items()
-        }
-        return cls(source, entered_as, lidars)
+    def lidar(self, name: str) -> _Lidar:
+        """Return what the campaign states of an instrument."""
+        instrument = self.campaign.instruments[name]
+        return _Lidar(instrument, self.campaign.stations[instrument.station])
 
 
 def read_row(headers: Headers, due: UnreadFile) -> GranuleRow:
     """Read the header of a file and return its row; see `read_header`."""
     granule = read_header(headers, due)
     retry = granule.reason.startswith(_TRY_AGAIN)
-    return row_of(granule, headers.campaign, RETRY if retry else due.scan_key)
+    return row_of(granule, headers.entered_as, RETRY if retry else due.scan_key)
 
 
 def read_header(headers: Headers, due: UnreadFile) -> Granule:
@@ -136,10 +130,10 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
     try:
         head = headers.source.head(file.path, HEADER_BYTES)
         header = parse_raw_header(head, file=file.path, size=file.size)
-        return _accepted(due, header, headers.lidars[due.instrument])
+        return _accepted(due, header, headers.lidar(due.instrument))
     except RawFormatError as error:
         reason = str(error).removeprefix(f"{file.path}: ")
-        return _refused(due, reason, _start(head, headers.lidars[due.instrument]))
+        return _refused(due, reason, _start(head, headers.lidar(due.instrument)))
     except OSError as error:
         return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
 

@@ -119,7 +119,7 @@ def scan_archive(
     processes = 1 if remote else min(workers, _MOST_PROCESSES)
     with (
         store.fingerprints() as known,
-        Processes(processes, Headers.of(campaign, work.source, store.campaign)) as readers,
+        Processes(processes, Headers(work.source, campaign, store.campaign)) as readers,
     ):
         due = work.due(_joined(work.source.files(work.is_claimed), known))
         rows = readers.map_items(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
