@@ -325,9 +325,9 @@ class _ClusterQueue:
         for job in jobs:
             for tries in range(MOST_TRIES):
                 self._workers.ready(self._stop)
-                ended = list(self._ended(iter([job])))
-                if self._stop and not ended:
+                if self._stop:
                     return
+                ended = list(self._ended(iter([job])))
                 if ended:
                     yield replace(ended[0], lost_worker=tries > 0)
                     break

@@ -287,6 +287,7 @@ class Pass:
         return local_client(options.workers, memory=options.memory)
 
     def _enter(self, ended: Iterable[EndedScene], stop: StopRequest) -> None:
+        self.begin()
         for scene in ended:
             judged = self.judgements.pop(scene.outcome.scene)
             outcome = self.end(judged, scene.outcome, final=scene.final)
