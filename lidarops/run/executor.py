@@ -381,9 +381,16 @@ def _is_local(client: Client) -> bool:
 
 def _outcome_of(future: Future, job: Job) -> EndedScene | None:
     """Return how a scene ended, or None if its worker died."""
+    from concurrent.futures import CancelledError  # noqa: PLC0415 - used where it is caught
+
     from distributed import KilledWorker  # noqa: PLC0415 - takes a second to import
 
-    error = None if future.status == "finished" else _error_of(future)
+    try:
+        error = None if future.status == "finished" else future.exception()
+        if isinstance(error, CancelledError):
+            raise error
+    except CancelledError as gone:
+        raise _scheduler_lost() from gone
     if error is None:
         result = future.result()
         if not isinstance(result, str):
@@ -396,18 +403,6 @@ def _outcome_of(future: Future, job: Job) -> EndedScene | None:
     else:
         failure = Failure.of_bug(error.with_traceback(future.traceback()), final=False)
     return EndedScene.failed(failure, job.scene, job.plan)
-
-
-def _error_of(future: Future) -> BaseException | None:
-    from concurrent.futures import CancelledError  # noqa: PLC0415 - used where it is caught
-
-    try:
-        error: BaseException | None = future.exception()
-    except CancelledError as gone:
-        raise _scheduler_lost() from gone
-    if isinstance(error, CancelledError):
-        raise _scheduler_lost() from error
-    return error
 
 
 def _scheduler_lost() -> SceneError:
