@@ -255,7 +255,7 @@ def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None
     if days or _is_something_left(states, signatures):
         from lidarops.run.processing import Pass  # noqa: PLC0415 - loads the numerics
 
-        work = Pass(campaign, store, lock, states, options, summary, days, signatures, verdicts)
+        work = Pass(states, lock, options, summary, days, signatures, verdicts)
         return work.carry_out(client)
     empty_scenes, set_aside = unused(verdicts, signatures)
     return Result(

@@ -7,7 +7,7 @@ import secrets
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import chain, islice
@@ -21,7 +21,7 @@ from lidarops.catalog import product_files
 from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import ScanSummary
-from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Store, Verdict
+from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Verdict
 from lidarops.errors import CatalogError
 from lidarops.records import (
     FileNote,
@@ -85,62 +85,75 @@ def new_run(campaign: Campaign) -> Run:
     )
 
 
-@dataclass(slots=True)
 class Pass:
-    """One pass over the days to judge, after the catalog was updated."""
+    """One pass over the days to judge, after the catalog was updated.
 
-    campaign: Campaign
-    store: Store
-    lock: Lock
-    states: DayStates
-    """Since which no file was refused."""
-    options: Options
-    summary: ScanSummary
-    days: Sequence[int]
-    """To be judged."""
-    signatures: Mapping[int, Signature]
-    """Of all days."""
-    known: Mapping[int, Verdict]
-    """Verdicts before the pass."""
-    judge: Judge = field(init=False)
-    orphans: dict[str, Orphan] = field(default_factory=dict)
-    """By path; this and what follows as it was judged last."""
-    set_aside: dict[str, Granule] = field(default_factory=dict)
-    """By path."""
-    file_notes: list[FileNote] = field(default_factory=list)
-    """Notes on files of the days that were judged, which the catalog does not know."""
-    held: dict[str, Judgement] = field(default_factory=dict)
-    """By scene."""
-    frozen: dict[str, str] = field(default_factory=dict)
-    """Product of a frozen period that would be replaced -> why."""
-    empty_scenes: dict[str, str] = field(default_factory=dict)
-    """Scene -> why it can give no product."""
-    verdicts: dict[int, Verdict] = field(default_factory=dict)
-    """Of days that are settled, without signature; of those in `open` only once all their scenes
-    succeed."""
-    open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
-    """Days with stale products -> scenes."""
-    judgements: dict[str, Judgement] = field(default_factory=dict)
-    """Of the scenes that are yet to end."""
-    suspects: list[Job] = field(default_factory=list)
-    run: Run | None = None
-    """Begun before the first scene is processed."""
-    journal: Journal | None = None
-    outcomes: dict[str, SceneOutcome] = field(default_factory=dict)
-    """By scene, for the record of the run."""
-    named: int = 0
-    """Granules that the record names."""
-    left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = field(default_factory=dict)
-    fresh: set[str] = field(default_factory=set)
-    """Scenes whose products are all fresh now."""
-    lost_worker: bool = False
-    """Whether a worker died, or was abandoned at a stop."""
-    months: bool = False
-    """Whether months are processed now, or all other scenes, of whose products they are made."""
-    reduced: set[int] = field(default_factory=set)
-    """Days whose products may use a file that the processing has refused."""
-    failing: int = 0
-    """Number of scenes in a row that failed for a cause that may pass."""
+    Parameters
+    ----------
+    states : DayStates
+        Since which no file was refused.
+    lock : Lock
+    options : Options
+    summary : ScanSummary
+    days : sequence of int
+        To be judged.
+    signatures : mapping of int to Signature
+        Of all days.
+    known : mapping of int to Verdict
+        Verdicts before the pass.
+    """
+
+    def __init__(
+        self,
+        states: DayStates,
+        lock: Lock,
+        options: Options,
+        summary: ScanSummary,
+        days: Sequence[int],
+        signatures: Mapping[int, Signature],
+        known: Mapping[int, Verdict],
+    ) -> None:
+        self.campaign, self.store = states.campaign, states.store
+        self.states, self.lock, self.options, self.summary = states, lock, options, summary
+        self.days, self.signatures, self.known = days, signatures, known
+        self.reduced: set[int] = set()
+        """Days whose products may use a file that the processing has refused."""
+        self.judge = self._new_judge()
+        self.orphans: dict[str, Orphan] = {}
+        """By path; this and what follows as it was judged last."""
+        self.set_aside: dict[str, Granule] = {}
+        """By path."""
+        self.file_notes: list[FileNote] = []
+        """Notes on files of the days that were judged, which the catalog does not know."""
+        self.held: dict[str, Judgement] = {}
+        """By scene."""
+        self.frozen: dict[str, str] = {}
+        """Product of a frozen period that would be replaced -> why."""
+        self.empty_scenes: dict[str, str] = {}
+        """Scene -> why it can give no product."""
+        self.verdicts: dict[int, Verdict] = {}
+        """Of settled days, without signature; of those in `open` once all their scenes succeed."""
+        self.open: dict[int, set[str]] = defaultdict(set)
+        """Days with stale products -> scenes."""
+        self.judgements: dict[str, Judgement] = {}
+        """Of the scenes that are yet to end."""
+        self.suspects: list[Job] = []
+        self.run: Run | None = None
+        """Begun before the first scene is processed."""
+        self.journal: Journal | None = None
+        self.outcomes: dict[str, SceneOutcome] = {}
+        """By scene, for the record of the run."""
+        self.named = 0
+        """Granules that the record names."""
+        self.left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
+        self.fresh: set[str] = set()
+        """Scenes whose products are all fresh now."""
+        self.lost_worker = False
+        """Whether a worker died, or was abandoned at a stop."""
+        self.months = False
+        """Whether months are processed now, or the scenes of whose products they are made."""
+        self.failing = 0
+        """Number of scenes in a row that failed for a cause that may pass."""
 
     def carry_out(self, client: Client | None) -> Result:
         """Return what was done, and the state of the archive after it.
@@ -150,7 +163,6 @@ class Pass:
         OvertakenError
             If another run has worked on the catalog since it was read.
         """
-        self.judge = self._new_judge()
         days, signatures = self.days, self.signatures
         workers = self.options.workers
         clean = unused(self.known, signatures.keys() - set(days))
