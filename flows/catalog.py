@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Annotated
 
 import typer
 from prefect import flow, get_run_logger
@@ -24,7 +25,6 @@ from lidarops.campaign.model import load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
-from lidarops.cli.app import ArchiveOption, CatalogOption, OutOption, WaitOption
 from lidarops.run.archive import update_catalog
 
 
@@ -73,10 +73,12 @@ def catalog(
 
 def main(
     campaign: str,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    url: CatalogOption = None,
-    wait: WaitOption = 0.0,
+    archive: str | None = None,
+    out: str | None = None,
+    url: Annotated[
+        str | None, typer.Option("--catalog", help="SQLAlchemy URL of catalog and ledger.")
+    ] = None,
+    wait: Annotated[float, typer.Option(min=0, help="Seconds to wait for another run.")] = 0.0,
 ) -> None:
     """Update the catalog of a campaign as a Prefect flow."""
     # Check before the flow, which would start a server first and show tracebacks.

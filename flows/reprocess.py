@@ -51,20 +51,6 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.product_files import publish_products
 from lidarops.catalog.store import RunStatus, Store
-from lidarops.cli.app import (
-    ArchiveOption,
-    CatalogOption,
-    ClusterOption,
-    InstrumentOption,
-    OutOption,
-    ProductOption,
-    SchedulerOption,
-    SinceOption,
-    StationOption,
-    UntilOption,
-    WaitOption,
-    selection_of,
-)
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
@@ -287,7 +273,7 @@ def reprocess(
         workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
     )
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
-    selection = selection_of(instruments, stations, products, since, until)
+    selection = _selection(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # First, because copy and report may fail.
     message = _log_problems(settings, result) if result.has_failures else ""
@@ -314,6 +300,22 @@ def reprocess(
     # Prefect uses a returned state as that of the flow, and gives its data to callers.
     ended: State[Any] = Completed(name=WITH_FAILURES, message=message, data=(result, built))
     return cast("tuple[Result, Path | None]", ended)
+
+
+def _selection(
+    instruments: list[str] | None,
+    stations: list[str] | None,
+    products: list[str] | None,
+    since: datetime | None,
+    until: datetime | None,
+) -> Selection:
+    return Selection(
+        stations=tuple(stations or ()),
+        instruments=tuple(instruments or ()),
+        kinds=tuple(products or ()),
+        since=since,
+        until=until,
+    )
 
 
 def _log_problems(campaign: Campaign, result: Result) -> str:
@@ -367,23 +369,39 @@ def _refused(campaign: Campaign, result: Result) -> Mapping[str, str]:
 
 def main(
     campaign: str,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
-    instruments: InstrumentOption = None,
-    stations: StationOption = None,
-    products: ProductOption = None,
-    since: SinceOption = None,
-    until: UntilOption = None,
+    archive: str | None = None,
+    out: str | None = None,
+    catalog: Annotated[
+        str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger.")
+    ] = None,
+    instruments: Annotated[
+        list[str] | None, typer.Option("--instrument", help="Only this one; may be repeated.")
+    ] = None,
+    stations: Annotated[
+        list[str] | None, typer.Option("--station", help="Only this one; may be repeated.")
+    ] = None,
+    products: Annotated[
+        list[str] | None, typer.Option("--product", help="Only this kind; may be repeated.")
+    ] = None,
+    since: Annotated[
+        datetime | None, typer.Option(help="Only scenes that end after this UTC time.")
+    ] = None,
+    until: Annotated[
+        datetime | None, typer.Option(help="Only scenes that start before this UTC time.")
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Number of workers.")
     ] = None,
-    scheduler: SchedulerOption = None,
-    cluster: ClusterOption = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a running dask scheduler to use.")
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes a cluster.")
+    ] = None,
     memory_limit: Annotated[
         str | None, typer.Option(help="Memory limit of a local worker, such as 2GiB.")
     ] = None,
-    wait: WaitOption = 0.0,
+    wait: Annotated[float, typer.Option(min=0, help="Seconds to wait for another run.")] = 0.0,
     publish: Annotated[
         str | None, typer.Option(help="URL of a store to which the products are copied.")
     ] = None,
@@ -401,7 +419,7 @@ def main(
         valid = reprocess.validate_parameters(parameters)
         settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
         selection_names = ("instruments", "stations", "products", "since", "until")
-        check_selection(settings, selection_of(*(valid[name] for name in selection_names)))
+        check_selection(settings, _selection(*(valid[name] for name in selection_names)))
         clusters.choose_cluster(
             workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
         )

@@ -23,7 +23,6 @@ from pydantic import AfterValidator, Field
 
 from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.database import WITHOUT_PASSWORD, holds_password
-from lidarops.cli.app import REFUSED, WRONG_USE
 from lidarops.errors import CatalogError, LidarOpsError
 from lidarops.system.stores import WITHOUT_KEYS, is_url, refuse_keys
 
@@ -34,6 +33,9 @@ _START: Final = "_run_uvicorn_command"
 _LOG = logging.getLogger(__name__)
 _watchers: list[subprocess.Popen[bytes]] = []
 
+_WRONG_USE = 2
+_REFUSED = 1
+
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
@@ -43,7 +45,7 @@ def plain_errors() -> Iterator[None]:
     except (LidarOpsError, ParameterTypeError) as error:
         typer.echo(f"error: {error}", err=True)
         wrong_use = not isinstance(error, LidarOpsError) or error.wrong_use
-        raise typer.Exit(WRONG_USE if wrong_use else REFUSED) from error
+        raise typer.Exit(_WRONG_USE if wrong_use else _REFUSED) from error
 
 
 def _without_keys(location: str) -> str:

@@ -77,14 +77,6 @@ WaitOption = Annotated[
     typer.Option("--wait", min=0, help="Seconds to wait for another run on the same catalog."),
 ]
 
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", help="Address of a running dask scheduler to use."),
-]
-ClusterOption = Annotated[
-    str | None,
-    typer.Option("--cluster", help="slurm, kubernetes, or a YAML file that describes a cluster."),
-]
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=1, max=256, help="Number of processes.")
 ]

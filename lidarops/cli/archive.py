@@ -16,7 +16,6 @@ from lidarops.cli.app import (
     ArchiveOption,
     CampaignFile,
     CatalogOption,
-    ClusterOption,
     InstrumentOption,
     JsonOption,
     LogFileOption,
@@ -24,7 +23,6 @@ from lidarops.cli.app import (
     LogLevelOption,
     OutOption,
     ProductOption,
-    SchedulerOption,
     SinceOption,
     StationOption,
     UntilOption,
@@ -169,7 +167,9 @@ def reprocess(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Number of worker processes; default 1.")
     ] = None,
-    scheduler: SchedulerOption = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="Address of a running dask scheduler to use.")
+    ] = None,
     tls: Annotated[
         tuple[Path, Path, Path] | None,
         typer.Option(
@@ -177,7 +177,12 @@ def reprocess(
             help="Certificate of the authority, own certificate and own key, for --scheduler.",
         ),
     ] = None,
-    cluster: ClusterOption = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster", help="slurm, kubernetes, or a YAML file that describes a cluster."
+        ),
+    ] = None,
     memory_limit: Annotated[
         str | None,
         typer.Option(
