@@ -24,7 +24,6 @@ PURPOSES: Final = {
     "site": "pages to browse an archive",
     "aggregate": "many products as one",
     "reports": "page and record of a run",
-    "plan": "scenes, and the graph of each",
     "figures": "data reduction and drawing",
     "products": "one folder for each kind",
     "scene": "one scene: plan, signals, products",

@@ -13,7 +13,7 @@ Readers of files go by the ``flag_masks`` and ``flag_meanings`` of the file
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from typing import Final, NamedTuple, Self
 
@@ -209,6 +209,16 @@ class Flags:
     """Raised when a bit gets another place. Version 1 is that of files that state none."""
     bits: tuple[FlagBit, ...]
     """Bits of `Quality`, then the kind's own; rising."""
+    layout: str = field(init=False)
+    """Name of the places, such as ``elastic 2``."""
+    words: str = field(init=False)
+    """Names of the bits, as in ``flag_meanings``."""
+    explanation: str = field(init=False)
+    """Severity and meaning of each bit."""
+    rejecting: int = field(init=False)
+    """Union of the bits that reject a value."""
+    caring: int = field(init=False)
+    """Union of the bits of values to be used with care."""
 
     def __post_init__(self) -> None:
         places = [bit.bit_length() - 1 for bit in self.bits]
@@ -222,37 +232,20 @@ class Flags:
                 f"flags of {self.kind}: names and places must differ, and places rise: shared bits"
                 f" below {FIRST_OWN}, own bits from {FIRST_OWN} to {PLACES - 1}"
             )
+        union = rejecting(self.bits)
+        texts = [f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in self]
+        for name, value in {
+            "layout": f"{self.kind} {self.version}",
+            "words": " ".join(bit.word for bit in self.bits),
+            "explanation": "; ".join(texts),
+            "rejecting": union,
+            "caring": sum(self.bits) - union,
+        }.items():
+            object.__setattr__(self, name, value)
 
     def __iter__(self) -> Iterator[FlagBit]:
         """Iterate over the bits, rising."""
         return iter(self.bits)
-
-    @property
-    def layout(self) -> str:
-        """Name of the places, such as ``elastic 2``."""
-        return f"{self.kind} {self.version}"
-
-    @property
-    def words(self) -> str:
-        """Names of the bits, as in ``flag_meanings``."""
-        return " ".join(bit.word for bit in self.bits)
-
-    @property
-    def explanation(self) -> str:
-        """Severity and meaning of each bit."""
-        return "; ".join(
-            f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in self.bits
-        )
-
-    @property
-    def rejecting(self) -> int:
-        """Union of the bits that reject a value."""
-        return rejecting(self.bits)
-
-    @property
-    def caring(self) -> int:
-        """Union of the bits of values to be used with care."""
-        return sum(self.bits) - self.rejecting
 
     def raised(self, value: int) -> tuple[FlagBit, ...]:
         """Return the bits that a value carries; bits that the kind does not have are left out."""

@@ -12,7 +12,7 @@ main variable is drawn. A package outside lidarops adds a kind by an entry point
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
 from importlib import import_module
@@ -38,6 +38,32 @@ class _Named(Protocol):
 
 
 _Part = TypeVar("_Part", bound=_Named)
+
+
+class Registry(dict[str, _Part]):
+    """Objects that packages add by entry point, by name.
+
+    Parameters
+    ----------
+    parts : iterable
+    noun : str
+        What they are, in messages.
+    error : type
+        What is raised for a name that none has.
+    """
+
+    def __init__(
+        self, parts: Iterable[_Part], noun: str, error: type[LidarOpsError] = LidarOpsError
+    ) -> None:
+        super().__init__({part.name: part for part in parts})
+        self._noun, self._error = noun, error
+
+    def __missing__(self, name: str) -> _Part:
+        """Raise an error that names those that are installed."""
+        raise self._error(
+            f"there is no {self._noun} {name!r}",
+            remedy=f"{', '.join(self)} are installed; install the package that adds it",
+        )
 
 
 class Scope(StrEnum):
@@ -100,13 +126,15 @@ class Kind:
     """Kinds of product that it is made of, of smaller rank, so that they are made before; of the
     same scene or, with a `MonthProduct` as settings, of a month. Empty for kinds made of raw files.
     """
+    scope: Scope = field(init=False)
+    """Data that one product is made of."""
 
-    @property
-    def scope(self) -> Scope:
-        """Data that one product is made of."""
+    def __post_init__(self) -> None:
+        of_month = issubclass(self.settings, MonthProduct)
+        scope = Scope.MONTH if of_month else Scope.CHANNEL
         if issubclass(self.settings, NetworkProduct):
-            return Scope.NETWORK
-        return Scope.MONTH if issubclass(self.settings, MonthProduct) else Scope.CHANNEL
+            scope = Scope.NETWORK
+        object.__setattr__(self, "scope", scope)
 
     def part(self, module: str, name: str) -> Any:
         """Return an object of one of the modules of the kind, such as ``variables``.
@@ -134,7 +162,7 @@ class Kind:
 
 @cache
 def kinds() -> Mapping[str, Kind]:
-    """Return all kinds of product by name, in the order of their rank.
+    """Return all kinds of product by name, in the order of their rank; see `Registry`.
 
     Raises
     ------
@@ -142,7 +170,8 @@ def kinds() -> Mapping[str, Kind]:
         If an entry point cannot be loaded, two have one name, or a kind reads none that is made
         before it.
     """
-    unordered = registered(GROUP, Kind, "kind of product")
+    noun = "kind of product"
+    unordered = registered(GROUP, Kind, noun)
     order = sorted(unordered.values(), key=lambda kind: (kind.rank, kind.name))
     before: dict[str, Kind] = {}
     for kind in order:
@@ -155,18 +184,7 @@ def kinds() -> Mapping[str, Kind]:
                     f" adds {name!r}",
                 )
         before[kind.name] = kind
-    return MappingProxyType(before)
-
-
-def kind_of(name: str) -> Kind:
-    """Return a kind of product by its name.
-
-    Raises
-    ------
-    LidarOpsError
-        If there is none of that name.
-    """
-    return by_name(kinds(), name, "kind of product")
+    return MappingProxyType(Registry(order, noun))
 
 
 @cache
@@ -178,7 +196,7 @@ def flags_of(name: str) -> Flags:
     LidarOpsError
         If there is no such kind, or it has no valid flags.
     """
-    kind = kind_of(name)
+    kind = kinds()[name]
     try:
         flags: Flags = kind.part("variables", "LAYOUT").flags
     except ValueError as error:
@@ -193,17 +211,11 @@ def kinds_of(*scopes: Scope) -> tuple[Kind, ...]:
     return tuple(kind for kind in kinds().values() if kind.scope in scopes)
 
 
-def reads_of(name: str) -> tuple[str, ...]:
-    """Return the kinds that a kind of product is made of; none if it is not known."""
-    known = kinds().get(name)
-    return known.reads if known else ()
-
-
 def with_read(names: Iterable[str]) -> set[str]:
     """Return the names of some kinds of product, and of all kinds that these are made of."""
     found: set[str] = set()
     for name in names:
-        found |= {name} | with_read(reads_of(name))
+        found |= {name} | with_read(kinds()[name].reads)
     return found
 
 
@@ -261,15 +273,3 @@ def _distribution(point: EntryPoint) -> str:
 
 def _package(point: EntryPoint) -> str:
     return point.module.partition(".")[0]
-
-
-def by_name(
-    parts: Mapping[str, _Part], name: str, noun: str, error: type[LidarOpsError] = LidarOpsError
-) -> _Part:
-    """Return the one of `registered` objects that has a name; raise `error` if none has."""
-    if name not in parts:
-        raise error(
-            f"there is no {noun} {name!r}",
-            remedy=f"{', '.join(parts)} are installed; install the package that adds it",
-        )
-    return parts[name]

@@ -41,9 +41,15 @@ GLUED: Final = "glued_"
 """Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
 
 
-def is_glued(channel: str) -> bool:
-    """Return whether a channel is glued from two of the files."""
-    return channel.startswith(GLUED)
+def glued_parts(glued: str) -> tuple[str, str]:
+    """Return the names of the analog and the photon-counting channel of a glued channel."""
+    label = glued.removeprefix(GLUED)
+    return f"analog_{label}", f"photon_{label}"
+
+
+def file_channels(channel: str) -> tuple[str, ...]:
+    """Return the channels of the files that a channel is made from."""
+    return glued_parts(channel) if channel.startswith(GLUED) else (channel,)
 
 
 class Role(StrEnum):
@@ -83,10 +89,6 @@ class ChannelLayout:
     """0 for photon counting."""
     recorder: str = ""
     """What digitises it, such as ``BT5``; empty where the raw format names none."""
-
-    def __hash__(self) -> int:
-        # Layouts are looked up for every file.
-        return hash((self.name, self.bins))
 
 
 UNREADABLE: Final = "cannot be read"
@@ -247,15 +249,6 @@ class PlannedStep:
     warning: str = ""
     """Why its results may be of no use; empty where nothing is known against them."""
 
-    @property
-    def words(self) -> str:
-        """The reason, with the warning."""
-        return "; ".join(filter(None, (self.reason, self.warning)))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the step as plain JSON types."""
-        return _plain_entry(self)
-
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
@@ -273,16 +266,13 @@ class LeftOut:
     product: str = ""
     """Kind of product to which the step belongs; empty where all kinds share it."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the omission as plain JSON types."""
-        return _plain_entry(self)
-
 
 _ALWAYS: Final = frozenset({"name", "channel", "settings", "reason"})
 """Fields that entries state even where they are empty."""
 
 
-def _plain_entry(entry: PlannedStep | LeftOut) -> dict[str, Any]:
+def entry_as_dict(entry: PlannedStep | LeftOut) -> dict[str, Any]:
+    """Return an entry of a plan as plain JSON types."""
     values = {item.name: getattr(entry, item.name) for item in fields(entry)}
     return {
         name: list(value) if isinstance(value, tuple) else value
@@ -303,13 +293,15 @@ class Plan:
         """Return the plan as plain JSON types."""
         return {
             "scene": self.scene,
-            "steps": [step.as_dict() for step in self.steps],
-            "left_out": [omission.as_dict() for omission in self.left_out],
+            "steps": list(map(entry_as_dict, self.steps)),
+            "left_out": list(map(entry_as_dict, self.left_out)),
         }
 
     def lines(self, channel: str) -> list[str]:
         """Return what runs and what is left out, one line each, with channels other than this."""
-        steps = ((step.name, step.channel, step.words) for step in self.steps)
+        steps = (
+            (s.name, s.channel, "; ".join(filter(None, (s.reason, s.warning)))) for s in self.steps
+        )
         omitted = ((f"left out {o.name}", o.channel, o.reason) for o in self.left_out)
         return [
             f"{name}{f' of {owner}' if owner not in ('', channel) else ''}: {words}"

@@ -203,31 +203,15 @@ BackgroundRange = Annotated[tuple[Metres, Metres], AfterValidator(_wide_enough)]
 
 
 class SettingsModel(BaseModel):
-    """Base of the models: frozen, without unknown keys, and without booleans for numbers."""
+    """Base of the models: frozen, and without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _no_boolean(cls, values: Any) -> Any:
-        # YAML reads yes, no, on and off as booleans, and pydantic reads these as 1 and 0.
-        for key, value in values.items() if isinstance(values, dict) else ():
-            field = cls.model_fields.get(str(key))
-            if field is not None and field.annotation is not bool and _holds_boolean(value):
-                raise PydanticCustomError("no_boolean", "is a boolean", {"keys": (key,)})
-        return values
 
     @classmethod
     def taken_from(cls, other: BaseModel, **given: Any) -> Self:
         """Return settings with given values, and those of another model for all other fields."""
         names = (cls.model_fields.keys() - given.keys()) & type(other).model_fields.keys()
         return cls(**given, **{name: getattr(other, name) for name in names})
-
-
-def _holds_boolean(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return any(_holds_boolean(item) for item in value)
-    return isinstance(value, bool)
 
 
 def _divides_day(interval: timedelta) -> timedelta:

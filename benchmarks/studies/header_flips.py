@@ -23,11 +23,11 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.headers import HEADER_BYTES, Headers, UnreadFile, read_header
 from lidarops.catalog.sources import RawFile, Source, path_pattern
 from lidarops.errors import RawFormatError
-from lidarops.plan.outlying_headers import without_outlying
-from lidarops.plan.scenes import cut_scenes
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import Granule, Role, Status, day_of
+from lidarops.run.outlying_headers import without_outlying
+from lidarops.run.scenes import cut_scenes
 from lidarops.simulate.campaign import simulate_campaign
 
 ROOT: Final = Path(__file__).resolve().parents[2]

@@ -17,7 +17,6 @@ from lidarops.catalog.headers import row_of
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.scan import scan_keys
 from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Store
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
@@ -30,6 +29,7 @@ from lidarops.records import (
     Status,
 )
 from lidarops.run.leftovers import product_file
+from lidarops.run.scenes import cut_scenes
 from lidarops.run.staleness import Judge
 from lidarops.scene import dependence
 from lidarops.scene.plan import plan_scene

@@ -23,7 +23,7 @@ from lidarops.netcdf.context import RECORDERS
 from lidarops.netcdf.read import opened_product
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
-from lidarops.records import DetectionMode, Verdicts, is_glued
+from lidarops.records import GLUED, DetectionMode, Verdicts
 from lidarops.system.files import product_paths, sha256_of, within
 
 FOLDER: Final = "aggregates"
@@ -86,7 +86,7 @@ class Facts:
     @property
     def counting(self) -> DetectionMode:
         """How the signal is stated: glued ones as counted."""
-        return DetectionMode.PHOTON if is_glued(self.channel) else DetectionMode(self.mode)
+        return DetectionMode.PHOTON if self.channel.startswith(GLUED) else DetectionMode(self.mode)
 
     @property
     def group(self) -> Group:

@@ -7,7 +7,7 @@ periods, because instruments change within an archive of years.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from itertools import pairwise
@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 import yaml
 from pydantic import (
-    BaseModel,
     Field,
     PrivateAttr,
     ValidationError,
@@ -26,9 +25,10 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from lidarops.campaign.simulation import SimulationSettings
-from lidarops.campaign.yaml_errors import duplicate_keys, explain_yaml_error
+from lidarops.campaign.yaml_errors import Loader, duplicate_keys, explain_yaml_error
 from lidarops.errors import CampaignError
 from lidarops.kinds import Scope, kinds_of
+from lidarops.records import file_channels
 from lidarops.settings import (
     NO_UNIT,
     ChannelProduct,
@@ -56,7 +56,6 @@ __all__ = [
     "Products",
     "Scenes",
     "Station",
-    "as_settings",
     "campaign_schema",
     "channel_facts",
     "load_campaign",
@@ -334,19 +333,13 @@ class Instrument(SettingsModel):
                 raise ValueError(f"the validity periods of facts overlap at {start:%Y-%m-%d}")
         return self
 
-    def facts_at(self, moment: datetime) -> InstrumentFacts:
-        """Return the facts that are valid at `moment`, or empty facts."""
-        valid = (fact for fact in self.facts if fact.valid_from <= moment < fact.valid_to)
-        return next(valid, None) or InstrumentFacts()
-
-    def facts_by_clock(self, moment: datetime) -> InstrumentFacts:
-        """Return the facts of a time by the clock of the instrument, or empty facts."""
-        valid = (
-            fact
-            for fact in self.facts
-            if fact.valid_from <= moment - timedelta(seconds=fact.clock_offset) < fact.valid_to
-        )
-        return next(valid, None) or InstrumentFacts()
+    def facts_at(self, moment: datetime, *, by_clock: bool = False) -> InstrumentFacts:
+        """Return the facts of a time, UTC or by the clock of the instrument; or empty facts."""
+        for fact in self.facts:
+            behind = timedelta(seconds=fact.clock_offset if by_clock else 0.0)
+            if fact.valid_from <= moment - behind < fact.valid_to:
+                return fact
+        return InstrumentFacts()
 
 
 class NetworkMembers(SettingsModel):
@@ -646,7 +639,7 @@ def load_campaign(
             f"cannot be read: {error}", file=path, remedy="give the path of a campaign YAML file"
         ) from error
     try:
-        loader = yaml.SafeLoader(text)
+        loader = Loader(text)
         tree = loader.get_single_node()
         duplicates = duplicate_keys(tree)
         # Merges the mappings that `<<` names into the nodes.
@@ -711,11 +704,8 @@ def _located(location: str, base: Path) -> str:
 
 
 def channel_facts(facts: InstrumentFacts, channel: str) -> ChannelFacts:
-    """Return the facts about a channel, or empty facts."""
-    return facts.channels.get(channel) or ChannelFacts()
+    """Return the facts about a channel, or empty facts.
 
-
-def as_settings(model: BaseModel) -> Mapping[str, Any]:
-    """Return a model as plain JSON types, for provenance and hashes."""
-    dumped: dict[str, Any] = model.model_dump(mode="json")
-    return dumped
+    Of a glued one, those of its photon-counting channel, which defines its ranges.
+    """
+    return facts.channels.get(file_channels(channel)[-1]) or ChannelFacts()

@@ -28,6 +28,19 @@ _WORDS = {
 Schema = dict[str, Any]
 
 
+class Loader(yaml.SafeLoader):
+    """Reads a YAML file as `yaml.SafeLoader`, but yes, no, on and off as texts.
+
+    Models know what is a boolean: a text or number is never taken for one, nor a key.
+    """
+
+
+Loader.yaml_implicit_resolvers = {
+    first: [known for known in resolvers if known[0] != "tag:yaml.org,2002:bool"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
 def duplicate_keys(tree: yaml.Node | None) -> list[str]:
     """Return messages on keys that a mapping holds twice; PyYAML silently keeps the last one.
 
@@ -137,10 +150,6 @@ class _Problem:
             return f"must be {self.mapping.words_of_keys()}, not {self.name!r}"
         if kind == "missing":
             return f"is required: {self.expected.words()}"
-        if kind == "no_boolean":
-            text = self.node.value if isinstance(self.node, yaml.ScalarNode) else "a boolean"
-            words = self.expected.words()
-            return f"must be {words}, not {text}; YAML reads it as a boolean: quote a text"
         if kind in _OWN_WORDS or kind.startswith("union_tag"):
             return self.details["msg"].removeprefix("Value error, ")
         return f"must be {self.expected.words()}, not {self._value()}{self._hint()}"
@@ -176,19 +185,13 @@ def _find(
     """Return line and node of the last key that the file has, and the keys as written there."""
     line, names, value = None, [], node
     for key in keys:
-        entry = next((entry for entry in _children(value) if _is_key(entry, key)), None)
+        entry = next((entry for entry in _children(value) if entry[0] == key), None)
         names.append(key if entry is None else entry[0])
         if entry is not None:
             line, value = entry[1].line + 1, entry[2]
         else:
             value = None
     return line, value, names
-
-
-def _is_key(entry: tuple[str, yaml.Mark, yaml.Node], key: str) -> bool:
-    # PyYAML reads keys such as no and on as booleans, whose location pydantic gives as 0 or 1.
-    read = yaml.SafeLoader.bool_values.get(entry[0].lower())
-    return key == entry[0] or (read is not None and key == str(int(read)))
 
 
 def _children(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Mark, yaml.Node]]:

@@ -143,7 +143,7 @@ def _start(head: bytes, lidar: _Lidar) -> datetime | None:
     start = read_start(head)
     if start is None:
         return None
-    return start - timedelta(seconds=lidar.instrument.facts_by_clock(start).clock_offset)
+    return start - timedelta(seconds=lidar.instrument.facts_at(start, by_clock=True).clock_offset)
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
@@ -161,7 +161,7 @@ def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Gra
 
 def _accepted(due: UnreadFile, header: RawHeader, lidar: _Lidar) -> Granule:
     instrument, station = lidar.instrument, lidar.station
-    facts = instrument.facts_by_clock(header.start)
+    facts = instrument.facts_at(header.start, by_clock=True)
     header = header.read_as(instrument.header_pointing)
     if header.doubt and facts.zenith_angle is None:
         raise RawFormatError(

@@ -103,9 +103,9 @@ def catalog(
     Example: lidarops catalog catalogs/demo.yaml --rebuild
     """
     from lidarops.catalog.store import Store
-    from lidarops.plan.channels import ChannelNames
     from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
+    from lidarops.run.channels import ChannelNames
 
     settings = loaded_campaign(campaign, archive, out, catalog)
     with progress_bar("catalog", None) as bar:

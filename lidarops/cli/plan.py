@@ -193,7 +193,8 @@ def _words(effect: str, entry: PlannedStep | LeftOut, needs: str) -> str:
     number = decided_on(entry.number)
     rule = f"[{entry.rule} {number}]" if number else f"[{entry.rule}]" if entry.rule else ""
     member = f"of {entry.instrument}" if entry.instrument else ""
-    words = entry.words if isinstance(entry, PlannedStep) else entry.reason
+    warning = entry.warning if isinstance(entry, PlannedStep) else ""
+    words = "; ".join(filter(None, (entry.reason, warning)))
     reason = " ".join(filter(None, (words, rule)))
     return "; ".join(filter(None, (member, effect, reason, needs)))
 
@@ -203,16 +204,16 @@ def _needs(plan: Plan) -> Iterator[str]:
 
     For a product, also the channels with which it is compared.
     """
-    from lidarops.scene.dependence import is_product, needed_places
+    from lidarops.scene.dependence import needed_places
 
-    for step, places in zip(plan.steps, needed_places(plan), strict=True):
+    for step, places in zip(plan.steps, needed_places(plan.steps), strict=True):
         others = [plan.steps[place] for place in places]
         names = [
             other.name if other.channel in ("", step.channel) else f"{other.channel}/{other.name}"
             for other in others
-            if not is_product(other)
+            if other.name != other.product
         ]
-        compared = [other.channel for other in others if is_product(other)]
+        compared = [other.channel for other in others if other.name == other.product]
         words = {"after": names, "compared with": compared}
         yield "; ".join(f"{word} {', '.join(those)}" for word, those in words.items() if those)
 
@@ -256,6 +257,7 @@ def _show_kept(judged: Judgement) -> None:
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
+    from lidarops.records import entry_as_dict
     from lidarops.scene.choices import idle_window
 
     stale, frozen, kept = (
@@ -268,7 +270,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     plan = judged.requested
     idle = [idle_window(step, plan.steps) for step in plan.steps]
     steps = [
-        {**step.as_dict(), **({"no_effect": why} if why else {})}
+        {**entry_as_dict(step), **({"no_effect": why} if why else {})}
         for step, why in zip(plan.steps, idle, strict=True)
     ]
     return {

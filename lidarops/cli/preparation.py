@@ -47,9 +47,9 @@ def init(
     Example: lidarops init raw harbour.yaml
     """
     from lidarops.campaign.model import campaign_schema
+    from lidarops.catalog.draft import draft_campaign
     from lidarops.catalog.folder import read_folder
     from lidarops.errors import CampaignError, CatalogError
-    from lidarops.plan.draft import draft_campaign
 
     if campaign.exists() and not force:
         raise CampaignError(

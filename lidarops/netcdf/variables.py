@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lidarops import __version__
 from lidarops.errors import ProductError
 from lidarops.flags import Flags, Severity
-from lidarops.kinds import kind_of, kinds
+from lidarops.kinds import kinds
 from lidarops.records import DetectionMode
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
@@ -320,7 +320,7 @@ def layout_of(kind: str) -> Layout:
     LidarOpsError
         If there is no such kind, or it has no ``variables``.
     """
-    layout: Layout = kind_of(kind).part("variables", "LAYOUT")
+    layout: Layout = kinds()[kind].part("variables", "LAYOUT")
     coordinates = tuple(completed(row, Coverage.COORDINATE) for row in layout.coordinates)
     data = tuple(completed(row, sampled=layout.sampled) for row in layout.data)
     return replace(layout, coordinates=coordinates, data=data)

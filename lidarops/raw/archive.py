@@ -39,7 +39,7 @@ from dask.base import tokenize
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError
-from lidarops.raw.formats import RawFile, raw_format, read_raw_header
+from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.raw.header import (
     POLARISATIONS,
     Layout,
@@ -445,7 +445,7 @@ class Chunk:
         dtype = np.int32 if self.scales is None else np.float32
         values = np.empty((len(self.places), self.bins), dtype)
         row = np.empty(self.bins, np.dtype("<i4"))
-        read_channel = raw_format(self.format).read_channel
+        read_channel = raw_formats()[self.format].read_channel
         for index, ((path, size), places) in enumerate(zip(self.files, self.places, strict=True)):
             with RawFile(path) as file:
                 file.expect(size)
@@ -487,7 +487,7 @@ def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Da
         variables,
         {**_axes(files, grids), **_place(files)},
         {
-            "source_format": raw_format(files.format).title,
+            "source_format": raw_formats()[files.format].title,
             "site": ", ".join(sorted({file.header.site for file in files.files})),
             **({"notes": "; ".join(sorted(notes))} if notes else {}),
         },
@@ -511,7 +511,7 @@ def _properties(
         "polarisation": polarisation,
         "bin_width": channel.bin_width,
         "adc_bits": channel.adc_bits,
-        "conversion": raw_format(files.format).conversion,
+        "conversion": raw_formats()[files.format].conversion,
         "device": channel.device,
         **_full_scale(files, index, scaled=scaled),
     }

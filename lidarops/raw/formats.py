@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import RawFormatError, UnreadableFileError
-from lidarops.kinds import RAW_FORMATS, by_name, registered
+from lidarops.kinds import RAW_FORMATS, Registry, registered
 from lidarops.raw.header import IncompleteHeaderError, RawHeader, Stretches, holds_text
 from lidarops.records import UNKNOWN_FORMAT
 
@@ -157,26 +157,16 @@ class RawFormat:
 
 @cache
 def raw_formats() -> Mapping[str, RawFormat]:
-    """Return all raw formats by name, in alphabetical order.
+    """Return all raw formats by name, in alphabetical order; see `lidarops.kinds.Registry`.
 
     Raises
     ------
     LidarOpsError
         If an entry point cannot be loaded, or two have one name.
     """
-    formats = registered(RAW_FORMATS, RawFormat, "raw format")
-    return MappingProxyType(dict(sorted(formats.items())))
-
-
-def raw_format(name: str) -> RawFormat:
-    """Return a raw format by its name.
-
-    Raises
-    ------
-    RawFormatError
-        If there is none of that name.
-    """
-    return by_name(raw_formats(), name, "raw format", RawFormatError)
+    noun = "raw format"
+    formats = sorted(registered(RAW_FORMATS, RawFormat, noun).items())
+    return MappingProxyType(Registry((known for _, known in formats), noun, RawFormatError))
 
 
 def parse_raw_header(head: bytes, *, file: str, size: int, known: str = "") -> RawHeader:
@@ -200,7 +190,7 @@ def parse_raw_header(head: bytes, *, file: str, size: int, known: str = "") -> R
         file and field.
     """
     if known:
-        return raw_format(known).parse_header(head, file, size)
+        return raw_formats()[known].parse_header(head, file, size)
     formats = _recognised(head)
     if len(formats) == 1:
         return formats[0].parse_header(head, file, size)
@@ -243,6 +233,6 @@ def read_all_counts(file: RawFile, header: RawHeader) -> None:
     RawFormatError
         If one cannot.
     """
-    raw = raw_format(header.format)
+    raw = raw_formats()[header.format]
     for channel in header.channels:
         raw.read_channel(file, channel.places, None, np.empty(channel.bins, np.dtype("<i4")))

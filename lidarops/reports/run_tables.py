@@ -200,8 +200,8 @@ def _carried_out(scene: SceneOutcome) -> Iterator[PlannedStep]:
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
         idle = idle_window(step, steps)
-        reason = f"{step.words}; no effect: {idle}" if idle else step.words
-        yield replace(step, reason=reason)
+        words = (step.reason, step.warning, idle and f"no effect: {idle}")
+        yield replace(step, reason="; ".join(filter(None, words)))
 
 
 def _left_out(scene: SceneOutcome) -> Iterator[LeftOut]:

@@ -1,5 +1,7 @@
 """Bring the archive of a campaign up to date.
 
+- `scenes` cuts granules into scenes, without what `outlying_headers` finds; `unused_files` names
+  refused files of a scene, and `channels` the channels of all files.
 - `archive`: catalog, plan, process and report; what the command line and the flows call.
 - `options`: how to run and which part of the campaign, and what a run returns.
 - `staleness`: decides which products are stale, and why; `leftovers`: scenes without product, and

@@ -32,7 +32,7 @@ from pydantic import (
     field_validator,
 )
 
-from lidarops.campaign.yaml_errors import duplicate_keys
+from lidarops.campaign.yaml_errors import Loader, duplicate_keys
 from lidarops.errors import LidarOpsError, SceneError
 from lidarops.system.processes import keep_memory, start_method
 
@@ -259,7 +259,7 @@ def _read_description(cluster: str) -> dict[str, Any]:
     try:
         text = Path(cluster).read_text(encoding="utf-8")
         problem = "; ".join(duplicate_keys(yaml.compose(text, Loader=yaml.SafeLoader)))
-        raw = yaml.safe_load(text)
+        raw = Loader(text).get_single_data()
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         problem = f"cannot be read: {error}"
     if problem or not isinstance(raw, dict):

@@ -13,16 +13,16 @@ from functools import cached_property
 from math import ceil
 from typing import Any, Final, NamedTuple
 
-from lidarops.campaign.model import OPERATION, Campaign, as_settings
+from lidarops.campaign.model import OPERATION, Campaign
 from lidarops.catalog.store import RecordedProduct, Store, Verdict
 from lidarops.errors import AncillaryError
 from lidarops.kinds import Scope, kinds_of
-from lidarops.plan.channels import ChannelNames
-from lidarops.plan.outlying_headers import NEAR_DAYS
-from lidarops.plan.scenes import DARK_REACH
-from lidarops.plan.unused_files import Refused, dated
 from lidarops.records import Role, UnusedFile, day_of, digest, first_of_month
+from lidarops.run.channels import ChannelNames
 from lidarops.run.options import Selection, requested_kinds
+from lidarops.run.outlying_headers import NEAR_DAYS
+from lidarops.run.scenes import DARK_REACH
+from lidarops.run.unused_files import RefusedFile, dated
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 
@@ -31,11 +31,11 @@ REACH: Final = NEAR_DAYS + DARK_DAYS
 """Days before and after a file on which products may use it."""
 
 _PLANNING: Final = (
-    "lidarops.plan.channels",
-    "lidarops.plan.outlying_headers",
+    "lidarops.run.channels",
+    "lidarops.run.outlying_headers",
     "lidarops.scene.plan",
-    "lidarops.plan.scenes",
-    "lidarops.plan.unused_files",
+    "lidarops.run.scenes",
+    "lidarops.run.unused_files",
 )
 """Modules that decide which scenes and plans a day has. A product records its own scene and plan,
 so that a change of these modules makes it stale only if they changed."""
@@ -120,7 +120,7 @@ class DayStates:
     @cached_property
     def base(self) -> str:
         """Digest of settings, code and recorders on which scenes, plans and products depend."""
-        settings, held = as_settings(self.campaign), self.names.holdings
+        settings, held = self.campaign.model_dump(mode="json"), self.names.holdings
         return digest(
             [
                 {key: value for key, value in settings.items() if key not in OPERATION},
@@ -156,7 +156,7 @@ class DayStates:
         return ChannelNames(self.campaign, self.store)
 
     @cached_property
-    def refused(self) -> tuple[Refused, ...]:
+    def refused(self) -> tuple[RefusedFile, ...]:
         """Files that the catalog refuses, with times to which they belong."""
         store = self.store
         return tuple(dated(self.campaign, store.refused(), store.files_in, store.days_below))

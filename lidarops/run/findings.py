@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Verdict
-from lidarops.kinds import Scope, kind_of
-from lidarops.plan import channels
+from lidarops.kinds import Scope, kinds
 from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, UnusableFile
+from lidarops.run import channels
 from lidarops.run.day_states import DayStates
 from lidarops.run.options import requested_products, station_of
 
@@ -162,7 +162,7 @@ def _unmade(
     known = {} if limited else {day: verdict.unmade for day, verdict in settled.items()}
     for owner, kind, channel in missing:
         days = _first_and_last_day(campaign, owner, spans)
-        if kind_of(kind).scope is Scope.MONTH:
+        if kinds()[kind].scope is Scope.MONTH:
             days = states.months(days)
         found = [_unmade_on(states, day, known).get(f"{owner} {kind} {channel}") for day in days]
         if days and None not in found:

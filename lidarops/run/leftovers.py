@@ -18,9 +18,9 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.sources import path_pattern
 from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import path_of_product
-from lidarops.plan.scenes import Cut, parse_scene_id
 from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene, UnusedFile
 from lidarops.run.options import requested_products
+from lidarops.run.scenes import Cut, parse_scene_id
 from lidarops.scene import dependence
 from lidarops.scene.case import NO_PRODUCT, READ_STEP, REQUEST
 from lidarops.scene.dependence import ProductKey

@@ -13,9 +13,9 @@ from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import RecordedProduct, RunStatus, Store, Verdict
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
-from lidarops.plan.scenes import parse_scene_id, scene_stop
 from lidarops.records import Findings, RunRecord, SceneOutcome, day_of
 from lidarops.reports import run_record
+from lidarops.run.scenes import parse_scene_id, scene_stop
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -276,7 +276,7 @@ def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
     """
     if selection.everything:
         return False
-    from lidarops.plan.scenes import cut_scenes  # noqa: PLC0415 - loads numerics
+    from lidarops.run.scenes import cut_scenes  # noqa: PLC0415 - loads numerics
 
     with Store(campaign.catalog_url, campaign.name, create=False) as store:
         days = selection.days(sorted({day_sum.day for day_sum in store.day_sums()}))

@@ -23,10 +23,10 @@ from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import recoding
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.plan.scenes import MONTH, parse_scene_id
 from lidarops.records import ProductRecord, Role, SceneOutcome, day_of
 from lidarops.run.processing import new_run
 from lidarops.run.recipe import Recipe
+from lidarops.run.scenes import MONTH, parse_scene_id
 from lidarops.run.staleness import Judge, settings_digest
 from lidarops.scene import dependence
 from lidarops.system.files import product_paths, sha256_of

@@ -19,12 +19,9 @@ from lidarops.catalog.headers import HEADER_BYTES
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Dependence, LastTry, RecordedProduct, Store, Verdict
 from lidarops.errors import ProductError, RawFormatError
-from lidarops.kinds import reads_of
+from lidarops.kinds import kinds
 from lidarops.netcdf.comparison import planned_changes
 from lidarops.netcdf.provenance import package_versions
-from lidarops.plan.outlying_headers import NEAR_DAYS, new_notes, without_outlying
-from lidarops.plan.scenes import Cut, as_recorded, cut_scenes, months_of_products
-from lidarops.plan.unused_files import Refused, name_unused
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import (
@@ -50,6 +47,9 @@ from lidarops.run.leftovers import (
     unmade_products,
 )
 from lidarops.run.options import Selection
+from lidarops.run.outlying_headers import NEAR_DAYS, new_notes, without_outlying
+from lidarops.run.scenes import Cut, as_recorded, cut_scenes, months_of_products
+from lidarops.run.unused_files import RefusedFile, name_unused
 from lidarops.scene import dependence
 from lidarops.scene.dependence import ProductKey, ancillary_files
 from lidarops.scene.guard import Failure, guarded
@@ -342,7 +342,7 @@ class Judge(DayStates):
                 if granule.role is Role.DARK or day_of(_moment(granule)) in days
             ],
         )
-        unused = [*self.refused, *(Refused(granule, _moment(granule)) for granule in refused)]
+        unused = [*self.refused, *(RefusedFile(granule, _moment(granule)) for granule in refused)]
         recorded = defaultdict[str, list[RecordedProduct]](list)
         for product in products:
             recorded[product.scene].append(product)
@@ -411,21 +411,24 @@ class Judge(DayStates):
     def _planned(self, scene: Scene, made: Mapping[str, RecordedProduct]) -> Judgement:
         planned = plan_scene(scene, self.campaign)
         files = ancillary_files(planned.steps)
-        problems = {name: self.file_problem(name, role) for name, role in files.items()}
-        whole = dependence.without_unusable_files(
-            planned, {name: problem for name, problem in problems.items() if problem}
-        )
+        problems = {
+            name: problem
+            for name, role in files.items()
+            if (problem := self.file_problem(name, role))
+        }
+        whole = dependence.without_unusable_files(planned, problems) if problems else planned
         # Also files that cannot be used: the day is judged again when they change.
         judged = replace(self.judgement(scene, whole), ancillaries=self._ancillary_records(planned))
         stale: list[Stale] = []
         frozen: list[Stale] = []
         kept: list[Stale] = []
-        requested = dependence.plan_of_kinds(whole, self.selection.kinds)
+        kinds_ = self.selection.kinds
+        requested = dependence.plan_of_kinds(whole, kinds_) if kinds_ else whole
         products = dependence.planned_products(requested)
         for kind, channel in products:
             path = product_file(scene, (kind, channel))
             known = made.get(path)
-            if reads_of(kind):
+            if kinds()[kind].reads:
                 read = self._products_read(judged, (kind, channel), made)
                 judged = replace(judged, products=tuple(dict.fromkeys((*judged.products, *read))))
             reason, restored = self._reason(judged, (kind, channel), known)

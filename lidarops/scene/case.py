@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.campaign.model import ChannelFacts, Instrument, InstrumentFacts, channel_facts
-from lidarops.kinds import reads_of
+from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
+from lidarops.kinds import kinds
 from lidarops.raw.header import label_of
 from lidarops.records import (
     GLUED,
@@ -23,11 +23,11 @@ from lidarops.records import (
     LeftOut,
     PlannedStep,
     Scene,
-    is_glued,
+    file_channels,
+    glued_parts,
 )
 from lidarops.settings import ChannelProduct, SettingsModel
 
-R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
 
 ALL_STEPS: Final = "all_steps is set: no bin, section or file is skipped"
@@ -47,13 +47,16 @@ class NoSettings(SettingsModel):
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelCase:
-    """One channel of a scene, as the pipe sees it before any signal is read."""
+class ChannelCase(Generic[R_co]):
+    """One channel of a scene, as the pipe and kinds of product see it before any signal is read."""
 
     scene: Scene
     channel: ChannelLayout
     facts: InstrumentFacts
     facts_of_channel: ChannelFacts
+    """Of a glued channel, those of its photon-counting part."""
+    request: R_co
+    """Settings of the kind in the campaign file; None for the pipe."""
     all_steps: bool = False
     """Whether steps without effect run too."""
     member: str = ""
@@ -71,11 +74,6 @@ class ChannelCase:
     def last(self) -> float:
         """Far end of the last bin, m, without range offset."""
         return self.channel.bins * self.channel.bin_width
-
-    def of_product(self, product: str, request: R) -> ProductCase[R]:
-        """Return the case of a kind of product, with its settings."""
-        shared = {known.name: getattr(self, known.name) for known in fields(self)}
-        return ProductCase(**{**shared, "product": product}, request=request)
 
     def run(
         self,
@@ -105,33 +103,18 @@ class ChannelCase:
             Why its results may be of no use; `lidarops plan` prints it.
         """
         stated = {} if settings is None else settings.model_dump(mode="json", exclude_none=True)
-        origin = self._origin(name, reason, number, rule)
+        left = self.leave(name, reason, number=number, rule=rule)
+        origin = {item.name: getattr(left, item.name) for item in fields(left)}
         return PlannedStep(settings=stated, needs=tuple(needs), warning=warning, **origin)
 
     def leave(
         self, name: str, reason: str, *, number: float | None = None, rule: str = ""
     ) -> LeftOut:
         """Return the entry of something, or of a part of it, that is left out; as `run`."""
-        return LeftOut(**self._origin(name, reason, number, rule))
-
-    def _origin(self, name: str, reason: str, number: float | None, rule: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "channel": self.channel.name,
-            "reason": f"{self.member}: {reason}" if self.member else reason,
-            "instrument": self.member,
-            "rule": rule or name,
-            "number": number,
-            "product": self.product,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProductCase(ChannelCase, Generic[R_co]):
-    """One channel of a scene, as a kind of product sees it."""
-
-    request: R_co
-    """Settings of the kind in the campaign file."""
+        stated = f"{self.member}: {reason}" if self.member else reason
+        return LeftOut(
+            name, self.channel.name, stated, self.member, rule or name, number, self.product
+        )
 
 
 READ_STEP: Final = "read"
@@ -142,25 +125,16 @@ UNMATCHED: Final = "facts_fit"
 """Rules that leave out what the files lack."""
 
 
-def glued_parts(glued: str) -> tuple[str, str]:
-    """Return the names of the analog and the photon-counting channel of a glued channel."""
-    label = glued.removeprefix(GLUED)
-    return f"analog_{label}", f"photon_{label}"
-
-
-def file_channels(channel: str) -> tuple[str, ...]:
-    """Return the channels of the files that a channel is made from."""
-    return glued_parts(channel) if is_glued(channel) else (channel,)
-
-
 def sources(step: PlannedStep) -> tuple[str, ...]:
     """Return the other channels whose profiles a step takes.
 
     Not those with which it is compared, or whose products it reads.
     """
     parts = [need.rpartition("/") for need in step.needs if "/" in need]
-    products = (step.product, *reads_of(step.product)) if parts else ()
-    return tuple(channel for channel, _, name in parts if name not in products)
+    reads = kinds()[step.product].reads if parts and step.product else ()
+    return tuple(
+        channel for channel, _, name in parts if name != step.product and name not in reads
+    )
 
 
 def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
@@ -174,7 +148,7 @@ def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, 
     order: dict[str, None] = {}
 
     def visit(name: str) -> None:
-        for other in (*file_channels(name), *needed.get(name, ())):
+        for other in needed.get(name, ()):
             if other not in order and other != name:
                 visit(other)
         order[name] = None
@@ -185,7 +159,7 @@ def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, 
 
 def counted_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
     """Return the channels of the files from which the products of a channel are made."""
-    return tuple(name for name in prepared_channels(steps, channel) if not is_glued(name))
+    return tuple(name for name in prepared_channels(steps, channel) if not name.startswith(GLUED))
 
 
 def product_channel(
@@ -195,11 +169,6 @@ def product_channel(
     return ChannelLayout(name, mode, wavelength, bins=0, bin_width=math.nan, adc_bits=0)
 
 
-def range_channel(channel: str) -> str:
-    """Return the channel that defines the ranges: for a glued one, the photon-counting one."""
-    return file_channels(channel)[-1]
-
-
 def estimated_against(
     channel: ChannelLayout, facts: InstrumentFacts, layout: Iterable[ChannelLayout]
 ) -> str:
@@ -207,7 +176,7 @@ def estimated_against(
 
     Empty where none is requested, or the files hold none with the same bin width.
     """
-    if channel.mode is not DetectionMode.PHOTON or is_glued(channel.name):
+    if channel.mode is not DetectionMode.PHOTON or channel.name.startswith(GLUED):
         return ""
     if channel_facts(facts, channel.name).dead_time != "estimate":
         return ""
@@ -236,16 +205,11 @@ def joined_layout(
     """
     present = {channel.name: channel for channel in layout}
     glued = []
-    for name in sorted({name for name in names if is_glued(name)}):
+    for name in sorted({name for name in names if name.startswith(GLUED)}):
         analog, photon = (present.get(part) for part in glued_parts(name))
         if analog and photon and analog.bin_width == photon.bin_width:
             glued.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
     return tuple(glued)
-
-
-def wavelength(channel: ChannelLayout, facts: ChannelFacts) -> float:
-    """Return the wavelength in m from the campaign or else the header; may be NaN."""
-    return channel.wavelength if facts.wavelength is None else facts.wavelength
 
 
 def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
@@ -264,18 +228,16 @@ def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
 
 def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:
     """Return the ranges of the bin centres of a channel, m."""
-    ranged = replace(channel, name=range_channel(channel.name))
     middles = (np.arange(channel.bins) + 0.5) * channel.bin_width
-    return np.asarray(middles + range_offset(ranged, facts))
+    return np.asarray(middles + range_offset(channel, facts))
 
 
-def named_channels(instrument: Instrument) -> list[str]:
-    """Return the channels that the products of an instrument request by name, or are made of."""
-    requested = instrument.products.requested().values()
+def named_channels(requested: Mapping[str, ChannelProduct]) -> list[str]:
+    """Return the channels that requested products name, or are made of."""
     return list(
         dict.fromkeys(
             name
-            for settings in requested
+            for settings in requested.values()
             for channel in settings.named
             for name in (channel, *settings.companions(channel))
         )
@@ -283,7 +245,9 @@ def named_channels(instrument: Instrument) -> list[str]:
 
 
 def missing_channels(
-    layout: tuple[ChannelLayout, ...], instrument: Instrument, facts: InstrumentFacts
+    layout: tuple[ChannelLayout, ...],
+    requested: Mapping[str, ChannelProduct],
+    facts: InstrumentFacts,
 ) -> Iterator[LeftOut]:
     """Yield the channels that a campaign requests or gives facts of, and that files lack.
 
@@ -291,13 +255,14 @@ def missing_channels(
     ----------
     layout : tuple of ChannelLayout
         Channels of the files.
-    instrument : Instrument
+    requested : mapping of str to ChannelProduct
+        Settings of the products that are requested of the instrument, by kind.
     facts : InstrumentFacts
         The facts about it at the time of the files.
     """
     present = {channel.name: channel for channel in layout}
-    glued = [channel.name for channel in joined_layout(layout, named_channels(instrument))]
-    for kind, settings in instrument.products.requested().items():
+    glued = [channel.name for channel in joined_layout(layout, named_channels(requested))]
+    for kind, settings in requested.items():
         for name in settings.named:
             if name not in present and name not in glued:
                 reason = _why_absent(name, present, channel_facts(facts, name).recorder)
@@ -312,7 +277,7 @@ def missing_channels(
 
 
 def _instead(name: str, present: Mapping[str, ChannelLayout]) -> str:
-    if is_glued(name) and set(glued_parts(name)) <= set(present):
+    if name.startswith(GLUED) and set(glued_parts(name)) <= set(present):
         analog, photon = glued_parts(name)
         return f"give the lag to {analog}, and dead time and lidar ratio to {photon}"
     return f"they hold {_held(name, present)}"
@@ -326,7 +291,7 @@ def _held(missing: str, present: Mapping[str, ChannelLayout]) -> str:
 
 
 def _why_absent(name: str, present: Mapping[str, ChannelLayout], recorder: str | None) -> str:
-    if is_glued(name):
+    if name.startswith(GLUED):
         parts = glued_parts(name)
         if set(parts) <= set(present):
             widths = [f"{present[part].bin_width:g} m" for part in parts]

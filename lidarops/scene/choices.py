@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Sequence
 from datetime import timedelta
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import xarray as xr
@@ -38,7 +38,7 @@ def with_methods(
     )
 
 
-def tail(case: ChannelCase, limits: tuple[float, float] | None) -> tuple[float, float]:
+def tail(case: ChannelCase[Any], limits: tuple[float, float] | None) -> tuple[float, float]:
     """Return the limits in m of the far range whose mean is the background.
 
     By default the last tenth of the bins.
@@ -58,7 +58,7 @@ class BackgroundSettings(SettingsModel):
 
 
 def background(
-    case: ChannelCase,
+    case: ChannelCase[Any],
     method: Literal["tail_mean", "cubic", "known_shape"],
     limits: tuple[float, float] | None = None,
 ) -> Entry:
@@ -97,7 +97,7 @@ class AverageSettings(SettingsModel):
     seconds: float = quantity(unit="s")
 
 
-def average(case: ChannelCase, interval: timedelta, reason: str) -> Entry:
+def average(case: ChannelCase[Any], interval: timedelta, reason: str) -> Entry:
     """Return over which clock intervals profiles are averaged, and why."""
     seconds = interval.total_seconds()
     return case.run("average", reason, AverageSettings(seconds=seconds), number=seconds)
@@ -125,14 +125,14 @@ def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: floa
     return rows.assign(quality_flag=rows["quality_flag"].copy(data=flags | bit))
 
 
-def _zenith_angles(case: ChannelCase) -> list[float | None]:
+def _zenith_angles(case: ChannelCase[Any]) -> list[float | None]:
     """Return the zenith angle of each file of a scene, degree; one if the campaign states it."""
     if case.facts.zenith_angle is not None:
         return [case.facts.zenith_angle]
     return [granule.zenith_angle for granule in case.scene.granules]
 
 
-def no_scan(case: ChannelCase) -> str:
+def no_scan(case: ChannelCase[Any]) -> str:
     """Return why the files of a scene are not a scan; empty where they are."""
     if case.facts.zenith_angle is not None:
         angle = case.facts.zenith_angle
@@ -153,7 +153,7 @@ def no_scan(case: ChannelCase) -> str:
     return ""
 
 
-def moves(case: ChannelCase) -> bool:
+def moves(case: ChannelCase[Any]) -> bool:
     """Return whether the files of a scene point to several directions, of any pattern."""
     if case.facts.zenith_angle is not None:
         return False
@@ -161,7 +161,7 @@ def moves(case: ChannelCase) -> bool:
     return bool(angles and max(angles) - min(angles) > FIXED) or _azimuth_sector(case) > FIXED
 
 
-def _azimuth_sector(case: ChannelCase) -> float:
+def _azimuth_sector(case: ChannelCase[Any]) -> float:
     """Return the narrowest azimuth sector that holds all beams, degree."""
     if case.facts.azimuth is not None:
         return 0.0
@@ -171,7 +171,7 @@ def _azimuth_sector(case: ChannelCase) -> float:
     return 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
 
 
-def fixed_zenith(case: ChannelCase) -> tuple[float, str]:
+def fixed_zenith(case: ChannelCase[Any]) -> tuple[float, str]:
     """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
     stated = _zenith_angles(case)
     angles = [angle for angle in stated if angle is not None]
@@ -256,7 +256,7 @@ def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
     return f"{' and '.join(needing)} need{'s' if len(needing) == 1 else ''} all bins"
 
 
-def bins_with_noise(nearest: float, farthest: float, case: ChannelCase) -> tuple[int, int]:
+def bins_with_noise(nearest: float, farthest: float, case: ChannelCase[Any]) -> tuple[int, int]:
     """Return the bins of counts between ranges in m, with those that their noise needs.
 
     The variance of a count is that of the mean over a share of the range on either side.
@@ -267,16 +267,16 @@ def bins_with_noise(nearest: float, farthest: float, case: ChannelCase) -> tuple
         The first bin, and the one past the last, which may lie beyond the channel.
     """
     width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+    # Two for rounding.
+    before, behind = (
+        max(math.ceil(THRESHOLDS.noise_window * distance / width), MIN_NOISE_BINS) + 2
+        for distance in (nearest, farthest)
+    )
+    first = math.floor((nearest - offset) / width) - before
+    return max(first, 0), math.ceil((farthest - offset) / width) + behind
 
-    def margin(distance: float) -> int:
-        # Two for rounding.
-        return max(math.ceil(THRESHOLDS.noise_window * distance / width), MIN_NOISE_BINS) + 2
 
-    first = math.floor((nearest - offset) / width) - margin(nearest)
-    return max(first, 0), math.ceil((farthest - offset) / width) + margin(farthest)
-
-
-def bins_within(nearest: float, farthest: float, case: ChannelCase) -> tuple[int, int]:
+def bins_within(nearest: float, farthest: float, case: ChannelCase[Any]) -> tuple[int, int]:
     """Return the bins of counts between ranges in m, without a margin for their noise.
 
     For bins that are averaged: the noise at the ends then comes from fewer bins.

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from lidarops.campaign.model import Campaign, InstrumentFacts, as_settings
-from lidarops.kinds import reads_of, with_read
+from lidarops.campaign.model import Campaign, InstrumentFacts
+from lidarops.kinds import kinds, with_read
 from lidarops.netcdf.context import product_of_path
 from lidarops.records import (
     InputRecord,
@@ -25,7 +25,6 @@ from lidarops.records import (
     UnusedFile,
 )
 from lidarops.scene.case import READ_STEP, sources
-from lidarops.scene.pipe import lacks_dark, required_by
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
@@ -45,22 +44,17 @@ _FILES: Final = {
 """Settings of a plan that name ancillary files, with their roles."""
 
 
-def is_product(entry: PlannedStep | LeftOut) -> bool:
-    """Return whether an entry of a plan is about the step that makes a product."""
-    return bool(entry.product) and entry.name == entry.product
-
-
 def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
     """Return kind and channel of the products that a step reads."""
-    reads = reads_of(step.product) if is_product(step) else ()
+    reads = kinds()[step.product].reads if step.name == step.product else ()
     parts = (need.rpartition("/") for need in step.needs) if reads else ()
     return tuple((name, channel or step.channel) for channel, _, name in parts if name in reads)
 
 
 def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
     """Return kind and channel of the products that a plan makes, in its order."""
-    keys = ((step.name, step.channel) for step in plan.steps if is_product(step))
-    return tuple(dict.fromkeys(keys))
+    steps = (step for step in plan.steps if step.name == step.product)
+    return tuple(dict.fromkeys((step.name, step.channel) for step in steps))
 
 
 def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
@@ -78,21 +72,34 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         The same for a product, whatever else the whole plan holds.
     """
     entries: Sequence[PlannedStep | LeftOut] = (*plan.steps, *plan.left_out)
-    places = _places(entries)
+    needed = needed_places(entries)
     waiting = [
-        entry for entry in entries if is_product(entry) and (entry.name, entry.channel) in products
+        place
+        for place, entry in enumerate(entries)
+        if entry.name == entry.product and (entry.name, entry.channel) in products
     ]
     reached: set[int] = set()
     while waiting:
-        entry = waiting.pop()
-        if id(entry) not in reached:
-            reached.add(id(entry))
-            waiting += _needed(entry, places)
-    kept = [entry for entry in entries if id(entry) in reached]
+        place = waiting.pop()
+        if place not in reached:
+            reached.add(place)
+            waiting += needed[place]
+    kept = [entries[place] for place in sorted(reached)]
     steps = [entry for entry in kept if isinstance(entry, PlannedStep)]
+    # A channel is read for the products and channels that are left.
+    readers = defaultdict[str, set[tuple[bool, str]]](set)
+    for step in steps:
+        if step.name == step.product:
+            readers[step.channel].add((False, step.name))
+        for channel in sources(step):
+            readers[channel].add((True, step.channel))
+    for place, step in enumerate(steps):
+        if step.name == READ_STEP and not step.instrument:
+            words = " and ".join(name for _, name in sorted(readers[step.channel]))
+            steps[place] = replace(step, reason=f"required by {words}")
     return replace(
         plan,
-        steps=tuple(_with_requesters(step, steps) for step in steps),
+        steps=tuple(steps),
         left_out=tuple(entry for entry in kept if isinstance(entry, LeftOut)),
     )
 
@@ -129,45 +136,21 @@ def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
     return replace(plan, steps=steps, left_out=(*plan.left_out, *left_out))
 
 
-def needed_places(plan: Plan) -> list[list[int]]:
-    """Return, for each step of a plan, the places of the steps whose outputs it takes."""
-    places = _places(plan.steps)
-    numbers = {id(step): number for number, step in enumerate(plan.steps)}
-    return [sorted(numbers[id(other)] for other in _needed(step, places)) for step in plan.steps]
-
-
-def _places(
-    entries: Iterable[PlannedStep | LeftOut],
-) -> Mapping[tuple[str, str], Sequence[PlannedStep | LeftOut]]:
-    """Return the entries of a plan by channel and name."""
-    places: dict[tuple[str, str], list[PlannedStep | LeftOut]] = defaultdict(list)
-    for entry in entries:
-        places[entry.channel, entry.name].append(entry)
-    return places
-
-
-def _needed(
-    entry: PlannedStep | LeftOut,
-    places: Mapping[tuple[str, str], Sequence[PlannedStep | LeftOut]],
-) -> Iterator[PlannedStep | LeftOut]:
-    """Yield the entries of a plan that a step names as needed."""
-    if isinstance(entry, LeftOut):
-        return
-    for need in entry.needs:
-        channel, _, name = need.rpartition("/")
-        for other in places.get((channel or entry.channel, name), ()):
-            of_member = not entry.instrument or other.instrument == entry.instrument
-            if of_member and other.product in ("", entry.product):
-                yield other
-
-
-def _with_requesters(step: PlannedStep, steps: Iterable[PlannedStep]) -> PlannedStep:
-    """Return a step whose reason, if it reads a channel, names only what it is read for."""
-    if step.instrument or step.name != READ_STEP:
-        return step
-    products = sorted(s.name for s in steps if is_product(s) and s.channel == step.channel)
-    glued = sorted({s.channel for s in steps if step.channel in sources(s)})
-    return replace(step, reason=required_by(dict.fromkeys((*products, *glued))))
+def needed_places(entries: Sequence[PlannedStep | LeftOut]) -> list[list[int]]:
+    """Return, for each entry of a plan, the places of the entries that it names as needed."""
+    places: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for place, entry in enumerate(entries):
+        places[entry.channel, entry.name].append(place)
+    needed: list[list[int]] = [[] for _ in entries]
+    for found, entry in zip(needed, entries, strict=True):
+        for need in entry.needs if isinstance(entry, PlannedStep) else ():
+            channel, _, name = need.rpartition("/")
+            for place in places.get((channel or entry.channel, name), ()):
+                other = entries[place]
+                of_member = not entry.instrument or other.instrument == entry.instrument
+                if of_member and other.product in ("", entry.product):
+                    found.append(place)
+    return [sorted(found) for found in needed]
 
 
 def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
@@ -177,38 +160,18 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
     ----------
     plan : Plan
     selected : collection of str
-        Kinds of product; all where empty.
+        Kinds of product.
     """
-    if not selected:
-        return plan
-    kinds = with_read(selected)
-    products = [product for product in planned_products(plan) if product[0] in kinds]
+    chosen = with_read(selected)
+    products = [product for product in planned_products(plan) if product[0] in chosen]
     closure = plan_closure(plan, products)
-    names = {*kinds, READ_STEP}
+    names = {*chosen, READ_STEP}
     left_out = tuple(
         omission
         for omission in plan.left_out
         if omission.name in names or omission in closure.left_out
     )
     return replace(closure, left_out=left_out)
-
-
-def product_notes(scene: Scene, plan: Plan, channel: str) -> tuple[str, ...]:
-    """Return the notes on the files of a scene, without those on channels that a product lacks.
-
-    Parameters
-    ----------
-    scene : Scene
-    plan : Plan
-        Plan of the product, from `plan_closure`.
-    channel : str
-        Channel of the product.
-    """
-    if not reads_files(plan):
-        return ()
-    others = {held.name for member in scene.members or (scene,) for held in member.layout}
-    others -= {step.channel for step in plan.steps} | {channel}
-    return tuple(note for note in scene.notes if others.isdisjoint(note.split(": ")))
 
 
 def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
@@ -224,7 +187,9 @@ def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     """
     if not reads_files(plan):
         return ()
-    dark = _reads_dark(plan) or any(map(lacks_dark, plan.left_out))
+    dark = any(step.name == "dark" for step in plan.steps) or any(
+        omission.name == "dark" and omission.number == 0.0 for omission in plan.left_out
+    )
     return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
 
 
@@ -257,7 +222,7 @@ def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str
         `known` as plain JSON types, without the edges of its validity period, because closing a
         period changes nothing within it.
     """
-    settings = as_settings(known)
+    settings = known.model_dump(mode="json")
     channels = {step.channel for step in plan.steps} | {channel}
     read = ancillary_files(plan.steps)
     return {
@@ -291,7 +256,8 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     files : iterable of InputRecord
         Files and products of the scene.
     """
-    raw = {Role.SIGNAL: reads_files(plan), Role.DARK: _reads_dark(plan)}
+    names = {step.name for step in plan.steps}
+    raw = {Role.SIGNAL: READ_STEP in names, Role.DARK: "dark" in names}
     named = ancillary_files(plan.steps)
     products = {product for step in plan.steps for product in read_products(step)}
     return tuple(
@@ -306,10 +272,6 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
 def reads_files(plan: Plan) -> bool:
     """Return whether a part of a plan reads raw files; without, it reads other products."""
     return any(step.name == READ_STEP for step in plan.steps)
-
-
-def _reads_dark(plan: Plan) -> bool:
-    return any(step.name == "dark" for step in plan.steps)
 
 
 def inputs_digest(files: Sequence[InputRecord]) -> str:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
+from lidarops.records import glued_parts
 from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_groups
-from lidarops.scene.case import LAG_STEP, ChannelCase, Entry, glued_parts, lag_is_unknown
+from lidarops.scene.case import LAG_STEP, ChannelCase, Entry, lag_is_unknown
 from lidarops.scene.profiles import ChannelSignal, FileProfiles, GluedProfiles
 from lidarops.settings import SettingsModel, quantity
 
@@ -27,7 +28,7 @@ class LagSettings(SettingsModel):
     lag: float | None = quantity(None, unit="bins", description="with the method ``given``")
 
 
-def plan_lag(case: ChannelCase) -> Entry:
+def plan_lag(case: ChannelCase[Any]) -> Entry:
     """Find the lag of the analog record, but where the ranges of the campaign state it."""
     analog, photon = glued_parts(case.channel.name)
     lag = channel_facts(case.facts, analog).lag
@@ -44,11 +45,6 @@ def plan_lag(case: ChannelCase) -> Entry:
     return case.run(LAG_STEP, reason, LagSettings(method="estimate"))
 
 
-def give_lag(settings: LagSettings, signal: ChannelSignal) -> None:
-    """Give whether the lag is to be estimated; a given one has shifted the analog ranges."""
-    signal.estimated_lag = settings.method == "estimate"
-
-
 class GlueSettings(SettingsModel):
     """Settings of the stage ``glue``."""
 
@@ -56,7 +52,7 @@ class GlueSettings(SettingsModel):
     photon: str
 
 
-def plan_glue(case: ChannelCase) -> Entry:
+def plan_glue(case: ChannelCase[Any]) -> Entry:
     """Glue the profiles of both channels: the channel is there because a product needs it."""
     parts = analog, photon = glued_parts(case.channel.name)
     return case.run(
@@ -67,8 +63,16 @@ def plan_glue(case: ChannelCase) -> Entry:
     )
 
 
-def glue(settings: GlueSettings, signal: ChannelSignal) -> None:
-    """Give the glued profiles."""
+def glue(settings: GlueSettings, signal: ChannelSignal, *, estimated: bool) -> GluedProfiles:
+    """Return the glued profiles.
+
+    Parameters
+    ----------
+    settings : GlueSettings
+    signal : ChannelSignal
+    estimated : bool
+        Whether the lag is to be estimated. A given one has shifted the analog ranges.
+    """
     # Parts of a glued channel are channels of the files.
     analog, photon = (
         cast("FileProfiles", signal.channels[part].profiles)
@@ -76,14 +80,14 @@ def glue(settings: GlueSettings, signal: ChannelSignal) -> None:
     )
     archive = signal.source.archive
     lag = labeled_gluing.ChannelLag(labeled_gluing.range_lag(analog.range, photon.range))
-    if signal.estimated_lag:
+    if estimated:
         lag = labeled_gluing.estimate_lag(_groups(archive, analog, photon), known=lag.bins)
 
     @functools.cache
     def slope() -> labeled_gluing.Slope:
         return labeled_gluing.scene_slope(_samples(archive, analog, photon), lag)
 
-    signal.profiles = GluedProfiles(analog, photon, lag, slope)
+    return GluedProfiles(analog, photon, lag, slope)
 
 
 def _groups(

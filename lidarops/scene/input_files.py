@@ -85,11 +85,13 @@ def check_files(
     for granule in (*scene.granules, *scene.dark):
         sha256 = None
         try:
-            same = not read_all and _is_unchanged(granule, root)
+            status = os.stat(f"{root}/{granule.path}")  # noqa: PTH116 - for each, a Path is slow
+            stated = (status.st_size, status.st_mtime_ns) == (granule.size, granule.mtime_ns)
+            same = stated and not read_all
             sha256 = granule.sha256 if same else None
             if sha256 is None:
                 read += granule.size
-                content = _read(granule, root)
+                content = (root / granule.path).read_bytes()
                 sha256 = hashlib.sha256(content).hexdigest()
                 _check(content, granule, root)
         except FileNotFoundError:
@@ -99,7 +101,7 @@ def check_files(
         except OSError as error:
             refused.append(_refused(granule, f"{UNREADABLE}: {error.strerror or error}"))
         except LidarOpsError as error:
-            passing = isinstance(error, UnreadableFileError)
+            passing = isinstance(error, UnreadableFileError | SceneError)
             error.file = None
             refused.append(_refused(granule, str(error), None if passing else sha256))
         else:
@@ -113,24 +115,13 @@ def _refused(granule: Granule, reason: str, sha256: str | None = None) -> Granul
     return replace(granule, status=Status.REFUSED, reason=reason, sha256=sha256)
 
 
-def _is_unchanged(granule: Granule, root: Path) -> bool:
-    """Return whether a file has the size and modification time of the catalog."""
-    status = os.stat(f"{root}/{granule.path}")  # noqa: PTH116 - for each file, a Path is slow
-    return (status.st_size, status.st_mtime_ns) == (granule.size, granule.mtime_ns)
-
-
-def _read(granule: Granule, root: Path) -> bytes:
-    data = (root / granule.path).read_bytes()
-    if len(data) != granule.size:
+def _check(content: bytes, granule: Granule, root: Path) -> None:
+    """Raise an error if size, header or counts cannot be used, also those that no step reads."""
+    if len(content) != granule.size:
         raise SceneError(
-            f"{UNREADABLE}: holds {len(data)} bytes, {granule.size} according to the catalog",
+            f"{UNREADABLE}: holds {len(content)} bytes, {granule.size} according to the catalog",
             remedy="run lidarops catalog again",
         )
-    return data
-
-
-def _check(content: bytes, granule: Granule, root: Path) -> None:
-    """Raise an error if header or counts cannot be used, also those that no step reads."""
     header = parse_raw_header(content, file=granule.path, size=granule.size, known=granule.format)
     with RawFile(root / granule.path) as file:
         read_all_counts(file, header)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
-from lidarops.campaign.model import Campaign, InstrumentFacts, Station, as_settings
+from lidarops.campaign.model import Campaign, InstrumentFacts, Station
 from lidarops.kinds import Scope, kinds_of
 from lidarops.netcdf import provenance
 from lidarops.netcdf.context import Context
-from lidarops.raw.formats import raw_format
+from lidarops.raw.formats import raw_formats
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
@@ -22,7 +22,7 @@ from lidarops.records import (
 )
 from lidarops.scene import dependence
 from lidarops.scene.case import REQUEST
-from lidarops.scene.dependence import ProductKey, is_product, scene_facts
+from lidarops.scene.dependence import ProductKey
 from lidarops.system.code_version import code_version
 
 
@@ -38,6 +38,10 @@ class Place:
     """Of that product."""
 
 
+NO_PLACE: Final = Place(Stamp())
+"""Of a new product."""
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """Everything that a worker needs to process one scene."""
@@ -51,24 +55,15 @@ class Job:
     places: Mapping[ProductKey, Place] = field(default_factory=dict)
     """Of products that were made before."""
 
-    def place(self, kind: str, channel: str) -> Place:
-        """Return what stands at the place of a product."""
-        return self.places.get((kind, channel), Place(Stamp()))
-
     def writes(self, kind: str, channel: str) -> bool:
         """Whether a product is written."""
         return self.products is None or (kind, channel) in self.products
-
-    @property
-    def facts(self) -> InstrumentFacts:
-        """Facts about the instrument at the time of the scene."""
-        return scene_facts(self.campaign, self.scene)
 
 
 def nothing_to_do(plan: Plan) -> str:
     """Return why a plan makes no product: omissions of requested steps, those of products first."""
     requested = [omission for omission in plan.left_out if omission.rule != REQUEST]
-    omissions = sorted(requested or plan.left_out, key=lambda omission: not is_product(omission))
+    omissions = sorted(requested or plan.left_out, key=lambda left: left.name != left.product)
     reasons = dict.fromkeys(
         f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
     )
@@ -102,20 +97,21 @@ def product_context(
     campaign = job.campaign
     # A product states only what it depends on.
     closure = dependence.plan_closure(job.plan, [(kind, channel.name)])
-    notes = dependence.product_notes(scene, closure, channel.name)
+    settings = recorded_settings(job, scene, closure, (kind, channel.name))
+    station, instrument = _owner(campaign, scene)
     return Context(
         mode=DetectionMode(channel.mode),
         wavelength=wavelength,
         station_key=scene.station,
-        station=_station(campaign, scene),
+        station=station,
         instrument_key=scene.instrument,
-        instrument_name=_instrument_name(campaign, scene),
+        instrument_name=instrument,
         metadata=campaign.metadata,
         title=campaign.title,
         summary=campaign.summary,
         start=scene.start,
         stop=scene.stop,
-        notes=notes,
+        notes=tuple(settings["notes"]),
         unused=dependence.product_unused(scene, closure),
         provenance=Provenance(
             campaign=campaign.name,
@@ -124,18 +120,18 @@ def product_context(
             channel=channel.name,
             inputs=dependence.product_inputs(closure, inputs),
             plan=closure,
-            settings=recorded_settings(job, scene, closure, (kind, channel.name)),
+            settings=settings,
             versions=provenance.package_versions(),
             code_version=code_version(kind),
         ),
         raw_format=" and ".join(
             sorted(
-                {raw_format(granule.format).title for granule in (*scene.granules, *scene.dark)}
+                {raw_formats()[granule.format].title for granule in (*scene.granules, *scene.dark)}
                 if dependence.reads_files(closure)
                 else ()
             )
         ),
-        stamp=job.place(kind, channel.name).stamp,
+        stamp=job.places.get((kind, channel.name), NO_PLACE).stamp,
     )
 
 
@@ -154,40 +150,50 @@ def recorded_settings(
     product : (str, str)
         Its kind and channel.
     """
-    campaign, unused = job.campaign, dependence.product_unused(scene, plan)
-    return {
-        **_campaign_settings(job, plan, *product),
-        "metadata": as_settings(campaign.metadata),
-        "keys": {"station": scene.station, "instrument": scene.instrument},
-        "campaign": {"title": campaign.title, "summary": campaign.summary},
-        "window": [scene.start.isoformat(), scene.stop.isoformat()],
-        "notes": list(dependence.product_notes(scene, plan, product[1])),
-        **({dependence.UNUSED: [file._asdict() for file in unused]} if unused else {}),
-    }
-
-
-def _campaign_settings(job: Job, plan: Plan, kind: str, channel: str) -> dict[str, Any]:
-    """Return the settings of stations and instruments on which a product depends."""
-    campaign, scene = job.campaign, job.scene
-    if not scene.members:
-        instrument = campaign.instruments[scene.instrument]
+    campaign, whole, (kind, channel) = job.campaign, job.scene, product
+    unused = dependence.product_unused(scene, plan)
+    others = {held.name for member in scene.members or (scene,) for held in member.layout}
+    others -= {step.channel for step in plan.steps} | {channel}
+    # Without those on channels that the product lacks.
+    notes = [note for note in scene.notes if others.isdisjoint(note.split(": "))]
+    if whole.members:
+        dependent = _network_settings(campaign, whole, plan, kind, channel)
+    else:
+        instrument = campaign.instruments[whole.instrument]
+        reads_files = dependence.reads_files(plan)
         # Other products state the facts that they were made with.
-        facts = job.facts if dependence.reads_files(plan) else InstrumentFacts()
-        return {
-            "station": as_settings(campaign.stations[scene.station]),
+        facts = dependence.scene_facts(campaign, whole) if reads_files else InstrumentFacts()
+        request = instrument.products.requested()[kind]
+        dependent = {
+            "station": campaign.stations[whole.station].model_dump(mode="json"),
             "facts": dependence.facts_settings(facts, plan, channel),
             # `lidarops reproduce` also needs these to make the same bytes.
             "instrument": instrument.name,
             # As if only this product were requested, here and below.
-            "products": {**as_settings(instrument.products)[kind], "channels": [channel]},
+            "products": {**request.model_dump(mode="json"), "channels": [channel]},
         }
-    network = as_settings(campaign.networks[scene.instrument])
+    return {
+        **dependent,
+        "metadata": campaign.metadata.model_dump(mode="json"),
+        "keys": {"station": scene.station, "instrument": scene.instrument},
+        "campaign": {"title": campaign.title, "summary": campaign.summary},
+        "window": [scene.start.isoformat(), scene.stop.isoformat()],
+        "notes": notes if dependence.reads_files(plan) else [],
+        **({dependence.UNUSED: [file._asdict() for file in unused]} if unused else {}),
+    }
+
+
+def _network_settings(
+    campaign: Campaign, scene: Scene, plan: Plan, kind: str, channel: str
+) -> dict[str, Any]:
+    """Return the settings of the members of a network on which a product depends."""
+    network = campaign.networks[scene.instrument].model_dump(mode="json")
     others = {other.name for other in kinds_of(Scope.NETWORK)} - {kind}
     return {
         "network": {key: value for key, value in network.items() if key not in others},
         "members": {
             member.instrument: {
-                "station": as_settings(campaign.stations[member.station]),
+                "station": campaign.stations[member.station].model_dump(mode="json"),
                 "facts": dependence.facts_settings(
                     dependence.scene_facts(campaign, member), plan, channel
                 ),
@@ -200,28 +206,19 @@ def _campaign_settings(job: Job, plan: Plan, kind: str, channel: str) -> dict[st
     }
 
 
-def _station(campaign: Campaign, scene: Scene) -> Station:
-    """Return the station of a scene; for a network, the mean position of its stations."""
+def _owner(campaign: Campaign, scene: Scene) -> tuple[Station, str]:
+    """Return station and name of an instrument; of a network, the mean of its stations."""
+    owner = (campaign.networks if scene.members else campaign.instruments)[scene.instrument]
+    name = owner.name or scene.instrument
     if not scene.members:
-        return campaign.stations[scene.station]
+        return campaign.stations[scene.station], name
     places = [campaign.stations[member.station] for member in scene.members]
-    latitude, longitude, altitude = (
-        sum(getattr(place, name) for place in places) / len(places)
-        for name in ("latitude", "longitude", "altitude")
+    mean = {
+        key: sum(getattr(place, key) for place in places) / len(places)
+        for key in ("latitude", "longitude", "altitude")
+    }
+    members = (
+        campaign.instruments[member.instrument].name or place.name
+        for member, place in zip(scene.members, places, strict=True)
     )
-    return Station(
-        name=campaign.networks[scene.instrument].name or scene.instrument,
-        latitude=latitude,
-        longitude=longitude,
-        altitude=altitude,
-    )
-
-
-def _instrument_name(campaign: Campaign, scene: Scene) -> str:
-    if scene.members:
-        members = (
-            campaign.instruments[member.instrument].name or campaign.stations[member.station].name
-            for member in scene.members
-        )
-        return "network of " + ", ".join(members)
-    return campaign.instruments[scene.instrument].name or scene.instrument
+    return Station(name=name, **mean), f"network of {', '.join(members)}"

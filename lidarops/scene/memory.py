@@ -6,11 +6,10 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import Final
 
-from lidarops.kinds import kind_of
+from lidarops.kinds import kinds
 from lidarops.records import Plan, PlannedStep, Scene
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE
 from lidarops.scene.case import counted_channels, prepared_channels
-from lidarops.scene.dependence import is_product
 from lidarops.scene.profiles import CHUNK_BYTES
 from lidarops.scene.retrieval import Making, Workload, making, product_settings
 
@@ -80,7 +79,7 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
     members = {member.instrument: member for member in scene.members}
     for step in plan.steps:
         work = Workload(members.get(step.instrument, scene), step.channel)
-        if is_product(step):
+        if step.name == step.product:
             known = making(step.product, Making)
             settings = product_settings(plan.steps, step.product, step.channel)
             held[step.channel] += known.held(settings, work)
@@ -88,8 +87,8 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
         elif not step.product:
             held[step.channel] += _held_by_stage(step, work)
     files = len(scene.granules) + len(scene.dark)
-    products = [step for step in plan.steps if is_product(step)]
-    compared = [held[step.channel] for step in products if kind_of(step.product).common]
+    products = [step for step in plan.steps if step.name == step.product]
+    compared = [held[step.channel] for step in products if kinds()[step.product].common]
     # Channels are processed one after the other.
     channels = [prepared_channels(plan.steps, step.channel) for step in products]
     most = max((sum(held[name] for name in names) for names in channels), default=0.0)

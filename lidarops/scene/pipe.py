@@ -1,7 +1,8 @@
 """The pipe from raw counts to the profiles of a channel, and the air: its stages, in their order.
 
 Of each stage there is a function ``plan_...``, which decides on the headers and the campaign
-whether it runs, and one that carries it out. Those of glued channels: `lidarops.scene.gluing`.
+whether it runs; those of glued channels are in `lidarops.scene.gluing`. `channel_signal` carries
+out what is planned.
 """
 
 from __future__ import annotations
@@ -10,15 +11,15 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from types import MappingProxyType
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.campaign.model import channel_facts
 from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
-from lidarops.records import DetectionMode, Granule, LeftOut, PlannedStep, Role, is_glued
+from lidarops.records import GLUED, DetectionMode, Granule, LeftOut, PlannedStep, Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
@@ -34,9 +35,7 @@ from lidarops.scene.case import (
     estimated_against,
     lag_is_unknown,
     prepared_channels,
-    range_channel,
     range_offset,
-    wavelength,
 )
 from lidarops.scene.profiles import ChannelSignal, FileProfiles, Source, bin_ranges
 from lidarops.settings import SettingsModel, quantity
@@ -53,9 +52,9 @@ class ReadSettings(SettingsModel):
     recorder: str = ""
 
 
-def plan_read(case: ChannelCase) -> Entry:
+def plan_read(case: ChannelCase[Any]) -> Entry:
     """Read a channel that a product needs, at a known wavelength."""
-    requesters = [*case.requests, *case.requesters]
+    requesters = (*case.requests, *case.requesters)
     if not requesters and case.networks:
         word = "networks" if len(case.networks) > 1 else "network"
         reason = f"used only by {word} {' and '.join(case.networks)}"
@@ -63,21 +62,11 @@ def plan_read(case: ChannelCase) -> Entry:
     if not requesters:
         reason = "no product of the campaign uses this channel"
         return case.leave(READ_STEP, reason, rule=REQUEST)
-    metres = wavelength(case.channel, channel_facts(case.facts, range_channel(case.channel.name)))
+    metres = case.facts_of_channel.wavelength or case.channel.wavelength
     if math.isnan(metres):
         return case.leave(READ_STEP, NO_WAVELENGTH, rule="channel")
     settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder)
-    return case.run(READ_STEP, required_by(requesters), settings, rule="channel")
-
-
-def required_by(requesters: Iterable[str]) -> str:
-    """Return the reason why a channel is read: the products and glued channels that need it."""
-    return f"required by {' and '.join(requesters)}"
-
-
-def read(settings: ReadSettings, signal: ChannelSignal) -> None:
-    """Give the wavelength."""
-    signal.wavelength = settings.wavelength
+    return case.run(READ_STEP, f"required by {' and '.join(requesters)}", settings, rule="channel")
 
 
 class OverlapSettings(SettingsModel):
@@ -88,7 +77,7 @@ class OverlapSettings(SettingsModel):
     """Ancillary file of the overlap function."""
 
 
-def plan_overlap(case: ChannelCase) -> Entry:
+def plan_overlap(case: ChannelCase[Any]) -> Entry:
     """Flag bins before full overlap, and give the overlap function, where they are stated."""
     full, profile = case.facts.full_overlap_range, case.facts.overlap_profile
     if not profile and full <= 0:
@@ -104,20 +93,13 @@ def plan_overlap(case: ChannelCase) -> Entry:
     return case.run("overlap", reason, settings, number=full)
 
 
-def overlap(settings: OverlapSettings, signal: ChannelSignal) -> None:
-    """Give the range of full overlap, and the overlap function where it is known."""
-    signal.full_overlap_range = settings.full_overlap_range
-    if settings.overlap_profile is not None:
-        signal.overlap = signal.source.ancillaries.overlaps[settings.overlap_profile].at
-
-
 class RangeOffsetSettings(SettingsModel):
     """Settings of the stage ``range_offset``."""
 
     range_offset: float = quantity(unit="m")
 
 
-def plan_range_offset(case: ChannelCase) -> Entry:
+def plan_range_offset(case: ChannelCase[Any]) -> Entry:
     """Shift the ranges of the bins where the campaign gives an offset or a lag."""
     offset, lag = range_offset(case.channel, case.facts), case.facts_of_channel.lag
     if offset:
@@ -131,11 +113,6 @@ def plan_range_offset(case: ChannelCase) -> Entry:
     return case.leave("range_offset", "the campaign gives no range_offset")
 
 
-def shift_ranges(settings: RangeOffsetSettings, signal: ChannelSignal) -> None:
-    """Give the offset."""
-    signal.range_offset = settings.range_offset
-
-
 class DarkSettings(SettingsModel):
     """Settings of the stage ``dark``."""
 
@@ -143,7 +120,7 @@ class DarkSettings(SettingsModel):
     method: Literal["interpolated", "nearest"]
 
 
-def plan_dark(case: ChannelCase) -> Entry:
+def plan_dark(case: ChannelCase[Any]) -> Entry:
     """Subtract the signal of dark files near the scene from an analog channel."""
     if case.channel.mode is DetectionMode.PHOTON:
         return case.leave("dark", "dark counts are part of the photon-counting background")
@@ -169,18 +146,6 @@ def plan_dark(case: ChannelCase) -> Entry:
     reason = f"{files} within 24 h of the scene, {order}: {use}"
     settings = DarkSettings(files=count, method=method)
     return case.run("dark", reason, settings, needs=("read",), number=float(count))
-
-
-def subtract_dark(settings: DarkSettings, signal: ChannelSignal) -> None:
-    """Give the dark signals."""
-    dark = signal.source.dark
-    if dark is not None:
-        signal.dark = labeled.read_dark(dark, signal.channel, method=settings.method)
-
-
-def lacks_dark(entry: LeftOut) -> bool:
-    """Return whether an entry of a plan says that dark files are wanting."""
-    return entry.name == "dark" and entry.number == 0.0
 
 
 def _sessions(dark: Iterable[Granule]) -> int:
@@ -218,7 +183,7 @@ class DeadTimeSettings(SettingsModel):
     """Whether the lag of that channel is estimated too, or given by the ranges of the campaign."""
 
 
-def plan_dead_time(case: ChannelCase) -> Entry:
+def plan_dead_time(case: ChannelCase[Any]) -> Entry:
     """Correct photon counts for a known dead time, or one that can be estimated."""
     dead_time = case.facts_of_channel.dead_time
     if case.channel.mode is not DetectionMode.PHOTON:
@@ -236,7 +201,7 @@ def plan_dead_time(case: ChannelCase) -> Entry:
     return case.run("dead_time", reason, settings, number=dead_time)
 
 
-def _plan_estimate(case: ChannelCase) -> Entry:
+def _plan_estimate(case: ChannelCase[Any]) -> Entry:
     """Estimate the dead time against the analog channel of the detector."""
     analog = estimated_against(case.channel, case.facts, case.scene.layout)
     if case.member:
@@ -253,33 +218,29 @@ def _plan_estimate(case: ChannelCase) -> Entry:
     return case.leave("dead_time", reason)
 
 
-def correct_dead_time(settings: DeadTimeSettings, signal: ChannelSignal) -> None:
-    """Give the dead time, and its relative standard error."""
-    if settings.analog is not None:
-        estimate = _estimated_dead_time(signal, signal.channels[settings.analog], settings)
-        words = f"dead_time: no estimate of {signal.channel} against {settings.analog}"
-        if estimate is None:
-            signal.notes.append(
-                f"dead_time: estimate of {signal.channel}: the data give none against"
-                f" {settings.analog}, so that pile-up is not corrected, and flagged for an"
-                " assumed 4 ns; give dead_time in s, as the data sheet of the counter states it"
-            )
-        else:
-            signal.dead_time = estimate.dead_time
-            signal.dead_time_uncertainty = min(estimate.standard_error / estimate.dead_time, 1.0)
-            words = (
-                f"dead_time: {1e9 * estimate.dead_time:.3f} ns of {signal.channel}, estimated"
-                f" against {settings.analog}, standard error"
-                f" {1e9 * estimate.standard_error:.3f} ns"
-            )
-        signal.statements.append(words)
-    elif settings.dead_time is not None and settings.dead_time_uncertainty is not None:
-        signal.dead_time = settings.dead_time
-        signal.dead_time_uncertainty = settings.dead_time_uncertainty
+def _estimate_dead_time(signal: ChannelSignal, analog: ChannelSignal, lag: str | None) -> None:
+    """Give the dead time, and its relative standard error, from the first profiles of a scene."""
+    estimate = _estimated_dead_time(signal, analog, estimates_lag=lag == "estimate")
+    words = f"dead_time: no estimate of {signal.channel} against {analog.channel}"
+    if estimate is None:
+        signal.notes.append(
+            f"dead_time: estimate of {signal.channel}: the data give none against"
+            f" {analog.channel}, so that pile-up is not corrected, and flagged for an"
+            " assumed 4 ns; give dead_time in s, as the data sheet of the counter states it"
+        )
+    else:
+        signal.dead_time = estimate.dead_time
+        signal.dead_time_uncertainty = min(estimate.standard_error / estimate.dead_time, 1.0)
+        words = (
+            f"dead_time: {1e9 * estimate.dead_time:.3f} ns of {signal.channel}, estimated"
+            f" against {analog.channel}, standard error"
+            f" {1e9 * estimate.standard_error:.3f} ns"
+        )
+    signal.statements.append(words)
 
 
 def _estimated_dead_time(
-    photon: ChannelSignal, analog: ChannelSignal, settings: DeadTimeSettings
+    photon: ChannelSignal, analog: ChannelSignal, *, estimates_lag: bool
 ) -> DeadTimeEstimate | None:
     """Return the dead time from the first profiles of a scene."""
     archive, profiles = photon.source.archive, analog.profiles
@@ -307,7 +268,7 @@ def _estimated_dead_time(
 
     distance = bin_ranges(archive, channel, photon.range_offset)
     lag = labeled_gluing.range_lag(profiles.range, distance)
-    if settings.lag == "estimate":
+    if estimates_lag:
         lag = labeled_gluing.estimate_lag(records(), known=lag).bins
     else:
         for _ in records():
@@ -331,7 +292,7 @@ class NoiseSettings(SettingsModel):
     )
 
 
-def plan_noise(case: ChannelCase) -> Entry:
+def plan_noise(case: ChannelCase[Any]) -> Entry:
     """Turn counts into power, with a noise that is Poisson, given, or estimated."""
     variance = case.facts_of_channel.noise_variance
     if case.channel.mode is DetectionMode.PHOTON:
@@ -351,24 +312,6 @@ def plan_noise(case: ChannelCase) -> Entry:
     return case.run("noise", reason, settings, needs=needs, number=settings.noise_variance)
 
 
-def weigh(settings: NoiseSettings, signal: ChannelSignal) -> None:
-    """Give the profiles of the channel."""
-    signal.relative_variance = settings.method == "differences"
-    signal.profiles = FileProfiles(
-        signal.source.archive,
-        signal.channel,
-        {
-            "dead_time": signal.dead_time,
-            "dead_time_uncertainty": signal.dead_time_uncertainty,
-            "noise_variance": settings.noise_variance,
-            "baseline_uncertainty": settings.baseline_uncertainty,
-            "dark": signal.dark,
-            "range_offset": signal.range_offset,
-            "full_overlap_range": signal.full_overlap_range or 0.0,
-        },
-    )
-
-
 class MolecularSettings(SettingsModel):
     """Settings of the stage ``molecular``."""
 
@@ -376,7 +319,7 @@ class MolecularSettings(SettingsModel):
     """Ancillary file of pressure and temperature; None for the US Standard Atmosphere 1976."""
 
 
-def plan_molecular(case: ChannelCase) -> Entry:
+def plan_molecular(case: ChannelCase[Any]) -> Entry:
     """Give the density of the air, of a file or of the standard atmosphere."""
     source = case.facts.molecular_profile
     reason = "given by the campaign"
@@ -385,34 +328,20 @@ def plan_molecular(case: ChannelCase) -> Entry:
     return case.run("molecular", reason, MolecularSettings(molecular_profile=source or None))
 
 
-def give_air(settings: MolecularSettings, signal: ChannelSignal) -> None:
-    """Give the profile of the file, or of the standard atmosphere."""
-    source, known = settings.molecular_profile, signal.source.ancillaries.profiles
-    signal.molecules = MolecularProfile.us_standard() if source is None else known[source]
-
-
-class Stage(NamedTuple):
-    """One stage: the settings that a plan states, the decision, and its execution."""
-
-    settings: type[SettingsModel]
-    decide: Callable[[ChannelCase], Entry]
-    carry_out: Callable[[Any, ChannelSignal], None]
-
-
-PIPE: Final[Mapping[str, Stage]] = MappingProxyType(
+PIPE: Final[Mapping[str, Callable[[ChannelCase[Any]], Entry]]] = MappingProxyType(
     {
-        "read": Stage(ReadSettings, plan_read, read),
-        "overlap": Stage(OverlapSettings, plan_overlap, overlap),
-        "range_offset": Stage(RangeOffsetSettings, plan_range_offset, shift_ranges),
-        "dark": Stage(DarkSettings, plan_dark, subtract_dark),
-        "dead_time": Stage(DeadTimeSettings, plan_dead_time, correct_dead_time),
-        "noise": Stage(NoiseSettings, plan_noise, weigh),
-        "lag": Stage(gluing.LagSettings, gluing.plan_lag, gluing.give_lag),
-        "glue": Stage(gluing.GlueSettings, gluing.plan_glue, gluing.glue),
-        "molecular": Stage(MolecularSettings, plan_molecular, give_air),
+        "read": plan_read,
+        "overlap": plan_overlap,
+        "range_offset": plan_range_offset,
+        "dark": plan_dark,
+        "dead_time": plan_dead_time,
+        "noise": plan_noise,
+        "lag": gluing.plan_lag,
+        "glue": gluing.plan_glue,
+        "molecular": plan_molecular,
     }
 )
-"""The stages by name, in the order in which they run."""
+"""What decides on a stage, by its name, in the order in which stages run."""
 _OF_FILES: Final = ("read", "overlap", "range_offset", "dark", "dead_time", "noise")
 """From the counts of a channel of the files to its profiles."""
 _OF_GLUED: Final = ("read", "overlap", "lag", "glue")
@@ -421,34 +350,89 @@ AIR: Final = "molecular"
 """Stage that runs once a channel, if one of its products needs it."""
 
 
-def plan_stages(case: ChannelCase) -> list[Entry]:
+class Stages(SettingsModel):
+    """What a plan states of the pipe of a channel: None where a stage is left out."""
+
+    read: ReadSettings
+    overlap: OverlapSettings | None = None
+    range_offset: RangeOffsetSettings | None = None
+    dark: DarkSettings | None = None
+    dead_time: DeadTimeSettings | None = None
+    noise: NoiseSettings | None = None
+    lag: gluing.LagSettings | None = None
+    glue: gluing.GlueSettings | None = None
+    molecular: MolecularSettings | None = None
+
+
+def plan_stages(case: ChannelCase[Any]) -> list[Entry]:
     """Return what is decided from the counts of a channel to its profiles.
 
     Only that it is not read, if no product needs the channel.
     """
-    reading, *others = _OF_GLUED if is_glued(case.channel.name) else _OF_FILES
-    read = PIPE[reading].decide(case)
+    reading, *others = _OF_GLUED if case.channel.name.startswith(GLUED) else _OF_FILES
+    read = PIPE[reading](case)
     if isinstance(read, LeftOut):
         return [read]
-    return [read, *(PIPE[name].decide(case) for name in others)]
+    return [read, *(PIPE[name](case) for name in others)]
 
 
-def channel_signal(source: Source, steps: Iterable[PlannedStep], channel: str) -> ChannelSignal:
+def channel_signal(source: Source, steps: Sequence[PlannedStep], channel: str) -> ChannelSignal:
     """Return the signal of a channel, for which the planned stages are carried out.
 
     Parameters
     ----------
     source : Source
-    steps : iterable of PlannedStep
+    steps : sequence of PlannedStep
         Of the plan, in its order.
     channel : str
     """
-    stages: Sequence[PlannedStep] = [step for step in steps if not step.product]
     signals: dict[str, ChannelSignal] = {}
     for name in prepared_channels(steps, channel):
-        signals[name] = ChannelSignal(source, name, signals)
-        for step in stages:
-            if step.channel == name:
-                stage = PIPE[step.name]
-                stage.carry_out(stage.settings.model_validate(dict(step.settings)), signals[name])
+        own = [step for step in steps if step.channel == name and not step.product]
+        stages = Stages.model_validate({step.name: dict(step.settings) for step in own})
+        signals[name] = ChannelSignal(source, name, signals, stages.read.wavelength)
+        _carry_out(stages, signals[name])
     return signals[channel]
+
+
+def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
+    """Give the profiles of a channel, what they are made with, and the air."""
+    source = signal.source
+    if stages.overlap is not None:
+        signal.full_overlap_range = stages.overlap.full_overlap_range
+        if stages.overlap.overlap_profile is not None:
+            signal.overlap = source.ancillaries.overlaps[stages.overlap.overlap_profile].at
+    if stages.range_offset is not None:
+        signal.range_offset = stages.range_offset.range_offset
+    dark = None
+    if stages.dark is not None and source.dark is not None:
+        dark = labeled.read_dark(source.dark, signal.channel, method=stages.dark.method)
+    correction = stages.dead_time
+    if correction is not None and correction.analog is not None:
+        _estimate_dead_time(signal, signal.channels[correction.analog], correction.lag)
+    elif correction is not None:
+        signal.dead_time = correction.dead_time
+        signal.dead_time_uncertainty = correction.dead_time_uncertainty or 0.0
+    if stages.noise is not None:
+        signal.relative_variance = stages.noise.method == "differences"
+        signal.profiles = FileProfiles(
+            signal.channel,
+            bin_ranges(source.archive, signal.channel, signal.range_offset),
+            dark,
+            partial(
+                labeled.condition,
+                dead_time=signal.dead_time,
+                dead_time_uncertainty=signal.dead_time_uncertainty,
+                noise_variance=stages.noise.noise_variance,
+                baseline_uncertainty=stages.noise.baseline_uncertainty,
+                dark=dark,
+                range_offset=signal.range_offset,
+                full_overlap_range=signal.full_overlap_range or 0.0,
+            ),
+        )
+    if stages.glue is not None:
+        estimated = stages.lag is not None and stages.lag.method == "estimate"
+        signal.profiles = gluing.glue(stages.glue, signal, estimated=estimated)
+    if stages.molecular is not None:
+        file, known = stages.molecular.molecular_profile, source.ancillaries.profiles
+        signal.molecules = MolecularProfile.us_standard() if file is None else known[file]

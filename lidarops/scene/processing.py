@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,47 +21,44 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.errors import ProductError, RawFormatError
-from lidarops.kinds import kind_of
+from lidarops.kinds import kinds
 from lidarops.netcdf.context import Context, path_of_product, product_of_path, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.netcdf.read import opened_product
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
+    GLUED,
     DetectionMode,
     Disagreement,
     Grade,
     Granule,
     InputRecord,
-    Plan,
     PlannedStep,
     ProductRecord,
     Role,
     Scene,
     SceneOutcome,
-    is_glued,
+    file_channels,
 )
 from lidarops.scene.agreement import Retrieved, compare_channels
 from lidarops.scene.case import (
     READ_STEP,
     channel_ranges,
     counted_channels,
-    file_channels,
     member_channel,
     product_channel,
 )
 from lidarops.scene.choices import read_windows
 from lidarops.scene.dependence import (
     ancillary_files,
-    is_product,
-    plan_closure,
     planned_products,
     read_products,
     scene_facts,
 )
 from lidarops.scene.guard import Failure, guarded
 from lidarops.scene.input_files import check_files, local_files, open_granules
-from lidarops.scene.job import Job, nothing_to_do, product_context
+from lidarops.scene.job import NO_PLACE, Job, nothing_to_do, product_context
 from lidarops.scene.pipe import channel_signal
 from lidarops.scene.profiles import (
     READ_TOGETHER,
@@ -109,12 +107,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
         False where a disk, a network or memory failed, so that a retry may succeed.
     """
     begin = time.thread_time()
-
-    def process() -> tuple[SceneOutcome, bool]:
-        with local_files(job.campaign.archive, job.scene) as (root, denied):
-            return _process(job, root, denied)
-
-    result = guarded(process)
+    result = guarded(partial(_process, job))
     if isinstance(result, Failure):
         return result.outcome(job.scene, job.plan), result.final
     outcome, final = result
@@ -122,31 +115,33 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     return replace(outcome, cpu_seconds=time.thread_time() - begin), final
 
 
-def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutcome, bool]:
-    clock = _Clock()
-    if not any(is_product(step) for step in job.plan.steps):
-        return Failure(nothing_to_do(job.plan)).outcome(job.scene, job.plan), True
-    read_all = job.campaign.all_steps
-    usable, inputs, refused, read = check_files(job.scene, root, read_all=read_all, denied=denied)
-    clock.lap("digest")
+def _process(job: Job) -> tuple[SceneOutcome, bool]:
+    laps = _Laps()
     failure = Failure("").outcome(job.scene, job.plan)
-    failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
-    if refused:
-        # Without them the scene is another one, of another plan.
-        lost = "" if usable.granules else "no granule of the scene can be read"
-        return replace(failure, error=lost), not lost
-    # Of a scheduler by its name, dask loads `distributed`, which takes 0.3 s.
-    with dask.config.set(scheduler=dask.local.get_sync), count_bytes_read() as tally:
+    order = planned_products(job.plan)
+    if not order:
+        return replace(failure, error=nothing_to_do(job.plan)), True
+    with local_files(job.campaign.archive, job.scene) as (root, denied):
+        read_all = job.campaign.all_steps
+        usable, inputs, refused, read = check_files(
+            job.scene, root, read_all=read_all, denied=denied
+        )
+        laps.end("digest")
+        failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
+        if refused:
+            # Without them the scene is another one, of another plan.
+            lost = "" if usable.granules else "no granule of the scene can be read"
+            return replace(failure, error=lost), not lost
         process = _Network if usable.members else _Instrument
-        work = process(job, usable, inputs, root, clock)
-        failed = guarded(work.all_products)
-    order = planned_products(work.job.plan)
+        work = process(job, usable, inputs, root, laps)
+        # Of a scheduler by its name, dask loads `distributed`, which takes 0.3 s.
+        with dask.config.set(scheduler=dask.local.get_sync), count_bytes_read() as tally:
+            failed = guarded(work.all_products)
     outcome = replace(
         failure,
-        plan=work.job.plan,
         inputs=work.inputs,
         refused=work.refused,
-        seconds=clock.laps,
+        seconds=laps.seconds,
         notes=tuple(work.notes),
         disagreements=work.disagreements,
         bytes_read=read + tally.bytes,
@@ -159,17 +154,18 @@ def _process(job: Job, root: Path, denied: Mapping[str, str]) -> tuple[SceneOutc
     return replace(outcome, error=error, internal=failed.internal), failed.final
 
 
-class _Clock:
+class _Laps:
     """Wall time by stage."""
 
     def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+        self._began = time.perf_counter()
 
-    def lap(self, stage: str) -> None:
+    def end(self, stage: str) -> None:
+        """Add the time since the end of the last stage."""
         now = time.perf_counter()
-        self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
-        self._last = now
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._began
+        self._began = now
 
 
 class _Work(ABC):
@@ -181,10 +177,10 @@ class _Work(ABC):
         scene: Scene,
         inputs: tuple[InputRecord, ...],
         root: Path,
-        clock: _Clock,
+        laps: _Laps,
     ) -> None:
         self.job, self.inputs = job, inputs
-        self._scene, self._root, self._clock = scene, root, clock
+        self.scene, self.root, self.laps = scene, root, laps
         self.made: list[ProductRecord] = []
         """Products that are written, in the order in which they were complete."""
         self.notes: dict[str, None] = {}
@@ -199,7 +195,7 @@ class _Work(ABC):
             self.products()
         except RawFormatError:
             # A file of known content was not checked, and differs from it or cannot be read now.
-            self.refused = check_files(self.job.scene, self._root, read_all=True)[2]
+            self.refused = check_files(self.job.scene, self.root, read_all=True)[2]
             raise
 
     @abstractmethod
@@ -226,13 +222,13 @@ class _Work(ABC):
             archive=open_granules(
                 *open_files,
                 scene.granules,
-                self._root,
+                self.root,
                 list(bins),
                 profiles_per_chunk=max(1, profiles // READ_TOGETHER),
                 stretches=stretches,
             ),
             dark=(
-                open_granules(*open_files, scene.dark, self._root, subtracted)
+                open_granules(*open_files, scene.dark, self.root, subtracted)
                 if subtracted and scene.dark
                 else None
             ),
@@ -246,21 +242,21 @@ class _Work(ABC):
     def _writer(self, frame: xr.Dataset, context: Context) -> Iterator[ProductWriter]:
         """Yield a writer of a product, which is complete at the end."""
         target = self.job.campaign.products_root / product_path(context)
-        place = self.job.place(context.kind, context.channel)
+        place = self.job.places.get((context.kind, context.channel), NO_PLACE)
         with create_product(frame, context, target, place.sha256) as writer:
             yield writer
         record = writer.record
         stays = record.change is not None and record.change.grade is Grade.NONE
         self.made.append(replace(record, stamp=place.former) if stays else record)
-        self._clock.lap("write")
+        self.laps.end("write")
 
     def _write(self, context: Context, results: Iterator[xr.Dataset]) -> None:
         """Write a product from its frame and the rows that follow."""
         with self._writer(next(results), context) as writer:
             for rows in results:
-                self._clock.lap("retrieve")
+                self.laps.end("retrieve")
                 writer.add(rows)
-                self._clock.lap("write")
+                self.laps.end("write")
 
 
 class _Instrument(_Work):
@@ -269,16 +265,16 @@ class _Instrument(_Work):
     def products(self) -> None:
         """Make the products of all channels."""
         steps = self.job.plan.steps
-        products = [step for step in steps if is_product(step)]
+        products = [step for step in steps if step.name == step.product]
         derived = [step for step in products if read_products(step)]
         channels = dict.fromkeys(step.channel for step in products if step not in derived)
         compared: list[Retrieved] = []
         if channels:
-            source = self._source(self._scene, steps, read_windows(steps))
+            source = self._source(self.scene, steps, read_windows(steps))
             for channel in channels:
                 self._make_products(source, channel, compared)
         judged, pairs = compare_channels(compared) if compared else ([], ())
-        self._clock.lap("retrieve")
+        self.laps.end("retrieve")
         # Pairs of two products that stand were reported when these were made.
         self.disagreements = tuple(
             pair
@@ -300,15 +296,15 @@ class _Instrument(_Work):
         with opened_product(first, in_parts=True, decode_cf=False) as product:
             wavelength = float(product["wavelength"]) * 1e-9
             stated = product.attrs["lidarops_detection_mode"]
-        mode = DetectionMode.PHOTON if is_glued(step.channel) else DetectionMode(stated)
+        mode = DetectionMode.PHOTON if step.channel.startswith(GLUED) else DetectionMode(stated)
         channel = product_channel(step.channel, mode, wavelength)
-        context = product_context(job, self._scene, kind, channel, wavelength, self.inputs)
+        context = product_context(job, self.scene, kind, channel, wavelength, self.inputs)
         settings = product_settings(job.plan.steps, kind, step.channel)
         self._write(context, making(kind, Derivation).derive(settings, read))
 
     def _paths_read(self, step: PlannedStep) -> list[str]:
         """Return the paths of the products that a step reads, of its scene or its month."""
-        scene, keys = self._scene, read_products(step)
+        scene, keys = self.scene, read_products(step)
         if scene.granules:
             owner = (scene.station, scene.instrument)
             return sorted(path_of_product((*owner, *key), scene.id, scene.start) for key in keys)
@@ -338,31 +334,31 @@ class _Instrument(_Work):
         if any(self.job.writes(kind, channel) for kind in streams):
             for part in signal.channels.values():
                 self.notes.update(dict.fromkeys(part.notes))
-        layout = member_channel(self._scene.layout, channel)
+        layout = member_channel(self.scene.layout, channel)
         contexts = {
             kind: product_context(
-                self.job, self._scene, kind, layout, signal.wavelength, self.inputs
+                self.job, self.scene, kind, layout, signal.wavelength, self.inputs
             )
             for kind in streams
         }
-        words = {kind: _words(self.job.plan, kind, signal) for kind in streams}
         with ExitStack() as until_written:
             writers: dict[str, ProductWriter] = {}
             channels = counted_channels(steps, channel)
             profiles = profiles_together(source, channels, self.job.profiles_per_chunk)
             for chunk in chunks(source, channels, streams.values(), profiles):
                 for kind, rows in ((k, rows) for k, s in streams.items() for rows in s.add(chunk)):
-                    self._clock.lap("retrieve")
+                    self.laps.end("retrieve")
                     if kind in writers:
                         writers[kind].add(rows)
-                        self._clock.lap("write")
+                        self.laps.end("write")
                     else:
-                        writer = self._writer(_with_words(rows, words[kind]), contexts[kind])
+                        frame = _with_words(rows, contexts[kind], signal)
+                        writer = self._writer(frame, contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
         for kind in [kind for kind in streams if kind not in writers]:
             results = streams[kind].results()
-            frame = _with_words(next(results), words[kind])
-            common = kind_of(kind).common
+            frame = _with_words(next(results), contexts[kind], signal)
+            common = kinds()[kind].common
             if self.job.writes(kind, channel):
                 self.notes.update(dict.fromkeys(streams[kind].notes))
             if common:
@@ -371,15 +367,10 @@ class _Instrument(_Work):
                 self._write(contexts[kind], itertools.chain([frame], results))
 
 
-def _words(plan: Plan, product: str, signal: ChannelSignal) -> list[str]:
-    """Return what steps decided from the data of all channels from which a product is made."""
-    steps = plan_closure(plan, [(product, signal.channel)]).steps
-    parts = counted_channels(steps, signal.channel)
-    return [words for part in parts for words in signal.channels[part].statements]
-
-
-def _with_words(frame: xr.Dataset, words: Sequence[str]) -> xr.Dataset:
+def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> xr.Dataset:
     """Return the frame of a product that states what steps decided from the data."""
+    parts = counted_channels(context.provenance.plan.steps, signal.channel)
+    words = [words for part in parts for words in signal.channels[part].statements]
     stated = [frame.attrs["steps"]] if frame.attrs.get("steps") else []
     return frame.assign_attrs(steps="; ".join([*words, *stated])) if words else frame
 
@@ -390,7 +381,7 @@ class _Network(_Work):
     def products(self) -> None:
         """Make the products of the network."""
         plan = self.job.plan
-        for step in [step for step in plan.steps if is_product(step)]:
+        for step in [step for step in plan.steps if step.name == step.product]:
             members = list(self._members(step))
             settings = product_settings(plan.steps, step.product, step.channel)
             stream = making(step.product, NetworkRetrieval).stream(settings, members)
@@ -403,11 +394,11 @@ class _Network(_Work):
                     for chunk in chunks(source, channels, (), profiles):
                         stream.add(member, chunk)
             made = stream.result()
-            self._clock.lap("retrieve")
+            self.laps.end("retrieve")
             first = next(m for m in self.job.scene.members if m.instrument == members[0].instrument)
             context = product_context(
                 self.job,
-                self._scene,
+                self.scene,
                 step.product,
                 member_channel(first.layout, step.channel),
                 stream.wavelength,
@@ -418,7 +409,7 @@ class _Network(_Work):
     def _members(self, product: PlannedStep) -> Iterator[Member[Any]]:
         """Yield the instruments that take part, with the data of the channel of a product."""
         job = self.job
-        for planned, usable in zip(job.scene.members, self._scene.members, strict=True):
+        for planned, usable in zip(job.scene.members, self.scene.members, strict=True):
             steps = [s for s in job.plan.steps if s.instrument == planned.instrument]
             if not steps:
                 continue

@@ -7,7 +7,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypedDict
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ import xarray as xr
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.constants import DEAD_TIME_UNCERTAINTY
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.signal import labeled, labeled_gluing
+from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
@@ -33,10 +33,9 @@ _PARTS: Final = ("power", "variance", "quality")
 class Chunk:
     """Consecutive profiles of a scene, with their counts in memory."""
 
-    def __init__(self, counts: xr.Dataset, first: int) -> None:
-        self.counts = counts
-        self.rows = slice(first, first + counts.sizes["time"])
-        """Place of the profiles in the scene."""
+    def __init__(self, counts: xr.Dataset, rows: slice) -> None:
+        self.counts, self.rows = counts, rows
+        """Counts of the profiles, and their place in the scene."""
         self._profiles: dict[int, xr.Dataset] = {}
 
     @property
@@ -52,18 +51,6 @@ class Chunk:
         return self._profiles[key]
 
 
-class Conditioning(TypedDict):
-    """Arguments of `lidarops.retrieve.signal.labeled.condition`."""
-
-    dead_time: float | None
-    dead_time_uncertainty: float
-    noise_variance: float | None
-    baseline_uncertainty: float | None
-    dark: DarkSignals | None
-    range_offset: float
-    full_overlap_range: float
-
-
 def bin_ranges(archive: xr.Dataset, channel: str, offset: float) -> npt.NDArray[np.float64]:
     """Return the ranges of the bin centres of a channel of the files, m, shifted by an offset."""
     # As `condition` adds it, in the type of the coordinate.
@@ -76,20 +63,24 @@ class FileProfiles:
 
     Parameters
     ----------
-    archive : xr.Dataset
-        The raw counts of the scene, whose ranges are used.
     channel : str
-    settings : Conditioning
+    range : ndarray of float64
+        Ranges of the bin centres, m.
+    dark : DarkSignals or None
+        The dark signals that are subtracted.
+    condition : callable
+        `lidarops.retrieve.signal.labeled.condition` with its settings.
     """
 
-    def __init__(self, archive: xr.Dataset, channel: str, settings: Conditioning) -> None:
-        self._channel, self._settings = channel, settings
-        self._range = bin_ranges(archive, channel, settings["range_offset"])
-
-    @property
-    def range(self) -> npt.NDArray[np.float64]:
-        """Ranges of the bin centres, m."""
-        return self._range
+    def __init__(
+        self,
+        channel: str,
+        range: npt.NDArray[np.float64],  # noqa: A002 - the field's word
+        dark: DarkSignals | None,
+        condition: Callable[[xr.Dataset, str], xr.Dataset],
+    ) -> None:
+        self.range = range
+        self._channel, self._dark, self._condition = channel, dark, condition
 
     def shots(self, counts: xr.Dataset) -> xr.DataArray:
         """Return the number of laser shots of each profile."""
@@ -97,19 +88,18 @@ class FileProfiles:
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles."""
-        return labeled.condition(counts, self._channel, **self._settings)
+        return self._condition(counts, self._channel)
 
     def sums(
         self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
     ) -> IntervalSums:
         """Return the sums over clock intervals, still without profiles."""
-        dark = self._settings["dark"]
         return IntervalSums(
             geometry,
-            self._range,
+            self.range,
             seconds=seconds,
             shots=shots,
-            shared_variance=None if dark is None else dark.variance,
+            shared_variance=None if self._dark is None else self._dark.variance,
             parts=parts,
             lag=lag,
         )
@@ -294,7 +284,7 @@ class ChannelSignal:
     channel: str
     channels: Mapping[str, ChannelSignal]
     """The channels that it is made from, and itself."""
-    wavelength: float = field(init=False)
+    wavelength: float
     """m."""
     full_overlap_range: float | None = None
     """m, nearer bins are flagged."""
@@ -302,13 +292,10 @@ class ChannelSignal:
     """Returns the overlap at ranges in m."""
     range_offset: float = 0.0
     """m, added to the range of every bin."""
-    dark: DarkSignals | None = None
     dead_time: float | None = None
     """s."""
     dead_time_uncertainty: float = DEAD_TIME_UNCERTAINTY
     """Relative standard error of the dead time."""
-    estimated_lag: bool = False
-    """Whether the lag of a glued channel is to be estimated."""
     relative_variance: bool = False
     """Whether the variance is estimated from the profile, and so scatters."""
     profiles: Profiles = field(init=False)
@@ -375,15 +362,6 @@ def profiles_together(source: Source, channels: Iterable[str], requested: int | 
     return chunk_profiles(sum(int(array.shape[1]) for array in counts), requested)
 
 
-def loaded(archive: xr.Dataset, channels: Iterable[str], rows: slice) -> xr.Dataset:
-    """Return some profiles of channels, with their counts in memory."""
-    of_channels = tuple(f"{channel}_" for channel in channels)
-    names = [
-        name for name in archive.variables if name in GEOMETRY or f"{name}_".startswith(of_channels)
-    ]
-    return archive[names].isel(time=rows).load()
-
-
 def chunks(
     source: Source, channels: Sequence[str], streams: Iterable[ProductStream], profiles: int
 ) -> Iterator[Chunk]:
@@ -398,24 +376,17 @@ def chunks(
     profiles : int
         Number of profiles of a chunk, unless a product needs more together.
     """
-    archive = source.archive
+    archive, count = source.archive, source.archive.sizes["time"]
     streams = list(streams)
     reads = not streams or any(stream.reads for stream in streams)
-    for rows in _rows(archive.sizes["time"], _ends(streams), profiles if reads else None):
-        counts = loaded(archive, channels, rows) if reads else archive.isel(time=rows)
-        yield Chunk(counts, rows.start)
-
-
-def _ends(streams: Iterable[ProductStream]) -> np.ndarray[Any, Any] | None:
-    """Return the rows before which a chunk may end; None for any."""
+    size = profiles if reads else count
     limiting = [rows for stream in streams if (rows := stream.ends()) is not None]
-    return functools.reduce(np.intersect1d, limiting) if limiting else None
-
-
-def _rows(count: int, ends: np.ndarray[Any, Any] | None, profiles: int | None) -> Iterator[slice]:
-    """Yield consecutive rows, about `profiles` together, cut before some of `ends` only."""
-    size = profiles or count
-    allowed = np.arange(count + 1) if ends is None else np.append(ends, count)
+    allowed = functools.reduce(np.intersect1d, limiting, np.arange(count + 1))
+    if not allowed.size or allowed[-1] < count:
+        allowed = np.append(allowed, count)
+    if reads:
+        known = tuple(f"{name}_" for name in (*GEOMETRY, *channels))
+        archive = archive[[name for name in archive.variables if f"{name}_".startswith(known)]]
     first = 0
     while first < count:
         place = int(np.searchsorted(allowed, first + size, side="right")) - 1
@@ -423,5 +394,7 @@ def _rows(count: int, ends: np.ndarray[Any, Any] | None, profiles: int | None) -
         past = int(allowed[place]) if place >= 0 else 0
         if past <= first:
             past = int(allowed[np.searchsorted(allowed, first, side="right")])
-        yield slice(first, past)
+        chunk = slice(first, past)
+        counts = archive.isel(time=chunk)
+        yield Chunk(counts.load() if reads else counts, chunk)
         first = past

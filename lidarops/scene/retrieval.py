@@ -18,12 +18,11 @@ from pydantic import BaseModel
 
 from lidarops.campaign.model import Campaign, Station
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import kind_of, reads_of
+from lidarops.kinds import kinds
 from lidarops.netcdf.read import open_product
-from lidarops.records import PlannedStep, Scene
-from lidarops.scene.case import Entries, file_channels
-from lidarops.scene.dependence import is_product
-from lidarops.scene.pipe import PIPE
+from lidarops.records import PlannedStep, Scene, file_channels
+from lidarops.scene.case import Entries
+from lidarops.scene.pipe import Stages
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream
 from lidarops.settings import SettingsModel
 
@@ -80,7 +79,7 @@ class Making(Generic[S]):
 
 @dataclass(frozen=True, kw_only=True)
 class Retrieval(Making[S]):
-    """How the products of a kind come about, each from one channel: `needs` of a `ProductCase`."""
+    """How the products of a kind come about, each from one channel: `needs` of a `ChannelCase`."""
 
     stream: Callable[[S, ChannelSignal], ProductStream]
     """Returns the product in the making, which takes the profiles of the scene in chunks."""
@@ -101,7 +100,7 @@ class InputProduct:
 
 @dataclass(frozen=True, kw_only=True)
 class Derivation(Making[S]):
-    """How the products of a kind come about, each from others: `needs` of a `ProductCase`.
+    """How the products of a kind come about, each from others: `needs` of a `ChannelCase`.
 
     It is asked only where all products are there that the kind reads, of the channel and of its
     `companions`. The case of a month has no facts, and a channel without bins.
@@ -175,7 +174,7 @@ def making(kind: str, sort: type[M]) -> M:
     LidarOpsError
         If there is no such kind, its package is incomplete, or it is of another sort.
     """
-    known = kind_of(kind)
+    known = kinds()[kind]
     found: M = known.part("retrieval", "RETRIEVAL")
     if not isinstance(found, sort) or kind not in found.settings.model_fields:
         raise LidarOpsError(
@@ -207,18 +206,18 @@ def streams_of(steps: Sequence[PlannedStep], signal: ChannelSignal) -> dict[str,
             product_settings(steps, step.product, channel), signal
         )
         for step in steps
-        if step.channel == channel and is_product(step) and not reads_of(step.product)
+        if step.channel == channel and step.name == step.product and not kinds()[step.product].reads
     }
 
 
 def settings_model(step: PlannedStep) -> type[BaseModel]:
     """Return the model of the settings of an entry of a plan."""
-    if not step.product:
-        return PIPE[step.name].settings
-    known = making(step.product, Making)
-    fields = known.settings.model_fields | (
-        known.member.model_fields if isinstance(known, NetworkRetrieval) else {}
-    )
+    fields = Stages.model_fields
+    if step.product:
+        known = making(step.product, Making)
+        fields = known.settings.model_fields | (
+            known.member.model_fields if isinstance(known, NetworkRetrieval) else {}
+        )
     annotation = fields[step.name].annotation
     # None is what a product states where the entry is left out.
     models = [model for model in (*get_args(annotation), annotation) if model is not NoneType]

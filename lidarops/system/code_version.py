@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import RAW_FORMATS, Kind, kind_of, kinds
+from lidarops.kinds import RAW_FORMATS, Kind, kinds
 
 _EVERY_PRODUCT: Final = (
     "lidarops.scene.processing",
@@ -79,7 +79,7 @@ def code_version(kind: str, *others: str) -> str:
     LidarOpsError
         If there is no such kind, or a source is missing or cannot be read.
     """
-    return version_of(kind_of(kind), _installed(), *others)
+    return version_of(kinds()[kind], _installed(), *others)
 
 
 def joint_code_version(names: Iterable[str] | None = None, *others: str) -> str:

@@ -19,11 +19,11 @@ from lidarops.campaign.ancillary_files import (
     overlap_profile,
 )
 from lidarops.errors import AncillaryError
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Role
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
 from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene.dependence import ancillary_files
 from lidarops.scene.plan import plan_scene
 

@@ -23,7 +23,7 @@ import flows
 import lidarops
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Severity
-from lidarops.kinds import flags_of, kind_of
+from lidarops.kinds import flags_of, kinds
 
 # Made of the settings of all kinds of product, and listed among the keys of a campaign file.
 ASSEMBLED = {"Products", "Network"}
@@ -167,7 +167,7 @@ def test_the_table_of_backgrounds_names_the_products_that_take_each(repository) 
     taken = {
         (method, kind)
         for kind in OWN_KINDS
-        if (field := kind_of(kind).settings.model_fields.get("background"))
+        if (field := kinds()[kind].settings.model_fields.get("background"))
         for method in get_args(field.annotation)
         if isinstance(method, str)
     }

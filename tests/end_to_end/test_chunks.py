@@ -30,7 +30,7 @@ with open(sys.argv[1], "rb") as stream:
 for job in jobs:
     outcome = process_scene(job)
     assert outcome.products, outcome.error
-print(*(name for name in sys.modules if f"{name}.".startswith(("lidarops.plan.", "distributed."))))
+print(*(name for name in sys.modules if f"{name}.".startswith(("lidarops.run.", "distributed."))))
 """
 
 

@@ -17,11 +17,11 @@ from support.oracles.angle_scenes import on_altitudes
 
 from lidarops.catalog.schema import GRANULE
 from lidarops.catalog.store import Store
-from lidarops.plan.scenes import cut_scenes
 from lidarops.raw.formats import RawFile
 from lidarops.records import Plan, PlannedStep, ProductRecord, Role, RunRecord
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence
 from lidarops.scene.choices import idle_window, read_windows
 from lidarops.scene.job import Job
@@ -321,7 +321,7 @@ def test_the_window_holds_the_farthest_section_and_the_bins_for_its_noise():
     (window,) = (step for step in plan.steps if step.name == "range_window")
     assert window.settings == {"bins": [[0, 1102]]}
     assert window.number == 1102
-    assert window.as_dict()["rule"] == "range_window"
+    assert window.rule == "range_window"
     moved = with_facts(channels={"photon_532o": {"range_offset": -75.0}})
     (window,) = (
         s for s in planned(products=HOMOGENEOUS, **moved).steps if s.name == "range_window"

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 from support import factories
 
-from lidarops.plan.scenes import cut_scenes
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene.plan import plan_scene
 
 

@@ -18,12 +18,12 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import MOST_UNUSED, UNUSED_INPUTS
-from lidarops.plan.unused_files import MOST_IN_DOUBT, dated
 from lidarops.records import Grade, Granule, Role, Status
 from lidarops.reports import run_tables
 from lidarops.reports.inspection import describe
 from lidarops.run.archive import bring_up_to_date, reprocess
 from lidarops.run.reproduction import reproduce_product
+from lidarops.run.unused_files import MOST_IN_DOUBT, dated
 from lidarops.system.stores import RemoteStore
 
 Fault = Callable[[Path, pytest.MonkeyPatch], None]

@@ -18,9 +18,9 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, Metadata
 from lidarops.flags import Quality
 from lidarops.netcdf.context import Context
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import DetectionMode, Plan, Provenance, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence, pipe
 from lidarops.scene.case import counted_channels
 from lidarops.scene.plan import plan_scene

@@ -25,7 +25,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.syspath_prepend(tmp_path)
     kind = Kind("odd", "Odd", "odd_kind", SignalSettings, rank=99)
     known = {**all_kinds.kinds(), "odd": kind}
-    monkeypatch.setattr(all_kinds, "kinds", lambda: known)
+    monkeypatch.setattr("lidarops.scene.retrieval.kinds", lambda: known)
     yield folder
     for name in [name for name in sys.modules if name.startswith("odd_kind")]:
         del sys.modules[name]

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from support import factories
 
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, Scene
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene.memory import scene_memory
 from lidarops.scene.plan import plan_scene
 

@@ -12,8 +12,8 @@ from support import factories
 from support.archives.network_plans import campaign as network_campaign
 from support.archives.network_plans import granules as network_granules
 
-from lidarops.plan.scenes import cut_scenes
-from lidarops.records import Plan, PlannedStep, Role
+from lidarops.records import Plan, PlannedStep, Role, entry_as_dict
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence
 from lidarops.scene.job import Job, recorded_settings
 from lidarops.scene.plan import plan_scene
@@ -69,7 +69,7 @@ def test_settings_of_one_kind_concern_no_other_product_of_the_network() -> None:
 
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
 def test_the_places_of_needed_steps_are_those_that_the_plan_names(plan: Plan) -> None:
-    for step, places in zip(plan.steps, dependence.needed_places(plan), strict=True):
+    for step, places in zip(plan.steps, dependence.needed_places(plan.steps), strict=True):
         taken = [plan.steps[place] for place in places]
         names = {
             other.name if other.channel == step.channel else f"{other.channel}/{other.name}"
@@ -129,7 +129,7 @@ def test_settings_survive_json(plan):
         json.loads(json.dumps(plan.as_dict()))["steps"], plan.steps, strict=True
     ):
         again = PlannedStep(**fields)
-        assert again.as_dict() == step.as_dict()
+        assert entry_as_dict(again) == entry_as_dict(step)
         model = settings_model(step)
         typed = model.model_validate(dict(again.settings))
         assert typed == model.model_validate(dict(step.settings))

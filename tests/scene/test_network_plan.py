@@ -13,9 +13,9 @@ from support.archives.network_plans import MEMBERS, campaign, granules
 from support.factories import ANALOG, DAY, PHOTON
 
 from lidarops.campaign.model import Campaign
-from lidarops.plan.scenes import cut_scenes
 from lidarops.products.visibility.network import angle_between
 from lidarops.records import Granule, Plan, Scene
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene.plan import plan_scene
 
 

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from support import factories
 
 from lidarops.kinds import Scope, kinds_of
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Plan, Role, Scene
 from lidarops.retrieve.signal.dark import DarkSignals
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence
 from lidarops.scene.plan import plan_scene
 

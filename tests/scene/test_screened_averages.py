@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from lidarops.records import DetectionMode
+from lidarops.retrieve.signal import labeled
 from lidarops.retrieve.signal.labeled_averaging import Screening
-from lidarops.scene.profiles import Averages, Chunk, FileProfiles
+from lidarops.scene.profiles import Averages, Chunk, FileProfiles, bin_ranges
 
 STEP, BINS, PROFILES = 7.5, 400, 12
 DISTANCE = STEP * (np.arange(BINS) + 0.5)
@@ -44,19 +47,21 @@ def means(archive: xr.Dataset) -> tuple[xr.Dataset, ...]:
     """Return the mean of both channels."""
     channels = [
         FileProfiles(
-            archive,
             name,
-            {
-                "dead_time": None, "dead_time_uncertainty": 0.0, "noise_variance": None,
-                "dark": None, "range_offset": offset, "full_overlap_range": 0.0,
-            },
+            bin_ranges(archive, name, offset),
+            None,
+            partial(
+                labeled.condition,
+                dead_time=None, dead_time_uncertainty=0.0, noise_variance=None,
+                dark=None, range_offset=offset, full_overlap_range=0.0,
+            ),
         )
         for name, offset in OFFSETS.items()
     ]  # fmt: skip
     averages = Averages(
         channels, archive, archive["photon_355_shots"], 900.0, Screening(2.0, 2500.0)
     )
-    averages.add(Chunk(archive, 0))
+    averages.add(Chunk(archive, slice(0, archive.sizes["time"])))
     (completed,) = averages.completed()
     return completed
 

@@ -10,10 +10,10 @@ import pytest
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError
-from lidarops.plan.scenes import cut_scenes
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
 from lidarops.records import Status
+from lidarops.run.scenes import cut_scenes
 from lidarops.simulate.campaign import simulate_campaign
 
 DIALECTS = ["licel", "manaus", "saopaulo", "pilar", "golmud"]

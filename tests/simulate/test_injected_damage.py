@@ -15,10 +15,10 @@ from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality
-from lidarops.plan.scenes import cut_scenes
 from lidarops.raw import licel
 from lidarops.records import Role, Status
 from lidarops.run.archive import reprocess
+from lidarops.run.scenes import cut_scenes
 from lidarops.simulate.campaign import simulate_campaign
 
 # A stale pointing needs a scan, see `test_scans_of_raymetrics.py`.

@@ -14,8 +14,8 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Status
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene.input_files import check_files, local_files
 from lidarops.system.stores import RemoteStore
 

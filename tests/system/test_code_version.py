@@ -8,7 +8,7 @@ import pytest
 from support.sources import Copy
 
 from lidarops.errors import LidarOpsError
-from lidarops.kinds import Kind, kind_of, kinds
+from lidarops.kinds import Kind, kinds
 from lidarops.settings import ChannelProduct
 from lidarops.system import code_version as versions
 from lidarops.system.code_version import (
@@ -116,7 +116,7 @@ def test_what_makes_no_product_changes_no_version(growing: Copy, package: str):
 
 @pytest.mark.parametrize(
     "module",
-    ["campaign/simulation.py", "campaign/yaml_errors.py", "plan/scenes.py",
+    ["campaign/simulation.py", "campaign/yaml_errors.py", "run/scenes.py",
      "site/templates/day.html"],
 )  # fmt: skip
 def test_neighbours_of_what_makes_products_change_no_version(growing: Copy, module: str):
@@ -190,7 +190,7 @@ def test_a_kind_of_another_package_counts_its_own_modules(copy: Copy, tmp_path: 
 
     def versions() -> tuple[str, str]:
         sources = Sources({**source_roots(), "lidarops": (copy.root,), "other": (package,)})
-        return version_of(kind, sources), version_of(kind_of("signal"), sources)
+        return version_of(kind, sources), version_of(kinds()["signal"], sources)
 
     first = versions()
     for name in ("unused.py", "clouds/figures.py"):

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 import xarray as xr
 
-from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.products.elastic import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
@@ -20,11 +18,10 @@ from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import (
     REQUESTED,
+    ChannelCase,
     Entries,
     Entry,
     NoSettings,
-    ProductCase,
-    range_channel,
     range_offset,
 )
 from lidarops.scene.choices import (
@@ -45,7 +42,7 @@ from lidarops.scene.profiles import (
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
-Case = ProductCase[ElasticSettings]
+Case = ChannelCase[ElasticSettings]
 
 
 class ReferenceWindowSettings(SettingsModel):
@@ -66,8 +63,7 @@ def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
     stretch = 1.0 / math.cos(math.radians(zenith))
     window = case.request.reference
     # A window is a set of bin centres.
-    ranged = replace(case.channel, name=range_channel(case.channel.name))
-    reach = case.last - 0.5 * case.channel.bin_width + range_offset(ranged, case.facts)
+    reach = case.last - 0.5 * case.channel.bin_width + range_offset(case.channel, case.facts)
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if top - bottom < window.width * stretch * (1.0 - 1e-9):
         return (
@@ -96,7 +92,7 @@ def _reference(case: Case, limits: ReferenceWindowSettings) -> Entry:
 
 def _lidar_ratio(case: Case) -> dict[str, Any]:
     """Return the settings of the lidar ratio: facts of the channel, or the settings of the kind."""
-    facts = channel_facts(case.facts, range_channel(case.channel.name))
+    facts = case.facts_of_channel
     names = ("lidar_ratio", "lidar_ratio_standard_error")
     given = {name: getattr(facts, name) for name in names}
     return {"lidar_ratio_profile": facts.lidar_ratio_profile} | {

@@ -15,7 +15,7 @@ from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.flags import Quality
 from lidarops.products.homogeneous import HomogeneousSettings, Method
 from lidarops.products.homogeneous.variables import LAYOUT
-from lidarops.records import DetectionMode, is_glued
+from lidarops.records import GLUED, DetectionMode
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -24,7 +24,7 @@ from lidarops.retrieve.signal.labeled import (
     baseline_error,
     counts_per_power,
 )
-from lidarops.scene.case import ALL_STEPS, REQUESTED, Entries, Entry, NoSettings, ProductCase
+from lidarops.scene.case import ALL_STEPS, REQUESTED, ChannelCase, Entries, Entry, NoSettings
 from lidarops.scene.choices import (
     ANALOG_NOISE,
     FEWEST_BINS,
@@ -38,7 +38,7 @@ from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, in_one_
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
 
-Case = ProductCase[HomogeneousSettings]
+Case = ChannelCase[HomogeneousSettings]
 
 Section = tuple[float, float]
 
@@ -146,7 +146,7 @@ def _needs(case: Case) -> Entries:
 
     Of those that lie within the bins, along a nearly level path.
     """
-    if is_glued(case.channel.name):
+    if case.channel.name.startswith(GLUED):
         reason = "not made of glued channels: each record is fitted with its own background"
         yield case.leave("homogeneous", reason, rule="channel_present")
         return

@@ -13,7 +13,7 @@ from lidarops.records import DetectionMode
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
-from lidarops.scene.case import Entry, ProductCase
+from lidarops.scene.case import ChannelCase, Entry
 from lidarops.scene.profiles import Chunk, Profiles
 from lidarops.scene.retrieval import Workload
 
@@ -25,7 +25,7 @@ _TOGETHER: Final = 8
 """Profiles that are averaged together; the result does not depend on it."""
 
 
-def plan_baseline(case: ProductCase[MultiAngleSettings]) -> Entry:
+def plan_baseline(case: ChannelCase[MultiAngleSettings]) -> Entry:
     """Subtract the analog baseline that blocked beams show.
 
     For analog channels of scans with beams so low that they may be blocked.

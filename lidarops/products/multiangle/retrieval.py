@@ -35,14 +35,14 @@ from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.scene.case import REQUESTED, Entries, Entry, NoSettings, ProductCase
+from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettings
 from lidarops.scene.choices import BackgroundSettings, background, no_scan, with_low_signal_to_noise
 from lidarops.scene.profiles import ChannelSignal, Chunk, Indices, ProductStream, in_one_batch
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
 Array = npt.NDArray[np.float64]
-Case = ProductCase[MultiAngleSettings]
+Case = ChannelCase[MultiAngleSettings]
 Numbers = tuple[tuple[float, ...], ...]
 """Angles, or bounds of time, of each granule."""
 _HALF_TURN: Final = 180.0

@@ -13,6 +13,7 @@ from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.products.raman import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
+from lidarops.records import file_channels
 from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.scattering import (
@@ -25,15 +26,7 @@ from lidarops.retrieve.raman.signals import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
-from lidarops.scene.case import (
-    REQUESTED,
-    Entries,
-    ProductCase,
-    file_channels,
-    member_channel,
-    range_channel,
-    wavelength,
-)
+from lidarops.scene.case import REQUESTED, ChannelCase, Entries, member_channel
 from lidarops.scene.choices import (
     AverageSettings,
     average,
@@ -51,7 +44,7 @@ from lidarops.scene.profiles import (
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
-Case = ProductCase[RamanProductSettings]
+Case = ChannelCase[RamanProductSettings]
 
 LOOKED_AT: Final = 64
 """Profiles of a scene that are looked at for a Raman signal."""
@@ -146,8 +139,9 @@ def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
         return (
             f"{channel} has bins of {found.bin_width:g} m, {case.channel.bin_width:g} m are needed"
         )
-    length = wavelength(found, channel_facts(case.facts, range_channel(channel)))
-    own = wavelength(case.channel, channel_facts(case.facts, range_channel(case.channel.name)))
+    facts = channel_facts(case.facts, channel)
+    length = facts.wavelength or found.wavelength
+    own = case.facts_of_channel.wavelength or case.channel.wavelength
     if not is_raman_line(length, own, shift):
         return (
             f"{channel} measures {length * 1e9:g} nm, but the Raman line of {gas} for"
@@ -169,7 +163,7 @@ def _needs(case: Case) -> Entries:
     if reason:
         yield case.leave("raman", reason)
         return
-    facts = None if water is None else channel_facts(case.facts, range_channel(water))
+    facts = None if water is None else channel_facts(case.facts, water)
     absent = "" if water is None else _absent(case, water, "water vapour", WATER_SHIFT)
     if facts is not None and not absent and facts.water_vapour_calibration is None:
         absent = f"the facts of {water} give no water_vapour_calibration"

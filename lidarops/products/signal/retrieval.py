@@ -15,7 +15,7 @@ from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.signal import SignalSettings
 from lidarops.products.signal.variables import LAYOUT
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
-from lidarops.scene.case import REQUESTED, Entries, ProductCase
+from lidarops.scene.case import REQUESTED, ChannelCase, Entries
 from lidarops.scene.choices import (
     FEWEST_BINS,
     BackgroundSettings,
@@ -41,7 +41,7 @@ class SignalPlan(SettingsModel):
     signal: RangeCorrection
 
 
-def _needs(case: ProductCase[SignalSettings]) -> Entries:
+def _needs(case: ChannelCase[SignalSettings]) -> Entries:
     """Subtract the background and correct for range, where its range holds enough bins."""
     limits = case.request.background_range
     start, stop = tail(case, limits)

@@ -38,7 +38,6 @@ from lidarops.kinds import flags_of
 from lidarops.products.visibility.network import NAME
 from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
-from lidarops.scene.dependence import is_product
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +100,7 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
     """Return the instrument of each beam of a scene from its plan; empty if it lists none."""
     steps = scene.plan.steps if scene.plan else ()
     for step in steps:
-        if is_product(step) and step.name == NAME:
+        if step.name == step.product == NAME:
             return tuple(beam["instrument"] for beam in step.settings["beams"])
     return ()
 

@@ -16,8 +16,6 @@ from lidarops.scene.case import (
     channel_ranges,
     joined_layout,
     member_channel,
-    range_channel,
-    wavelength,
 )
 from lidarops.scene.dependence import scene_facts
 from lidarops.scene.pipe import NO_WAVELENGTH
@@ -62,13 +60,14 @@ class MemberCase:
         """The channel that the network uses."""
         return member_channel(self.scene.layout, self.settings.channel)
 
-    def channel_case(self, channel: ChannelLayout) -> ChannelCase:
+    def channel_case(self, channel: ChannelLayout) -> ChannelCase[VisibilityProductSettings]:
         """Return the case of a channel."""
         return ChannelCase(
             self.scene,
             channel,
             self.facts,
             channel_facts(self.facts, channel.name),
+            self.settings,
             all_steps=self.campaign.all_steps,
             member=self.scene.instrument,
             requesters=(NAME,),
@@ -81,8 +80,8 @@ class MemberCase:
         held = [channel.name for channel in (*self.scene.layout, *glued)]
         if name not in held:
             return f"the files hold no {name}, only {', '.join(held)}", None
-        photon = channel_facts(facts, range_channel(name))
-        if math.isnan(wavelength(self.channel, photon)):
+        photon = channel_facts(facts, name)
+        if math.isnan(photon.wavelength or self.channel.wavelength):
             return NO_WAVELENGTH, None
         if not (facts.overlap_profile or facts.full_overlap_range > 0):
             return (

@@ -26,7 +26,7 @@ from lidarops.products.visibility.network import (
     crossings,
 )
 from lidarops.products.visibility.variables import LAYOUT
-from lidarops.records import DetectionMode, LeftOut, PlannedStep, is_glued
+from lidarops.records import GLUED, DetectionMode, LeftOut, PlannedStep, file_channels
 from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
@@ -40,8 +40,6 @@ from lidarops.scene.case import (
     Entries,
     Entry,
     NoSettings,
-    ProductCase,
-    file_channels,
     member_channel,
     product_channel,
 )
@@ -63,7 +61,7 @@ from lidarops.scene.profiles import Averages, Chunk, Indices
 from lidarops.scene.retrieval import Member, NetworkCase, NetworkRetrieval, NetworkStream, Workload
 from lidarops.settings import SettingsModel, VisibilitySettings
 
-Case = ProductCase[VisibilityProductSettings]
+Case = ChannelCase[VisibilityProductSettings]
 
 _SAME_WAVELENGTH: Final = 1e-9
 """m; largest difference between equal wavelengths of instruments."""
@@ -76,7 +74,7 @@ def _window(case: Case, farthest: float) -> Entry:
     Some bins are not needed in photon counting beyond the farthest crossing, given in m.
     """
     rule, channel = "member_window", case.channel
-    if is_glued(channel.name) or channel.mode is not DetectionMode.PHOTON:
+    if channel.name.startswith(GLUED) or channel.mode is not DetectionMode.PHOTON:
         return case.leave(WINDOW, ANALOG_NOISE, rule=rule)
     if case.all_steps:
         return case.leave(WINDOW, ALL_STEPS, rule=rule)
@@ -232,18 +230,15 @@ class _NetworkPlan:
         for channel in dict.fromkeys((*file_channels(name), name)):
             case = member.channel_case(member_channel(member.scene.layout, channel))
             yield from plan_stages(case)
-        of_product = self._of_product(case)
+        of_product = replace(case, product=NAME)
         yield background(of_product, "tail_mean", self._settings.background_range)
-
-    def _of_product(self, case: ChannelCase) -> Case:
-        return case.of_product(NAME, self._settings)
 
     @property
     def _joint_case(self) -> Case:
         """The case of the steps of the whole network."""
         channel = product_channel(self._settings.channel)
-        return self._of_product(
-            ChannelCase(self._scene, channel, InstrumentFacts(), ChannelFacts())
+        return ChannelCase(
+            self._scene, channel, InstrumentFacts(), ChannelFacts(), self._settings, product=NAME
         )
 
     def _why_none(self, beams: Sequence[BeamPlan], wavelengths: Sequence[float]) -> Entry | None:
@@ -290,7 +285,7 @@ class _NetworkPlan:
             numbers = [n for n, beam in enumerate(beams) if beam.instrument == name]
             if numbers:
                 farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
-                case = self._of_product(member.channel_case(member.channel))
+                case = replace(member.channel_case(member.channel), product=NAME)
                 yield _window(case, farthest)
         case = self._joint_case
         reason = "signals are averaged before the retrieval: noise biases means of retrieved values"

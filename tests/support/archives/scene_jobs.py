@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
-from lidarops.plan.scenes import cut_scenes
 from lidarops.records import Scene
 from lidarops.run.archive import update_catalog
+from lidarops.run.scenes import cut_scenes
 from lidarops.scene.job import Job
 from lidarops.scene.plan import plan_scene
 

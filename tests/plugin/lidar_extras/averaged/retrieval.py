@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_extras.averaged import AveragedSettings
-from lidarops.scene.case import REQUESTED, Entries, NoSettings, ProductCase
+from lidarops.scene.case import REQUESTED, ChannelCase, Entries, NoSettings
 from lidarops.scene.profiles import in_one_batch
 from lidarops.scene.retrieval import Derivation, InputProduct
 from lidarops.settings import SettingsModel
@@ -24,7 +24,7 @@ class AveragedPlan(SettingsModel):
     averaged: NoSettings
 
 
-def needs(case: ProductCase[AveragedSettings]) -> Entries:
+def needs(case: ChannelCase[AveragedSettings]) -> Entries:
     """Average over the scene, always."""
     yield case.run("averaged", REQUESTED)
 

@@ -11,7 +11,7 @@ import xarray as xr
 from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
-from lidarops.scene.case import REQUESTED, Entries, ProductCase, channel_ranges
+from lidarops.scene.case import REQUESTED, ChannelCase, Entries, channel_ranges
 from lidarops.scene.choices import FEWEST_BINS, BackgroundSettings, background, tail
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
 from lidarops.scene.retrieval import Retrieval
@@ -34,7 +34,7 @@ class IntegratedPlan(SettingsModel):
     integrated: WindowSettings
 
 
-def needs(case: ProductCase[IntegratedSettings]) -> Entries:
+def needs(case: ChannelCase[IntegratedSettings]) -> Entries:
     """Integrate over the windows that hold a bin, where that of the background holds enough."""
     limits = case.request.background_range
     start, stop = tail(case, limits)

@@ -9,7 +9,7 @@ import xarray as xr
 
 from lidar_extras.averaged.retrieval import GEOMETRY
 from lidar_extras.monthly import MonthlySettings
-from lidarops.scene.case import REQUESTED, Entries, NoSettings, ProductCase
+from lidarops.scene.case import REQUESTED, ChannelCase, Entries, NoSettings
 from lidarops.scene.profiles import in_one_batch
 from lidarops.scene.retrieval import Derivation, InputProduct
 from lidarops.settings import SettingsModel
@@ -21,7 +21,7 @@ class MonthlyPlan(SettingsModel):
     monthly: NoSettings
 
 
-def needs(case: ProductCase[MonthlySettings]) -> Entries:
+def needs(case: ChannelCase[MonthlySettings]) -> Entries:
     """Join the products of the month, always."""
     yield case.run("monthly", REQUESTED)
 

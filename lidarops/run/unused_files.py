@@ -17,15 +17,15 @@ from typing import Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
-from lidarops.plan.scenes import DARK_REACH, window_at
 from lidarops.records import Granule, Role, Scene, UnusedFile
+from lidarops.run.scenes import DARK_REACH, window_at
 
 MOST_IN_DOUBT: Final = 10
 """Dark files of unknown time that a scene names; all those of an archive may be refused."""
 _ALWAYS: Final = (datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
 
 
-class Refused(NamedTuple):
+class RefusedFile(NamedTuple):
     """A refused file, and a time to which it belongs."""
 
     granule: Granule
@@ -39,7 +39,7 @@ def dated(
     refused: Iterable[Granule],
     files_in: Callable[[str], Iterable[DatedFile]],
     days_below: Callable[[str, str], Sequence[datetime]],
-) -> Iterator[Refused]:
+) -> Iterator[RefusedFile]:
     """Yield refused files with the times of the good files beside which they belong.
 
     These are the ones before and after in the order of names, of the same folder, instrument and
@@ -70,11 +70,11 @@ def dated(
         undated: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
         for granule in granules:
             if granule.start:
-                yield Refused(granule, granule.start)
+                yield RefusedFile(granule, granule.start)
                 continue
             beside = series.get((granule.instrument, granule.role))
             times = beside.times_beside(granule.path) if beside else []
-            yield from (Refused(granule, time) for time in times)
+            yield from (RefusedFile(granule, time) for time in times)
             # Where good dark files are of one window, their names do not show how those of others
             # differ.
             sure = beside and times and beside.in_common >= 0
@@ -85,7 +85,7 @@ def dated(
             days = _nearest(folder, instrument, days_below)
             within = [day for day in days if since <= day <= until]
             for granule in dark[:MOST_IN_DOUBT]:
-                yield from (Refused(granule, day, in_doubt=True) for day in within)
+                yield from (RefusedFile(granule, day, in_doubt=True) for day in within)
 
 
 def _nearest(
@@ -155,32 +155,29 @@ def _alike(one: str, other: str) -> int:
 
 def name_unused(
     scenes: Iterable[Scene],
-    refused: Iterable[Refused],
+    refused: Iterable[RefusedFile],
     lost: Mapping[str, Iterable[UnusedFile]],
 ) -> tuple[Scene, ...]:
     """Return scenes that name as unused the refused files of their instruments and time.
 
     So they name files that the archive has lost, which are given by the id of the scene.
     """
-    of_instrument: dict[str, list[Refused]] = defaultdict(list)
+    of_instrument: dict[str, list[RefusedFile]] = defaultdict(list)
     for file in refused:
         of_instrument[file.granule.instrument].append(file)
-    return tuple(_named(scene, of_instrument, lost.get(scene.id, ())) for scene in scenes)
+    named = []
+    for scene in scenes:
+        unused = {*scene.unused, *lost.get(scene.id, ())} | {
+            UnusedFile.of(file.granule)
+            for member in scene.members or (scene,)
+            for file in of_instrument[member.instrument]
+            if _belongs(file, member)
+        }
+        named.append(replace(scene, unused=tuple(sorted(unused))) if unused else scene)
+    return tuple(named)
 
 
-def _named(
-    scene: Scene, refused: Mapping[str, Iterable[Refused]], lost: Iterable[UnusedFile]
-) -> Scene:
-    unused = {*scene.unused, *lost} | {
-        UnusedFile.of(file.granule)
-        for member in scene.members or (scene,)
-        for file in refused.get(member.instrument, ())
-        if _belongs(file, member)
-    }
-    return replace(scene, unused=tuple(sorted(unused))) if unused else scene
-
-
-def _belongs(file: Refused, scene: Scene) -> bool:
+def _belongs(file: RefusedFile, scene: Scene) -> bool:
     if file.granule.role is Role.SIGNAL:
         return scene.start <= file.time < scene.stop
     if file.in_doubt and scene.dark:

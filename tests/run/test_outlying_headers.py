@@ -11,13 +11,13 @@ from support.archives.small_archive import DAY, Archive
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
-from lidarops.plan.outlying_headers import Outlying, outlying_headers
 from lidarops.raw.formats import RawFile, read_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import Granule, RunRecord, Status, day_of
 from lidarops.reports.findings import finding_rows
 from lidarops.run import staleness
 from lidarops.run.archive import Result, bring_up_to_date
+from lidarops.run.outlying_headers import Outlying, outlying_headers
 from lidarops.run.reproduction import reproduce_product
 
 FILES = 5

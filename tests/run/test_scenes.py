@@ -8,9 +8,9 @@ from datetime import timedelta
 
 from support import factories
 
-from lidarops.plan.scenes import cut_scenes, scene_stop
 from lidarops.records import Granule, Role, Status
 from lidarops.run.options import Selection
+from lidarops.run.scenes import cut_scenes, scene_stop
 
 
 def test_one_scene_for_each_utc_day() -> None:

@@ -359,17 +359,9 @@ def window_at(campaign: Campaign, instruments: Sequence[str], start: datetime) -
     closes = opens + length
     for instrument in instruments:
         for fact in campaign.instruments[instrument].facts:
-            opens, closes = _narrow(fact, start, opens, closes)
-    return opens, closes
-
-
-def _narrow(
-    fact: InstrumentFacts, moment: datetime, opens: datetime, closes: datetime
-) -> tuple[datetime, datetime]:
-    """Narrow a window around `moment` so that no edge of the validity period lies inside."""
-    for edge in (fact.valid_from, fact.valid_to):
-        if opens < edge <= moment:
-            opens = edge
-        elif moment < edge < closes:
-            closes = edge
+            for edge in (fact.valid_from, fact.valid_to):
+                if opens < edge <= start:
+                    opens = edge
+                elif start < edge < closes:
+                    closes = edge
     return opens, closes

@@ -18,23 +18,15 @@ from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.store import Store
 from lidarops.raw.header import Layout, label_of, named_layout, recorder_names
 from lidarops.records import (
-    ChannelLayout,
+    GLUED,
     FactsNote,
     FileNote,
     Granule,
     Holding,
-    LeftOut,
     Unmet,
-    is_glued,
-)
-from lidarops.scene.case import (
-    ABSENT,
-    LAG_STEP,
-    UNMATCHED,
     glued_parts,
-    missing_channels,
-    named_channels,
 )
+from lidarops.scene.case import ABSENT, LAG_STEP, UNMATCHED, missing_channels, named_channels
 
 _ROUNDING_OF_WAVELENGTHS: Final = 1e-9
 """m; headers hold whole nanometres."""
@@ -55,8 +47,8 @@ def unused_lidar_ratios(
     facts : InstrumentFacts
     instrument : Instrument
     """
-    named = named_channels(instrument)
-    for glued in filter(is_glued, named):
+    named = named_channels(instrument.products.requested())
+    for glued in [name for name in named if name.startswith(GLUED)]:
         analog, photon = glued_parts(glued)
         of_analog, of_photon = (_has_lidar_ratio(facts, part) for part in (analog, photon))
         if of_analog and not of_photon and analog not in named:
@@ -80,14 +72,6 @@ def validity_edges(campaign: Campaign) -> list[datetime]:
         for edge in (facts.valid_from, facts.valid_to)
     }
     return sorted(edges - {_FIRST, _LAST})
-
-
-def _lacking(
-    layout: tuple[ChannelLayout, ...], instrument: Instrument, facts: InstrumentFacts
-) -> list[LeftOut]:
-    """Return the channels that files lack, without misplaced facts about a lag."""
-    missing = missing_channels(layout, instrument, facts)
-    return [omission for omission in missing if omission.name != LAG_STEP]
 
 
 def unavailable_channels(
@@ -139,10 +123,10 @@ def unavailable_channels(
             until is None or facts.valid_from < until
         )
         reasons = {}
-        for omission in _lacking(holding.layout, instrument, facts):
+        for omission in missing_channels(holding.layout, instrument.products.requested(), facts):
             if omission.rule == ABSENT and (not kinds or omission.name in kinds):
                 reasons[omission.name, omission.channel] = omission.reason
-            elif omission.rule == UNMATCHED and touched:
+            elif omission.rule == UNMATCHED and touched and omission.name != LAG_STEP:
                 reasons[period, omission.channel] = omission.reason
         for (requester, channel), reason in reasons.items():
             lacking[name, requester, channel].append((holding.files, reason))
@@ -201,9 +185,10 @@ class ChannelNames:
         self._bound = store.channel_names()
         self._layouts: dict[tuple[object, Layout], Layout] = {}
         self.holdings = [
-            replace(held, layout=self._layout(held.instrument, held.layout, held.since))
+            replace(held, layout=self._layout(held.instrument, held.layout, facts))
             for held in self._stored
             if held.instrument in campaign.instruments
+            for facts in [campaign.instruments[held.instrument].facts_at(held.since)]
         ]
         """Those of the instruments of the campaign, with these names."""
 
@@ -211,8 +196,8 @@ class ChannelNames:
         """Return a good granule whose channels have these names."""
         if granule.instrument not in self._instruments or granule.start is None:
             return granule
-        layout = self._layout(granule.instrument, granule.layout, granule.start)
         facts = self._instruments[granule.instrument].facts_at(granule.start)
+        layout = self._layout(granule.instrument, granule.layout, facts)
         notes = (*granule.notes, *overridden_wavelengths(layout, facts))
         return replace(granule, layout=layout, notes=notes)
 
@@ -226,8 +211,7 @@ class ChannelNames:
             for text in overridden_wavelengths(held.layout, facts)
         )
 
-    def _layout(self, instrument: str, layout: Layout, moment: datetime) -> Layout:
-        facts = self._instruments[instrument].facts_at(moment)
+    def _layout(self, instrument: str, layout: Layout, facts: InstrumentFacts) -> Layout:
         stated = {name: fact.recorder for name, fact in facts.channels.items() if fact.recorder}
         key = (instrument, *stated.items())
         if (key, layout) not in self._layouts:

@@ -12,11 +12,11 @@ from support import factories
 
 from lidarops.catalog.headers import row_of
 from lidarops.catalog.store import Store
-from lidarops.plan.channels import (
+from lidarops.records import Granule, Role, Unmet
+from lidarops.run.channels import (
     unavailable_channels,
     validity_edges,
 )
-from lidarops.records import Granule, Role, Unmet
 
 DAY = 1440
 OLD = factories.PHOTON

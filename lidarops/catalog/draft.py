@@ -23,9 +23,8 @@ from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
-from lidarops.records import ChannelLayout, DetectionMode
+from lidarops.records import ChannelLayout, DetectionMode, file_channels
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
-from lidarops.scene.case import file_channels
 
 _NEAR: Final = 0.2
 """degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""
