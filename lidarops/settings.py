@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
@@ -259,7 +260,7 @@ class ChannelProduct(SettingsModel):
         description="names of channels; all means every channel of the files, without glued ones"
     )
 
-    @property
+    @cached_property
     def named(self) -> list[str]:
         """The channels that are requested by name."""
         return [] if self.channels == "all" else list(self.channels)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Sequence
 from datetime import UTC, datetime, timedelta
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
@@ -264,8 +264,9 @@ def _fields(*scopes: Scope) -> dict[str, Any]:
 class ChannelProducts(SettingsModel):
     """The requested products of an instrument; `Products` has a field for every kind."""
 
+    @cached_property
     def requested(self) -> dict[str, ChannelProduct]:
-        """Return the settings of each requested kind of product, by its name."""
+        """The settings of each requested kind of product, by its name."""
         return {
             name: settings
             for name in type(self).model_fields
@@ -357,10 +358,10 @@ class NetworkMembers(SettingsModel):
     def _fitting_instruments(self) -> Self:
         if len(set(self.instruments)) < len(self.instruments):
             raise ValueError("instruments lists an instrument twice")
-        if not self.requested():
+        if not self.requested:
             kinds = ", ".join(kind.name for kind in kinds_of(Scope.NETWORK))
             raise ValueError(f"a network needs a product: {kinds}")
-        for kind, settings in self.requested().items():
+        for kind, settings in self.requested.items():
             try:
                 settings.check_members(self.instruments)
             except PydanticCustomError as error:
@@ -370,8 +371,9 @@ class NetworkMembers(SettingsModel):
                 raise located_error(str(error), kind) from error
         return self
 
+    @cached_property
     def requested(self) -> dict[str, NetworkProduct]:
-        """Return the settings of each requested kind of product, by its name."""
+        """The settings of each requested kind of product, by its name."""
         return {
             kind.name: settings
             for kind in kinds_of(Scope.NETWORK)

@@ -47,7 +47,7 @@ def unused_lidar_ratios(
     facts : InstrumentFacts
     instrument : Instrument
     """
-    named = named_channels(instrument.products.requested())
+    named = named_channels(instrument.products.requested)
     for glued in [name for name in named if name.startswith(GLUED)]:
         analog, photon = glued_parts(glued)
         of_analog, of_photon = (_has_lidar_ratio(facts, part) for part in (analog, photon))
@@ -123,7 +123,7 @@ def unavailable_channels(
             until is None or facts.valid_from < until
         )
         reasons = {}
-        for omission in missing_channels(holding.layout, instrument.products.requested(), facts):
+        for omission in missing_channels(holding.layout, instrument.products.requested, facts):
             if omission.rule == ABSENT and (not kinds or omission.name in kinds):
                 reasons[omission.name, omission.channel] = omission.reason
             elif omission.rule == UNMATCHED and touched and omission.name != LAG_STEP:

@@ -121,7 +121,7 @@ def unmade_products(campaign: Campaign, planned: Iterable[Planned]) -> dict[str,
 def _networks_of_member(scene: Scene, campaign: Campaign) -> list[str]:
     """Return the networks of an instrument that has no requested product of its own."""
     owner = campaign.instruments.get(scene.instrument)
-    if owner is None or owner.products.requested():
+    if owner is None or owner.products.requested:
         return []
     return [name for name, net in campaign.networks.items() if scene.instrument in net.instruments]
 
@@ -236,10 +236,10 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
     """Return whether the campaign requests a product of its instrument or network."""
     name, _ = parse_scene_id(product.scene)
     if name in campaign.networks:
-        joint = campaign.networks[name].requested().get(product.kind)
+        joint = campaign.networks[name].requested.get(product.kind)
         return joint is not None and joint.channel == product.channel
     owner = campaign.instruments.get(name)
-    settings = None if owner is None else owner.products.requested().get(product.kind)
+    settings = None if owner is None else owner.products.requested.get(product.kind)
     of_files = not product.channel.startswith(GLUED)
     return settings is not None and settings.covers(product.channel, of_files=of_files)
 

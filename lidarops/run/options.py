@@ -245,9 +245,9 @@ def requested_kinds(campaign: Campaign) -> list[str]:
     """Return the kinds of product that a campaign requests."""
     requested: set[str] = set()
     for instrument in campaign.instruments.values():
-        requested |= instrument.products.requested().keys()
+        requested |= instrument.products.requested.keys()
     for network in campaign.networks.values():
-        requested |= network.requested().keys()
+        requested |= network.requested.keys()
     return [kind for kind in kinds() if kind in requested]
 
 
@@ -257,10 +257,10 @@ def requested_products(campaign: Campaign, owner: str) -> Iterator[tuple[str, st
     The channel is empty if all are requested.
     """
     if owner in campaign.networks:
-        for kind, joint in campaign.networks[owner].requested().items():
+        for kind, joint in campaign.networks[owner].requested.items():
             yield kind, joint.channel
         return
-    for kind, settings in campaign.instruments[owner].products.requested().items():
+    for kind, settings in campaign.instruments[owner].products.requested.items():
         for channel in settings.named or [""]:
             yield kind, channel
 

@@ -125,7 +125,7 @@ def months_of_products(
             held[instrument, window].append(product)
     for (name, (start, stop)), own in sorted(held.items()):
         owner = campaign.instruments.get(name)
-        requested = owner.products.requested() if owner else ()
+        requested = owner.products.requested if owner else ()
         if owner and any(kind.name in requested for kind in kinds_of(Scope.MONTH)):
             yield Scene(
                 id=f"{name}_{start:{STAMP}}{MONTH}",

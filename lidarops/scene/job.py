@@ -163,7 +163,7 @@ def recorded_settings(
         reads_files = dependence.reads_files(plan)
         # Other products state the facts that they were made with.
         facts = dependence.scene_facts(campaign, whole) if reads_files else InstrumentFacts()
-        request = instrument.products.requested()[kind]
+        request = instrument.products.requested[kind]
         dependent = {
             "station": campaign.stations[whole.station].model_dump(mode="json"),
             "facts": dependence.facts_settings(facts, plan, channel),

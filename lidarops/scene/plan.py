@@ -81,14 +81,14 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
 
 
 def _network_entries(scene: Scene, campaign: Campaign) -> Entries:
-    for kind, request in campaign.networks[scene.instrument].requested().items():
+    for kind, request in campaign.networks[scene.instrument].requested.items():
         yield from making(kind, NetworkRetrieval).needs(NetworkCase(scene, campaign, request))
 
 
 def _entries(scene: Scene, campaign: Campaign) -> Entries:
     # A scene never spans an edge of a validity period, so the facts of its first granule hold.
     facts = scene_facts(campaign, scene)
-    wanted = campaign.instruments[scene.instrument].products.requested()
+    wanted = campaign.instruments[scene.instrument].products.requested
     yield from missing_channels(scene.layout, wanted, facts)
     cases = list(_cases(scene, campaign, facts, wanted))
     entries = [entry for case in cases for entry in _channel_entries(case)]
@@ -154,14 +154,14 @@ def _cases(
                 key
                 for key, network in campaign.networks.items()
                 if scene.instrument in network.instruments
-                and any(name in file_channels(one.channel) for one in network.requested().values())
+                and any(name in file_channels(one.channel) for one in network.requested.values())
             ),
         )
 
 
 def _month_entries(scene: Scene, campaign: Campaign) -> Entries:
     """Yield the entries of a month, of the channels that are requested or have products."""
-    requested = campaign.instruments[scene.instrument].products.requested()
+    requested = campaign.instruments[scene.instrument].products.requested
     held = dict.fromkeys(product_of_path(product.path) for product in scene.products)
     for kind in kinds_of(Scope.MONTH):
         if settings := requested.get(kind.name):

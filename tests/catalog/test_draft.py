@@ -101,9 +101,9 @@ def test_every_good_file_gets_its_instrument_and_role(raw: Path, tmp_path: Path)
 def test_products_follow_from_the_pointing(raw: Path, tmp_path: Path) -> None:
     campaign, text = drafted(raw, tmp_path / "campaign.yaml")
     level, steep = (campaign.instruments[f"{site}-lidar"] for site in ("coast", "hill"))
-    assert set(level.products.requested()) == {"signal", "homogeneous"}
-    assert set(steep.products.requested()) == {"signal", "elastic"}
-    assert steep.products.requested()["elastic"].channels == ["glued_532o"]
+    assert set(level.products.requested) == {"signal", "homogeneous"}
+    assert set(steep.products.requested) == {"signal", "elastic"}
+    assert steep.products.requested["elastic"].channels == ["glued_532o"]
     assert "pairs that can be joined: glued_532o" in text
     assert level.facts[0].zenith_angle == 90.0
     # Gluing takes high rates from the analog channel.
@@ -115,7 +115,7 @@ def test_a_scan_keeps_the_pointing_of_its_headers(tmp_path: Path) -> None:
         write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle))
     campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     (lidar,) = campaign.instruments.values()
-    assert set(lidar.products.requested()) == {"signal", "multiangle"}
+    assert set(lidar.products.requested) == {"signal", "multiangle"}
     facts = lidar.facts[0].channels
     assert facts["photon_532o"].dead_time == "estimate"
     assert facts["analog_532o"].dead_time is None
@@ -146,7 +146,7 @@ def test_a_scan_whose_headers_do_not_tell_what_its_angles_are_is_a_question(
     assert lidar.header_pointing == pointing
     (line,) = (line for line in text.splitlines() if "header_pointing" in line)
     assert "# ? elevation or zenith_angle" in line
-    assert set(lidar.products.requested()) == {"signal", "multiangle"}
+    assert set(lidar.products.requested) == {"signal", "multiangle"}
     known = granules(campaign)
     assert [granule.zenith_angle for granule in known] == zenith
     assert [granule.azimuth for granule in known] == azimuth
@@ -207,7 +207,7 @@ def test_an_instrument_with_the_channels_of_a_scanning_one_gets_its_dead_times(
         write(tmp_path / f"raw/h26{number}", content(number, zenith_angle=angle))
     write(tmp_path / "raw/v26", content(90.0, site="Hill", zenith_angle=0.0))
     campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
-    assert set(campaign.instruments["hill-lidar"].products.requested()) == {"signal", "elastic"}
+    assert set(campaign.instruments["hill-lidar"].products.requested) == {"signal", "elastic"}
     for lidar in campaign.instruments.values():
         assert lidar.facts[0].channels["photon_532o"].dead_time == "estimate"
 
@@ -225,7 +225,7 @@ def test_lidars_of_near_stations_are_shown_as_a_network(tmp_path: Path) -> None:
     campaign.write_text(f"{text}\nnetworks:\n{block}", encoding="utf-8")
     (network,) = load_campaign(campaign).networks.values()
     assert set(network.instruments) == {"west-lidar", "east-lidar"}
-    assert network.requested()["visibility"].channel == "photon_532o"
+    assert network.requested["visibility"].channel == "photon_532o"
 
 
 @pytest.mark.parametrize(
