@@ -1,1 +1,1 @@
-"""Shared by all benchmarks: `rows` (results, tables, page), `statistics`, `costs`, `timing`."""
+"""Shared by all benchmarks: `results` (tables, JSON, page), `plots`, `statistics`, `timing`."""

@@ -1,8 +1,8 @@
 """Numerics of the retrievals: arrays in, arrays out, with numpy, scipy and numba only.
 
-Each package is one retrieval, independent of the others: `homogeneous`, `elastic`, `multiangle`,
-`network`. They share `signal` (raw counts to signals), `background`, `air` (molecules, visibility)
-and `common` (input checks). The modules named `labeled` do the same on `xarray` data.
+`homogeneous`, `elastic`, `raman`, `multiangle` and `network` are retrievals, independent of each
+other. They share `signal` (raw counts to signals), `background`, `clouds`, `air` (molecules,
+visibility) and `common` (input checks). The modules `labeled*` do the same on `xarray` data.
 """
 
 from lidarops.retrieve.common.compiled_code import keep_apart

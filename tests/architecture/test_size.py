@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 74_810,
-    "lines of code alone": 48_900,
-    "modules": 292,
-    "dataclasses": 310,
-    "lines of dataclasses": 7_710,
+    "lines": 72_700,
+    "lines of code alone": 47_430,
+    "modules": 288,
+    "dataclasses": 282,
+    "lines of dataclasses": 7_110,
     "tuning numbers": 252,
     "tuning numbers that are assumed": 86,
     "copied thresholds": 0,
     "most parameters": 24,
-    "lines of the largest package": 6_310,
+    "lines of the largest package": 6_210,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 70, "functions": 729, "changes": 395},
-    "elastic": {"modules": 78, "functions": 867, "changes": 415},
+    "homogeneous": {"modules": 66, "functions": 616, "changes": 218},
+    "elastic": {"modules": 75, "functions": 760, "changes": 235},
 }
 
 
