@@ -281,7 +281,7 @@ def test_the_history_of_a_glued_channel_names_the_steps_of_its_parts():
     )
     about = replace(about, provenance=of_glued)
     history = build_product(MAKERS["elastic"](), about).attrs["history"]
-    assert f"dead_time of photon_532o: {part.words}" in history
+    assert f"dead_time of photon_532o: {part.reason}" in history
     assert "left out dark of photon_532o: photon counting has no dark signal" in history
 
 

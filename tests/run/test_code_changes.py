@@ -46,7 +46,7 @@ def installed(
         ("products/homogeneous/variables.py", {"homogeneous"}),
         ("retrieve/network/geometry.py", set()),
         ("netcdf/write.py", {"elastic", "homogeneous", "signal"}),
-        ("plan/scenes.py", set()),
+        ("run/scenes.py", set()),
         ("run/processing.py", set()),
         ("site/pages.py", set()),
     ],
@@ -98,7 +98,7 @@ def test_a_day_is_judged_again_if_the_planning_changed(
     installed.change("retrieve/network/geometry.py")
     installed.reload(monkeypatch)
     assert state() == before
-    installed.change("plan/scenes.py")
+    installed.change("run/scenes.py")
     installed.reload(monkeypatch)
     after = state()
     assert before.keys() == after.keys()

@@ -217,10 +217,8 @@ def _blocks() -> Answer:
 
 
 def _turned() -> Answer:
-    power = CLEAR.noisy(20)
-    reference = path_fit.fit_homogeneous_path(power[:, ::-1], CLEAR.range[::-1], variance=1.0)
-    changed = path_fit.fit_homogeneous_path(power, CLEAR.range, variance=1.0)
-    return Answer({"same bits": float(np.array_equal(reference.extinction, changed.extinction))})
+    path_fit.fit_homogeneous_path(CLEAR.noisy(20)[:, ::-1], CLEAR.range[::-1], variance=1.0)
+    return Answer({})
 
 
 def memory_layout_cases() -> tuple[StiffCase, ...]:
@@ -239,5 +237,6 @@ def memory_layout_cases() -> tuple[StiffCase, ...]:
         *chunks,
         StiffCase("whole numbers", Retrieval.HOMOGENEOUS, dict, _whole_numbers, same),
         StiffCase("blocks of all NaN", Retrieval.HOMOGENEOUS, dict, _blocks, same),
-        StiffCase("descending ranges", Retrieval.HOMOGENEOUS, dict, _turned, same),
+        StiffCase("descending ranges", Retrieval.HOMOGENEOUS, dict, _turned,
+             (Refused(RetrievalInputError, "range"),)),
     )  # fmt: skip
