@@ -17,8 +17,8 @@ from benchmarks.harness.verdicts import Score, Scores
 
 _RMSE: Final = "RMSE"
 STRONGEST: Final = "Ours beside the strongest peer"
-_SHOWN: Final = frozenset({"background of 100000 counts", "3 x 2 beams, plume, noise 5 %"})
-"""Settings shown for a retrieval, if not its first."""
+_DRAWN: Final = frozenset({"background of 100000 counts", "3 x 2 beams, plume, noise 5 %"})
+"""Settings drawn for a retrieval, if not its first."""
 Works = Mapping[str, Sequence[Work]]
 """Works by retrieval."""
 
@@ -116,8 +116,8 @@ def _score(work: Work) -> Score:
     return {_RMSE: work.error, "95 %": coverage, CPU_TIME: work.time}
 
 
-def _shown(settings: Sequence[str]) -> str:
-    return next((setting for setting in settings if setting in _SHOWN), settings[0])
+def _drawn_setting(settings: Sequence[str]) -> str:
+    return next((setting for setting in settings if setting in _DRAWN), settings[0])
 
 
 def best_methods(works: Works) -> Scores:
@@ -129,7 +129,7 @@ def best_methods(works: Works) -> Scores:
     for retrieval, every in works.items():
         for quantity in dict.fromkeys(work.quantity for work in every):
             group = [w for w in every if w.quantity == quantity and not w.informed]
-            setting = _shown([work.setting for work in group])
+            setting = _drawn_setting([work.setting for work in group])
             for ours in (True, False):
                 rivals = [work for work in group if work.ours is ours and work.setting == setting]
                 if rivals:
@@ -151,11 +151,12 @@ def against_peers(works: Works) -> Scores:
             if ours and peers:
                 best = _best(ours)
                 key = (f"{retrieval}, {setting}: {quantity}", best.method)
-                scores[key] = _beside(best, _best(peers))
+                scores[key] = _compared(best, _best(peers))
     return scores
 
 
-def _beside(ours: Work, peer: Work) -> Score:
+def _compared(ours: Work, peer: Work) -> Score:
+    """Return the ratios of error and time of a method of ours to those of a peer, and words."""
     ratio = ours.error.value / peer.error.value
     scatter = math.hypot(ours.error.error / ours.error.value, peer.error.error / peer.error.value)
     faster = ours.time.value <= peer.time.value
@@ -185,7 +186,7 @@ def _chart(retrieval: str, works: Sequence[Work]) -> Chart:
     quantity = works[0].quantity
     drawn = [work for work in works if work.quantity == quantity]
     settings = list(dict.fromkeys(work.setting for work in drawn if not work.ours))
-    last = _shown(settings)
+    last = _drawn_setting(settings)
     chosen = {settings[0], last if last != settings[0] else settings[-1]}
     scores = {(work.setting, work.method): _score(work) for work in drawn if work.setting in chosen}
     return Chart(

@@ -221,7 +221,7 @@ class Expected:
     def below(self, key: str) -> Expected | None:
         """Return what is expected at a key or index, or None if the schemas have no such place."""
         inner = [schema for outer in self.schemas for schema in _below(outer, key)]
-        return self._of(inner, self.unit) if inner else None
+        return self._resolved(inner, self.unit) if inner else None
 
     def member(self, tag: str) -> Expected:
         """Return what is expected of the member of a union that has a tag or title."""
@@ -246,7 +246,7 @@ class Expected:
         texts = [self._words(schema) for schema in self.schemas if schema.get("type") != "null"]
         return " or ".join(dict.fromkeys(texts))
 
-    def _of(self, schemas: list[Schema], unit: str | None) -> Expected:
+    def _resolved(self, schemas: list[Schema], unit: str | None) -> Expected:
         """Return the schemas without references and unions, with the unit of the innermost."""
         plain = [pair for schema in schemas for pair in self._plain(schema, unit)]
         unit = next((own for _, own in plain if own), None)
@@ -276,7 +276,7 @@ class Expected:
 
     def _list(self, schema: Schema) -> str:
         inner = schema.get("prefixItems", [schema.get("items", {})])
-        item = self._of(inner, schema.get("unit")).words()
+        item = self._resolved(inner, schema.get("unit")).words()
         if "prefixItems" in schema:
             return f"a list of {len(inner)} values, each {item}"
         least = schema.get("minItems", 0)

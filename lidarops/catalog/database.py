@@ -81,7 +81,7 @@ class Database:
     @property
     def place(self) -> str:
         """The URL without its password."""
-        return _shown(self._url)
+        return _without_passwords(self._url)
 
     def close(self) -> None:
         """Close the database connections."""
@@ -319,7 +319,7 @@ def holds_password(url: str) -> bool:
     return bool(parsed.password) or any(map(_SECRET.search, parsed.query))
 
 
-def _shown(url: sa.URL) -> str:
+def _without_passwords(url: sa.URL) -> str:
     """Return a URL without its passwords."""
     secrets = filter(_SECRET.search, url.query)
     return url.difference_update_query(secrets).render_as_string(hide_password=True)
@@ -344,14 +344,14 @@ def _engine(url: sa.URL) -> sa.Engine:
     except sa.exc.NoSuchModuleError as error:
         raise CatalogError(
             f"unknown kind of database: {error}",
-            file=_shown(url),
+            file=_without_passwords(url),
             remedy=_URLS,
             wrong_use=True,
         ) from error
     except (ImportError, sa.exc.SQLAlchemyError) as error:
         raise CatalogError(
             f"cannot be opened: {error}",
-            file=_shown(url),
+            file=_without_passwords(url),
             remedy="install its driver: pip install lidarops[postgresql]",
         ) from error
 

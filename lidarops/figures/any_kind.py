@@ -72,10 +72,10 @@ def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None
     some = some.isel(time=np.argsort(some["time"].values, kind="stable"))
     variable = some[name]
     table, unknown = _table(variable), np.full(variable.sizes["time"], np.nan)
-    flags = quality_bits(_beside(some, QUALITY_FLAG, name, 0.0)).reshape(table.shape)
+    flags = quality_bits(_matching_variable(some, QUALITY_FLAG, name, 0.0)).reshape(table.shape)
     stated = some[QUALITY_FLAG].attrs if QUALITY_FLAG in some else {}
     rejecting = rejecting_mask(stored_bits(stated, kind))
-    errors = _table(_beside(some, f"{name}_standard_error", name, np.nan))
+    errors = _table(_matching_variable(some, f"{name}_standard_error", name, np.nan))
     units = str(variable.attrs.get("units", ""))
     most_values = np.argsort(-np.isfinite(table).sum(axis=0), kind="stable")[:SERIES]
     series = tuple(
@@ -106,7 +106,7 @@ def main_name(product: xr.Dataset) -> str | None:
     return next(iter([*preferred, *uncertain, *over_time]), None)
 
 
-def _beside(product: xr.Dataset, other: str, name: str, default: float) -> xr.DataArray:
+def _matching_variable(product: xr.Dataset, other: str, name: str, default: float) -> xr.DataArray:
     """Return another variable along the dimensions of one; the default if there is none."""
     variable = product[name]
     same = other in product and product[other].dims == variable.dims

@@ -192,7 +192,7 @@ def _content(figure: Figure, width: int) -> tuple[str, float]:
         above = tuple(replace(panel, right=None) for panel in above)
         beside, lower = False, _LOWER if figure.beside else 1.0
         panels = tuple(_narrowed(panel, width, lower) for panel in panels)
-    boxes = list(_beside(panels, width) if beside else _stacked(panels, width, above))
+    boxes = list(_side_by_side(panels, width) if beside else _stacked(panels, width, above))
     return "".join(map(_panel, boxes)), max(box.foot + _below(box) for box in boxes)
 
 
@@ -243,7 +243,7 @@ def _stacked(panels: Sequence[Panel], whole: int, above: Sequence[Panel]) -> Ite
         y = box.foot + _below(box)
 
 
-def _beside(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
+def _side_by_side(panels: Sequence[Panel], whole: int) -> Iterator[_Box]:
     left, right = _margins(panels)
     width = (whole - left - right - _BETWEEN * (len(panels) - 1)) / len(panels)
     legends = list(_legends(panels))

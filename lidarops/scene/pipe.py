@@ -131,17 +131,17 @@ def plan_dark(case: ChannelCase[Any]) -> Entry:
         return case.leave("dark", f"no {which} within 24 h of the scene", number=0.0)
     times = sorted(granule.start for granule in case.scene.dark if granule.start)
     profiles = [granule.start for granule in case.scene.granules if granule.start]
-    around = times[0] < max(profiles) and min(profiles) < times[-1]
+    enclosed = times[0] < max(profiles) and min(profiles) < times[-1]
     sessions = _sessions(case.scene.dark)
     method: Literal["interpolated", "nearest"]
     # Interpolation needs two sessions.
-    if around and sessions > 1:
+    if enclosed and sessions > 1:
         use, method = "interpolated in time", "interpolated"
     elif sessions > 1:
         use, method = "the nearest in time is used", "nearest"
     else:
         use, method = "one session, used for all profiles", "nearest"
-    order = _times_around(times, min(profiles), max(profiles))
+    order = _order_in_words(times, min(profiles), max(profiles))
     files = "1 dark file" if count == 1 else f"{count} dark files"
     reason = f"{files} within 24 h of the scene, {order}: {use}"
     settings = DarkSettings(files=count, method=method)
@@ -159,7 +159,7 @@ def _sessions(dark: Iterable[Granule]) -> int:
     return 1 + sum(gap > THRESHOLDS.session_gap for gap in gaps)
 
 
-def _times_around(times: Sequence[datetime], first: datetime, last: datetime) -> str:
+def _order_in_words(times: Sequence[datetime], first: datetime, last: datetime) -> str:
     """Return in words how many times lie before, among and after the profiles of a scene."""
     counts = {
         "before": sum(time < first for time in times),

@@ -372,7 +372,7 @@ def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entr
     """Write what leads to and from each product into its page; yield entries with new digests."""
     for entry, neighbours in with_neighbours(entries):
         page = within(site, entry.page).read_bytes()
-        linked = pages.with_around(page, pages.around(entry, neighbours, links))
+        linked = pages.with_navigation(page, pages.navigation(entry, neighbours, links))
         if linked != page:
             _write(site, entry.page, linked)
         yield replace(entry, digests=(hashlib.sha256(linked).hexdigest(), *entry.digests[1:]))

@@ -36,7 +36,7 @@ _YEARS: Final = 48
 """Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
 _LATEST: Final = 6
-_AROUND: Final = (b"<!-- around -->", b"<!-- /around -->")
+_NAVIGATION: Final = (b"<!-- navigation -->", b"<!-- /navigation -->")
 """Ends of the part of a product page that does not follow from the product."""
 _FILTERED: Final = 16
 """Most kinds that can be chosen on a page of a day."""
@@ -107,7 +107,7 @@ def product(
     )
 
 
-def around(entry: Entry, neighbours: Neighbours, links: Links) -> bytes:
+def navigation(entry: Entry, neighbours: Neighbours, links: Links) -> bytes:
     """Return the part of a product page that leads to its file and to other products."""
     page = entry.page
     ends = [
@@ -123,7 +123,7 @@ def around(entry: Entry, neighbours: Neighbours, links: Links) -> bytes:
         }
         for other in neighbours.siblings
     ]
-    module = environment("lidarops.site").get_template("around.html")
+    module = environment("lidarops.site").get_template("navigation.html")
     text = module.render(
         download=links.product(entry, page),
         file=entry.path.rsplit("/", 1)[-1],
@@ -136,10 +136,10 @@ def around(entry: Entry, neighbours: Neighbours, links: Links) -> bytes:
     return text.encode("utf-8", "replace")
 
 
-def with_around(page: bytes, part: bytes) -> bytes:
-    """Return a product page with another part of `around`."""
-    head, first, rest = page.partition(_AROUND[0])
-    _, last, tail = rest.partition(_AROUND[1])
+def with_navigation(page: bytes, part: bytes) -> bytes:
+    """Return a product page with another part of `navigation`."""
+    head, first, rest = page.partition(_NAVIGATION[0])
+    _, last, tail = rest.partition(_NAVIGATION[1])
     return b"".join((head, first, b"\n", part, b"\n", last, tail))
 
 

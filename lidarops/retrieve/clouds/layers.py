@@ -157,7 +157,7 @@ def find_visible_air(
     marked = np.reshape(cloudy, tests.power.shape)
     known = np.isfinite(tests.power) & np.isfinite(tests.variance) & ~marked
     signal, air, noise = (
-        _sums_around(np.where(known, values, 0.0), bins)
+        _moving_sums(np.where(known, values, 0.0), bins)
         for values in (tests.power, tests.shape, tests.variance)
     )
     error = np.sqrt(noise)
@@ -171,7 +171,7 @@ def find_visible_air(
     return visible.reshape(*tests.leading, -1)
 
 
-def _sums_around(values: Array, bins: int) -> Array:
+def _moving_sums(values: Array, bins: int) -> Array:
     """Return sums over a number of bins around each, from the far end, so that they keep digits."""
     size = values.shape[-1]
     beyond = np.zeros((values.shape[0], size + 1))

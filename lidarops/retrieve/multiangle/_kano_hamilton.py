@@ -68,16 +68,16 @@ def _surrounds_zenith(weights: Array, design: Array, k: int) -> bool:
 
 
 @compiled
-def _around(weights: Array, design: Array, around: Array) -> None:
+def _surrounded_altitudes(weights: Array, design: Array, surrounded: Array) -> None:
     """Fill 1 at the altitudes where the beams with weight surround the zenith, else 0."""
-    for k in range(around.size):
+    for k in range(surrounded.size):
         changed = k == 0
         for a in range(weights.shape[0]):
             changed |= (weights[a, k] > 0.0) != (weights[a, k - 1] > 0.0)
         if changed:
-            around[k] = 1.0 if _surrounds_zenith(weights, design, k) else 0.0
+            surrounded[k] = 1.0 if _surrounds_zenith(weights, design, k) else 0.0
         else:
-            around[k] = around[k - 1]
+            surrounded[k] = surrounded[k - 1]
 
 
 @compiled
@@ -159,12 +159,12 @@ def _gradients(
     weights: Array, design: Array, beams: Array, q: Array, norm: Array, mean: Array, sides: Array
 ) -> None:
     """Fill the columns of the gradients, and their number `sides` at each altitude."""
-    around, lever, share = np.empty(sides.size), np.empty(sides.size), np.empty(sides.size)
-    _around(weights, design, around)
+    surrounded, lever, share = np.empty(sides.size), np.empty(sides.size), np.empty(sides.size)
+    _surrounded_altitudes(weights, design, surrounded)
     _sums(weights, design[0], design[0], lever)
     _sums(weights, design[1], design[1], share)
     for k in range(sides.size):
-        lever[k] = _DEPENDENT * (lever[k] + share[k]) if around[k] > 0.0 else np.inf
+        lever[k] = _DEPENDENT * (lever[k] + share[k]) if surrounded[k] > 0.0 else np.inf
     for c in range(2):
         _orthogonal_columns(weights, design, lever, q, norm, mean, c)
         for k in range(sides.size):

@@ -105,7 +105,7 @@ class ScanSignals:
         pull = weight * change
         level = pull / np.sqrt(fit.total)[:, np.newaxis]
         slope = pull * fit.arm / np.sqrt(fit.squares)[:, np.newaxis]
-        information = _beside(pull * change) - _outer(level) - _outer(slope)
+        information = _diagonal(pull * change) - _outer(level) - _outer(slope)
         misfit = (pull * fit.residual(residual)).sum(axis=-1)
         # Without the backgrounds, which are common to all altitudes.
         background, _ = self._posterior(information, misfit)
@@ -221,7 +221,7 @@ def _altitudes_together(scaled: Array) -> float:
     return float((1.0 + correlation) / (1.0 - correlation))
 
 
-def _beside(values: Array) -> Array:
+def _diagonal(values: Array) -> Array:
     """Return the sums over altitudes as diagonal matrices, (time, beam, beam)."""
     return np.asarray(values.sum(axis=-1)[:, np.newaxis] * np.eye(values.shape[1]))
 

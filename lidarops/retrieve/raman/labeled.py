@@ -48,7 +48,9 @@ from lidarops.retrieve.signal.labeled import (
 _WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
 _DOUBTED: Final = _WITHHELD | int(Quality.PILE_UP)
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
-_ANY: Final = (_DOUBTED | int(Quality.INCOMPLETE_OVERLAP | Quality.SINGLE_RECORD)) & ~int(_MISSING)
+_BITS_OF_ANY_BIN: Final = (
+    _DOUBTED | int(Quality.INCOMPLETE_OVERLAP | Quality.SINGLE_RECORD)
+) & ~int(_MISSING)
 _DIGITS_OF_A_BIN: Final = 6
 """Digits of the difference of ranges in bins, which are no more certain: 1e-6 bins are 10 um."""
 
@@ -366,7 +368,7 @@ def _quality(cells: Cells, channels: list[_Channel], overlap: Array) -> Flags:
     rows = len(channels[0].quality)
     bits = np.zeros((rows, cells.range.size), dtype=np.int32)
     for channel in channels:
-        parts = cells.split(channel.quality & np.int32(_ANY))
+        parts = cells.split(channel.quality & np.int32(_BITS_OF_ANY_BIN))
         bits |= np.bitwise_or.reduce(parts, axis=-1).astype(np.int32)
         bits[~cells.split(channel.known).any(axis=-1)] |= _MISSING
     unknown = np.isnan(cells.split(overlap)).any(axis=-1)
