@@ -31,7 +31,8 @@ Schema = dict[str, Any]
 class Loader(yaml.SafeLoader):
     """Reads a YAML file as `yaml.SafeLoader`, but yes, no, on and off as texts.
 
-    Models know what is a boolean: a text or number is never taken for one, nor a key.
+    A key or a name may be ``no``. Where a model has a boolean, pydantic takes these texts for one,
+    as it does 1, 0, ``'true'`` and ``'false'``.
     """
 
 

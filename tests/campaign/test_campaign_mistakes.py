@@ -197,6 +197,32 @@ def test_a_number_without_a_point_is_read(tmp_path: Path) -> None:
     assert facts.channels["photon_532o"].dead_time == 4e-9
 
 
+@pytest.mark.parametrize("word", ["yes", "no", "on", "off"])
+def test_a_name_or_key_may_be_a_word_that_yaml_takes_for_a_boolean(
+    tmp_path: Path, word: str
+) -> None:
+    path = tmp_path / "campaign.yaml"
+    stations = f"{word}: {{name: {word}, latitude: 46.4"
+    text = CAMPAIGN.replace("name: small", f"name: {word}")
+    text = text.replace("coast: {name: Coast, latitude: 46.4", stations)
+    path.write_text(text.replace("station: coast", f"station: {word}"))
+    campaign = load_campaign(path)
+    assert campaign.name == word
+    assert campaign.stations[word].name == word
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [("yes", True), ("1", True), ("'true'", True), ("no", False), ("0", False), ("off", False)],
+)
+def test_a_key_of_true_or_false_takes_words_and_numbers(
+    tmp_path: Path, word: str, *, expected: bool
+) -> None:
+    path = tmp_path / "campaign.yaml"
+    path.write_text(CAMPAIGN.replace("all_steps: false", f"all_steps: {word}"))
+    assert load_campaign(path).all_steps is expected
+
+
 Place = tuple[tuple[Any, ...], dict[str, Any], str | None]
 
 
