@@ -440,8 +440,18 @@ def _place(form: str, **values: float | None) -> str:
     """Return what line 2 holds after the dates, with the values that the form has places for."""
     for name, value in values.items():
         if (value is not None) != (f"{{{name}:" in _PLACES[form]):
-            problem = "needs one" if value is None else "holds none"
-            raise RawFormatError(f"a {form} header {problem}", field=name)
+            if value is None:
+                raise RawFormatError(
+                    f"is needed in a {form} header",
+                    field=name,
+                    remedy="give it, or write another dialect",
+                )
+            other = next(other for other, places in _PLACES.items() if f"{{{name}:" in places)
+            raise RawFormatError(
+                f"a {form} header has no place for it",
+                field=name,
+                remedy=f"omit it, or write the {other} dialect",
+            )
     return _PLACES[form].format_map(values)
 
 
