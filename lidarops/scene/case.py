@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
+from lidarops.errors import SceneError
 from lidarops.kinds import kinds
 from lidarops.raw.header import label_of
 from lidarops.records import (
@@ -220,10 +221,19 @@ def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
 
 
 def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
-    """Return a channel of the files, or one glued from two of them."""
+    """Return a channel of the files, or one glued from two of them.
+
+    Raises
+    ------
+    SceneError
+        If the files hold no such channel.
+    """
     layout = tuple(layout)
-    known = (*layout, *joined_layout(layout, [name]))
-    return next(channel for channel in known if channel.name == name)
+    for channel in (*layout, *joined_layout(layout, [name])):
+        if channel.name == name:
+            return channel
+    held = ", ".join(channel.name for channel in layout)
+    raise SceneError(f"the files hold no channel {name}, only {held}")
 
 
 def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:

@@ -11,6 +11,7 @@ import xarray as xr
 
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
+from lidarops.errors import SceneError
 from lidarops.products.raman import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import file_channels
@@ -129,12 +130,10 @@ def _slope_error(case: Case) -> float:
 
 def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
     """Return why a Raman channel of a gas cannot be used; empty where it can."""
-    layout = case.scene.layout
     try:
-        found = member_channel(layout, channel)
-    except StopIteration:
-        held = ", ".join(known.name for known in layout)
-        return f"the files hold no channel {channel}, only {held}"
+        found = member_channel(case.scene.layout, channel)
+    except SceneError as error:
+        return error.problem
     if found.bin_width != case.channel.bin_width:
         return (
             f"{channel} has bins of {found.bin_width:g} m, {case.channel.bin_width:g} m are needed"
