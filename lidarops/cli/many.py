@@ -21,6 +21,7 @@ from lidarops.cli.app import (
     utc,
 )
 from lidarops.figures.wording import visible
+from lidarops.site.paths import CALENDAR_HEIGHT
 
 if TYPE_CHECKING:
     from lidarops.aggregate.aggregates import AggregateResult
@@ -171,7 +172,7 @@ def site(
             help="Height above the station, m, below which a profile with a usable value counts in"
             " the calendar.",
         ),
-    ] = 5000.0,
+    ] = CALENDAR_HEIGHT,
     as_json: JsonOption = False,
 ) -> None:
     """Make a static site of all products: calendar, figures, flags, provenance, downloads.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
 from lidarops.records import Grade, Measure
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
     from lidarops.records import Change, Verdicts
 
+_NAMED: Final = 2
+"""Most descriptions that `named_shares` names."""
 _REORDERING: Final = frozenset(
     "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
     "\N{LEFT-TO-RIGHT OVERRIDE}\N{RIGHT-TO-LEFT OVERRIDE}"
@@ -33,6 +36,20 @@ def percent(share: float) -> str:
     # Halves are rounded up, whatever the rounding errors of the share.
     tenths = math.floor(10.0 * round(number, 6) + 0.5) / 10.0
     return f"{tenths:.1f} %" if number % 100.0 else f"{number:.0f} %"
+
+
+def named_shares(counts: Iterable[tuple[str, int]], values: int) -> str:
+    """Return the most frequent of some descriptions with their shares, such as why values lack.
+
+    Parameters
+    ----------
+    counts : iterable of (str, int)
+        Descriptions, and the number of values that each concerns; those of none are left out.
+    values : int
+        Number of all values.
+    """
+    most = sorted((pair for pair in counts if pair[1]), key=lambda pair: -pair[1])[:_NAMED]
+    return "; ".join(f"{words} ({percent(count / values)})" for words, count in most)
 
 
 def verdicts_in_words(verdicts: Verdicts) -> str:

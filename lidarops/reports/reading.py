@@ -18,7 +18,7 @@ from lidarops.errors import ProductError
 from lidarops.figures.kind_figures import ProductSource, View
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.series_data import Comparison
-from lidarops.figures.wording import percent
+from lidarops.figures.wording import named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.read import open_product, profiles_in
@@ -39,8 +39,6 @@ _UNREADABLE: Final = (
 _AT_A_TIME: Final = 8
 """Products sent to a process together, so that it waits less."""
 _LENGTHS_AT_A_TIME: Final = 32
-CAUSES: Final = 2
-"""Most causes named for products without a usable value."""
 
 Content = TypeVar("Content")
 _Content_co = TypeVar("_Content_co", covariant=True)
@@ -160,12 +158,12 @@ class Group:
         counts: Counter[str] = Counter()
         for product in products:
             counts.update(product.flagged)
-        worst = [
-            f"{bit.description} ({percent(count / values)})"
-            for name, count in counts.most_common()
+        rejecting = (
+            (bit.description, count)
+            for name, count in counts.items()
             if (bit := flags.named(name)) is not None and bit.severity is Severity.REJECT
-        ]
-        return "; ".join(worst[:CAUSES])
+        )
+        return named_shares(rejecting, values)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from lidarops.site import pages, product_contents
 from lidarops.site.links import BESIDE, Links
 from lidarops.site.neighbours import with_neighbours
 from lidarops.site.paths import (
+    CALENDAR_HEIGHT,
     day_page,
     month_list,
     product_folder,
@@ -94,7 +95,7 @@ def build_site(
     copies: bool = False,
     stac_at: str = "",
     reports_at: str = "",
-    below: float = product_contents.LOW,
+    below: float = CALENDAR_HEIGHT,
     progress: Callable[[int], None] | None = None,
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.

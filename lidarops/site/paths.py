@@ -11,6 +11,8 @@ from urllib.parse import quote
 
 from lidarops.errors import ProductError
 
+CALENDAR_HEIGHT: Final = 5000.0
+"""Height above the station, m, below which a profile with a usable value counts in the calendar."""
 _SAFE: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 

@@ -15,15 +15,12 @@ from numpy.typing import NDArray
 from lidarops.figures.product_names import attribute, scalar
 from lidarops.figures.quality_panel import READ_VALUES
 from lidarops.figures.series_data import blocks, quality_bits
-from lidarops.figures.wording import percent
+from lidarops.figures.wording import named_shares, percent
 from lidarops.netcdf.stored_flags import StoredBit, count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.site.paths import CALENDAR_HEIGHT
 
 PROVENANCE: Final = "provenance"
-LOW: Final = 5000.0
-"""Height above the station, m, below which a profile with a usable value counts in the calendar."""
-_CAUSES: Final = 2
-"""Most causes named for a product without usable value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +54,8 @@ class QualityCounts:
         """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
         if self.usable or not self.values:
             return ""
-        worst = sorted((row for row in self.rows if row.css == "bad"), key=lambda row: -row.count)
-        return "; ".join(f"{row.meaning} ({row.share})" for row in worst[:_CAUSES])
+        rejecting = ((row.meaning, row.count) for row in self.rows if row.css == "bad")
+        return named_shares(rejecting, self.values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +114,7 @@ class Span:
     stop: str
 
 
-def count_quality(product: xr.Dataset, below: float = LOW) -> QualityCounts:
+def count_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> QualityCounts:
     """Count the values of a product by quality bit, and the profiles with a usable value.
 
     Parameters
@@ -260,20 +257,19 @@ def origin(product: xr.Dataset) -> Origin:
     if PROVENANCE not in product:
         return Origin(problem="the product has no provenance")
     try:
-        text = str(product[PROVENANCE].item())
-        document = json.loads(text)
-        return _origin(text, document)
+        document = json.loads(str(product[PROVENANCE].item()))
+        return _origin(document)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return Origin(problem=f"the provenance cannot be read: {error!r:.200}")
 
 
-def _origin(text: str, document: Mapping[str, Any]) -> Origin:
+def _origin(document: Mapping[str, Any]) -> Origin:
     entities = document["entity"]
     product, plan = entities["lidarops:product"], entities["lidarops:plan"]
     software = document["agent"]["lidarops:software"]
     planned = json.loads(plan["lidarops:json"])
     return Origin(
-        text=json.dumps(document, indent=1, sort_keys=True) + "\n" if text else "",
+        text=json.dumps(document, indent=1, sort_keys=True) + "\n",
         id=str(product["lidarops:id"]),
         plan_hash=str(plan["lidarops:sha256"]),
         code_version=str(software["lidarops:code_version"]),
