@@ -29,7 +29,14 @@ from support.products.fabricated import (
 
 from lidarops.errors import CatalogError
 from lidarops.figures import svg
-from lidarops.figures.wording import counted, duration, percent, size, verdicts_in_words
+from lidarops.figures.wording import (
+    counted,
+    duration,
+    named_shares,
+    percent,
+    size,
+    verdicts_in_words,
+)
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of
 from lidarops.records import (
@@ -659,6 +666,12 @@ def test_stages_sum_over_scenes():
 )  # fmt: skip
 def test_percent_never_rounds_to_all_or_nothing(share, words):
     assert percent(share) == words
+
+
+def test_the_two_most_frequent_descriptions_are_named_and_none_of_no_value():
+    counts = [("dark", 0), ("weak", 1), ("saturated", 3), ("near", 1)]
+    assert named_shares(counts, 4) == "saturated (75.0 %); weak (25.0 %)"
+    assert named_shares([("dark", 0)], 0) == ""
 
 
 def test_percent_of_equal_shares_has_the_same_words():

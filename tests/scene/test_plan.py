@@ -11,11 +11,13 @@ import pytest
 from pydantic import ValidationError
 from support import factories
 
+from lidarops.errors import SceneError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.records import Plan, Role, Scene
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence
+from lidarops.scene.case import member_channel
 from lidarops.scene.plan import plan_scene
 
 
@@ -113,6 +115,16 @@ def test_a_channel_that_the_files_lack_is_named() -> None:
     products = {"homogeneous": {"channels": ["photon_999x"], "sections": [[500, 900]]}}
     reason = _left_out(plan_scene(_scene(), factories.campaign(products=products)), "photon_999x")
     assert "photon_532o" in reason["homogeneous"]
+
+
+def test_a_channel_that_the_files_lack_has_no_layout() -> None:
+    layout = _scene().layout
+    with pytest.raises(
+        SceneError, match="the files hold no channel photon_1o, only photon_532o, analog_532o"
+    ):
+        member_channel(layout, "photon_1o")
+    with pytest.raises(SceneError, match="no channel glued_1o"):
+        member_channel(layout, "glued_1o")
 
 
 @pytest.mark.parametrize("section", [[14_000, 16_000], [1000, 1030]])
