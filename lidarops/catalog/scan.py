@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import heapq
 import json
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import groupby
-from operator import itemgetter
+from itertools import chain
 from typing import Final
 from urllib.parse import unquote
 
@@ -25,7 +23,7 @@ from lidarops.errors import CatalogError
 from lidarops.records import UNREADABLE, IdlePattern, Role, Status
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import Processes
-from lidarops.system.stores import Stored, without_keys
+from lidarops.system.stores import without_keys
 
 _BATCH = 2000
 _TOGETHER = 250
@@ -132,15 +130,19 @@ def _joined(
     files: Iterator[RawFile], known: Iterator[Fingerprint]
 ) -> Iterator[tuple[RawFile | None, Fingerprint | None]]:
     """Pair the files of the archive with those of the catalog; both are sorted by path."""
-    listed = ((printable(file.path), file) for file in files)
-    stored = ((before.path, before) for before in known)
-    for _, alike in groupby(heapq.merge(listed, stored, key=itemgetter(0)), itemgetter(0)):
-        found = [each for _, each in alike]
-        yield (
-            # The printable form of a name that is not UTF-8 may equal another path.
-            next((each for each in found if isinstance(each, Stored)), None),
-            next((each for each in found if isinstance(each, Fingerprint)), None),
-        )
+    before, last = next(known, None), None
+    for file in chain(files, [None]):
+        path = None if file is None else printable(file.path)
+        while before is not None and (path is None or before.path < path):
+            yield None, before
+            before = next(known, None)
+        if before is not None and before.path == path:
+            yield file, before
+            before = next(known, None)
+        # The printable form of a name that is not UTF-8 may equal another path.
+        elif file is not None and path != last:
+            yield file, None
+        last = path
 
 
 class _Scan:
