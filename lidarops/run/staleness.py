@@ -199,9 +199,9 @@ class Judge(DayStates):
         self._touched: dict[str, int] = {}
         self._to_be_made: dict[str, str] = {}
         """Stale products of scenes that were judged, by path -> scene."""
-        self._whole: Plan | None = None
-        self._parts: dict[ProductKey, tuple[Plan, Mapping[str, Any]]] = {}
-        """Parts of the plan `_whole`, of the scene that was judged last."""
+        self._last: tuple[Plan | None, dict[ProductKey, tuple[Plan, Mapping[str, Any]]]] = None, {}
+        """Plan of the scene that was judged last, and its parts. One pair, because two threads may
+        judge different scenes."""
 
     # Days
 
@@ -422,6 +422,7 @@ class Judge(DayStates):
         stale: list[Stale] = []
         frozen: list[Stale] = []
         kept: list[Stale] = []
+        frozen_period = not self._thaw and self.campaign.is_frozen(scene.start)
         kinds_ = self.selection.kinds
         requested = dependence.plan_of_kinds(whole, kinds_) if kinds_ else whole
         products = dependence.planned_products(requested)
@@ -436,7 +437,7 @@ class Judge(DayStates):
                 one = Stale(kind, channel, reason, known, restored)
                 if known and known.path in self.lost.protected:
                     kept.append(one)
-                elif known and not restored and self._is_frozen(scene):
+                elif known and not restored and frozen_period:
                     frozen.append(self._with_remedy(one))
                 else:
                     stale.append(one)
@@ -461,9 +462,6 @@ class Judge(DayStates):
         of_scene = (self._read(product_file(scene, key), made) for key in keys)
         return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)
 
-    def _is_frozen(self, scene: Scene) -> bool:
-        return not self._thaw and self.campaign.is_frozen(scene.start)
-
     def _with_remedy(self, frozen: Stale) -> Stale:
         """Return a frozen product whose reason says, if its file is missing, what restores it."""
         if frozen.before is None or (self.campaign.products_root / frozen.before.path).exists():
@@ -473,8 +471,7 @@ class Judge(DayStates):
 
     def judgement(self, scene: Scene, whole: Plan) -> Judgement:
         """Return a judgement by which every product of a scene is stale."""
-        products = dependence.planned_products(whole)
-        stale = tuple(Stale(kind, channel, "requested") for kind, channel in products)
+        stale = tuple(Stale(*one, "requested") for one in dependence.planned_products(whole))
         day, files = day_of(scene.start), self._ancillary_records(whole)
         return Judgement(scene, whole, whole, day, files, stale)
 
@@ -537,8 +534,7 @@ class Judge(DayStates):
         if (known.plan_hash, known.settings_hash) == (closure.hash, settings_digest(settings)):
             return stale
         try:
-            file = self.campaign.products_root / made.path
-            changes = planned_changes(file, settings, closure)
+            changes = planned_changes(self.campaign.products_root / made.path, settings, closure)
         except ProductError:
             # A file that is lost is a reason of its own.
             return stale
@@ -548,13 +544,15 @@ class Judge(DayStates):
         self, scene: Scene, whole: Plan, product: ProductKey
     ) -> tuple[Plan, Mapping[str, Any]]:
         """Return the part of a plan that a product needs, and the settings that it would state."""
-        if self._whole is not whole:
-            self._whole, self._parts = whole, {}
-        if product not in self._parts:
+        last, parts = self._last
+        if last is not whole:
+            parts = {}
+            self._last = whole, parts
+        if product not in parts:
             closure = dependence.plan_closure(whole, [product])
             job = Job(self.campaign, scene, whole)
-            self._parts[product] = closure, recorded_settings(job, scene, closure, product)
-        return self._parts[product]
+            parts[product] = closure, recorded_settings(job, scene, closure, product)
+        return parts[product]
 
     def depends_on(
         self, scene: Scene, whole: Plan, product: ProductKey, files: Sequence[InputRecord]

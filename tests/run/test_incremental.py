@@ -6,8 +6,10 @@ import json
 import os
 import signal
 import sqlite3
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +27,7 @@ from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import RunStatus, Store, Verdict
 from lidarops.cli import app
 from lidarops.records import SceneOutcome, day_of
-from lidarops.run import executor
+from lidarops.run import executor, staleness
 from lidarops.run.archive import (
     Options,
     Selection,
@@ -66,6 +68,34 @@ def test_a_run_with_nothing_to_do_writes_nothing(archive: Archive) -> None:
     after = {path: path.stat().st_mtime_ns for path in (archive.folder / "out").rglob("*")}
     folders = {path for path in after if path.is_dir() or path.suffix == ".nc"}
     assert {path: after[path] for path in folders} == {path: stamps[path] for path in folders}
+
+
+def test_threads_that_judge_different_scenes_share_no_part_of_a_plan(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the next days are judged while the scenes of others end."""
+    campaign, product = archive.write(), ("signal", "photon")
+    within, done = threading.Event(), threading.Event()
+    settings = staleness.recorded_settings
+
+    def interrupted(*words: Any) -> dict[str, Any]:
+        if threading.current_thread() is not threading.main_thread():
+            within.set()
+            assert done.wait(60)
+        return settings(*words)
+
+    with Store(campaign.catalog_url, campaign.name) as store, ThreadPoolExecutor(1) as thread:
+        judge = Judge(campaign, store)
+        first, second = judge.days(sorted(judge.signatures())).judgements[:2]
+        monkeypatch.setattr(staleness, "recorded_settings", interrupted)
+        ahead = thread.submit(judge.plan_and_settings, first.scene, first.plan, product)
+        assert within.wait(60)
+        judge.plan_and_settings(second.scene, second.plan, product)
+        done.set()
+        assert ahead.result()[0].scene == first.scene.id
+        assert judge.plan_and_settings(second.scene, second.plan, product)[0].scene == (
+            second.scene.id
+        )
 
 
 def _dead_time(archive: Archive) -> None:
