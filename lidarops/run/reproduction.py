@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
+import xarray as xr
 
 from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.store import Store
@@ -292,25 +293,24 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
 
 def _compared(before: Path, after: Path) -> list[Difference]:
     """Return the differences between two NetCDF files whose bytes differ."""
-    old, new = (_content(file) for file in (before, after))
-    found = [
-        Difference(what, name, _words(old.get((what, name)), new.get((what, name))))
-        for what, name in sorted({*old, *new})
-    ]
+    old, new = (opened_product(file, decode_cf=False) for file in (before, after))
     same = Difference("bytes", before.name, "the same content, stored in other bytes")
-    return [difference for difference in found if difference.problem] or [same]
+    with old as recorded, new as made:
+        return list(_differences(recorded, made)) or [same]
 
 
-def _content(file: Path) -> dict[tuple[str, str], Any]:
-    """Return the attributes and the values of a file by what they are, and name."""
-    with opened_product(file, decode_cf=False) as product:
-        owners = {"": product.attrs, **{str(n): v.attrs for n, v in product.variables.items()}}
-        attributes = {
-            ("attribute", f"{owner}:{name}"): value
-            for owner, own in owners.items()
-            for name, value in own.items()
-        }
-        return attributes | {("variable", str(n)): v.values for n, v in product.variables.items()}
+def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[Difference]:
+    """Yield how a file differs from what it was; one variable of each is in memory at a time."""
+    for name in ["", *sorted(map(str, {*old.variables, *new.variables}))]:
+        before, after = (file.variables.get(name) if name else file for file in (old, new))
+        if before is None or after is None:
+            yield Difference("variable", name, "is new" if before is None else "no longer exists")
+            continue
+        for key in sorted({*before.attrs, *after.attrs}):
+            if words := _words(before.attrs.get(key), after.attrs.get(key)):
+                yield Difference("attribute", f"{name}:{key}", words)
+        if name and (words := _words(before.values, after.values)):
+            yield Difference("variable", name, words)
 
 
 def _words(before: Any, after: Any) -> str:

@@ -243,6 +243,15 @@ def test_a_tampered_value_is_detected(campaign: Campaign, tmp_path: Path):
     assert "1 of" in explain_difference(result)
 
 
+def test_variables_that_come_and_go_are_named(campaign: Campaign, tmp_path: Path):
+    copied = Path(shutil.copy(of_kind(campaign, "homogeneous"), tmp_path / "renamed.nc"))
+    with netCDF4.Dataset(copied, "a") as file:
+        file.renameVariable("background", "sky")
+    text = explain_difference(reproduce_product(copied, archive=campaign.archive))
+    assert "variable background: is new\n" in text
+    assert "variable sky: no longer exists" in text
+
+
 def test_the_same_content_in_other_bytes_is_reported(campaign: Campaign, tmp_path: Path):
     source = of_kind(campaign, "homogeneous")
     copied = Path(shutil.copy(source, tmp_path / "same.nc"))
