@@ -8,6 +8,8 @@ from pathlib import Path
 
 import python_api
 
+import lidarops
+
 
 def test_every_public_name_is_used_or_belongs_to_the_api(repository: Path):
     used: set[str] = set()
@@ -38,3 +40,8 @@ def test_every_public_name_is_used_or_belongs_to_the_api(repository: Path):
     }
     unused = {name: str(path) for name, path in defined.items() if name not in used}
     assert {name: path for name, path in unused.items() if name not in offered | entry_points} == {}
+
+
+def test_public_functions_are_listed():
+    assert dir(lidarops) == sorted(lidarops.__all__)
+    assert all(getattr(lidarops, name) is not None for name in dir(lidarops))

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 72_700,
-    "lines of code alone": 47_430,
+    "lines": 72_734,
+    "lines of code alone": 47_452,
     "modules": 288,
     "dataclasses": 282,
     "lines of dataclasses": 7_110,
@@ -28,8 +28,8 @@ MOST = {
     "lines of the largest package": 6_210,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 66, "functions": 616, "changes": 218},
-    "elastic": {"modules": 75, "functions": 760, "changes": 235},
+    "homogeneous": {"modules": 66, "functions": 617, "changes": 219},
+    "elastic": {"modules": 75, "functions": 761, "changes": 236},
 }
 
 
