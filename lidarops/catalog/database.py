@@ -218,13 +218,16 @@ class Database:
         return self._url.set(database=file.absolute().as_uri(), query={"uri": "true", **query})
 
     def _settle_schema(self, connection: sa.Connection) -> None:
-        inspector = sa.inspect(connection)
-        if not inspector.has_table(SCHEMA.name):
+        newest = sa.select(sa.func.max(SCHEMA.c.version))
+        known = sa.inspect(connection).has_table(SCHEMA.name)
+        version = connection.scalar(newest) if known else None
+        # Also where a process was killed before it had written the version.
+        if version is None:
             if not self._create:
                 raise self._absent()
             METADATA.create_all(connection)
             connection.execute(self.upsert(SCHEMA, replacing=False), {"version": SCHEMA_VERSION})
-        version = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+            version = connection.scalar(newest)
         if version == _UPGRADED:
             for table in REMADE:
                 connection.execute(sa.text(f"DROP TABLE IF EXISTS {table}"))

@@ -107,6 +107,17 @@ def test_a_catalog_of_another_schema_version_is_refused(
         Store(url, "test")
 
 
+def test_a_catalog_whose_making_was_killed_is_made(url: str, tmp_path: Path) -> None:
+    Store(url, "test").close()
+    with sqlite3.connect(tmp_path / "catalog.sqlite") as connection:
+        connection.executescript("delete from schema_version; drop table verdict")
+    with pytest.raises(CatalogError, match="there is no catalog yet"):
+        Store(url, "test", create=False)
+    with Store(url, "test") as store:
+        assert store.verdicts() == {}
+    Store(url, "test", create=False).close()
+
+
 def test_a_catalog_of_the_version_before_is_upgraded(url: str, tmp_path: Path) -> None:
     started = datetime(2026, 3, 1, tzinfo=UTC)
     run = Run("before", started, None, RunStatus.RUNNING, "me", "0", "0", "", "")
