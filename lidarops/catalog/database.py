@@ -247,7 +247,7 @@ class Database:
             "there is no catalog yet", file=self.place, remedy="run lidarops reprocess first"
         )
 
-    def _other_version(self, version: int | None) -> CatalogError:
+    def _other_version(self, version: int) -> CatalogError:
         return CatalogError(
             f"is a catalog of schema version {version}; this lidarops needs {SCHEMA_VERSION}",
             file=self.place,

@@ -159,15 +159,14 @@ def _groups(record: RunRecord) -> list[Group]:
     signals = [group for group in groups if not is_retrieved(group.kind)]
     quicklooks = [next(first) for _, first in groupby(signals, lambda group: group.instrument)]
     turns: Counter[tuple[str, str]] = Counter()
-
-    def place(group: Group) -> tuple[Any, ...]:
+    placed = []
+    for group in sorted(groups, key=lambda group: group.channel):
         stage = 1 if is_retrieved(group.kind) else 0 if group in quicklooks else 2
         turns[group.kind, group.instrument] += 1
-        turn = turns[group.kind, group.instrument]
-        kind = rank_of(group.kind), group.kind
-        return bool(group.lacking), stage, kind, turn, group.instrument
-
-    return sorted(sorted(groups, key=lambda group: group.channel), key=place)
+        turn = turns[group.kind, group.instrument], group.instrument
+        place = bool(group.lacking), stage, rank_of(group.kind), group.kind, turn
+        placed.append((place, group))
+    return [group for _, group in sorted(placed, key=lambda pair: pair[0])]
 
 
 def _shares(record: RunRecord) -> Mapping[str, Mapping[str, float]]:

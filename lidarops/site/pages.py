@@ -205,12 +205,9 @@ def _order(entry: Entry) -> tuple[Any, ...]:
 
 def _cell(share: float | None) -> dict[str, Any]:
     """Return what a day or month shows: the share of usable profiles, and its grade."""
-    words = "" if share is None else _short(share)
-    return {
-        "share": words,
-        "of": " of profiles usable" * bool(words),
-        "grade": ShareGrade.of(share),
-    }
+    if share is None:
+        return {"share": "", "of": "", "grade": ShareGrade.UNKNOWN}
+    return {"share": _short(share), "of": " of profiles usable", "grade": ShareGrade.of(share)}
 
 
 def _short(share: float) -> str:
