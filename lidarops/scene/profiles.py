@@ -325,8 +325,6 @@ class ProductStream(ABC):
     on time.
     """
 
-    reads: bool = True
-    """Whether it needs the counts of the profiles."""
     notes: Sequence[str] = ()
     """What the report of the run states of it."""
 
@@ -377,24 +375,19 @@ def chunks(
         Number of profiles of a chunk, unless a product needs more together.
     """
     archive, count = source.archive, source.archive.sizes["time"]
-    streams = list(streams)
-    reads = not streams or any(stream.reads for stream in streams)
-    size = profiles if reads else count
     limiting = [rows for stream in streams if (rows := stream.ends()) is not None]
     allowed = functools.reduce(np.intersect1d, limiting, np.arange(count + 1))
     if not allowed.size or allowed[-1] < count:
         allowed = np.append(allowed, count)
-    if reads:
-        known = tuple(f"{name}_" for name in (*GEOMETRY, *channels))
-        archive = archive[[name for name in archive.variables if f"{name}_".startswith(known)]]
+    known = tuple(f"{name}_" for name in (*GEOMETRY, *channels))
+    archive = archive[[name for name in archive.variables if f"{name}_".startswith(known)]]
     first = 0
     while first < count:
-        place = int(np.searchsorted(allowed, first + size, side="right")) - 1
+        place = int(np.searchsorted(allowed, first + profiles, side="right")) - 1
         # More than the size where no cut is allowed within it.
         past = int(allowed[place]) if place >= 0 else 0
         if past <= first:
             past = int(allowed[np.searchsorted(allowed, first, side="right")])
         chunk = slice(first, past)
-        counts = archive.isel(time=chunk)
-        yield Chunk(counts.load() if reads else counts, chunk)
+        yield Chunk(archive.isel(time=chunk).load(), chunk)
         first = past

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import Final, cast
 
@@ -15,7 +15,6 @@ from lidarops.errors import SceneError
 from lidarops.products.raman import RamanProductSettings
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import file_channels
-from lidarops.retrieve.background.detectable_light import detect_light, spaced_indices
 from lidarops.retrieve.raman import labeled
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
@@ -25,7 +24,6 @@ from lidarops.retrieve.raman.scattering import (
 )
 from lidarops.retrieve.raman.signals import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, member_channel
 from lidarops.scene.choices import (
@@ -35,27 +33,11 @@ from lidarops.scene.choices import (
     with_low_signal_to_noise,
     with_methods,
 )
-from lidarops.scene.profiles import (
-    Averages,
-    ChannelSignal,
-    Chunk,
-    ProductStream,
-    in_one_batch,
-)
+from lidarops.scene.profiles import Averages, ChannelSignal, Chunk, ProductStream
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
 Case = ChannelCase[RamanProductSettings]
-
-LOOKED_AT: Final = 64
-"""Profiles of a scene that are looked at for a Raman signal."""
-NEAREST: Final = 500.0
-FARTHEST: Final = 3000.0
-"""m; where the Raman signal is looked for: beyond most overlap, before it gets weak."""
-LEAST_SIGNAL: Final = 4.0
-"""Standard errors of the signal of a profile. In 64 profiles of noise, the largest exceeds this in
-0.2 % of scenes."""
-
 
 STANDARD_SLOPE_ERROR: Final = 1.6e-5
 """m-1, of the derivative of the logarithm of the density of the standard atmosphere: root mean
@@ -197,12 +179,6 @@ def _needs(case: Case) -> Entries:
 _FROM_COMPANIONS: Final = ("read", "noise", "glue")
 
 
-def _stream(settings: RamanPlan, signal: ChannelSignal) -> ProductStream:
-    """Return the product, whose averages are retrieved as they become complete."""
-    dark = _without_signal(settings.raman, signal)
-    return _Dark(settings, signal, dark) if dark else _Retrieval(settings, signal)
-
-
 def _held(settings: RamanPlan, work: Workload) -> float:
     """Return the bytes of the averages that are completed together, and of their solution."""
     names = (work.channel, *settings.raman.channels)
@@ -294,55 +270,4 @@ class _Retrieval(ProductStream):
         return labeled.WaterVapour(averages, metres, constant, error)
 
 
-def _without_signal(settings: RetrievalSettings, signal: ChannelSignal) -> str:
-    """Return in words that no profile that is looked at has a Raman signal; empty if one has."""
-    archive, profiles = signal.source.archive, signal.channels[settings.nitrogen].profiles
-    places = spaced_indices(archive.sizes["time"], LOOKED_AT)
-    seen, most = 0, 0.0
-    for place in places:
-        power, variance, quality, length = (
-            profiles.of(archive.isel(time=[place]))[name].to_numpy()
-            for name in ("power", "variance", "quality", CORRELATION_LENGTH)
-        )
-        light = detect_light(power, variance * length, quality, profiles.range, NEAREST, FARTHEST)
-        seen, most = seen + light.profiles, max(most, light.significance)
-    if not seen or most >= LEAST_SIGNAL:
-        return ""
-    return (
-        f"no signal of {settings.nitrogen} from {NEAREST:g} to {FARTHEST:g} m in {seen}"
-        f" profiles looked at: at most {most:.1f} standard errors (limit {LEAST_SIGNAL:g});"
-        " nothing is retrieved"
-    )
-
-
-class _Dark(ProductStream):
-    """A product without values, whose rows are the averages of a scene without Raman signal."""
-
-    reads = False
-
-    def __init__(self, settings: RamanPlan, signal: ChannelSignal, reason: str) -> None:
-        self._settings, self._signal, self._reason = settings, signal, reason
-        self.notes = [f"raman of {signal.channel}: {reason}"]
-
-    def add(self, chunk: Chunk) -> Iterable[xr.Dataset]:  # noqa: ARG002
-        """Take nothing of the profiles."""
-        return ()
-
-    def results(self) -> Iterator[xr.Dataset]:
-        """Yield the empty product."""
-        signal, settings = self._signal, self._settings
-        geometry, seconds = signal.source.geometry, settings.average.seconds
-        empty = labeled.without_signal(
-            Averages([signal.profiles], geometry, signal.shots, seconds).times,
-            signal.shots.compute(),
-            signal.profiles.range,
-            signal.source.pointing,
-            molecules=signal.molecules,
-            station_altitude=signal.source.station_altitude,
-            settings=_assumed(settings.raman, signal),
-        )
-        product = with_methods(empty, signal.molecules, known_shape=settings.raman.known_shape)
-        return in_one_batch(product.assign_attrs(steps=f"raman: {self._reason}"))
-
-
-RETRIEVAL: Final = Retrieval(settings=RamanPlan, needs=_needs, stream=_stream, held=_held)
+RETRIEVAL: Final = Retrieval(settings=RamanPlan, needs=_needs, stream=_Retrieval, held=_held)

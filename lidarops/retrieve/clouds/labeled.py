@@ -23,7 +23,12 @@ from lidarops.retrieve.clouds import layers as _layers
 from lidarops.retrieve.clouds import outlying_bins as _outlying_bins
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common.arrays import Array, Booleans
-from lidarops.retrieve.signal.labeled import actual_noise, baseline_error, counts_per_power
+from lidarops.retrieve.signal.labeled import (
+    ActualNoise,
+    actual_noise,
+    baseline_error,
+    counts_per_power,
+)
 
 _CARRIED: Final = WITHHELD | int(Quality.PILE_UP | Quality.SINGLE_RECORD)
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
@@ -124,6 +129,8 @@ class MeanProfiles:
         NaN where it is not known.
     contrast : float
         Least contrast of a cloud (`lidarops.retrieve.signal.averaging.cloud_contrast`).
+    noise : ActualNoise, optional
+        Of the averages, where it is known already.
     """
 
     def __init__(
@@ -133,6 +140,7 @@ class MeanProfiles:
         air: Air,
         overlap: Array | None,
         contrast: float,
+        noise: ActualNoise | None = None,
     ) -> None:
         self.distance, self.air, self.contrast = distance, air, contrast
         self.overlap = np.ones(distance.size) if overlap is None else overlap
@@ -140,7 +148,7 @@ class MeanProfiles:
         quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
         self.quality = quality | partial.astype(np.int32)
         self.raw = averages["power"].to_numpy()
-        noise = actual_noise(averages)
+        noise = noise or actual_noise(averages)
         length = noise.correlation_length
         self.noise, self.correlation_length = noise.variance, length
         shots = averages["shots"].to_numpy()

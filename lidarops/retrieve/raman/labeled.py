@@ -37,7 +37,6 @@ from lidarops.retrieve.raman.signals import (
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import (
-    CORRELATION_LENGTH,
     actual_noise,
     analog_alone,
     counts_per_power,
@@ -86,7 +85,7 @@ class _Channel:
         hidden = (quality & np.int32(_WITHHELD)) != 0
         self.quality = quality[:, :-1] | quality[:, 1:] if share else quality
         self._power = np.where(hidden, np.nan, averages["power"].to_numpy())
-        noise = actual_noise(averages)
+        self.noise = noise = actual_noise(averages)
         self._variance = noise.variance * noise.correlation_length[:, np.newaxis]
         counts = counts_per_power(averages, averages["shots"].to_numpy())
         scale = noise.excess * noise.correlation_length
@@ -226,7 +225,7 @@ def retrieve(
     variables = {
         **_variables(result, cells, air, of_raman, settings, stated),
         **_clouds.window_variables(result.reference, reference, station_altitude, climb),
-        **_cloud_variables(channels[0].averages, settings, reference, cells, result, sky),
+        **_cloud_variables(channels[0], settings, reference, cells, result, sky),
         "background": ("time", of_elastic.background),
         "background_standard_error": ("time", of_elastic.background_standard_error),
         "profiles": elastic["profiles"],
@@ -241,69 +240,6 @@ def retrieve(
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
     product = xr.Dataset(variables, coords={**coords, "range": ("range", cells.range)})
     return without_analog_background(product, elastic)
-
-
-def without_signal(
-    times: xr.Dataset,
-    shots: xr.DataArray,
-    distance: Array,
-    pointing: Mapping[str, float],
-    *,
-    molecules: MolecularProfile,
-    station_altitude: float,
-    settings: RamanSettings,
-) -> xr.Dataset:
-    """Return the product of profiles in which a look found no Raman signal.
-
-    Parameters
-    ----------
-    times : xr.Dataset
-        ``time`` and ``time_bnds`` of the means.
-    shots : xr.DataArray, (time,)
-        Of all profiles, at their times.
-    distance : (range,) float
-        m, of the elastic channel.
-    pointing : mapping of str to float
-        Scalar coordinates in degree, ``zenith_angle`` among them.
-    molecules, station_altitude, settings
-        As for `retrieve`.
-
-    Returns
-    -------
-    xr.Dataset
-        As of `retrieve`, without values and water vapour; WEAK_SIGNAL everywhere.
-    """
-    starts = times["time_bnds"].to_numpy()[:, 0]
-    group = np.searchsorted(starts, shots["time"].to_numpy(), side="right") - 1
-    plane, shape = ("time", "range"), (starts.size, distance.size)
-    empty = xr.Dataset(
-        {
-            "power": (plane, np.full(shape, np.nan)),
-            "variance": (plane, np.full(shape, np.nan)),
-            "quality": (plane, np.zeros(shape, np.int32)),
-            CORRELATION_LENGTH: ("time", np.ones(starts.size)),
-            "profiles": ("time", np.bincount(group, minlength=starts.size).astype(np.int32)),
-            "shots": (
-                "time",
-                np.bincount(group, shots.to_numpy(), minlength=starts.size).astype(np.int32),
-            ),
-        },
-        coords={**times.coords, "range": ("range", distance), **pointing},
-    )
-    product = retrieve(
-        empty,
-        empty,
-        molecules=molecules,
-        station_altitude=station_altitude,
-        settings=replace(settings, known_shape=False),
-    )
-    missing = RamanQuality.WEAK_SIGNAL | RamanQuality.NO_REFERENCE | RamanQuality.NO_LIDAR_RATIO
-    unknown = xr.full_like(product["overlap"], np.nan)
-    return product.assign(
-        quality_flag=xr.full_like(product["quality_flag"], np.int32(missing)),
-        overlap=unknown,
-        overlap_standard_error=unknown,
-    )
 
 
 def _common_bins(
@@ -427,7 +363,7 @@ class _Sky:
 
 
 def _cloud_variables(
-    averages: xr.Dataset,
+    elastic: _Channel,
     settings: RamanSettings,
     reference: _clouds.Reference,
     cells: Cells,
@@ -436,10 +372,11 @@ def _cloud_variables(
 ) -> dict[str, Any]:
     """Return the clouds of the elastic signal, and the quality with their bits."""
     both = ("time", "range")
+    averages = elastic.averages
     distance = averages["range"].to_numpy()
     air = _clouds.air_along(sky.molecules, sky.altitude(distance), distance, settings.wavelength)
     contrast = cloud_contrast(settings.wavelength)
-    means = _clouds.MeanProfiles(averages, distance, air, sky.overlap, contrast)
+    means = _clouds.MeanProfiles(averages, distance, air, sky.overlap, contrast, elastic.noise)
     _, clouds = _clouds.signal_and_clouds(
         means,
         averages,
