@@ -1,18 +1,21 @@
-"""Opens products as pieces, and joins them along time and their own variables along products."""
+"""Joins products along time, and what a product states as a whole along products."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
+from dask.array import map_blocks
+from dask.base import tokenize
+from numpy.typing import NDArray
 
-from lidarops.aggregate.facts import UNSHARED, Facts, coordinate_names
+from lidarops.aggregate.facts import UNSHARED, Header, coordinate_names
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
-from lidarops.errors import ProductError
-from lidarops.netcdf.read import reading
+from lidarops.netcdf.read import stored_values
 from lidarops.netcdf.variables import attributes
 from lidarops.system.files import within
 
@@ -35,95 +38,147 @@ def shared_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     }
 
 
-def open_piece(root: Path, facts: Facts, *, dask: bool) -> xr.Dataset:
-    """Open a product, with the dimension ``product`` for variables of the whole product.
+class Source(NamedTuple):
+    """Where the values of a product are."""
+
+    file: Path
+    id: str
+
+    def read(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
+        """Return values as stored; see `lidarops.netcdf.read.stored_values`."""
+        return stored_values(self.file, self.id, name, rows)
+
+
+class Part(NamedTuple):
+    """One of the products that are joined."""
+
+    header: Header
+    source: Source
+    attributes: Mapping[str, Any]
+    times: NDArray[np.float64]
+    """s since 1970, of each profile."""
+
+    @classmethod
+    def of(cls, product: xr.Dataset, header: Header, root: Path) -> Part:
+        """Return the part of an open product, not decoded, of a root."""
+        source = Source(within(root, header.path), header.id)
+        return cls(header, source, product.attrs, product["time"].values)
+
+
+def pattern_of(product: xr.Dataset, header: Header) -> xr.Dataset:
+    """Return the variables of joined products, by the first of them.
 
     Parameters
     ----------
-    root : path
-        Folder that the path of the product is relative to.
-    facts : Facts
-    dask : bool
-        Whether values become dask arrays; without it, each read costs less.
+    product : xr.Dataset
+        Open, not decoded.
+    header : Header
 
     Returns
     -------
     xr.Dataset
-        Lazy, not decoded, with ``product`` (product,) and ``product_index`` (time,). The caller
-        closes it.
-
-    Raises
-    ------
-    ProductError
-        If the file cannot be read, or has changed since its facts were read.
+        Not decoded, in memory, with ``product`` (product,) and ``product_index`` (time,).
+        Variables of the whole product have the dimension ``product``. Only coordinates that do not
+        change with time have values.
     """
-    chunks: dict[str, int] | None = {} if dask else None
-    file = within(root, facts.path)
-    with reading(file):
-        opened = xr.open_dataset(
-            file, engine="netcdf4", chunks=chunks, drop_variables=list(UNSHARED), decode_cf=False
-        )
-    try:
-        facts.refuse_changed(opened)
-    except ProductError:
-        opened.close()
-        raise
-    static = coordinate_names(facts.kind)
-    variables = {}
-    for name, variable in opened.variables.items():
-        whole = "time" not in variable.dims and name not in static
-        variables[name] = variable.expand_dims("product") if whole else variable
-    index = np.zeros(facts.profiles, np.int32)
-    mode = facts.counting
-    about = {row.name: attributes(row, mode=mode) for row in (PRODUCT, PRODUCT_INDEX)}
+    static = coordinate_names(header.kind)
+    variables: dict[Any, xr.Variable] = {}
+    for name, variable in product.variables.items():
+        if name in UNSHARED:
+            continue
+        if name in static and "time" not in variable.dims:
+            variables[name] = variable.load()
+            continue
+        whole = "time" not in variable.dims
+        dims = (PRODUCT.name, *variable.dims) if whole else variable.dims
+        shape = (1, *variable.shape) if whole else variable.shape
+        hollow = np.broadcast_to(np.zeros((), variable.dtype), shape)
+        variables[name] = xr.Variable(dims, hollow, variable.attrs, variable.encoding)
+    about = {row.name: attributes(row, mode=header.counting) for row in (PRODUCT, PRODUCT_INDEX)}
     about[PRODUCT.name].pop("_Encoding")
+    index = np.zeros(header.profiles, np.int32)
     own = {
-        PRODUCT.name: (PRODUCT.dims, np.array([facts.id]), about[PRODUCT.name]),
+        PRODUCT.name: (PRODUCT.dims, np.array([header.id]), about[PRODUCT.name]),
         PRODUCT_INDEX.name: (PRODUCT_INDEX.dims, index, about[PRODUCT_INDEX.name]),
     }
-    piece = xr.Dataset(variables, coords=own, attrs=opened.attrs)
-    piece.set_close(opened.close)
-    return piece
+    return xr.Dataset(variables, coords=own, attrs=product.attrs)
 
 
-def join(pieces: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Join datasets along time and along products.
+def join(parts: Sequence[Part], pattern: xr.Dataset) -> xr.Dataset:
+    """Join products of one group along time and along products.
 
     Parameters
     ----------
-    pieces : sequence of xr.Dataset
-        Of one group, each with ``product`` (product,) and ``product_index`` (time,). Variables
-        with neither dimension must be equal in all.
+    parts : sequence of Part
+    pattern : xr.Dataset
+        From `pattern_of` the first.
 
     Returns
     -------
     xr.Dataset
-        Sorted by time.
+        Not decoded, sorted by time, on dask arrays of one chunk for each product.
     """
-    joined = pieces[0] if len(pieces) == 1 else _joined(pieces)
-    times = joined["time"].values
+    lengths = [part.header.profiles for part in parts]
+    known = {
+        "time": np.concatenate([part.times for part in parts]),
+        PRODUCT.name: np.array([part.header.id for part in parts]),
+        PRODUCT_INDEX.name: np.repeat(np.arange(len(parts), dtype=np.int32), lengths),
+    }
+    rows = {"time": tuple(lengths), PRODUCT.name: (1,) * len(parts)}
+    sources = tuple(part.source for part in parts)
+    variables = {
+        name: xr.Variable(variable.dims, known[name], variable.attrs, variable.encoding)
+        if name in known
+        else _on_dask(str(name), variable, rows, sources)
+        for name, variable in pattern.variables.items()
+    }
+    coordinates = {name: variables.pop(name) for name in pattern.coords}
+    shared = shared_attributes([part.attributes for part in parts])
+    return sorted_by_time(xr.Dataset(variables, coords=coordinates, attrs=shared))
+
+
+def sorted_by_time(data: xr.Dataset) -> xr.Dataset:
+    """Return data in the order of time."""
+    times = data["time"].values
     if (times[1:] < times[:-1]).any():
-        joined = joined.isel(time=np.argsort(times, kind="stable"))
-    return joined
+        return data.isel(time=np.argsort(times, kind="stable"))
+    return data
 
 
-def _joined(pieces: Sequence[xr.Dataset]) -> xr.Dataset:
-    starts = np.cumsum([0, *(piece.sizes["product"] for piece in pieces[:-1])])
-    first = pieces[0]
-    variables = {}
-    for name, variable in first.variables.items():
-        parts = [piece.variables[name].to_base_variable() for piece in pieces]
-        if name == PRODUCT_INDEX.name:
-            # Each piece counts its own products from 0.
-            parts = [part + np.int32(start) for part, start in zip(parts, starts, strict=True)]
-            parts[0].attrs = variable.attrs
-        dim = next((dim for dim in ("time", PRODUCT.name) if dim in variable.dims), None)
-        variables[name] = variable if dim is None else _concat(parts, dim)
-    coordinates = {name: variables.pop(name) for name in first.coords}
-    shared = shared_attributes([piece.attrs for piece in pieces])
-    return xr.Dataset(variables, coords=coordinates, attrs=shared)
+def _on_dask(
+    name: str,
+    variable: xr.Variable,
+    rows: Mapping[Any, tuple[int, ...]],
+    sources: tuple[Source, ...],
+) -> xr.Variable:
+    """Return a variable of all products, of which one is read at a time."""
+    along = next((dim for dim in variable.dims if dim in rows), None)
+    if along is None:
+        return variable
+    blocks = _Blocks(name, variable.dims.index(along), along == PRODUCT.name, sources)
+    data = map_blocks(  # type: ignore[no-untyped-call]
+        blocks,
+        name=f"{name}-{tokenize(sources, name)}",
+        chunks=tuple(
+            rows.get(dim, (size,)) for dim, size in zip(variable.dims, variable.shape, strict=True)
+        ),
+        dtype=variable.dtype,
+        meta=np.empty((0,) * variable.ndim, variable.dtype),
+    )
+    return xr.Variable(variable.dims, data, variable.attrs, variable.encoding)
 
 
-def _concat(parts: Sequence[xr.Variable], dim: str) -> xr.Variable:
-    joined: xr.Variable = xr.Variable.concat(parts, dim)  # type: ignore[no-untyped-call]
-    return joined
+@dataclass(frozen=True, slots=True)
+class _Blocks:
+    """Reads a variable of one product after the other."""
+
+    name: str
+    axis: int
+    whole: bool
+    """Whether it is of the whole product, so that it has the further dimension `axis`."""
+    sources: tuple[Source, ...]
+
+    def __call__(self, block_id: tuple[int, ...]) -> NDArray[Any]:
+        """Return the values of a block."""
+        values = self.sources[block_id[self.axis]].read(self.name)
+        return np.expand_dims(values, self.axis) if self.whole else values

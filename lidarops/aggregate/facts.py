@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -20,7 +20,7 @@ from lidarops.aggregate.selection import EVERYTHING, NAMES, ProductSelection
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import RECORDERS
-from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.read import changed, opened_product
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import GLUED, DetectionMode, Verdicts
@@ -37,51 +37,27 @@ _SCHEMA_ATTRIBUTES: Final = ("units", "standard_name", "flag_masks", "flag_meani
 _GRID_DIGITS: Final = 16
 
 
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """Facts of one product."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """What a product states of itself."""
 
     path: str
     """Relative to the folder of the aggregate's products, with forward slashes."""
     id: str
     kind: str
-    campaign: str
     station: str
     instrument: str
     channel: str
     mode: str
     """analog, photon, or glued of both."""
-    wavelength: float
-    """m; NaN if unknown."""
     start: datetime
     """Start of the first profile."""
     stop: datetime
-    latitude: float
-    """degree, of the station; mean over the stations of a network."""
-    longitude: float
-    altitude: float
-    """m above the geoid, of the station or mean over the network."""
-    sha256: str
-    size: int
     profiles: int
-    values: int
-    """Number of values of ``quality_flag``."""
-    usable: int
-    """Number of values that no bit rejects."""
-    unflagged: int
-    """Number of values without any bit."""
     grid: str
     """Digest of what must be equal in products that are joined along time."""
-    code_version: str
     recorder: str = ""
     """What digitised its channels; empty where the raw files name none. Part of the grid."""
-    flagged: Mapping[str, int] = field(default_factory=dict)
-    """Quality bit name -> number of values that carry it, if any."""
-
-    @property
-    def verdicts(self) -> Verdicts:
-        """Numbers of good values, of those to be used with care, and of rejected ones."""
-        return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
 
     @property
     def counting(self) -> DetectionMode:
@@ -93,23 +69,52 @@ class Facts:
         """Group of products that this one can be joined with."""
         return Group(*(getattr(self, name) for name in Group._fields))
 
-    def refuse_changed(self, product: xr.Dataset) -> None:
-        """Refuse an open product that is no longer the one of these facts.
+    @contextmanager
+    def opened(self, root: Path) -> Iterator[xr.Dataset]:
+        """Open the product of this header, of a root, without decoding.
 
         Raises
         ------
         ProductError
-            If its id is another one.
+            If it cannot be read, or is another product now.
         """
-        if product.attrs.get("id") != self.id:
-            raise ProductError("changed while it was read", file=self.path, remedy="run again")
-
-    @contextmanager
-    def opened(self, root: Path) -> Iterator[xr.Dataset]:
-        """Open the product of these facts, of a root, without decoding; see `refuse_changed`."""
-        with _opened(within(root, self.path)) as product:
-            self.refuse_changed(product)
+        with opened_undecoded(root, self.path) as product:
+            if product.attrs.get("id") != self.id:
+                raise changed(self.path)
             yield product
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts(Header):
+    """Facts of one product, with numbers of its values."""
+
+    campaign: str
+    wavelength: float
+    """m; NaN if unknown."""
+    latitude: float
+    """degree, of the station; mean over the stations of a network."""
+    longitude: float
+    altitude: float
+    """m above the geoid, of the station or mean over the network."""
+    sha256: str
+    size: int
+    values: int
+    """Number of values of ``quality_flag``."""
+    usable: int
+    """Number of values that no bit rejects."""
+    unflagged: int
+    """Number of values without any bit."""
+    code_version: str
+    flagged: Mapping[str, int] = field(default_factory=dict)
+    """Quality bit name -> number of values that carry it, if any."""
+
+    @property
+    def verdicts(self) -> Verdicts:
+        """Numbers of good values, of those to be used with care, and of rejected ones."""
+        return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
+
+
+_Stated = TypeVar("_Stated", bound=Header)
 
 
 class Group(NamedTuple):
@@ -193,83 +198,78 @@ def read_product_facts(
     """
     for path in paths:
         try:
-            facts = _selected_facts(root, path, selection)
+            with opened_undecoded(root, path) as product:
+                header = read_header(product, path, selection)
+                if header is None:
+                    continue
+                facts = _facts(product, within(root, path), header)
         except ProductError as error:
             yield Refused(path, error.problem)
         else:
-            yield from facts
+            yield facts
 
 
-def read_facts(root: Path, path: str) -> Facts:
-    """Read the facts of one product.
+def read_header(product: xr.Dataset, path: str, selection: ProductSelection) -> Header | None:
+    """Return what an open product states of itself; None where it is not selected.
 
     Parameters
     ----------
-    root : path
+    product : xr.Dataset
+        From `opened_undecoded`.
     path : str
-        Relative to `root`.
+    selection : ProductSelection
 
     Raises
     ------
     ProductError
-        If the file leads out of `root`, cannot be read, or is not a product of lidarops.
+        If it is not a product of lidarops, or of an unknown kind.
     """
-    (facts,) = _selected_facts(root, path, EVERYTHING)
-    return facts
-
-
-def _selected_facts(root: Path, path: str, selection: ProductSelection) -> list[Facts]:
-    """Return the facts of a product, if it is selected."""
-    file = within(root, path)
-    with _opened(file) as product:
-        kind = _kind_of(product, file)
-        ends = (product.attrs[f"time_coverage_{end}"] for end in ("start", "end"))
-        start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in ends)
-        names = {name: product.attrs[f"lidarops_{name}"] for name in NAMES}
-        if selection.admits(names, start, stop):
-            return [_facts(product, file, path, kind, start, stop)]
-    return []
-
-
-def _facts(
-    product: xr.Dataset, file: Path, path: str, kind: str, start: datetime, stop: datetime
-) -> Facts:
+    kind = _kind_of(product, path)
     attributes = product.attrs
+    ends = (attributes[f"time_coverage_{end}"] for end in ("start", "end"))
+    start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in ends)
+    names = {name: attributes[f"lidarops_{name}"] for name in NAMES}
+    if not selection.admits(names, start, stop):
+        return None
+    return Header(
+        path=path,
+        id=attributes["id"],
+        mode=attributes["lidarops_detection_mode"],
+        start=start,
+        stop=stop,
+        profiles=product.sizes["time"],
+        grid=_grid_digest(product, kind),
+        recorder=attributes.get(RECORDERS, ""),
+        **names,
+    )
+
+
+def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
     flags = product[QUALITY_FLAG].values
-    bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
+    bits = stored_bits(product[QUALITY_FLAG].attrs, header.kind)
     rejecting = np.int32(rejecting_mask(bits))
     height = "station_altitude" if "station_altitude" in product else "altitude"
     return Facts(
-        path=path,
-        id=attributes["id"],
-        kind=kind,
-        campaign=attributes["lidarops_campaign"],
-        station=attributes["lidarops_station"],
-        instrument=attributes["lidarops_instrument"],
-        channel=attributes["lidarops_channel"],
-        mode=attributes["lidarops_detection_mode"],
+        **{stated.name: getattr(header, stated.name) for stated in fields(header)},
+        campaign=product.attrs["lidarops_campaign"],
         wavelength=_middle(product, "wavelength") * 1e-9,
-        start=start,
-        stop=stop,
         latitude=_middle(product, "latitude"),
         longitude=_middle(product, "longitude"),
         altitude=_middle(product, height),
         sha256=sha256_of(file),
         size=file.stat().st_size,
-        profiles=product.sizes["time"],
         values=flags.size,
         usable=flags.size - int(np.count_nonzero(flags & rejecting)),
         unflagged=flags.size - int(np.count_nonzero(flags)),
-        grid=_grid_digest(product, kind),
-        code_version=attributes["lidarops_code_version"],
-        recorder=attributes.get(RECORDERS, ""),
+        code_version=product.attrs["lidarops_code_version"],
         flagged={bit.word.upper(): n for bit, n in count_bits(flags, bits).items()},
     )
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[xr.Dataset]:
-    """Open a product without decoding; what lacks what every product has is refused."""
+def opened_undecoded(root: Path, path: str) -> Iterator[xr.Dataset]:
+    """Open a file of a root; one that lacks what every product has is refused."""
+    file = within(root, path)
     with opened_product(file, decode_cf=False) as product:
         try:
             yield product
@@ -278,7 +278,7 @@ def _opened(file: Path) -> Iterator[xr.Dataset]:
             raise ProductError(problem, file=file) from error
 
 
-def _kind_of(product: xr.Dataset, file: Path) -> str:
+def _kind_of(product: xr.Dataset, file: str) -> str:
     """Return the kind of a product.
 
     Raises
@@ -338,20 +338,20 @@ def plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def groups(products: Iterable[Facts]) -> dict[Group, list[Facts]]:
+def groups(products: Iterable[_Stated]) -> dict[Group, list[_Stated]]:
     """Group products that can be joined, each group sorted by time.
 
     Parameters
     ----------
-    products : iterable of Facts
+    products : iterable of Header or Facts
 
     Returns
     -------
-    dict of Group to list of Facts
+    dict of Group to list of Header or Facts
         Groups sorted by name, products by start, then path.
     """
-    by_group: dict[Group, list[Facts]] = {}
-    for product in sorted(products, key=lambda facts: (facts.start, facts.path)):
+    by_group: dict[Group, list[_Stated]] = {}
+    for product in sorted(products, key=lambda header: (header.start, header.path)):
         by_group.setdefault(product.group, []).append(product)
     return dict(sorted(by_group.items()))
 

@@ -1,7 +1,7 @@
 """The index of products: a Parquet file with one row per product.
 
-It is derived from the products and can be written again at any time. `open_products` checks the
-result of a query against the files.
+It is derived from the products and can be written again at any time. `open_products` opens the
+files that a query gives, and takes from them what they state.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import pandas as pd
 
 from lidarops.aggregate import need
 from lidarops.aggregate.facts import FOLDER, Facts
-from lidarops.aggregate.selection import ProductSelection, parse_selection
-from lidarops.errors import ProductError
+from lidarops.aggregate.selection import EVERYTHING, ProductSelection, parse_selection
+from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.kinds import flags_of, kinds
 from lidarops.system.files import write_atomically
 
@@ -198,8 +198,45 @@ def find_in_index(index: Path, selection: ProductSelection) -> tuple[Path, list[
     LidarOpsError
         If pyarrow is not installed.
     """
-    paths = _read(index, selection, ["path"]).column("path").to_pylist()
-    return _root(index), sorted(paths)
+    return _root(index), sorted(_sizes(index, selection))
+
+
+def without_unselected(root: Path, paths: Iterable[str], selection: ProductSelection) -> list[str]:
+    """Leave out the files of a folder that its index knows and a selection does not admit.
+
+    A file that is not in the index, has another size, or changed after the index was written may
+    be selected. So may all where there is no index that can be read.
+
+    Parameters
+    ----------
+    root : path
+    paths : iterable of str
+        Relative to `root`.
+    selection : ProductSelection
+
+    Returns
+    -------
+    list of str
+    """
+    index = root / FOLDER / INDEX
+    try:
+        written = index.stat().st_mtime_ns
+        sizes = _sizes(index, EVERYTHING)
+        selected = _sizes(index, selection)
+    except (*NO_FILE, LidarOpsError):
+        return list(paths)
+
+    def is_known(path: str) -> bool:
+        state = (root / path).lstat()
+        return sizes.get(path) == state.st_size and state.st_mtime_ns < written
+
+    return [path for path in paths if path in selected or not is_known(path)]
+
+
+def _sizes(index: Path, selection: ProductSelection) -> dict[str, int]:
+    """Return the sizes of selected products by path."""
+    table = _read(index, selection, ["path", "size"])
+    return dict(zip(*(table.column(name).to_pylist() for name in ("path", "size")), strict=True))
 
 
 def _root(index: Path) -> Path:

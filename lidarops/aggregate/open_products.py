@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import xarray as xr
 
-from lidarops.aggregate._join import join, open_piece, shared_attributes
+from lidarops.aggregate._join import Part, join, pattern_of
 from lidarops.aggregate.facts import (
-    Facts,
-    Refused,
+    Group,
     groups,
     list_products,
-    read_facts,
-    read_product_facts,
+    opened_undecoded,
+    read_header,
     refuse_duplicates,
     refuse_several,
 )
-from lidarops.aggregate.index import INDEX, find_in_index
+from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
 from lidarops.aggregate.selection import ProductSelection, parse_selection
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
-from lidarops.netcdf.read import reading
 from lidarops.netcdf.variables import USABLE
 
 CARE: Final = 1
@@ -43,6 +42,7 @@ def open_products(
     since: datetime | str | None = None,
     until: datetime | str | None = None,
     usable: int = CARE,
+    on_altitude: bool = False,
     version: str | None = None,
 ) -> xr.Dataset:
     """Open products of one instrument, kind, channel and grid as one dataset in order of time.
@@ -51,7 +51,8 @@ def open_products(
     ----------
     source : path or str, or iterable of these
         Product files; or a folder of products or of a campaign's output; or an index or a store
-        that `lidarops aggregate` wrote, which is much faster for a large archive.
+        that `lidarops aggregate` wrote. Of a folder with an index, only files that are selected
+        or have changed since are opened, which is much faster for a large archive.
     kind, channel, station, instrument : str, optional
         Select products.
     since, until : datetime or ISO 8601 text, optional
@@ -60,14 +61,17 @@ def open_products(
     usable : int
         Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN.
         ``quality_flag`` and ``usable`` are not masked.
+    on_altitude : bool
+        Whether the dimension ``range`` becomes ``altitude``, m above the geoid, so that values can
+        be selected by it. Beams must go up and not move, as those of vertical lidars.
     version : str, optional
         Id of a snapshot of a store; without it the newest.
 
     Returns
     -------
     xarray.Dataset
-        Decoded, with units as attributes, on dask arrays, with one chunk per product or smaller
-        unless it is of a store.
+        Decoded, with units as attributes, on dask arrays, with one chunk per product unless it is
+        of a store.
         ``product`` (product) is the id of each product, ``product_index`` (time) the index of the
         product of each profile. Variables of a whole product, such as the assumed lidar ratio,
         have the dimension ``product``.
@@ -79,7 +83,8 @@ def open_products(
         no product is found; if the products cannot be joined (the message lists instruments,
         kinds, channels and grids to choose from).
     RetrievalInputError
-        If `usable`, `kind` or a time is invalid, or `version` is given without a store.
+        If `usable`, `kind` or a time is invalid, `version` is given without a store, or beams are
+        not as `on_altitude` needs them.
 
     Examples
     --------
@@ -89,19 +94,28 @@ def open_products(
     selection = parse_selection(kind, channel, station, instrument, since, until)
     store = Path(source) if isinstance(source, str | os.PathLike) else None
     if store is not None and is_store(store):
-        return _masked(open_store(store, selection, version), usable)
+        return _usable_values(
+            open_store(store, selection, version), usable, on_altitude=on_altitude
+        )
     if version is not None:
         raise RetrievalInputError(
             "only stores have versions", field="version", remedy="give the folder of a store"
         )
-    root, all_products = _find(source, selection)
-    if not all_products:
+    root, paths = _candidates(source, selection)
+    parts, patterns = _read(root, paths, selection)
+    if not parts:
         raise ProductError("no product found", file=store, remedy=_remedy(store))
-    by_group = groups(all_products)
+    by_group = groups(part.header for part in parts)
     remedy = "select by kind, channel, station or instrument, or give the files of one grid"
     refuse_several([group.words for group in by_group], store, remedy)
-    (products,) = by_group.values()
-    return _masked(_opened(root, products), usable)
+    ((group, headers),) = by_group.items()
+    by_path = {part.header.path: part for part in parts}
+    ordered = [by_path[header.path] for header in headers]
+    refuse_duplicates((part.header.path, part.times) for part in ordered)
+    # Decoded once, which is much faster than decoding each product.
+    return _usable_values(
+        xr.decode_cf(join(ordered, patterns[group])), usable, on_altitude=on_altitude
+    )
 
 
 def _remedy(folder: Path | None) -> str:
@@ -112,49 +126,56 @@ def _remedy(folder: Path | None) -> str:
     return f"open one of the stores in it: {', '.join(sorted(path.name for path in stores))}"
 
 
-def _find(source: Paths, selection: ProductSelection) -> tuple[Path, list[Facts]]:
-    """Return the selected products, and the folder that their paths are relative to."""
-    if not isinstance(source, str | os.PathLike):
-        return _from_files([Path(file) for file in source], selection)
-    path = Path(source)
-    if path.name == INDEX:
-        root, paths = find_in_index(path, selection)
-        # The facts are read again from the files, because the index may be outdated.
-        return root, [read_facts(root, indexed) for indexed in paths]
-    if path.is_dir():
-        return path, _strictly(read_product_facts(path, list_products(path), selection))
-    return _from_files([path], selection)
-
-
-def _from_files(files: Sequence[Path], selection: ProductSelection) -> tuple[Path, list[Facts]]:
+def _candidates(source: Paths, selection: ProductSelection) -> tuple[Path, list[str]]:
+    """Return files that may be selected products, and the folder that they are relative to."""
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
+        if path.name == INDEX:
+            return find_in_index(path, selection)
+        if path.is_dir():
+            return path, without_unselected(path, list_products(path), selection)
+    files = [Path(source)] if isinstance(source, str | os.PathLike) else [*map(Path, source)]
     missing = [file for file in files if not file.is_file()]
     if missing:
         raise ProductError("is not a file", file=missing[0])
     root = Path(os.path.commonpath([file.resolve().parent for file in files])) if files else Path()
-    names = [file.resolve().relative_to(root).as_posix() for file in files]
-    return root, _strictly(read_product_facts(root, names, selection))
+    return root, [file.resolve().relative_to(root).as_posix() for file in files]
 
 
-def _strictly(scanned: Iterator[Facts | Refused]) -> list[Facts]:
-    products = []
-    for facts in scanned:
-        if isinstance(facts, Refused):
-            raise ProductError(facts.reason, file=facts.path, remedy="leave the file out")
-        products.append(facts)
-    return products
+def _read(
+    root: Path, paths: Iterable[str], selection: ProductSelection
+) -> tuple[list[Part], dict[Group, xr.Dataset]]:
+    """Open each file once; return the selected products, and the pattern of each group."""
+    parts: list[Part] = []
+    first: dict[Group, tuple[tuple[datetime, str], xr.Dataset]] = {}
+    for path in paths:
+        try:
+            with opened_undecoded(root, path) as product:
+                header = read_header(product, path, selection)
+                if header is None:
+                    continue
+                parts.append(Part.of(product, header, root))
+                place = (header.start, path)
+                if header.group not in first or place < first[header.group][0]:
+                    first[header.group] = place, pattern_of(product, header)
+        except ProductError as error:
+            raise ProductError(error.problem, file=path, remedy="leave the file out") from error
+    return parts, {group: pattern for group, (_, pattern) in first.items()}
 
 
-def _opened(root: Path, products: Sequence[Facts]) -> xr.Dataset:
-    pieces = [open_piece(root, facts, dask=True) for facts in products]
-    times = []
-    for facts, piece in zip(products, pieces, strict=True):
-        with reading(facts.path):
-            times.append((facts.path, piece["time"].values))
-    refuse_duplicates(times)
-    joined = join(pieces)
-    joined.attrs = shared_attributes([piece.attrs for piece in pieces])
-    # Decoded once, which is much faster than decoding each piece.
-    return xr.decode_cf(joined)
+def _usable_values(data: xr.Dataset, worst: int, *, on_altitude: bool) -> xr.Dataset:
+    """Return data without worse values; with `on_altitude`, on altitudes instead of ranges."""
+    masked = _masked(data, worst)
+    if not on_altitude:
+        return masked
+    altitude = masked.get("altitude")
+    if altitude is None or altitude.dims != ("range",) or not (np.diff(altitude) > 0.0).all():
+        raise RetrievalInputError(
+            "beams are level or move, so that a range has no altitude of its own",
+            field="on_altitude",
+            remedy="select by range",
+        )
+    return masked.swap_dims(range="altitude")
 
 
 def _masked(data: xr.Dataset, worst: int) -> xr.Dataset:

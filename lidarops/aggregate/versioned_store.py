@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate import need
-from lidarops.aggregate._join import join, open_piece, shared_attributes
+from lidarops.aggregate._join import Part, Source, pattern_of, shared_attributes, sorted_by_time
 from lidarops.aggregate.facts import (
     Facts,
     Refused,
@@ -32,8 +32,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError
-from lidarops.netcdf.read import reading
-from lidarops.system.files import only_one
+from lidarops.system.files import only_one, within
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
@@ -262,16 +261,18 @@ def _write_group(
     # What all have in common is known of those that stay, unless others go.
     read = range(len(ids)) if gone else lacking
     times = {at: held.times[slice(*rows)] for at, rows in enumerate(pairwise(starts))}
-    attributes = {}
+    attributes, pattern = {}, None
     for at in read:
-        with _piece(root, products[at]) as piece, reading(products[at].path):
-            attributes[at], times[at] = piece.attrs, piece["time"].values
+        with _opened(root, products[at]) as product:
+            part = Part.of(product, products[at], root)
+            attributes[at], times[at] = part.attributes, part.times
+            if at == 0:
+                pattern = pattern_of(product, products[at])
     refuse_duplicates((products[at].path, part) for at, part in times.items())
     known = [] if gone or 0 in lacking else [held.attributes]
     shared = shared_attributes([*known, *attributes.values()])
-    if 0 in lacking:
-        with _piece(root, products[0]) as piece:
-            _create(store, name, piece)
+    if 0 in lacking and pattern is not None:
+        _create(store, name, pattern)
     group = _root(store)[name]
     group.attrs.put({key: plain(value) for key, value in shared.items()})
     _write_rows(group, root, products, lacking, starts)
@@ -302,11 +303,11 @@ def _held(store: Any, name: str) -> _Held:
 
 
 @contextmanager
-def _piece(root: Path, facts: Facts) -> Iterator[xr.Dataset]:
-    """Open a product as a piece; where it cannot be read, raise `UnreadableProductError`."""
+def _opened(root: Path, facts: Facts) -> Iterator[xr.Dataset]:
+    """Open a product; where it cannot be read, raise `UnreadableProductError`."""
     try:
-        with open_piece(root, facts, dask=False) as piece:
-            yield piece
+        with facts.opened(root) as product:
+            yield product
     except ProductError as error:
         raise UnreadableProductError(facts, error.problem) from error
 
@@ -326,11 +327,11 @@ def _write_rows(
         array.flush()
 
 
-def _create(store: Any, name: str, piece: xr.Dataset) -> None:
+def _create(store: Any, name: str, pattern: xr.Dataset) -> None:
     """Write a group like a product, but without its rows."""
     # Of variable length, which all readers of Zarr know.
-    text = piece[PRODUCT.name].astype(np.dtypes.StringDType(), keep_attrs=True)
-    like = piece.reset_coords().assign_coords({PRODUCT.name: text})
+    text = pattern[PRODUCT.name].astype(np.dtypes.StringDType(), keep_attrs=True)
+    like = pattern.reset_coords().assign_coords({PRODUCT.name: text})
     encoding = {}
     compressor = need("zarr.codecs").BloscCodec(cname="zstd", clevel=5, shuffle="shuffle")
     for key, variable in like.variables.items():
@@ -384,17 +385,26 @@ class _Rows:
 def _write_product(
     rows: Mapping[str, _Rows], root: Path, facts: Facts, number: int, start: int
 ) -> None:
-    with _piece(root, facts) as piece:
-        piece[PRODUCT_INDEX.name] = piece[PRODUCT_INDEX.name] + np.int32(number)
-        for name, variable in piece.variables.items():
-            if not _is_long(variable):
-                continue
-            array = rows[str(name)]
-            first = start if "time" in variable.dims else number
-            for low, high in _blocks(first, first + variable.shape[0], array.array.chunks[0]):
-                with reading(facts.path):
-                    values = variable[low - first : high - first].values
-                array.add(low, values)
+    source = Source(within(root, facts.path), facts.id)
+    known = {
+        PRODUCT.name: np.array([facts.id]),
+        PRODUCT_INDEX.name: np.full(facts.profiles, number, np.int32),
+    }
+    for name, waiting in rows.items():
+        along = waiting.array.metadata.dimension_names or ()
+        first, count = (start, facts.profiles) if "time" in along else (number, 1)
+        if not {"time", PRODUCT.name} & set(along):
+            continue
+        for low, high in _blocks(first, first + count, waiting.array.chunks[0]):
+            some = slice(low - first, high - first)
+            if name in known:
+                values = known[name][some]
+            else:
+                try:
+                    values = source.read(name, some) if "time" in along else source.read(name)[None]
+                except ProductError as error:
+                    raise UnreadableProductError(facts, error.problem) from error
+            waiting.add(low, values)
 
 
 def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:
@@ -439,7 +449,7 @@ def open_store(path: Path, selection: ProductSelection, version: str | None) -> 
     ids = data[PRODUCT.name]
     ids = xr.Variable(ids.dims, np.array(ids.values.tolist(), str), ids.attrs)
     data = data.assign_coords({PRODUCT.name: ids})
-    return join([_within_times(data.set_coords(PRODUCT_INDEX.name), selection, path)])
+    return sorted_by_time(_within_times(data.set_coords(PRODUCT_INDEX.name), selection, path))
 
 
 def _no_product(path: Path) -> ProductError:

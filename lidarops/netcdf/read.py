@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import h5py
+import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.netcdf.stored_flags import with_current_flags
@@ -206,6 +208,38 @@ def profiles_in(path: str | Path) -> int:
     """
     with reading(path), h5py.File(path, "r") as file:
         return len(file["time"]) if "time" in file else 0
+
+
+def stored_values(path: str | Path, key: str, name: str, rows: slice = slice(None)) -> NDArray[Any]:
+    """Return values of a variable of a product as stored, or some rows of them.
+
+    Parameters
+    ----------
+    path : path or str
+        A NetCDF-4 file.
+    key : str
+        Global attribute ``id`` that the product had before.
+    name : str
+        Of the variable.
+    rows : slice
+        Along its first dimension; all of a variable without dimensions.
+
+    Raises
+    ------
+    ProductError
+        If they cannot be read, or the file holds another product now.
+    """
+    # Opened some times faster than by netCDF4.
+    with reading(path), h5py.File(path, "r") as file:
+        if file.attrs["id"] not in (key, key.encode()):
+            raise changed(path)
+        stored = file[name]
+        return np.asarray(stored[rows] if stored.shape else stored[()])
+
+
+def changed(path: str | Path) -> ProductError:
+    """Return the error of a file that holds another product than before."""
+    return ProductError("changed while it was read", file=path, remedy="run again")
 
 
 def check_sizes(path: str | Path, *, in_parts: bool = False) -> None:

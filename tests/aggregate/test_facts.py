@@ -18,7 +18,6 @@ from lidarops.aggregate.facts import (
     grid_notes,
     groups,
     list_products,
-    read_facts,
     read_product_facts,
     within,
 )
@@ -30,7 +29,7 @@ from lidarops.netcdf.write import write_plain
 
 def test_facts_are_those_of_the_file(tmp_path: Path):
     path = add_day(tmp_path, 2, profiles=5, sections=3)
-    facts = read_facts(tmp_path, path)
+    (facts,) = facts_of(tmp_path)
     with xr.open_dataset(tmp_path / path) as product:
         flags = product.quality_flag.to_numpy()
         assert facts.id == product.attrs["id"]

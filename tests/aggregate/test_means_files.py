@@ -13,7 +13,7 @@ from support.archives.aggregate_archive import add_day, facts_of
 from support.products.compliance import findings
 from support.products.made_products import MAKERS
 
-from lidarops.aggregate.facts import Refused, groups, read_facts
+from lidarops.aggregate.facts import Refused, groups, read_product_facts
 from lidarops.aggregate.means import MeansResult, write_means
 from lidarops.aggregate.means_variables import (
     Period,
@@ -23,7 +23,6 @@ from lidarops.aggregate.means_variables import (
     systematic,
 )
 from lidarops.aggregate.open_products import open_products
-from lidarops.errors import ProductError
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.context import UNUSED_INPUTS
 from lidarops.netcdf.variables import ErrorKind, layout_of
@@ -471,8 +470,9 @@ def test_a_beam_that_moves_has_no_mean(tmp_path: Path):
 def test_means_are_no_products(tmp_path: Path):
     add_day(tmp_path, 0)
     (file,) = means_of(tmp_path).files
-    with pytest.raises(ProductError, match="holds means of products"):
-        read_facts(tmp_path, file.path)
+    (refused,) = read_product_facts(tmp_path, [file.path])
+    assert isinstance(refused, Refused)
+    assert refused.reason.startswith("holds means of products")
     assert not any(isinstance(product, Refused) for product in facts_of(tmp_path))
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import time
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +15,6 @@ import xarray as xr
 from support.archives.aggregate_archive import add_day, facts_of
 from support.products.damaged_products import damage_values
 
-from lidarops.aggregate import open_products as opening
-from lidarops.aggregate.facts import Facts, Group
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
@@ -123,19 +125,57 @@ def test_a_damaged_chunk_raises_an_error(tmp_path: Path):
 
 
 @pytest.mark.parametrize("profiles", [5, 6])
-def test_a_product_that_changes_while_it_is_opened_is_named(
-    profiles: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_product_that_is_replaced_after_it_was_opened_is_named(profiles: int, tmp_path: Path):
     path = add_day(tmp_path, 0)
-    groups = opening.groups
-
-    def replace_the_product(products: list[Facts]) -> dict[Group, list[Facts]]:
-        add_day(tmp_path, 0, version=2, profiles=profiles)
-        return groups(products)
-
-    monkeypatch.setattr(opening, "groups", replace_the_product)
+    data = open_products(tmp_path)
+    add_day(tmp_path, 0, version=2, profiles=profiles)
     with pytest.raises(ProductError, match=f"{path}: changed while it was read"):
-        open_products(tmp_path)
+        data.load()
+
+
+def test_only_selected_files_are_opened_and_each_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("pyarrow")
+    for day in range(4):
+        add_day(tmp_path, day)
+        add_day(tmp_path, day, "signal")
+    index = tmp_path / write_index(tmp_path, facts_of(tmp_path))
+    os.utime(index, ns=2 * (time.time_ns() + 10**9,))
+    replaced = add_day(tmp_path, 0, "signal", version=2)
+    os.utime(tmp_path / replaced, ns=2 * (time.time_ns() + 2 * 10**9,))
+    new = add_day(tmp_path, 4)
+    opened: Counter[str] = Counter()
+    open_dataset = xr.open_dataset
+
+    def counting(file: Path, **options: Any) -> xr.Dataset:
+        opened[Path(file).relative_to(tmp_path).as_posix()] += 1
+        return open_dataset(file, **options)
+
+    since = {"kind": "homogeneous", "since": "2026-03-03"}
+    with monkeypatch.context() as patch:
+        patch.setattr(xr, "open_dataset", counting)
+        data = open_products(tmp_path, **since)
+    selected = [facts.path for facts in facts_of(tmp_path) if facts.kind == "homogeneous"][2:]
+    assert new in selected
+    # What changed since the index was written may be selected.
+    assert opened == Counter([*selected, replaced])
+    index.unlink()
+    xr.testing.assert_identical(data.load(), open_products(tmp_path, **since).load())
+
+
+def test_a_vertical_lidar_can_be_selected_by_altitude(archive: Path):
+    data = open_products(archive, kind="elastic", on_altitude=True)
+    part = data.aerosol_backscatter.sel(altitude=slice(100.0, 200.0))
+    altitude = data["station_altitude"] + data["range"]
+    np.testing.assert_allclose(data["altitude"], altitude, atol=0.01)
+    assert part.sizes["altitude"] == np.count_nonzero((altitude >= 100.0) & (altitude <= 200.0)) > 9
+
+
+def test_a_level_beam_has_no_altitudes(tmp_path: Path):
+    add_day(tmp_path, 0, "signal", zenith=90.0)
+    with pytest.raises(RetrievalInputError, match="on_altitude: beams are level or move"):
+        open_products(tmp_path, on_altitude=True)
 
 
 def test_wrong_arguments_raise_clear_errors(archive: Path, tmp_path: Path):

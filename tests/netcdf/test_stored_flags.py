@@ -11,7 +11,7 @@ import xarray as xr
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
-from lidarops.aggregate.facts import read_facts
+from lidarops.aggregate.facts import Facts, read_product_facts
 from lidarops.aggregate.means import write_means
 from lidarops.aggregate.means_variables import Period
 from lidarops.errors import ProductError
@@ -61,9 +61,15 @@ def test_reading_moves_bits_to_their_places_of_now(tmp_path: Path, profiles: int
         np.testing.assert_array_equal(with_current_flags(product)["quality_flag"], now)
 
 
+def facts_of(file: Path) -> Facts:
+    (facts,) = read_product_facts(file.parent, [file.name])
+    assert isinstance(facts, Facts)
+    return facts
+
+
 def test_facts_and_inspection_go_by_the_meanings_of_the_file(tmp_path: Path):
     now = older(tmp_path / "older.nc")
-    facts = read_facts(tmp_path, "older.nc")
+    facts = facts_of(tmp_path / "older.nc")
     flags = flags_of("homogeneous")
     assert facts.usable == np.count_nonzero((now & flags.rejecting) == 0)
     counts = {bit.word: int(np.count_nonzero(now & int(bit))) for bit in flags}
@@ -79,12 +85,12 @@ def test_means_of_older_products_are_those_of_products_of_now(tmp_path: Path):
     older(tmp_path / "older.nc")
     means = []
     for name in ("now", "older"):
-        (written,) = write_means(tmp_path, [read_facts(tmp_path, f"{name}.nc")], Period.DAY).files
+        (written,) = write_means(tmp_path, [facts_of(tmp_path / f"{name}.nc")], Period.DAY).files
         means.append(xr.load_dataset(tmp_path / written.path))
     assert means[0].quality_flag.values.any()
     for name in ("quality_flag", "usable", "usable_share", "total_extinction"):
         xr.testing.assert_identical(means[0][name].variable, means[1][name].variable)
-    groups = {read_facts(tmp_path, f"{name}.nc").group for name in ("now", "older")}
+    groups = {facts_of(tmp_path / f"{name}.nc").group for name in ("now", "older")}
     assert len(groups) == 2, "views over both would mix bits"
 
 
