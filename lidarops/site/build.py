@@ -40,7 +40,7 @@ from lidarops.site.paths import (
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
-from lidarops.site.values import NO_VALUES, read_values
+from lidarops.site.values import read_values
 from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
     COPIES,
@@ -289,11 +289,9 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
                 quality,
                 origin,
                 [*figures[:1], *(over_time or ()), *figures[1:]],
-                values or NO_VALUES,
+                values or (),
             ),
             svg.thumbnail(figures[0] if figures else None, _EMPTY),
-            origin.text.encode(),
-            (values or NO_VALUES).csv,
         )
     for name, content in zip(entry.files, contents, strict=True):
         _write(task.site, name, content)
@@ -353,13 +351,16 @@ def _joined(*problems: str) -> str:
 
 
 def _write(site: Path, name: str, content: bytes | Path) -> None:
-    """Write a file of the site, or copy it, atomically. All files are written here."""
+    """Write a file of the site, or copy it, atomically; one that holds the same stays as it is.
+
+    All files are written here.
+    """
     target = within(site, name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(content, Path):
             copy_atomically(content, target)
-        else:
+        elif not target.is_file() or target.read_bytes() != content:
             write_atomically(target, content)
     except OSError as error:
         raise CatalogError(
@@ -374,8 +375,7 @@ def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entr
     for entry, neighbours in with_neighbours(entries):
         page = within(site, entry.page).read_bytes()
         linked = pages.with_navigation(page, pages.navigation(entry, neighbours, links))
-        if linked != page:
-            _write(site, entry.page, linked)
+        _write(site, entry.page, linked)
         yield replace(entry, digests=(hashlib.sha256(linked).hexdigest(), *entry.digests[1:]))
 
 

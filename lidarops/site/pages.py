@@ -27,11 +27,11 @@ from lidarops.site.paths import day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import Origin, QualityCounts, citation, contact, variables
 from lidarops.site.product_entry import Entry, Problem, ShareGrade, mean_availability
 from lidarops.site.station_map import Place, station_map
-from lidarops.site.values import Values
+from lidarops.site.values import ValueRow
 
 INDEX: Final = "index.html"
-ROWS: Final = 2000
-"""Most rows of a table on a page."""
+INPUTS: Final = 40
+"""Most input files that a page lists."""
 _YEARS: Final = 48
 """Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
@@ -64,7 +64,7 @@ def product(
     quality: QualityCounts,
     origin: Origin,
     figures: Sequence[Figure],
-    values: Values,
+    values: Sequence[ValueRow],
 ) -> bytes:
     """Return the page of a product; it depends only on the product and its path."""
     page = entry.page
@@ -85,6 +85,7 @@ def product(
         heading=f"{_about(entry.kind, 'Product of kind')}, {entry.light or entry.channel}",
         lead=f"{entry.place}; {entry.name}; {_span(entry)}",
         trail=[*_trail(entry, page), (entry.day, href(day_page(entry.station, entry.day), page))],
+        file=file,
         sha256=entry.sha256,
         problem=entry.problem,
         lacking=entry.lacking,
@@ -94,16 +95,14 @@ def product(
         grade=entry.grade,
         quality_text=_quality(entry),
         origin=origin,
-        prov=href(entry.files[2], page),
         values=values,
-        values_csv=href(entry.files[3], page),
         citation=citation(opened),
         license=entry.license,
         contact=contact(opened),
         references=str(opened.attrs.get("references", "")).splitlines(),
         variables=variables(opened),
         attributes=[(str(name), str(value)) for name, value in opened.attrs.items()],
-        most=ROWS,
+        most=INPUTS,
     )
 
 

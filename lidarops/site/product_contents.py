@@ -82,8 +82,6 @@ class InputRow:
 class Origin:
     """Provenance of a product from its PROV-JSON; empty without it."""
 
-    text: str = ""
-    """PROV-JSON document."""
     id: str = ""
     plan_hash: str = ""
     code_version: str = ""
@@ -269,7 +267,6 @@ def _origin(document: Mapping[str, Any]) -> Origin:
     software = document["agent"]["lidarops:software"]
     planned = json.loads(plan["lidarops:json"])
     return Origin(
-        text=json.dumps(document, indent=1, sort_keys=True) + "\n",
         id=str(product["lidarops:id"]),
         plan_hash=str(plan["lidarops:sha256"]),
         code_version=str(software["lidarops:code_version"]),

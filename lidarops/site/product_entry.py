@@ -107,8 +107,7 @@ class Entry:
     @property
     def files(self) -> tuple[str, ...]:
         """Files of the page, relative to the site."""
-        stem = self.page.removesuffix(".html")
-        return self.page, self.thumbnail, f"{stem}.prov.json", f"{stem}.csv"
+        return self.page, self.thumbnail
 
     @property
     def label(self) -> str:

@@ -314,11 +314,9 @@ def test_find_the_list_of_a_month(visitor: Visitor) -> None:
     assert text.count(".nc") == 13
 
 
-def test_download_values_as_a_table(visitor: Visitor) -> None:
-    visitor.product("Backscatter of elastic profiles")
-    with visitor.page.expect_download() as download:
-        visitor.click("Download values as CSV")
-    assert Path(download.value.path()).read_text(encoding="utf-8").startswith("time_start,")
+def test_find_how_to_open_all_values(visitor: Visitor) -> None:
+    visitor.product("Backscatter of elastic profiles").click("Values")
+    assert visitor.reads('xarray.open_dataset("odesa_lidar-1_elastic_photon_532o_')
 
 
 def test_go_to_the_next_day_of_a_channel(visitor: Visitor) -> None:

@@ -155,8 +155,7 @@ def test_product_page_has_flags_provenance_and_download(archive: Path, site: Pat
     )
     # Three images and a profile, with the quality as the second.
     assert text.count('<svg class="fig wide"') == 5
-    document = json.loads(page.with_suffix(".prov.json").read_text())
-    assert document["agent"]["lidarops:software"]["lidarops:code_version"] == "0123456789abcdef"
+    assert f'xarray.open_dataset("{file.name}")' in text.replace("&#34;", '"')
 
 
 def test_counts_of_quality_are_those_of_the_file(archive: Path, site: Path) -> None:
@@ -206,13 +205,13 @@ def test_unchanged_pages_are_kept_and_pages_of_removed_products_deleted(
     output = _copy(archive, tmp_path / "out")
     build_site(output)
     whole = contents(output / "site")
-    pages = {path: path.stat().st_mtime_ns for path in (output / "site/product").rglob("*.html")}
+    pages = {path: path.stat().st_mtime_ns for path in (output / "site").rglob("*.*")}
     again = build_site(output)
     assert again.made == 0
     assert contents(output / "site") == whole
     assert pages == {path: path.stat().st_mtime_ns for path in pages}
 
-    tampered = next(path for path in pages if "elastic" in path.name)
+    tampered = next((output / "site/product").rglob("*elastic*.html"))
     tampered.write_text("edited")
     changed = add(output, "signal", 1, title="Another title")
     gone = next((output / "products").rglob("*homogeneous*2027*.nc"))

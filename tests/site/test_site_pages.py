@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 import shutil
@@ -17,13 +15,14 @@ import pytest
 import xarray as xr
 from netCDF4 import Dataset
 from support.archives.site_archive import add, add_unknown, contents, small_archive
-from support.products.drawn import figures
 from support.products.fabricated import START as FIRST
 from support.products.fabricated import signal, times
 from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CatalogError
+from lidarops.figures.panels import number
+from lidarops.figures.wording import percent
 from lidarops.flags import Quality
 from lidarops.site import build, values
 from lidarops.site.build import build_site
@@ -72,108 +71,37 @@ def page_of(output: Path, kind: str, day: str = "20260301") -> Path:
 
 
 @pytest.mark.parametrize("kind", ["elastic", "homogeneous", "multiangle", "signal"])
-def test_the_csv_holds_the_values_of_the_file(output: Path, kind: str) -> None:
+def test_values_are_summarised_as_in_the_file(output: Path, kind: str) -> None:
     page = page_of(output, kind)
-    rows = list(csv.DictReader(io.StringIO(page.with_suffix(".csv").read_text("utf-8"))))
     file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
+    factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
     with xr.open_dataset(file, decode_timedelta=False) as product:
-        along, name = (list(rows[0])[place].partition(" (")[0] for place in (2, 3))
-        factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
-        expected = product[name].values.astype(float)
-        assert len(rows) == expected.size
-        column = next(key for key in rows[0] if key.startswith(name))
-        stated = np.array([float(row[column]) for row in rows]).reshape(expected.shape)
-        # All digits of a float32.
-        np.testing.assert_allclose(stated, factor * expected, rtol=1.2e-7)
-        flags = product["quality_flag"].values.ravel()
-        usable = product["usable"].values.ravel()
-    for row, flag, grade in zip(rows, flags, usable, strict=True):
-        assert row["quality"] == ("good", "care", "reject")[int(grade)]
-        assert bool(row["flags"]) == bool(flag)
-    assert rows[0]["time_start"] == "2026-03-01T10:00:00Z"
-    assert rows[0]["time_end"] == "2026-03-01T10:10:00Z"
-    assert along in {"range", "altitude", "section"}
+        row = read_values(product, kind)[0]
+        name = row.title.partition(" (")[0].lower().replace(" ", "_")
+        usable = (product["usable"] < 2) & np.isfinite(product[name])
+        values = factor * product[name].astype(float).values[usable]
+        errors = factor * product[f"{name}_standard_error"].astype(float).values[usable]
+    assert row.usable == percent(float(usable.mean()))
+    stated = (row.low, row.middle, row.high, row.error)
+    expected = (*np.percentile(values, (5, 50, 95)), np.median(errors))
+    assert stated == tuple(number(float(f"{value:.3g}")) for value in expected)
+    assert all(words in page.read_text("utf-8") for words in stated)
 
 
-def test_a_value_can_be_read_from_the_page(output: Path) -> None:
-    page = page_of(output, "homogeneous")
-    file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
-    with xr.open_dataset(file, decode_timedelta=False) as product:
-        value = 1e3 * float(product["total_extinction"][2, 0])
-        error = 1e3 * float(product["total_extinction_standard_error"][2, 0])
-    text = page.read_text(encoding="utf-8")
-    assert "Total extinction (km⁻¹)" in text
-    row = text[text.index("2026-03-01 10:20\u201310:30") :]
-    cell = row[row.index("<td") : row.index("</td>")].partition(">")[2]
-    stated, _, uncertain = cell.partition(" \u00b1 ")
-    uncertain = uncertain.rstrip(" *")
-    assert float(uncertain) == pytest.approx(error, rel=5e-2)
-    # The digits that the error leaves.
-    assert len(uncertain.lstrip("0.")) == 2
-    assert len(stated.partition(".")[2]) == len(uncertain.partition(".")[2])
-    assert abs(float(stated) - value) <= 0.051 * error
-
-
-def test_long_products_are_thinned_to_round_times_and_said() -> None:
-    time = np.datetime64("2026-03-01T00:03", "ns") + np.arange(144) * np.timedelta64(10, "m")
-    height = 7.5 * (np.arange(4000) + 0.5)
-    signal = np.where(height < 6000.0, 5.0, 0.0) + np.random.default_rng(1).normal(
-        0, 1, (144, 4000)
-    )
-    product = xr.Dataset(
-        {
-            "signal": (("time", "range"), signal, {"units": "MHz m2"}),
-            "signal_standard_error": (("time", "range"), np.ones_like(signal)),
-            "quality_flag": (("time", "range"), np.zeros(signal.shape, np.int32)),
-        },
-        coords={"time": time, "range": ("range", height, {"units": "m"})},
-    )
-    made = read_values(product, "signal")
-    (table,) = made.tables
-    assert [clock[11:16] for clock, _ in table.rows][1:4] == ["00:58", "01:58", "02:58"]
-    assert len(table.columns) <= 12
-    assert table.note.startswith(f"{len(table.rows)} of 144 times, nearest to round times")
-    assert "up to 7.2" in made.note
-    assert made.csv.count(b"\n") <= 4_001
-
-
-def test_a_narrow_table_may_be_long() -> None:
-    lengths = [len(read_values(fields(250, places), "signal").tables[0].rows) for places in (2, 3)]
-    assert lengths[0] == 250
-    assert lengths[1] <= 320 / 3
-
-
-@pytest.mark.parametrize("limit", [1, 10**9], ids=["single rows are read", "all is read"])
-def test_values_along_a_falling_altitude_rise(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
-    monkeypatch.setattr(values, "_READ_BYTES", limit)
-    product = fields(6, 40)
-    falling = product.isel(time=slice(None, None, -1), range=slice(None, None, -1))
-    assert read_values(falling, "signal") == read_values(product, "signal")
-
-
-@pytest.mark.parametrize("places", [[np.nan, *range(39)], [1.0] * 40], ids=["NaN", "one place"])
-def test_places_without_an_order_are_numbered(places: list[float]) -> None:
-    product = fields(6, 40).assign_coords(range=("range", places, {"units": "m"}))
-    (table,) = read_values(product, "signal").tables
-    assert table.columns[:2] == ("range 0", "range 1")
-
-
-@pytest.mark.parametrize("other", [None, "time"], ids=["none", "of other dimensions"])
-def test_values_without_flags_have_no_quality(tmp_path: Path, other: str | None) -> None:
+def test_values_without_flags_are_usable_where_they_are_known(tmp_path: Path) -> None:
     product = xr.load_dataset(add_unknown(tmp_path)).drop_vars("quality_flag")
-    if other:
-        product["quality_flag"] = other, np.zeros(product.sizes[other], np.int32)
-    made = read_values(product, "wind")
-    rows = list(csv.DictReader(io.StringIO(made.csv.decode())))
-    assert len(rows) == 48
-    assert {(row["quality"], row["flags"]) for row in rows} == {("", "")}
-    assert made.note.endswith("these values have no quality flags")
+    product["quality_flag"] = "time", np.ones(product.sizes["time"], np.int32)
+    (row,) = read_values(product, "wind")
+    assert (row.usable, row.error) == ("100 %", "0.2")
+    product["speed"][:] = np.nan
+    (row,) = read_values(product, "wind")
+    assert (row.usable, row.middle) == ("0 %", "\u2013")
 
 
 def test_only_values_that_are_shown_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(values, "_READ_BYTES", 1_000_000)
+    monkeypatch.setattr(values, "READ_BYTES", 1_000_000)
     fields(600, 4000).astype(np.float32).to_netcdf(tmp_path / "long.nc")
     with xr.open_dataset(tmp_path / "long.nc") as product:
         tracemalloc.start()
@@ -206,19 +134,6 @@ def fields(profiles: int, bins: int) -> xr.Dataset:
     product["signal_standard_error"][:] = 0.5
     product["quality_flag"][:] = np.arange(bins) % 2 * int(Quality.PILE_UP)
     return product
-
-
-def test_values_reach_as_far_as_the_figure() -> None:
-    product = signal(times(FIRST, 60, 60.0), bins=1000, bin_width=15.0)
-    product["quality_flag"][:] = 0
-    product["signal_standard_error"][:] = 1.0
-    noise = np.random.default_rng(0).standard_normal((60, 1000))
-    product["signal"][:] = noise + 10.0 * (product["range"].values < 3000.0)
-    product["signal"].values[20:30, 600:640] += 30.0
-    (figure,) = figures("signal", "signal", [product])
-    stated = float(read_values(product, "signal").note.partition("up to ")[2].removesuffix(" km"))
-    # The note has three digits.
-    assert stated == pytest.approx(figure.panels[0].right.high, abs=0.05)
 
 
 def test_a_product_leads_to_the_previous_the_next_and_its_siblings(output: Path) -> None:
