@@ -25,6 +25,14 @@ os.environ.setdefault("SOURCE_DATE_EPOCH", "1700000000")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+SLOW = {REPOSITORY / "tests" / name for name in ("benchmarks", "flows", "tools")}
+"""Folders of slow tests alone."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave folders of slow tests alone where none is run: each process loads Prefect for them."""
+    return True if collection_path in SLOW and "not slow" in config.option.markexpr else None
+
 
 @pytest.fixture(scope="session")
 def repository() -> Path:

@@ -12,6 +12,8 @@ from benchmarks.accuracy.multiangle import StudySize
 from benchmarks.harness.figure import Figure, cpu_time
 from benchmarks.harness.results import Effort, Work
 
+pytestmark = pytest.mark.slow
+
 SMALL = StudySize(blocks=2, profiles=4, slow=1)
 
 

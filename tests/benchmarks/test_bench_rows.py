@@ -12,6 +12,8 @@ from benchmarks.harness.results import Chapter, Results, Study, frame, table
 from benchmarks.harness.timing import CPU_TIME
 from lidarops.errors import CatalogError
 
+pytestmark = pytest.mark.slow
+
 
 def results():
     return {

@@ -7,6 +7,8 @@ import pytest
 from benchmarks.harness.figure import Figure, Unit
 from benchmarks.harness.verdicts import Judgement, Target, Verdict
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("value", "error", "verdict"),

@@ -238,6 +238,7 @@ def test_the_examples_of_the_help_name_files_that_the_demo_makes(
     assert named >= 3
 
 
+@pytest.mark.slow
 def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:
     files = sorted(str(path) for path in (demo_archive / "hill").glob("v24921*"))[:4]
     result = CliRunner().invoke(benchmarks, ["throughput", *files, "--repeats", "1"])

@@ -60,6 +60,8 @@ from lidarops.run.clusters import Local
 from lidarops.scene.guard import Failure
 from lidarops.scene.job import Job
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="session")
 def prefect_server() -> Iterator[None]:

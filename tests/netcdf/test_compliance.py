@@ -16,6 +16,8 @@ from lidarops.flags import Quality
 from lidarops.netcdf.write import write_product
 from lidarops.records import DetectionMode
 
+pytestmark = pytest.mark.slow
+
 SCAN = {"zenith": [0.0, 30.0, 60.0, 80.0, 90.0], "azimuth": [0.0, 1.0, 2.0, 3.0, 4.0]}
 SHAPES: dict[str, dict[str, Any]] = {
     "horizontal": {"zenith": 90.0, "azimuth": 200.0},

@@ -195,7 +195,13 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path):
         product.add(signal())
 
 
-@pytest.mark.parametrize("room", range(0, 900_000, 37_000))
+@pytest.mark.parametrize(
+    "room",
+    [
+        pytest.param(room, marks=[pytest.mark.slow] if room % 148_000 else [])
+        for room in range(0, 900_000, 37_000)
+    ],
+)
 def test_a_disk_that_fills_is_an_error_and_no_crash(
     room: int, large: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

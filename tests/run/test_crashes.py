@@ -205,6 +205,7 @@ def tiny_disk(tmp_path: Path) -> Path:
     subprocess.run(["umount", "--lazy", str(place)], check=False)
 
 
+@pytest.mark.slow
 def test_a_full_file_system_is_reported_and_nothing_is_damaged(
     tmp_path: Path, tiny_disk: Path
 ) -> None:
@@ -219,6 +220,7 @@ def test_a_full_file_system_is_reported_and_nothing_is_damaged(
     assert len(list((tiny_disk / "products").rglob("*.nc"))) == 24
 
 
+@pytest.mark.slow
 def test_a_target_that_cannot_be_written_is_reported(tmp_path: Path, tiny_disk: Path) -> None:
     campaign = crash_archive.make(tmp_path, scenes=2).model_copy(update={"output": str(tiny_disk)})
     subprocess.run(["mount", "-o", "remount,ro", str(tiny_disk)], check=True)

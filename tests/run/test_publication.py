@@ -42,6 +42,7 @@ def digests(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 def test_raw_from_s3_and_products_to_s3(tmp_path: Path, campaign_file: Path, s3: str) -> None:
     import fsspec
 

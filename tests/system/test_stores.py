@@ -9,13 +9,14 @@ import threading
 from pathlib import Path
 
 import pytest
+from support.cases import each
 from support.servers.ports import KEYS, free_port
 
 from lidarops.errors import CatalogError, ProductError
 from lidarops.system.stores import RemoteStore, without_keys
 
 
-@pytest.fixture(params=["s3", "memory", "file"])
+@pytest.fixture(params=[pytest.param("s3", marks=pytest.mark.slow), "memory", "file"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     """URL of an empty store of each kind."""
     name = tmp_path.name
@@ -95,6 +96,7 @@ def test_publish_refuses_a_product_that_differs_from_the_ledger(tmp_path: Path, 
         list(RemoteStore(url).files())
 
 
+@pytest.mark.slow
 def test_publish_of_many_parts(tmp_path: Path, s3: str) -> None:
     # Above twice the part size, S3 assembles an object from parts.
     data = bytes(range(256)) * 4096 * 120
@@ -190,7 +192,7 @@ def test_a_store_that_does_not_answer_is_reported(
     s3fs.S3FileSystem.clear_instance_cache()
 
 
-@pytest.mark.parametrize(
+@each(
     ("url", "shown"),
     [
         ("s3://key:secret@bucket/a", "s3://bucket/a"),
@@ -217,7 +219,7 @@ def test_keys_are_left_out_of_messages(url: str, shown: str) -> None:
     assert without_keys(url) == shown
 
 
-@pytest.mark.parametrize(
+@each(
     "url",
     [
         "s3://key:swordfish@bucket/a",

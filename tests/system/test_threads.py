@@ -29,7 +29,7 @@ def threads(package: str, **variables: str) -> int:
     (os.cpu_count() or 1) < 2 or not Path("/proc/self/task").exists(),
     reason="needs two processors and the files of Linux on threads",
 )
-@pytest.mark.parametrize("package", ["lidarops.cli", "flows"])
+@pytest.mark.parametrize("package", ["lidarops.cli", pytest.param("flows", marks=pytest.mark.slow)])
 def test_commands_and_flows_solve_in_one_thread_unless_the_environment_says_more(
     package: str,
 ) -> None:

@@ -14,6 +14,8 @@ import xarray as xr
 
 from lidarops.netcdf.write import chunk_sizes
 
+pytestmark = pytest.mark.slow
+
 
 def needs(name: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(shutil.which(name) is None, reason=f"{name} is not installed")

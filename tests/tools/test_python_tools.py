@@ -11,6 +11,8 @@ import xarray as xr
 from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_product
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def sample(product: Path) -> Path:
@@ -62,7 +64,6 @@ def test_iris_loads_every_variable_with_its_ancillaries_and_means(iris, sample: 
         np.testing.assert_allclose(np.ma.filled(mean.data, np.nan), expected, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_cf_python_reads_fields_without_errors(sample: Path):
     cf = pytest.importorskip("cf")
     fields = cf.read(str(sample))

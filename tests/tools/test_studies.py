@@ -12,6 +12,8 @@ import pytest
 from benchmarks.studies import path_guards
 from benchmarks.studies.ablation import BASE
 
+pytestmark = pytest.mark.slow
+
 STUDIES = sorted(
     path.stem
     for path in (Path(__file__).resolve().parents[2] / "benchmarks/studies").glob("*.py")

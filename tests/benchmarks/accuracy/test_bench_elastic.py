@@ -21,6 +21,8 @@ from lidarops.errors import CampaignError, RawFormatError
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.known_shape import fit_known_shape
 
+pytestmark = pytest.mark.slow
+
 DRAWS = 60
 
 

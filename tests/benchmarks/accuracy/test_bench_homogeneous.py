@@ -31,6 +31,8 @@ from benchmarks.harness.timing import CPU_TIME, READ, in_threads, least_times
 from benchmarks.throughput import retrievals
 from lidarops.errors import CampaignError, RawFormatError
 
+pytestmark = pytest.mark.slow
+
 PATH = Scenario(2500.0, 8000.0, 3e-5, 1000.0)
 PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e-3, 1e4)]
 

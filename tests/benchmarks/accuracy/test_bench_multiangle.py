@@ -19,6 +19,8 @@ from benchmarks.throughput import retrievals
 from lidarops.retrieve.multiangle import mld
 from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
+pytestmark = pytest.mark.slow
+
 SMALL = StudySize(blocks=3, profiles=8, slow=1)
 SHORT = multiangle_cases.clear(3000.0, bins=25)
 

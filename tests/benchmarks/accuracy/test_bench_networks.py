@@ -15,6 +15,8 @@ from benchmarks.harness.statistics import mean_by_block, share_by_block
 from benchmarks.harness.timing import CPU_TIME, READ
 from benchmarks.throughput import retrievals
 
+pytestmark = pytest.mark.slow
+
 PROFILES = 3 * network_cases.BLOCK
 
 

@@ -22,6 +22,8 @@ from benchmarks.stability import (
 from benchmarks.stability.random_scenes import COVERED, FALSE, SATISFIED
 from lidarops.flags import Quality, rejecting
 
+pytestmark = pytest.mark.slow
+
 FOUND = 0.95
 """Probability that twice the target is found."""
 CONFINED = 0.3
@@ -171,7 +173,6 @@ KNOWN = verdicts.above_target()
         pytest.param(networks, 1200, 50, CONFINED, id="network"),
     ],
 )
-@pytest.mark.slow
 def test_where_the_model_holds_few_values_of_each_class_are_false(
     score, clusters, profiles, confined
 ):

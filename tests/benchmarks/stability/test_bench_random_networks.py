@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks.stability.random_networks import score_networks
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("cluster", "failure", "false_before"),

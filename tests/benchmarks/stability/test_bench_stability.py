@@ -44,6 +44,8 @@ from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
+pytestmark = pytest.mark.slow
+
 HOLDS = Failure("none", satisfied=True)
 HIDDEN = Failure("hidden", unseen="it has the shape of the answer")
 BAD = int(Quality.NOT_HOMOGENEOUS)
@@ -391,7 +393,6 @@ def test_networks_have_the_same_values_each_time():
     assert np.array_equal(first, second, equal_nan=True)
 
 
-@pytest.mark.slow
 def test_the_cost_of_all_parts_is_a_target():
     whole = study.cost_scores({"a": 400.0, "b": 800.0})["", study.WHOLE]
     assert str(whole["target"]) == "20 min met"

@@ -15,6 +15,8 @@ from lidarops.errors import CampaignError
 from lidarops.records import Status
 from lidarops.run import archive as pipeline
 
+pytestmark = pytest.mark.slow
+
 SMALL = StandIns(instruments=2, days=2)
 
 

@@ -11,6 +11,8 @@ from benchmarks.throughput import campaigns
 from benchmarks.throughput.campaigns import CampaignSize, Stage
 from lidarops.run.archive import reprocess
 
+pytestmark = pytest.mark.slow
+
 SMALL = CampaignSize(scenes=2, profiles=15, bins=500)
 
 

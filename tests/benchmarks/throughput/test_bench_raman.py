@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from benchmarks.harness.results import Effort
 from benchmarks.throughput import raman_night
+
+pytestmark = pytest.mark.slow
 
 
 def test_the_night_is_timed_and_its_retrievals_give_values():
