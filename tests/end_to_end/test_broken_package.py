@@ -13,7 +13,6 @@ GROUPS = pytest.mark.parametrize(
     ("group", "command"),
     [
         ("product_kinds", ["schema"]),
-        ("product_kinds", ["plan", "campaign.yaml"]),
         ("raw_formats", ["inspect", "file"]),
     ],
 )

@@ -73,7 +73,7 @@ def test_any_number_of_profiles_together_gives_the_same_bits(
         assert any(kind in path for path in whole), kind
     # Small scenes are one chunk otherwise.
     monkeypatch.setattr("lidarops.scene.profiles.IN_MEMORY", 0)
-    for profiles in (1, 5, PROFILES):
+    for profiles in (1, 5):
         assert digests([replace(job, profiles_per_chunk=profiles) for job in jobs]) == whole
 
 
