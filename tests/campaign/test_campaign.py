@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import ValidationError
+from support.cases import each
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign
@@ -180,7 +181,7 @@ def test_facts_follow_time() -> None:
     assert lidar.facts_at(datetime(2020, 1, 1, tzinfo=UTC)).zenith_angle == 20
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "problem"),
     [
         ({"lag": 1}, "lag|method cubic only"),
@@ -252,14 +253,12 @@ def test_elastic_defaults() -> None:
     assert (window.scattering_ratio, window.relative_error) == (1.0, 0.02)
 
 
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("10s", 10), ("5min", 300), ("2h", 7200), ("1d", 86400), (900, 900)]
-)
+@each(("text", "seconds"), [("10s", 10), ("5min", 300), ("2h", 7200), ("1d", 86400), (900, 900)])
 def test_averages(text: object, seconds: float) -> None:
     assert _elastic(average=text).average.total_seconds() == seconds
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "words"),
     [
         ({"average": "7min"}, "divide a day"),
@@ -295,20 +294,20 @@ def test_invalid_elastic_settings_are_refused(settings: dict[str, object], words
         _elastic(**settings)
 
 
-@pytest.mark.parametrize("lag", [-100, 3.5, 0, "estimate", None])
+@each("lag", [-100, 3.5, 0, "estimate", None])
 def test_lags(lag: object) -> None:
     facts = _with_facts({"channels": {"analog_532o": {"lag": lag}}}).instruments["lidar"].facts[0]
     assert facts.channels["analog_532o"].lag == lag
 
 
-@pytest.mark.parametrize("lag", [101, -101, "guess", float("nan"), float("inf")])
+@each("lag", [101, -101, "guess", float("nan"), float("inf")])
 def test_invalid_lags_are_refused(lag: object) -> None:
     with pytest.raises(ValidationError, match="lag"):
         _with_facts({"channels": {"analog_532o": {"lag": lag}}})
 
 
-@pytest.mark.parametrize("name", ["overlap_profile", "molecular_profile"])
-@pytest.mark.parametrize("path", ["../air.csv", "/etc/air.csv", "~/air.csv", "a/../../air.csv"])
+@each("name", ["overlap_profile", "molecular_profile"])
+@each("path", ["../air.csv", "/etc/air.csv", "~/air.csv", "a/../../air.csv"])
 def test_profiles_stay_beside_the_campaign_file(name: str, path: str) -> None:
     with pytest.raises(ValidationError, match="must be a relative path"):
         _with_facts({name: path})

@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 import dask.config
 import pytest
 import yaml
+from support.cases import each
 from support.servers import loopback
 
 from lidarops.run import clusters
@@ -65,7 +66,7 @@ def test_a_wrong_description_is_reported_with_file_and_field(
     assert message in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     ("choice", "message"),
     [
         ({"scheduler": "tcp://head:8786", "workers": 2}, "has its own workers"),

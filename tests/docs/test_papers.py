@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import yaml
+from support.cases import each
 
 from lidarops import constants
 from lidarops.netcdf.variables import layout_of
@@ -60,7 +60,7 @@ def _words_of(package: str, repository: Path) -> set[str]:
     return words
 
 
-@pytest.mark.parametrize("name", PAGES)
+@each("name", PAGES)
 def test_a_page_names_functions_and_tests_that_exist(name: str, repository: Path) -> None:
     text = _page(repository, name)
     prefix = re.search(
@@ -107,7 +107,7 @@ def _variables() -> dict[str, Any]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", PAGES)
+@each("name", PAGES)
 def test_the_lines_of_code_of_a_page_run(name: str, repository: Path) -> None:
     names = _variables()
     if name == "multiposition":

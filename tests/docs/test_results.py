@@ -10,6 +10,7 @@ import benchmark_results
 import pytest
 import typer
 import verdicts
+from support.cases import each
 
 from benchmarks.__main__ import app
 from benchmarks.harness.figure import Figure, Unit
@@ -94,7 +95,7 @@ def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
     assert page.count("Of all scenes.") == 1
 
 
-@pytest.mark.parametrize("name", sorted(benchmark_results.SELECTIONS))
+@each("name", sorted(benchmark_results.SELECTIONS))
 def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
     path = benchmark_results.RESULTS / f"{name}.json"
     assert path.stat().st_size < 150_000
@@ -218,7 +219,7 @@ def test_the_scoreboard_shows_ours_beside_all_others() -> None:
     assert "+0.0 " not in text
 
 
-@pytest.mark.parametrize(
+@each(
     ("case", "accuracy", "speed"),
     [
         ("homogeneous path,", {"equal error"}, "slower"),

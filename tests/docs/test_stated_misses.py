@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import pytest
 import verdicts
+from support.cases import each
 
 from benchmarks.harness.verdicts import Verdict
 from benchmarks.stability.random_scenes import POOLED, TARGET
@@ -56,7 +56,7 @@ FLAGGED = {
 """Parts of the benchmark whose missed classes no comment states, and why."""
 
 
-@pytest.mark.parametrize("place", STATED)
+@each("place", STATED)
 def test_comments_name_what_no_flag_shows(place: tuple[str, str, str]) -> None:
     kind, variable, words = STATED[place]
     layout = kinds()[kind].part("variables", "LAYOUT")

@@ -13,6 +13,7 @@ import xarray as xr
 from support import factories
 from support.archives import mixed_campaign, raw_archives
 from support.archives.scene_jobs import catalogued_scenes
+from support.cases import each
 from support.oracles.angle_scenes import on_altitudes
 
 from lidarops.catalog.schema import GRANULE
@@ -90,7 +91,7 @@ TWO_BEAMS = scans((0.0, 90.0), (60.0, 90.0))
 BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[14_000, 16_000]]})
 
 
-@pytest.mark.parametrize(
+@each(
     ("rule", "with_need", "without_need"),
     [
         ("range_window", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
@@ -145,7 +146,7 @@ def test_what_is_not_requested_is_left_out(name, changes):
     assert not left_out & {(step.name, step.channel) for step in plan.steps}
 
 
-@pytest.mark.parametrize(
+@each(
     ("rule", "with_need", "without_need"),
     [
         ("noise", ([LEVEL], {}), ([LEVEL], with_products())),
@@ -174,7 +175,7 @@ def test_impossible_requests_are_left_out_by_name(rule, changes):
     assert decided(planned(LEVEL), rule) == ([], [])
 
 
-@pytest.mark.parametrize(
+@each(
     ("granules", "rule", "number"),
     [
         (ONE_SIDE, "gradient_regressor", 360.0),
@@ -268,7 +269,7 @@ def test_cycles_of_one_beam_are_warned_of_with_their_first_file():
     assert "leave their files out of `files` (first: coast/lone1)" in step.warning
 
 
-@pytest.mark.parametrize(
+@each(
     ("method", "retrieved"),
     [("auto", True), ("joint", True), ("two_angle", False), ("mld", False), ("mld_prior", False)],
 )
@@ -291,7 +292,7 @@ def test_invalid_angles_are_left_to_the_retrieval():
 # Headers --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("angles", "kept"),
     [
         ([90.0], 2),
@@ -329,7 +330,7 @@ def test_the_window_holds_the_farthest_section_and_the_bins_for_its_noise():
     assert window.settings == {"bins": [[0, 1112]]}
 
 
-@pytest.mark.parametrize(
+@each(
     ("products", "why"),
     [
         (HOMOGENEOUS, ""),

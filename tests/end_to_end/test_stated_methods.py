@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 import yaml
 from support.archives import mixed_campaign
+from support.cases import each
 
 import lidarops
 from lidarops.campaign.model import load_campaign
@@ -118,7 +119,7 @@ def _made(
     return xr.load_dataset(path), calls
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "settings", "method"),
     [
         ("homogeneous", {}, "direct"),
@@ -151,7 +152,7 @@ def test_the_stated_retrieval_is_the_one_that_ran(
         assert f'"method":"{method}"' in product["provenance"].item().replace("\\", "")
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "settings", "method"),
     [
         ("signal", {}, "tail_mean"),

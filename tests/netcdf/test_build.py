@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
+from support.cases import each
 from support.oracles.angle_scenes import retrieve_scan
 from support.products.encoded_products import build_product
 from support.products.made_products import (
@@ -46,7 +47,7 @@ def decoded(data: xr.Dataset, kind: str, **changes) -> xr.Dataset:
     return xr.decode_cf(build_product(data, context(kind, **changes)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_numbers_are_preserved(kind: str):
     data = MAKERS[kind]()
     product = decoded(data, kind)
@@ -69,7 +70,7 @@ def test_numbers_are_preserved(kind: str):
     assert product["station"].item() == STATION.name
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_attributes_name_existing_variables_only(kind: str):
     product = build_product(MAKERS[kind](), context(kind))
     for name, variable in product.variables.items():
@@ -78,7 +79,7 @@ def test_attributes_name_existing_variables_only(kind: str):
                 assert named in product.variables, (name, attribute)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_usable_is_the_worst_severity_of_the_bits(kind: str):
     data = MAKERS[kind]()
     flags = data["quality_flag"]
@@ -138,7 +139,7 @@ def test_the_input_is_not_changed():
     xr.testing.assert_identical(data, before)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_coordinates_are_listed_where_their_dimensions_are(kind: str):
     product = build_product(MAKERS[kind](zenith=30.0, azimuth=10.0), context(kind))
     for name, variable in product.variables.items():
@@ -351,7 +352,7 @@ def test_scenes_of_two_range_grids_have_two_files():
     assert len(paths) == 2
 
 
-@pytest.mark.parametrize("channel", ["../x", "", "a/b", ".hidden", "a b"])
+@each("channel", ["../x", "", "a/b", ".hidden", "a b"])
 def test_paths_stay_in_their_folder(channel: str):
     with pytest.raises(ProductError, match="file name"):
         product_path(context(channel=channel))
@@ -375,7 +376,7 @@ def put(name: str, value: float, where: tuple[int, ...] = ()) -> Callable[[xr.Da
     return change
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_every_missing_variable_is_named(kind: str):
     data = MAKERS[kind]()
     rows = (*layout_of(kind).coordinates, *layout_of(kind).variables)
@@ -388,7 +389,7 @@ def test_every_missing_variable_is_named(kind: str):
         assert caught.value.field == name
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field", "problem"),
     [
         (put("time", np.datetime64("NaT"), (1,)), "time", "missing times"),
@@ -435,7 +436,7 @@ def test_bad_results_are_refused(change, field, problem):
     assert field is None or caught.value.field == field
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field", "problem"),
     [
         (put("quality_flag", int(HomogeneousQuality.POOR_FIT), (0, 0)), "quality_flag", ": 18"),
@@ -458,7 +459,7 @@ def test_bad_signals_are_refused(change, field, problem):
     assert caught.value.field == field
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field", "problem"),
     [
         (put("altitude", 53.5, (0,)), "altitude", "station"),

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from support.cases import each
 
 from lidarops.netcdf._chunks import _planes, deflate_chunks
 
@@ -63,7 +64,7 @@ def test_text_is_cut_into_chunks_like_numbers():
     assert whole.tobytes() == text.tobytes() + bytes(128 - 70)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@each("dtype", DTYPES)
 def test_layout_in_memory_does_not_matter(dtype: str):
     values = np.arange(12 * 50).reshape(12, 50).astype(dtype)
     read_only = values.copy()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.cases import each
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
@@ -224,7 +225,7 @@ def bit_id(bit: FlagBit) -> str:
 BITS = list({bit_id(bit): bit for kind in OWN for bit in flags_of(kind)}.values())
 
 
-@pytest.mark.parametrize("kind", OWN)
+@each("kind", OWN)
 def test_published_places_do_not_change(kind: str):
     flags = flags_of(kind)
     places = {bit.word: int(bit).bit_length() - 1 for bit in flags}
@@ -260,7 +261,7 @@ class Twins(FlagBit):
     OUTLIER = FIRST_OWN + 1, Severity.REJECT, "has the name of a shared bit"
 
 
-@pytest.mark.parametrize(
+@each(
     "bits",
     [
         (Twins.ODD, Twins.ODD),

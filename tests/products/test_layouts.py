@@ -9,6 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from compliance_checker.cfunits import Unit
+from support.cases import each
 
 from lidarops.errors import ProductError
 from lidarops.kinds import kinds
@@ -254,7 +255,7 @@ def test_no_standard_name_means_total_extinction_in_air(standard_names: dict[str
     }
 
 
-@pytest.mark.parametrize(
+@each(
     ("mode", "name", "unit"),
     [
         (DetectionMode.ANALOG, "signal", "mV m2"),

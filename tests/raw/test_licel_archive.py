@@ -12,6 +12,7 @@ import dask
 import numpy as np
 import pytest
 import xarray as xr
+from support.cases import each
 from support.licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
 
 import lidarops
@@ -44,7 +45,7 @@ def make(tmp_path, name="a", minute=30, **changes):
     return path
 
 
-@pytest.mark.parametrize("profiles", [None, 1, 4, 5, 13, 100])
+@each("profiles", [None, 1, 4, 5, 13, 100])
 def test_archive_is_the_stack_of_its_files(pilar, stacked, profiles):
     archive = open_archive(pilar, profiles_per_chunk=profiles)
     computed = archive.compute(**SYNCHRONOUS)
@@ -152,7 +153,7 @@ def test_stretches_of_bins_lie_where_their_ranges_say(pilar, stacked):
     assert np.array_equal(some.analog_532p, stacked.analog_532p)
 
 
-@pytest.mark.parametrize(
+@each(
     "stretches",
     [
         {"photon_1o": ((0, 4),)},

@@ -9,6 +9,7 @@ import struct
 import numpy as np
 import pytest
 import xarray as xr
+from support.cases import each
 from support.licel_strategies import ANALOG, LINE_2, PHOTON, raw_file
 from support.physical import read_physical
 
@@ -178,7 +179,7 @@ def test_only_the_needed_bins_are_read(data_root, reads):
     assert reads == []
 
 
-@pytest.mark.parametrize(
+@each(
     "key",
     [
         (slice(None), slice(None)),

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from support.cases import each
 from support.licel_strategies import ANALOG, LINE_2, LINE_3, PHOTON, raw_file
 from support.physical import read_physical
 
@@ -30,7 +31,7 @@ def place(text: str) -> licel.Header:
     return parse(line_2=f" LidarPi  {DATES} {text}")
 
 
-@pytest.mark.parametrize(
+@each(
     ("written", "site"),
     [
         (" LidarPi  ", "LidarPi"),
@@ -103,7 +104,7 @@ def test_decimal_comma():
     assert header.datasets[0].input_range == 0.5
 
 
-@pytest.mark.parametrize(
+@each(
     ("written", "angle", "notes"),
     [("00", 0, 0), ("-90.0", 0, 1), ("90", 90, 0), ("-30", None, 0), ("-45.5", None, 0)],
 )
@@ -193,7 +194,7 @@ def test_mistyped_wavelength():
     assert math.isnan(dataset.wavelength)
 
 
-@pytest.mark.parametrize(
+@each(
     ("shots", "refused"),
     [
         (("101", "101", "101"), False),
@@ -368,7 +369,7 @@ def test_truncation_names_expected_and_found_bytes(tmp_path):
     assert "truncated" in text
 
 
-@pytest.mark.parametrize(
+@each(
     ("changes", "field"),
     [
         ({"line_2": " no date at all"}, "header line 2"),

@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.cases import each
 from support.licel_strategies import datasets, files, headers, naive_read, raw_file
 
 from lidarops.errors import RawFormatError
@@ -146,7 +147,7 @@ def test_other_time_zones_are_written_in_utc():
     assert header.start == start
 
 
-@pytest.mark.parametrize(
+@each(
     ("changes", "match"),
     [
         ({"zenith_angle": 72.5}, "zenith angle"),
@@ -179,7 +180,7 @@ def test_headers_that_cannot_be_written(changes, match):
         new(**changes)
 
 
-@pytest.mark.parametrize(
+@each(
     ("changes", "match"),
     [
         ({"bin_width": 7.4948}, "four characters"),

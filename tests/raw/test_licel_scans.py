@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 import xarray as xr
+from support.cases import each
 from support.licel_strategies import naive_read, raw_file
 
 from lidarops.errors import RawFormatError
@@ -49,7 +50,7 @@ def saved(tmp_path):
     return save
 
 
-@pytest.mark.parametrize(
+@each(
     ("elevation", "azimuth", "offset", "expected"),
     [
         ("-10.0", "37.0", "00.0", (80.0, 37.0)),
@@ -205,7 +206,7 @@ TRAPS = {
 """Zenith angle, azimuth, shots and duration of real files."""
 
 
-@pytest.mark.parametrize("path", TRAPS)
+@each("path", TRAPS)
 def test_real_files_state_pointing_shots_and_interval(path, data_root):
     zenith, azimuth, shots, seconds = TRAPS[path]
     header = real(data_root, path)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support import factories
+from support.cases import each
 from support.products.encoded_products import build_product
 
 from lidarops.campaign.ancillary_files import Ancillaries
@@ -311,8 +312,8 @@ def test_results_can_be_built_into_products(channel: str) -> None:
     np.testing.assert_allclose(product["altitude"][..., 100], STATION + distance[100], rtol=1e-6)
 
 
-@pytest.mark.parametrize("channel", ["photon_532o", "glued_532o"])
-@pytest.mark.parametrize("profiles", [1, 3, 20])
+@each("channel", ["photon_532o", "glued_532o"])
+@each("profiles", [1, 3, 20])
 def test_any_chunks_give_the_same_bits(channel: str, profiles: int) -> None:
     products = {"elastic": {**ELASTIC, "average": "10min"}}
     product = carry_out(products, archive(chunk=13), channel=channel, profiles=profiles)["elastic"]
@@ -493,7 +494,7 @@ def _glued(raw: xr.Dataset, **analog: object) -> xr.Dataset:
     return carry_out(products, raw, channel="glued_532o", channels=channels)["signal"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("lag", "settings"),
     [
         (6, {"lag": 6}),
@@ -636,7 +637,7 @@ class _Ends(ProductStream):
         return ()
 
 
-@pytest.mark.parametrize(
+@each(
     ("streams", "profiles", "edges"),
     [
         ((), 7, [7, 14, 20]),

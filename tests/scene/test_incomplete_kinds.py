@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from support.cases import each
 
 from lidarops import kinds as all_kinds
 from lidarops.errors import LidarOpsError
@@ -59,7 +60,7 @@ def test_a_kind_of_channels_is_no_kind_of_networks(package: Path) -> None:
         making("odd", Retrieval)
 
 
-@pytest.mark.parametrize("kind", all_kinds.kinds())
+@each("kind", all_kinds.kinds())
 def test_entries_of_a_kind_have_names_of_their_own(kind: str) -> None:
     assert not set(making(kind, Making).settings.model_fields) & set(PIPE)
 

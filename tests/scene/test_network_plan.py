@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from support.archives.network_plans import MEMBERS, campaign, granules
+from support.cases import each
 from support.factories import ANALOG, DAY, PHOTON
 
 from lidarops.campaign.model import Campaign
@@ -46,7 +47,7 @@ class TestCampaign:
         assert settings.visibility.threshold == 0.05
         assert settings.average == timedelta(minutes=10)
 
-    @pytest.mark.parametrize(
+    @each(
         ("visibility", "message"),
         [
             ({"average": "7min"}, "divide a day"),
@@ -205,7 +206,7 @@ class TestPlans:
         red = [*granules()[:2], replace(granules()[2], layout=other)]
         assert "different wavelengths: 532, 1064 nm" in reasons(planned(campaign(), red))
 
-    @pytest.mark.parametrize(
+    @each(
         ("rule", "settings", "files", "number"),
         [
             ("member_present", {}, granules()[:2], 0.0),

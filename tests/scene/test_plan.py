@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from support import factories
+from support.cases import each
 
 from lidarops.errors import SceneError
 from lidarops.kinds import Scope, kinds_of
@@ -135,7 +136,7 @@ def test_a_section_outside_the_bins_is_left_out(section: list[float]) -> None:
     assert _steps(result, "photon_532o")["homogeneous"]["sections"] == [[750.0, 4500.0]]
 
 
-@pytest.mark.parametrize(
+@each(
     ("pointings", "farthest", "method"),
     [
         ([(90.0, 20.0), (90.0, 20.0)], 4500, "direct"),
@@ -292,7 +293,7 @@ def test_the_reference_ends_with_the_bins() -> None:
     assert steps["reference"]["highest"] == 14_996.25
 
 
-@pytest.mark.parametrize(
+@each(
     ("granules", "facts", "settings", "words"),
     [
         (
@@ -336,7 +337,7 @@ def test_a_beam_is_fixed_despite_scattered_readings() -> None:
     assert "elastic" in _steps(_elastic(*moving, facts={"zenith_angle": 5.0}), "photon_532o")
 
 
-@pytest.mark.parametrize("zenith", [0.0, 5.0, 20.0, 30.0, 40.0, 47.0, 60.0, 63.0])
+@each("zenith", [0.0, 5.0, 20.0, 30.0, 40.0, 47.0, 60.0, 63.0])
 def test_a_reference_of_one_window_is_one_at_any_angle(zenith: float) -> None:
     window = {"lowest": 3000, "highest": 4000, "width": 1000}
     steps = _steps(_elastic(facts={"zenith_angle": zenith}, reference=window), "photon_532o")
@@ -376,7 +377,7 @@ class TestDark:
         assert self._step(*minutes) == {"files": len(minutes), "method": "nearest"}
         assert self.reason == f"{where}: the nearest in time is used"
 
-    @pytest.mark.parametrize(
+    @each(
         ("minutes", "where"),
         [
             ((90.0,), "1 dark file within 24 h of the scene, 1 among its profiles"),

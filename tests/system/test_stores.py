@@ -9,7 +9,6 @@ import threading
 from pathlib import Path
 
 import pytest
-from support.cases import each
 from support.servers.ports import KEYS, free_port
 
 from lidarops.errors import CatalogError, ProductError
@@ -192,7 +191,7 @@ def test_a_store_that_does_not_answer_is_reported(
     s3fs.S3FileSystem.clear_instance_cache()
 
 
-@each(
+@pytest.mark.parametrize(
     ("url", "shown"),
     [
         ("s3://key:secret@bucket/a", "s3://bucket/a"),
@@ -219,7 +218,7 @@ def test_keys_are_left_out_of_messages(url: str, shown: str) -> None:
     assert without_keys(url) == shown
 
 
-@each(
+@pytest.mark.parametrize(
     "url",
     [
         "s3://key:swordfish@bucket/a",

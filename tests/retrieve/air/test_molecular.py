@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import (
@@ -56,7 +57,7 @@ def test_the_infrared_check_values_are_of_the_fit_beyond_its_range():
     assert float(f"{_column() * fit * 1e-32:.5f}") == 0.00674
 
 
-@pytest.mark.parametrize("wavelength", np.array([308, 355, 387, 408, 532, 607, 694, 1064]) * 1e-9)
+@each("wavelength", np.array([308, 355, 387, 408, 532, 607, 694, 1064]) * 1e-9)
 def test_cross_sections_agree_with_bucholtz(wavelength):
     # bucholtz1995, table 3, from memory: an independent refractive index and depolarisation.
     um = wavelength * 1e6
@@ -120,8 +121,8 @@ def test_altitudes_outside_the_standard_are_refused(altitude):
             call(altitude)
 
 
-@pytest.mark.parametrize("station", [-300.0, 0.0, 850.0, 2400.0])
-@pytest.mark.parametrize("weather", [0.92, 1.0, 1.06])
+@each("station", [-300.0, 0.0, 850.0, 2400.0])
+@each("weather", [0.92, 1.0, 1.06])
 def test_pressure_units_are_detected(station, weather):
     levels = station + np.array([0.0, 1e3, 4e3])
     pressure, temperature = us_standard(levels)
@@ -135,7 +136,7 @@ def test_pressure_units_are_detected(station, weather):
     np.testing.assert_array_equal(hecto.pressure, unit.pressure)
 
 
-@pytest.mark.parametrize("factor", [1e-3, 0.1, 0.03, 7.5e-3, 0.5, 10.0, 1e3])
+@each("factor", [1e-3, 0.1, 0.03, 7.5e-3, 0.5, 10.0, 1e3])
 def test_other_pressures_are_refused(factor):
     pressure, temperature = _sounding()
     with pytest.raises(RetrievalInputError, match="neither Pa nor hPa") as caught:
@@ -157,7 +158,7 @@ def _with(name, change):
     return arguments | {name: change(arguments[name])}
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "change", "field", "message"),
     [
         ("altitude", lambda z: z / 1e3, "altitude", "looks like km"),

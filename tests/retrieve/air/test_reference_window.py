@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -117,7 +118,7 @@ def test_clean_windows_pass_at_the_rate_of_the_tests():
         assert rate == pytest.approx(expected, abs=4.0 * np.sqrt(expected / count))
 
 
-@pytest.mark.parametrize(
+@each(
     ("spoil", "reason"),
     [
         (lambda z: np.exp(-(z - 7e3) / 4e3), Rejection.SLOPE),
@@ -250,7 +251,7 @@ def test_candidates_are_made_within_their_bounds():
         candidate_windows(0.0, 1e5, 1e3, 1e-3)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field"),
     [
         ({"candidates": [[20e3, 21e3]]}, "candidates"),

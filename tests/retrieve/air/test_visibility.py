@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import visibility
@@ -160,7 +161,7 @@ def test_no_law_leaves_extinction_as_it_is():
     assert np.isnan(value[1])
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "field"),
     [
         ({"wavelength": 532.0, "law": "none"}, "wavelength"),
@@ -180,7 +181,7 @@ def test_wrong_settings_are_refused_by_name(arguments, field):
     assert raised.value.field == field
 
 
-@pytest.mark.parametrize(
+@each(
     ("extinction", "error", "contrast", "field"),
     [
         (1e-3, None, 0.0, "contrast"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 from support.oracles.homogeneous import (
     lowest_errors,
     quartic_derivative,
@@ -37,8 +38,8 @@ def without_noise(power, r, lag=None):
 # Algebra ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("lag", [1, 75, 90])
-@pytest.mark.parametrize(
+@each("lag", [1, 75, 90])
+@each(
     ("start", "length", "bins", "ratio", "digits"),
     [
         (2500.0, 1000.0, 225, 25.0, 12),
@@ -190,7 +191,7 @@ def test_noise_is_subtracted_from_the_coefficients_without_bias():
     assert np.all(np.abs(score(np.zeros_like(power))) > 20)
 
 
-@pytest.mark.parametrize(
+@each(
     ("start", "length", "height", "extinction", "most"),
     [
         (2500.0, 8000.0, 107.0, 0.03 * KM, 2.3),
@@ -200,7 +201,7 @@ def test_noise_is_subtracted_from_the_coefficients_without_bias():
         (2500.0, 8000.0, 107.0, 1.0 * KM, 3.7),
     ],
 )
-@pytest.mark.parametrize("variance", [1.0, None])
+@each("variance", [1.0, None])
 def test_cubic_is_unbiased_and_its_standard_error_honest(
     start, length, height, extinction, most, variance
 ):
@@ -277,12 +278,12 @@ def test_cubic_follows_scale_and_shift(exponent, shift):
     assert shifted.background - shift == pytest.approx(one.background, abs=1e-9)
 
 
-@pytest.mark.parametrize("bins", [3, 4, 5, 6, 7, 8, 16, 225, 4096])
+@each("bins", [3, 4, 5, 6, 7, 8, 16, 225, 4096])
 def test_default_lag_leaves_a_triple(bins):
     assert 1 <= default_lag(bins) <= (bins - 1) // 2
 
 
-@pytest.mark.parametrize("bins", [1, 2, 3, 4, 7])
+@each("bins", [1, 2, 3, 4, 7])
 def test_few_bins_are_flagged(bins):
     r = np.linspace(2500.0, 10500.0, bins) if bins > 1 else np.array([2500.0])
     estimate = cubic(25.0 + signal(r, 1.0, 0.03 * KM), r, variance=1e-12)
@@ -320,7 +321,7 @@ def test_shapes_follow_the_power():
     assert cubic(power[:, :0], LONG).background.shape == (2, 0)
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "field"),
     [
         ({"range": np.delete(LONG, 100)}, "power"),

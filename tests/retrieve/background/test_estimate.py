@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -176,8 +177,8 @@ def test_a_window_without_shape_falls_back_on_the_tail():
 # Cubic ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("extinction", [1e-5, 3e-4, 1e-3])
-@pytest.mark.parametrize("noise", [0.02, 0.5])
+@each("extinction", [1e-5, 3e-4, 1e-3])
+@each("noise", [0.02, 0.5])
 def test_the_cubic_gives_the_background_within_its_error(extinction, noise):
     result = METHODS["cubic"](*noisy(path(extinction), noise=noise))
     score = (result.background - SKY) / result.standard_error
@@ -273,9 +274,9 @@ def _with_range(data):
 # Bounds by the tail ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [0.01, 1.0])
-@pytest.mark.parametrize("amount", [0.0, 1.0, 20.0])
-@pytest.mark.parametrize("attenuation", [0.0, 5e-5, 3e-4])
+@each("noise", [0.01, 1.0])
+@each("amount", [0.0, 1.0, 20.0])
+@each("attenuation", [0.0, 5e-5, 3e-4])
 def test_the_bounded_tail_holds_the_background(amount, attenuation, noise):
     """Of air of constant scattering and any attenuation, from none to what leaves no signal."""
     signal = square_law(amount) * np.exp(-2.0 * attenuation * (RANGE - TAIL[0]))

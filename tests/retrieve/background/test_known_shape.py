@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -123,8 +124,8 @@ def test_errors_include_the_choice_of_the_window(haze, least):
     assert least < np.mean(covered) < 0.97
 
 
-@pytest.mark.parametrize("background", [0.0, 0.05, 2.0])
-@pytest.mark.parametrize("start", [None, 4500.0])
+@each("background", [0.0, 0.05, 2.0])
+@each("start", [None, 4500.0])
 def test_counts_are_weighed_without_bias(background, start):
     """Few counts per bin, where weights from the counts themselves are worst."""
     rng = np.random.default_rng(3)
@@ -321,7 +322,7 @@ def test_no_bit_depends_on_batch_or_layout():
         np.testing.assert_array_equal(other.background, alone)
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field"),
     [
         ({"range": RANGE / 1000.0}, "range"),

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy import signal, stats
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.raw import licel
@@ -82,8 +83,8 @@ CLOUDS = {
 }
 
 
-@pytest.mark.parametrize("cloud", CLOUDS)
-@pytest.mark.parametrize(("scale", "background"), [(1e18, 1.0), (1e18, 100.0), (1e20, 1e3)])
+@each("cloud", CLOUDS)
+@each(("scale", "background"), [(1e18, 1.0), (1e18, 100.0), (1e20, 1e3)])
 def test_clouds_are_detected_where_they_are(cloud, scale, background):
     rng = np.random.default_rng(1)
     base, depth, _ = CLOUDS[cloud]
@@ -283,9 +284,9 @@ def found_tops(wavelength, name, ratio):
     return total, (1.0 - 1.0 / total) * power / spread * np.sqrt(10.0), masks
 
 
-@pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
-@pytest.mark.parametrize("cloud", TOPS)
-@pytest.mark.parametrize("ratio", [1.0, 5.0, 30.0])
+@each("wavelength", [BLUE, 532e-9])
+@each("cloud", TOPS)
+@each("ratio", [1.0, 5.0, 30.0])
 def test_a_layer_holds_its_upper_part(wavelength, cloud, ratio):
     """Down to half the least excess, as far as means over 150 m show it, but for 180 m."""
     total, excess, masks = found_tops(wavelength, cloud, ratio)
@@ -297,9 +298,9 @@ def test_a_layer_holds_its_upper_part(wavelength, cloud, ratio):
     assert np.percentile(tops, 95) <= RANGE[above & (total > 1.02)].max() + 15.0
 
 
-@pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
-@pytest.mark.parametrize("cloud", ["weak cirrus", "cirrus"])
-@pytest.mark.parametrize("ratio", [5.0, 30.0])
+@each("wavelength", [BLUE, 532e-9])
+@each("cloud", ["weak cirrus", "cirrus"])
+@each("ratio", [5.0, 30.0])
 def test_a_layer_holds_its_lower_part(wavelength, cloud, ratio):
     """As its upper part, but for 90 m: longer windows are needed the farther the air is away."""
     total, excess, masks = found_tops(wavelength, cloud, ratio)
@@ -311,8 +312,8 @@ def test_a_layer_holds_its_lower_part(wavelength, cloud, ratio):
     assert np.percentile(bases, 5) >= RANGE[below & (total > 1.02)].min() - 15.0
 
 
-@pytest.mark.parametrize("wavelength", [BLUE, 532e-9])
-@pytest.mark.parametrize("cloud", TOPS)
+@each("wavelength", [BLUE, 532e-9])
+@each("cloud", TOPS)
 def test_the_margin_of_a_layer_holds_the_edge_that_noise_hides(wavelength, cloud):
     total, excess, masks = found_tops(wavelength, cloud, 30.0)
     half = 1.0 + 0.5 * (cloud_contrast(wavelength) - 1.0)
@@ -320,8 +321,8 @@ def test_the_margin_of_a_layer_holds_the_edge_that_noise_hides(wavelength, cloud
     assert with_margin(masks, RANGE)[:, edge_bins].mean() > 0.99
 
 
-@pytest.mark.parametrize(("ratio", "found"), [(3.0, False), (8.0, True)])
-@pytest.mark.parametrize("depth", [300.0, 500.0, 800.0, 1200.0])
+@each(("ratio", "found"), [(3.0, False), (8.0, True)])
+@each("depth", [300.0, 500.0, 800.0, 1200.0])
 def test_a_cirrus_that_rises_slowly_is_found(depth, ratio, found):
     excess = (ratio - 1.0) * np.exp(-0.5 * ((RANGE - 9500.0) / depth) ** 2)
     counts = 1e20 * attenuated(excess * BACKSCATTER, lidar_ratio=20.0)

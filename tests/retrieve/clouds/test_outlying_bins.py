@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.clouds.outlying_bins import bridge_outliers
@@ -23,7 +24,7 @@ def noisy(signal, ratio, profiles=1, *, seed=1):
 # Detected -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [15.0, 100.0, 1e4, -15.0, -1e4])
+@each("size", [15.0, 100.0, 1e4, -15.0, -1e4])
 def test_an_outlying_bin_is_interpolated_from_its_neighbours(size):
     power, variance = noisy(AIR, 50.0, 400)
     at = np.random.default_rng(2).integers(10, RANGE.size - 10, 400)
@@ -104,8 +105,8 @@ def test_thin_layers_are_left_unchanged(width, peak):
     assert not bridge_outliers(power, RANGE, variance).outlying.any()
 
 
-@pytest.mark.parametrize("bins", [1, 2, 8])
-@pytest.mark.parametrize("depth", [0.1, 1.0, 5.0])
+@each("bins", [1, 2, 8])
+@each("depth", [0.1, 1.0, 5.0])
 def test_clouds_of_any_width_are_left_unchanged(bins, depth):
     """The signal behind a cloud is attenuated."""
     at = np.random.default_rng(5).integers(50, 750, (500, 1))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.cases import each
 from support.oracles.homogeneous import GEOMETRIES, iterated_fit, lowest_errors, section, signal
 
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
@@ -48,8 +49,8 @@ def slow_fit(r, power, weights):
     return iterated_fit(r, power, weights, bounds)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("case", CASES)
+@each("kind", KINDS)
+@each("case", CASES)
 def test_result_is_the_least_squares_minimum_with_the_errors_of_its_information(case, kind):
     r, power, variance = measured(case, kind, 10)
     weights = np.where(np.isfinite(power), 1.0 / variance, 0.0)
@@ -71,10 +72,10 @@ def test_result_is_the_least_squares_minimum_with_the_errors_of_its_information(
         assert fit.valid_bins[k] == bins
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("bins", [12, 40, 225])
-@pytest.mark.parametrize("level", [-1e6, -5.0, 0.0, 1e6])
-@pytest.mark.parametrize("extinction", [0.0, 0.05, 2.0])
+@each("known", [True, False])
+@each("bins", [12, 40, 225])
+@each("level", [-1e6, -5.0, 0.0, 1e6])
+@each("extinction", [0.0, 0.05, 2.0])
 def test_profiles_with_gaps_are_at_the_global_minimum(extinction, level, bins, known):
     r = section(2500.0, 3000.0, bins)
     rng = np.random.default_rng([bins, known])
@@ -88,8 +89,8 @@ def test_profiles_with_gaps_are_at_the_global_minimum(extinction, level, bins, k
 
 
 @pytest.mark.filterwarnings("ignore:divide by zero")
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("case", CASES)
+@each("kind", KINDS)
+@each("case", CASES)
 def test_scatter_is_the_least_that_the_bins_allow(case, kind):
     _, _, height, extinction = case
     count = 4000
@@ -103,9 +104,9 @@ def test_scatter_is_the_least_that_the_bins_allow(case, kind):
     assert 0.935 < np.mean(np.abs(pull) < 1.96) < 0.965
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("level", [0.0, 100.0])
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
+@each("kind", KINDS)
+@each("level", [0.0, 100.0])
+@each(("start", "length"), GEOMETRIES)
 def test_noise_free_extinction_is_exact(start, length, level, kind):
     r = section(start, length)
     truth = np.geomspace(1e-5, 20.0 / length, 120)[:, np.newaxis]
@@ -142,8 +143,8 @@ def test_a_step_that_is_small_by_chance_does_not_end_the_search():
         assert abs(fit.extinction[k] - found) < 0.01 * fit.extinction_standard_error[k]
 
 
-@pytest.mark.parametrize(("start", "length", "bins"), [(500.0, 200.0, 32), (30.0, 15e3, 2000)])
-@pytest.mark.parametrize("level", [0.0, 1.0, 10.0, 100.0])
+@each(("start", "length", "bins"), [(500.0, 200.0, 32), (30.0, 15e3, 2000)])
+@each("level", [0.0, 1.0, 10.0, 100.0])
 def test_noise_free_extinction_of_profiles_without_gaps_is_exact(start, length, bins, level):
     r = np.linspace(start, start + length, bins)
     truth = np.geomspace(1e-5, 50.0 / length, 300)[:, np.newaxis]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy import stats
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality, rejecting
@@ -40,7 +41,7 @@ def test_a_signal_that_dies_within_a_bin_determines_no_extinction(variance, shar
     assert np.mean(false[others]) == pytest.approx(share, abs=0.01)
 
 
-@pytest.mark.parametrize(
+@each(
     ("bins", "factor", "far"),
     [(225, 1.01, 1e-4), (50, 1.05, 3e-4), (32, 1.08, 5.5e-4), (31, 1.09, 5.8e-4),
      (20, 1.15, 1.2e-3), (8, 1.60, 7.1e-3)],
@@ -85,7 +86,7 @@ def of_estimated_noise(bins, seed):
     )
 
 
-@pytest.mark.parametrize("bins", [8, 12, 16, 24, 32])
+@each("bins", [8, 12, 16, 24, 32])
 def test_intervals_of_short_sections_with_estimated_noise_hold_what_they_state(bins):
     """Those of 8 bins held 99.8 percent while their errors were widened for the far tail."""
     errors = np.concatenate([of_estimated_noise(bins, seed) for seed in range(24)], axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support.cases import each
 from support.mean_counts import mean_profile_variance
 from support.oracles.homogeneous import (
     GEOMETRIES,
@@ -83,7 +84,7 @@ def test_linear_step_from_the_truth_is_exact_without_noise():
     np.testing.assert_allclose(fit.background, 25.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
+@each(
     ("height", "extinction", "share"),
     [(107.0, 0.03, 1.0), (1e3, 0.03, 0.9), (1e3, 0.03, 0.7), (107.0, 1.0, 0.95), (1e4, 0.1, 0.95)],
 )
@@ -198,8 +199,8 @@ def test_background_at_known_extinction_is_the_published_formula():
     assert np.all(fit.extinction_standard_error == 0.0)
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize(("height", "extinction"), [(50.0, 0.03), (1e4, 0.5), (1e3, 0.0)])
+@each("known", [True, False])
+@each(("height", "extinction"), [(50.0, 0.03), (1e4, 0.5), (1e3, 0.0)])
 def test_errors_at_known_extinction_are_honest(height, extinction, known):
     variance = np.linspace(0.5, 1.5, 225)
     power = 370.0 + signal(LONG, height, extinction * KM)
@@ -224,10 +225,8 @@ def test_wrong_known_extinction_is_flagged():
 # Counts -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("dark", "height", "shots"), [(510.0, 5e3, 1), (10.0, 1e5, 1), (5.0, 60.0, 51)]
-)
-@pytest.mark.parametrize(
+@each(("dark", "height", "shots"), [(510.0, 5e3, 1), (10.0, 1e5, 1), (5.0, 60.0, 51)])
+@each(
     ("method", "given"),
     [
         ("direct", {}),
@@ -311,8 +310,8 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("call", CALLS)
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each("call", CALLS)
+@each("dtype", [np.float64, np.float32])
 def test_no_method_depends_on_the_batch(call, dtype):
     rng = np.random.default_rng(22)
     power = clean(60, seed=22).astype(dtype)
@@ -334,8 +333,8 @@ def test_no_method_depends_on_the_batch(call, dtype):
         same(solved(rows), rows_of(whole, rows))
 
 
-@pytest.mark.parametrize("call", [call for call in CALLS if call != "known_extinction"])
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
+@each("call", [call for call in CALLS if call != "known_extinction"])
+@each(("start", "length"), GEOMETRIES)
 def test_unflagged_values_are_right_within_their_errors(call, start, length):
     rng = np.random.default_rng(23)
     r, count = section(start, length), 4000
@@ -354,7 +353,7 @@ def test_unflagged_values_are_right_within_their_errors(call, start, length):
     assert np.mean(off[accepted]) < 2e-3
 
 
-@pytest.mark.parametrize("call", CALLS)
+@each("call", CALLS)
 def test_no_method_accepts_noise(call):
     for start, length in GEOMETRIES:
         r = section(start, length)
@@ -388,7 +387,7 @@ def test_model_error_and_signal_to_noise_are_reported():
 # Arguments ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "field"),
     [
         ({"method": "linearized"}, "extinction"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.cases import each
 from support.oracles.homogeneous import iterated_fit, section, signal
 
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
@@ -21,9 +22,9 @@ def bent(r, extinction, model_error, height=1000.0, slopes=(-1.0, 1.0)):
     return 370.0 + signal(r, height, extinction) * np.exp(departure * (r[-1] - r[0]) * turn)
 
 
-@pytest.mark.parametrize("length", [1700.0, 8000.0])
-@pytest.mark.parametrize("extinction", [-0.005 * KM, 0.03 * KM, 1.0 * KM])
-@pytest.mark.parametrize("kind", ["gaps", "weights", "plain"])
+@each("length", [1700.0, 8000.0])
+@each("extinction", [-0.005 * KM, 0.03 * KM, 1.0 * KM])
+@each("kind", ["gaps", "weights", "plain"])
 def test_model_error_is_the_effect_of_a_bent_signal(kind, extinction, length):
     r = section(2500.0, length)
     weights = np.ones(r.size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
+from support.cases import each
 from support.oracles.homogeneous import section, signal
 
 from lidarops.flags import Quality
@@ -55,8 +56,8 @@ def test_the_bit_is_raised_by_the_energy_in_two_shapes(length, height, extinctio
     assert 0.05 < np.mean(raised) < 0.95
 
 
-@pytest.mark.parametrize("variance", [1.0, None])
-@pytest.mark.parametrize("extinction", [0.0, 0.3 * KM, 5.0 * KM])
+@each("variance", [1.0, None])
+@each("extinction", [0.0, 0.3 * KM, 5.0 * KM])
 def test_false_alarms_of_both_are_as_rare_as_those_of_one(variance, extinction):
     r = section(2500.0, 8000.0)
     power = cut(r, 100.0, extinction, np.inf, 40_000, seed=12)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import mpmath as mp
 import numpy as np
 import pytest
+from support.cases import each
 from support.mean_counts import mean_profile_variance
 from support.oracles.homogeneous import (
     GEOMETRIES,
@@ -205,7 +206,7 @@ TABLE = {
 }
 
 
-@pytest.mark.parametrize("case", TABLE)
+@each("case", TABLE)
 def test_robustness_table(case):
     outcome = TABLE[case]
     power = clean()
@@ -240,7 +241,7 @@ def test_outlying_bin_is_flagged():
         assert share(fit, Quality.OUTLIER) > least
 
 
-@pytest.mark.parametrize("case", [name for name in TABLE if name != "clean"])
+@each("case", [name for name in TABLE if name != "clean"])
 def test_bad_profiles_do_not_affect_their_neighbours(case):
     power = clean(24)
     expected = fit_homogeneous_path(power, LONG, variance=1.0)
@@ -356,8 +357,8 @@ def test_s7_unit_of_range_does_not_matter():
     np.testing.assert_allclose(other.background, one.background, rtol=1e-13)
 
 
-@pytest.mark.parametrize("ratio", [0.0, 1.0, 10.0, 100.0])
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
+@each("ratio", [0.0, 1.0, 10.0, 100.0])
+@each(("start", "length"), GEOMETRIES)
 def test_s8_large_background_costs_no_digits(start, length, ratio):
     r = section(start, length)
     extinction = np.geomspace(0.01 * KM, 50.0 / length, 400)
@@ -484,8 +485,8 @@ def test_s18_cloud(known):
 # Missing near range -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("first", [1, 20, 60, 150])
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
+@each("first", [1, 20, 60, 150])
+@each(("start", "length"), GEOMETRIES)
 def test_missing_near_range_leaves_the_global_minimum(start, length, first):
     rng = np.random.default_rng(14)
     r = section(start, length)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 from support.oracles.homogeneous import (
     GEOMETRIES,
     amplitude,
@@ -70,9 +71,9 @@ def gaps(kind):
     return weights
 
 
-@pytest.mark.parametrize("kind", ["none", "near", "middle", "random", "all"])
-@pytest.mark.parametrize("ratio", [0.0, 1.0, 100.0])
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
+@each("kind", ["none", "near", "middle", "random", "all"])
+@each("ratio", [0.0, 1.0, 100.0])
+@each(("start", "length"), GEOMETRIES)
 def test_extinction_is_exact_without_noise(start, length, ratio, kind):
     r = section(start, length)
     extinction = np.geomspace(0.01 * KM, 50.0 / length, 300)
@@ -147,8 +148,8 @@ def test_common_factor_of_weights_does_not_matter():
 # Against slow solvers -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
-@pytest.mark.parametrize("weighted", [False, True])
+@each(("start", "length"), GEOMETRIES)
+@each("weighted", [False, True])
 def test_result_is_the_least_squares_minimum(start, length, weighted):
     rng = np.random.default_rng(3)
     r = section(start, length)
@@ -188,8 +189,8 @@ SCENARIOS = [
 ]
 
 
-@pytest.mark.parametrize(("start", "length", "height", "extinction"), SCENARIOS)
-@pytest.mark.parametrize("known", [True, False])
+@each(("start", "length", "height", "extinction"), SCENARIOS)
+@each("known", [True, False])
 def test_scatter_is_the_least_possible_and_errors_are_honest(
     start, length, height, extinction, known
 ):
@@ -208,8 +209,8 @@ def test_scatter_is_the_least_possible_and_errors_are_honest(
     assert np.mean(fit.quality == 0) > 0.995
 
 
-@pytest.mark.parametrize("kind", ["near", "middle", "random", "all"])
-@pytest.mark.parametrize(("start", "length"), GEOMETRIES)
+@each("kind", ["near", "middle", "random", "all"])
+@each(("start", "length"), GEOMETRIES)
 def test_scatter_is_the_least_possible_with_gaps(start, length, kind):
     r, height, extinction = section(start, length), 3e4, 0.05 * KM
     power, weights = clean(3000, height, extinction, seed=5, r=r), gaps(kind)
@@ -356,8 +357,8 @@ def test_cloud_and_outlier_are_flagged():
         assert abs(np.mean(fit.extinction - 0.03 * KM)) < 0.3e-6
 
 
-@pytest.mark.parametrize("variance", [2.0, None])
-@pytest.mark.parametrize("value", [0.0, 5.0, -3.7])
+@each("variance", [2.0, None])
+@each("value", [0.0, 5.0, -3.7])
 def test_constant_profile_has_no_signal(value, variance):
     fit = fit_homogeneous_path(np.full(225, value), LONG, variance=variance)
     assert fit.quality == Quality.NO_SIGNAL
@@ -384,7 +385,7 @@ def test_nothing_valid_is_missing():
     assert fit_homogeneous_path(clean(1), LONG, weights=0.0).quality == Quality.INPUT_MISSING
 
 
-@pytest.mark.parametrize("bins", [1, 2, 3, 4, 7, 8])
+@each("bins", [1, 2, 3, 4, 7, 8])
 def test_few_bins(bins):
     r = np.linspace(2500.0, 10500.0, bins) if bins > 1 else np.array([2500.0])
     whole = 370.0 + signal(r, 1e3, 0.03 * KM) + 0.01 * noise(1, bins)[0]
@@ -442,7 +443,7 @@ def test_result_does_not_depend_on_the_batch(method, dtype):
     same(fortran, whole)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308, 0.0])
+@each("bad", [np.nan, np.inf, -np.inf, 1e308, 0.0])
 def test_bad_neighbours_do_not_affect_a_profile(bad):
     power = clean(9)
     expected = fit_homogeneous_path(power, LONG, variance=1.0)
@@ -495,7 +496,7 @@ def test_masked_bins_are_excluded():
     same(fit_homogeneous_path(power, LONG, variance=np.where(holes, np.nan, 1.0)), expected)
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "field", "words"),
     [
         ({"power": np.ones((2, 7))}, "power", "225 bins"),
@@ -528,8 +529,8 @@ def test_invalid_arguments_are_refused(arguments, field, words):
 # The cubic ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize(
+@each("known", [True, False])
+@each(
     ("start", "length", "height", "extinction"),
     [(2500.0, 8000.0, 1e3, 0.03), (2500.0, 1700.0, 1e4, 0.03), (2500.0, 8000.0, 500.0, 1.0)],
 )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle import _smoothing
@@ -37,8 +38,8 @@ def solved(bands, estimates, stiffness, lam):
     return out
 
 
-@pytest.mark.parametrize("heights", [1, 2, 3, 7, 60])
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
+@each("heights", [1, 2, 3, 7, 60])
+@each("correlation", [0.0, 0.8])
 def test_solution_and_inverse_equal_dense_algebra(heights, correlation):
     rng = np.random.default_rng(heights)
     bands, estimates, stiffness, lam = systems(rng, 19, heights, correlation)
@@ -72,8 +73,8 @@ def test_scores_equal_dense_algebra():
         np.testing.assert_allclose(scores[:, i], expected, rtol=1e-8)
 
 
-@pytest.mark.parametrize("smoothing", [1e-10, 1e-3, 1.0])
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
+@each("smoothing", [1e-10, 1e-3, 1.0])
+@each("correlation", [0.0, 0.8])
 def test_solution_keeps_8_digits_of_60(smoothing, correlation):
     heights = 200
     rng = np.random.default_rng(4)

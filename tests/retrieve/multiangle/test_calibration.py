@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.cases import each
 from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle import _calibration, _smoothing
@@ -43,8 +44,8 @@ def noise_covariance(c):
     return both * c.correlation**apart + np.diag((1.0 - c.share) * error**2)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.6])
-@pytest.mark.parametrize("lower", [np.full(HEIGHTS, -1), ROWS - 1, np.maximum(ROWS - 5, -1)])
+@each("correlation", [0.0, 0.6])
+@each("lower", [np.full(HEIGHTS, -1), ROWS - 1, np.maximum(ROWS - 5, -1)])
 def test_sandwich_equals_dense_algebra(correlation, lower):
     c = calibration(correlation)
     components = _calibration.sandwich(c, ROWS, lower)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.cases import each
 
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import slant_paths
@@ -45,7 +46,7 @@ def cells(signal, angle, *, variance=None, quality=None):
     return average_over_cells(rows, noise, bits, np.ones(RANGE.size), RANGE, edges_of(angle))
 
 
-@pytest.mark.parametrize("angle", ANGLES)
+@each("angle", ANGLES)
 def test_all_beams_average_the_same_air(angle):
     means = cells(of_bins(angle, scattering), angle).signal[0]
     fine = EDGES[:-1, np.newaxis] + 60.0 * (np.arange(200) + 0.5) / 200.0

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import erfc
+from support.cases import each
 from support.oracles.multiangle import (
     Scan,
     ScanScene,
@@ -35,8 +36,8 @@ def test_false_alarms_are_fewer_than_one_in_a_hundred():
     assert np.mean(alarms) <= 0.01
 
 
-@pytest.mark.parametrize("largest", [15.0, 30.0, 45.0])
-@pytest.mark.parametrize("correlation", [0.5, 0.8])
+@each("largest", [15.0, 30.0, 45.0])
+@each("correlation", [0.5, 0.8])
 def test_variation_in_a_cloud_is_detected(largest, correlation):
     scene = cloud_scene(correlation, largest=largest)
     variable = replace(scene, variation=1.0)

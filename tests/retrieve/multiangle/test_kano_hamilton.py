@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 from support.oracles.multiangle import (
     ANGLES,
     PATHS,
@@ -213,8 +214,8 @@ def test_weak_signals_are_not_biased(ratio):
 # Standard errors ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["kano_hamilton", "two_angle"])
-@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.9])
+@each("method", ["kano_hamilton", "two_angle"])
+@each("correlation", [0.0, 0.6, 0.9])
 def test_extinction_allows_for_errors_that_neighbouring_altitudes_share(method, correlation):
     """As differences of independent errors, 95 percent intervals covered 99.6 and 100 percent."""
     atmosphere, rng = clear(100), np.random.default_rng(23)

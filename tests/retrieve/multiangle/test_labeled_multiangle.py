@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from support.cases import each
 from support.oracles.angle_scenes import on_altitudes, retrieve_scan
 
 from lidarops.errors import RetrievalInputError
@@ -366,7 +367,7 @@ def test_incomplete_cycles_are_used_as_far_as_possible():
     assert_explained(product)
 
 
-@pytest.mark.parametrize("method", [m.value for m in MultiAngleMethod])
+@each("method", [m.value for m in MultiAngleMethod])
 def test_every_missing_value_is_explained_whatever_the_method(method):
     conditioned, pointing = scan(5, ONE_SIDE, sigma=40.0)
     conditioned["power"][7] = np.nan
@@ -556,7 +557,7 @@ def test_bins_beyond_the_highest_altitude_and_piece_sizes_do_not_matter(monkeypa
 # Refusals
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field"),
     [
         ({"background_range": (20e3, 30e3)}, "background"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.cases import each
 
 from lidarops.retrieve.multiangle.analog_baseline import obstruction_range
 
@@ -32,8 +33,8 @@ def test_a_target_is_found_where_it_stands(target):
     assert (found > target - 130.0).all()
 
 
-@pytest.mark.parametrize("extinction", [0.0, 1e-4, 3e-3, 1e-2])
-@pytest.mark.parametrize("shots", [20, 60, 2000])
+@each("extinction", [0.0, 1e-4, 3e-3, 1e-2])
+@each("shots", [20, 60, 2000])
 def test_air_is_no_obstruction(extinction, shots):
     """Up to fog with a visibility of 300 m."""
     found = obstruction_range(*counts(300, extinction, shots), DISTANCE)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 from support.oracles.multiangle import (
     ANGLES,
     clear,
@@ -229,7 +230,7 @@ def test_layers_are_far_more_certain_than_differences():
 # Extreme cases ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@each("method", METHODS)
 def test_one_path_gives_no_optical_depth(small, method):
     signal, variance, height, _ = small
     for angles in ([ANGLES[3]], [30.0, 30.0, 30.0], [88.0, 89.0]):
@@ -256,7 +257,7 @@ def test_tiny_leverage_is_flagged_and_has_a_correct_error():
     assert rms(result.optical_depth - tau) == pytest.approx(14.4, rel=0.05)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@each("method", METHODS)
 def test_beams_at_the_horizon_have_no_effect(small, method):
     signal, variance, height, _ = small
     horizon = np.concatenate([signal, np.ones_like(signal[:, :2])], axis=1)
@@ -269,7 +270,7 @@ def test_beams_at_the_horizon_have_no_effect(small, method):
     assert close(with_them.optical_depth_standard_error, without.optical_depth_standard_error)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@each("method", METHODS)
 def test_invalid_profiles_do_not_affect_others(small, method):
     signal, variance, height, tau = small
     broken = signal.copy()
@@ -288,8 +289,8 @@ def test_invalid_profiles_do_not_affect_others(small, method):
         assert result.raised(MultiAngleQuality.INTERPOLATED)[1, 50]
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("variance_of", [np.nan, np.inf])
+@each("method", METHODS)
+@each("variance_of", [np.nan, np.inf])
 def test_samples_without_a_variance_count_as_missing(small, method, variance_of):
     signal, variance, height, _ = small
     unknown = np.array(variance)
@@ -345,8 +346,8 @@ def test_gaps_cost_no_more_than_the_samples_they_take():
     assert np.mean(np.abs(deviations) > 4.0) < 0.01
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("altitudes", [1, 3])
+@each("method", METHODS)
+@each("altitudes", [1, 3])
 def test_few_altitudes_and_one_profile_are_solved(small, method, altitudes):
     signal, variance, height, tau = small
     result = retrieve_optical_depth(
@@ -469,7 +470,7 @@ def test_known_inhomogeneity_is_not_estimated(small):
     assert not result.raised(MultiAngleQuality.NO_RESIDUAL).any()
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "field"),
     [
         ({"signal": np.ones((2, 11, 80))}, "signal"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.cases import each
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle.scan_cycles import cycles, directions, vertical_planes
@@ -175,7 +176,7 @@ def test_cycles_are_runs_without_a_return_or_a_long_gap(zenith, steps):
         assert np.all(gaps[members[:-1]] - 0.5 <= longest)
 
 
-@pytest.mark.parametrize(
+@each(
     ("zenith", "azimuth", "bounds", "field"),
     [
         ([0.0, 181.0], None, [[0, 1], [1, 2]], "zenith_angle"),
@@ -228,7 +229,7 @@ def whole(length, repeated=3):
     return np.repeat(np.arange(repeated), length).tolist()
 
 
-@pytest.mark.parametrize(
+@each(
     "beams",
     [
         UP,

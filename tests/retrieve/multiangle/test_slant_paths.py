@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from support.cases import each
 
 from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import RetrievalInputError
@@ -112,7 +113,7 @@ def test_opposite_beams_surround_the_zenith(azimuth, around):
     assert slant_paths.surrounds_zenith(np.radians(azimuth)) == around
 
 
-@pytest.mark.parametrize(
+@each(
     ("angles", "altitude", "azimuth", "field"),
     [
         ([0.0, 91.0], HEIGHT, None, "zenith_angle"),

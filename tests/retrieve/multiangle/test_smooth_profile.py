@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import erf
+from support.cases import each
 from support.oracles.angle_scenes import clear, clear_depth, cloud, estimates
 from support.oracles.banded_matrices import dense
 
@@ -165,8 +166,8 @@ def joined(scene, correlation, profiles, blocks, seed):
 DEPTH_68, DEPTH_95 = (0.60, 0.78), (0.91, 0.985)
 
 
-@pytest.mark.parametrize(("profiles", "blocks"), [(300, 2), (32, 12), (8, 30)])
-@pytest.mark.parametrize("name", SCENES)
+@each(("profiles", "blocks"), [(300, 2), (32, 12), (8, 30)])
+@each("name", SCENES)
 def test_standard_errors_cover_the_truth(name, profiles, blocks):
     rows, depth, extinction = joined(*SCENES[name], profiles, blocks, seed=1)
     within_1, within_2 = coverage(
@@ -479,7 +480,7 @@ def test_lag_sums_follow_their_definition():
     np.testing.assert_array_equal(moments.degrees_of_freedom, np.maximum(used.sum(axis=1) - 2, 0))
 
 
-@pytest.mark.parametrize(
+@each(
     ("ratios", "expected"),
     [
         ((-0.2, 0.0, 0.0), (0.0, 1.0)),
