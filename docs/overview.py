@@ -8,9 +8,9 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidarops.figures import svg
 from lidarops.figures.kind_figures import ProductSource, figures_of
 from lidarops.figures.panels import Figure, Panel
+from lidarops.figures.stills import still
 
 DEMO = Path(sys.argv[1] if sys.argv[1:] else Path(__file__).resolve().parents[1] / "demo")
 
@@ -34,7 +34,7 @@ def main() -> None:
     signal = _panel("signal", source)
     extinction = replace(_panel("homogeneous", source), x=signal.x)
     figure = Figure("One day of the demo", "extinction and signal", (extinction, signal))
-    Path(__file__).with_suffix(".svg").write_bytes(svg.file(figure))
+    Path(__file__).with_suffix(".svg").write_bytes(still(figure, ".svg"))
 
 
 if __name__ == "__main__":

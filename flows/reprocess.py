@@ -187,9 +187,11 @@ def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
     )
     create_link_artifact(built.page.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
     if built.quicklook is not None:
+        from lidarops.figures.stills import still  # noqa: PLC0415 - imports matplotlib
+
         # The server may run on another machine, so the artifact contains the picture.
-        encoded = base64.b64encode(built.quicklook.read_bytes()).decode()
-        url = f"data:image/svg+xml;base64,{encoded}"
+        encoded = base64.b64encode(still(built.quicklook, ".png")).decode()
+        url = f"data:image/png;base64,{encoded}"
         create_image_artifact(image_url=url, key=f"{key}-quicklook")
     return built.page
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from lidarops.cli.app import JsonOption, WorkersOption, command, exit_with_status, say, show
+from lidarops.errors import LidarOpsError
 
 
 @command()
@@ -60,24 +61,33 @@ def inspect(
 def plot(
     file: Annotated[Path, typer.Argument(help="A raw file or a product.", metavar="FILE")],
     out: Annotated[
-        Path, typer.Option("--out", help="Folder of the figures.", file_okay=False)
-    ] = Path(),
+        Path | None,
+        typer.Option("--out", "-o", help="PNG, SVG or PDF file; by default FILE.png here."),
+    ] = None,
+    variable: Annotated[str, typer.Option(help="Draw this variable only.")] = "",
+    time: Annotated[
+        str, typer.Option(help="UTC, such as 2024-03-01T06:00/2024-03-01T18:00.", metavar="SPAN")
+    ] = "",
+    range_: Annotated[str, typer.Option("--range", help="km, such as 0.3/5.", metavar="SPAN")] = "",
+    altitude: Annotated[str, typer.Option(help="km above sea level.", metavar="SPAN")] = "",
 ) -> None:
-    """Draw a raw file or a product as SVG files, which browsers show.
+    """Draw a raw file or a product; more than one figure get numbered files.
 
-    Example: lidarops plot demo/raw/coast/h2492106.010000 --out figures
+    Example: lidarops plot demo/raw/coast/h2492106.010000 -o h2492106.svg
     """
-    from lidarops.figures import svg
     from lidarops.reports import plotting
     from lidarops.system.files import write_atomically
 
-    figures = plotting.draw_file(file)
-    out.mkdir(parents=True, exist_ok=True)
+    out = out or Path(f"{file.name.removesuffix('.nc')}.png")
+    if out.suffix not in plotting.TYPES:
+        raise LidarOpsError(f"is none of {', '.join(plotting.TYPES)}", file=out, wrong_use=True)
+    figures = plotting.draw_file(file, plotting.selection(variable, time, range_, altitude))
+    from lidarops.figures.stills import still
+
+    out.parent.mkdir(parents=True, exist_ok=True)
     for number, figure in enumerate(figures, 1):
-        target = (
-            out / f"{file.name.removesuffix('.nc')}{'' if len(figures) == 1 else f'_{number}'}.svg"
-        )
-        write_atomically(target, svg.file(figure))
+        target = out if len(figures) == 1 else out.with_stem(f"{out.stem}_{number}")
+        write_atomically(target, still(figure, out.suffix))
         say(f"{target}: {figure.caption}")
 
 

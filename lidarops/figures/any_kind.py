@@ -48,7 +48,9 @@ class MainVariable:
         return f"{self.long_name[:1].upper()}{self.long_name[1:]}{few}"
 
 
-def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None:
+def read_main_variable(
+    product: xr.Dataset, *, kind: str, name: str | None = None
+) -> MainVariable | None:
     """Return the main variable of a product as series over time.
 
     Parameters
@@ -57,6 +59,8 @@ def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None
         Of any kind; may be lazy. Of a large variable, only some profiles are read.
     kind : str
         Kind of the product, which may be unknown.
+    name : str, optional
+        Another variable over time.
 
     Returns
     -------
@@ -64,7 +68,7 @@ def read_main_variable(product: xr.Dataset, *, kind: str) -> MainVariable | None
         The first that varies with time of: the preferred variables of all kinds, variables with a
         standard error, floating-point variables. None without any.
     """
-    name = main_name(product)
+    name = name or main_name(product)
     if name is None:
         return None
     step = max(1, -(-product[name].nbytes // _BULK))
@@ -117,9 +121,9 @@ def _table(variable: xr.DataArray) -> Floats:
     return variable.values.reshape(variable.sizes["time"], -1).astype(np.float64)
 
 
-def view_of(kind: str) -> View[MainVariable]:
-    """Return the view of products of a kind that states no figures, or is unknown."""
-    return View(kind, _variables(kind), partial(_read, kind), _draw)
+def view_of(kind: str, name: str | None = None) -> View[MainVariable]:
+    """Return the view of a variable; of the main one for kinds without figures, or unknown."""
+    return View(kind, _variables(kind, name), partial(_read, kind, name), _draw)
 
 
 def views_of(kind: str) -> Sequence[View[Any]]:
@@ -128,14 +132,17 @@ def views_of(kind: str) -> Sequence[View[Any]]:
     return figures.views if figures is not None else (view_of(kind),)
 
 
-def _read(kind: str, product: xr.Dataset, _: ProductSource) -> MainVariable | None:
-    return read_main_variable(product, kind=kind)
+def _read(
+    kind: str, name: str | None, product: xr.Dataset, _: ProductSource
+) -> MainVariable | None:
+    return read_main_variable(product, kind=kind, name=name)
 
 
-def _variables(kind: str) -> tuple[str, ...]:
+def _variables(kind: str, name: str | None) -> tuple[str, ...]:
     """Return the variables of which one may be the main variable, with their errors."""
-    data = layout_of(kind).data if kind in kinds() else ()
-    names = dict.fromkeys([*(row.name for row in data if row.uncertain), *preferred_variables()])
+    data = layout_of(kind).data if kind in kinds() and not name else ()
+    uncertain = [row.name for row in data if row.uncertain]
+    names = [name] if name else dict.fromkeys([*uncertain, *preferred_variables()])
     return "time", QUALITY_FLAG, *names, *(f"{name}_standard_error" for name in names)
 
 

@@ -9,29 +9,30 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.figures import pixels
 from lidarops.figures.panels import (
+    NEGATIVE,
+    REJECTED,
     Axis,
     Curve,
     Figure,
     Image,
     Mark,
     Panel,
+    codes_of,
     finite,
     number,
-    time_panel_axis,
+    time_axis,
     units,
 )
-from lidarops.figures.raster import BEYOND, COLUMNS, Raster, colour_limits, share_with_care
+from lidarops.figures.raster import BEYOND, Raster, colour_limits, share_with_care
 from lidarops.figures.series_panels import Quantity, background_panel
-from lidarops.figures.time_axis import TimeAxis, time_axis
+from lidarops.figures.time_axis import days
 from lidarops.figures.wording import percent
 from lidarops.flags import Quality, Severity
 
 Floats = NDArray[np.float64]
 
 _HEIGHT: Final = 306
-"""Height of a panel in units of the figure, and of its image in pixels."""
 _HALF: Final = 0.5
 """Share of the filled time that was measured, below which the words state it."""
 _NO_TIME: Final = np.timedelta64(0, "ns")
@@ -72,12 +73,11 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     -------
     Figure
         Block means on a logarithmic colour scale, up to the range where noise dominates; against
-        altitude, with range at the right, where the beam is not nearly horizontal. Means at
-        or below zero are grey, rejected bins striped, times without measurement empty; triangles
-        mark the lowest cloud bases.
+        altitude, with range at the right, where the beam is not nearly horizontal. Rejected bins
+        are light grey, means at or below zero dark grey, times without measurement empty;
+        triangles mark the lowest cloud bases.
     """
-    axis = _time_axis(rasters)
-    x = time_panel_axis(axis)
+    x = time_axis(*(np.concatenate([getattr(r, edge) for r in rasters]) for edge in _ENDS))
     full = min(max(float(raster.edges[-1]) for raster in rasters), quantity.farthest)
     reach = max(raster.reach for raster in rasters)
     # Of a quantity that noise hides, such as particles of clean air, all usable bins are shown.
@@ -88,79 +88,45 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     far = max(float(raster.edges[-1]) for raster in shown)
     values = quantity.factor * np.concatenate([r.mean[~r.flagged] for r in shown], axis=None)
     ends = quantity.limits or colour_limits(values)
-    image = np.full((_HEIGHT, COLUMNS), pixels.BLANK, dtype=np.uint8)
-    for raster in shown:
-        _fill(image, raster, axis, (near, far), quantity.factor, ends)
-    line = _altitude(rasters)
+    altitude = _altitude(rasters)
+    line = altitude or (0.0, 1.0)
     y, right = Axis(f"{along} (km)", near / 1e3, far / 1e3), None
-    if line is not None:
+    if altitude is not None:
         y, right = Axis("altitude (km)", *_kilometres(line, np.array([near, far])).tolist()), y
     label = f"{quantity.name} ({quantity.units or units(rasters[0].units)})"
     main = Panel(
         x,
         y,
-        (Image(pixels.striped(image)), *_clouds(rasters, axis, line or (0.0, 1.0))),
+        (*(_image(raster, quantity.factor, ends, line) for raster in shown), *_clouds(shown, line)),
         height=_HEIGHT,
         right=right,
         bar=Axis(label, *ends, log=True) if ends else None,
         note="" if (values > 0).any() else "no usable value above zero",
     )
-    lower = _background(rasters, x, axis) if quantity.background else ()
+    lower = _background(rasters, x) if quantity.background else ()
     below = ", with the background below" if lower else ""
     name = f"{quantity.name[:1].upper()}{quantity.name[1:]}"
-    caption = f"{name} against time and {along if line is None else 'altitude'}{below}"
-    words = _in_words(rasters, shown, reach, ends, along)
-    return Figure(caption, words, (main, *lower))
+    caption = f"{name} against time and {along if altitude is None else 'altitude'}{below}"
+    return Figure(caption, _in_words(rasters, shown, reach, ends, along), (main, *lower))
 
 
-def _time_axis(rasters: Sequence[Raster]) -> TimeAxis:
-    """Return the axis from the start of the first profile to the end of the last."""
-    start, stop = (
-        np.concatenate([getattr(raster, edge) for raster in rasters]) for edge in ("start", "stop")
-    )
-    order = np.argsort(start, kind="stable")
-    start, stop = start[order], stop[order]
-    return time_axis(start + (stop - start) / 2, (start, stop))
+_ENDS: Final = ("start", "stop")
 
 
-def _fill(
-    image: NDArray[np.uint8],
-    raster: Raster,
-    axis: TimeAxis,
-    span: tuple[float, float],
-    factor: float,
-    ends: tuple[float, float] | None,
-) -> None:
-    """Fill the pixels that lie in a raster; the first row of the image is the farthest."""
-    height, width = image.shape
-    along = span[1] - (np.arange(height) + 0.5) / height * (span[1] - span[0])
-    column = _columns(raster, axis, width)
-    row = np.searchsorted(raster.edges, along, side="right") - 1
-    across = np.flatnonzero(column >= 0)
-    up = np.flatnonzero((row >= 0) & (row < raster.edges.size - 1))
+def _image(
+    raster: Raster, factor: float, ends: tuple[float, float] | None, line: tuple[float, float]
+) -> Image:
     mean = factor * raster.mean
-    if ends is None:
-        shares = np.full(mean.shape, np.nan)
-    else:
+    shares = np.full(mean.shape, np.nan)
+    if ends is not None:
         low, high = ends
         shares = np.log(np.clip(mean, low, high) / low) / np.log(high / low)
-    blocks = np.where(mean <= 0.0, pixels.NEGATIVE, pixels.steps(shares))
-    blocks = np.where(raster.flagged, pixels.REJECTED, blocks).astype(np.uint8)
-    image[np.ix_(up, across)] = blocks[np.ix_(column[across], row[up])].T
-
-
-def _columns(raster: Raster, axis: TimeAxis, width: int) -> NDArray[np.intp]:
-    """Return the column of a raster at each pixel, -1 for none; a column has at least a pixel."""
-    first, last = axis.limits
-    left, right = (
-        np.rint((axis.x(edge) - first) / (last - first) * width).astype(np.intp)
-        for edge in (raster.start, raster.stop)
-    )
-    left = np.minimum(left, width - 1)
-    column = np.full(width, -1, dtype=np.intp)
-    for place, (start, stop) in enumerate(zip(left, np.maximum(right, left + 1), strict=True)):
-        column[start:stop] = place
-    return column
+    codes = np.where(mean <= 0.0, NEGATIVE, codes_of(shares))
+    codes = np.where(raster.flagged, REJECTED, codes).astype(np.uint8)
+    edges = _kilometres(line, raster.edges)
+    if line[1] < 0.0:
+        codes, edges = codes[:, ::-1], edges[::-1]
+    return Image(codes, days(raster.start), days(raster.stop), edges)
 
 
 def _kilometres(line: tuple[float, float], ranges: Floats) -> Floats:
@@ -168,13 +134,13 @@ def _kilometres(line: tuple[float, float], ranges: Floats) -> Floats:
     return np.asarray((line[0] + line[1] * ranges) / 1e3)
 
 
-def _clouds(rasters: Sequence[Raster], axis: TimeAxis, line: tuple[float, float]) -> list[Curve]:
+def _clouds(rasters: Sequence[Raster], line: tuple[float, float]) -> list[Curve]:
     base = _kilometres(line, np.concatenate([raster.clouds for raster in rasters]))
-    time = np.concatenate([raster.time for raster in rasters])
     if not np.isfinite(base).any():
         return []
+    time = days(np.concatenate([raster.time for raster in rasters]))
     label = "base of the lowest cloud or dense layer"
-    return [Curve(axis.x(time), base, "cloud", Mark.DOWN, joined=False, label=label)]
+    return [Curve(time, base, "cloud", Mark.DOWN, joined=False, label=label)]
 
 
 def _altitude(rasters: Sequence[Raster]) -> tuple[float, float] | None:
@@ -184,15 +150,16 @@ def _altitude(rasters: Sequence[Raster]) -> tuple[float, float] | None:
     return None if line is None or abs(line[1]) < _UPRIGHT else line
 
 
-def _background(rasters: Sequence[Raster], x: Axis, axis: TimeAxis) -> tuple[Panel, ...]:
-    time = np.concatenate([raster.time for raster in rasters])
+def _background(rasters: Sequence[Raster], x: Axis) -> tuple[Panel, ...]:
+    time, level, error = (
+        np.concatenate([getattr(raster, name) for raster in rasters])
+        for name in ("time", "background", "background_error")
+    )
     order = np.argsort(time, kind="stable")
-    level = np.concatenate([raster.background for raster in rasters])[order]
-    error = np.concatenate([raster.background_error for raster in rasters])[order]
     if not finite([level]).size:
         return ()
     quantity = Quantity("background", 1.0, units(rasters[0].background_units))
-    return (background_panel(x, axis, quantity, time[order], level, error),)
+    return (background_panel(x, quantity, time[order], level[order], error[order]),)
 
 
 def _in_words(
@@ -208,7 +175,7 @@ def _in_words(
         words.append(f"noise dominates beyond {reach / 1e3:.3g} km")
     if ends:
         words.append(
-            f"colour scale from {number(ends[0])} to {number(ends[1])}, grey at or below 0"
+            f"colour scale from {number(ends[0])} to {number(ends[1])}, dark grey at or below 0"
         )
     measured = sum((raster.profiles.sum() * raster.length for raster in rasters), _NO_TIME)
     drawn = sum(((raster.stop - raster.start).sum() for raster in rasters), _NO_TIME)
@@ -223,7 +190,7 @@ def _in_words(
     }
     flagged = np.concatenate([raster.flagged for raster in shown], axis=None).mean()
     if flagged:
-        words.append(f"striped, {percent(float(flagged))}: flagged {names[Severity.REJECT]}")
+        words.append(f"light grey, {percent(float(flagged))}: flagged {names[Severity.REJECT]}")
     care = share_with_care(rasters)
     if care:
         words.append(f"{percent(care)} of all bins: use with care ({names[Severity.CARE]})")

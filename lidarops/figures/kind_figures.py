@@ -15,7 +15,7 @@ import xarray as xr
 
 from lidarops.figures.image_panels import ImageQuantity, image_figure
 from lidarops.figures.panels import Figure
-from lidarops.figures.raster import Raster
+from lidarops.figures.raster import Raster, raster_variables, read_raster
 from lidarops.figures.series_data import Comparison
 from lidarops.figures.series_panels import Quantity
 from lidarops.kinds import kinds
@@ -55,8 +55,8 @@ class View(Generic[Content]):
     """Compares contents with the truth."""
     first: bool = False
     """Whether a report draws only the first product that has content."""
-    image: bool = False
-    """Whether `read` needs `ProductSource.profiles`."""
+    shows: str = ""
+    """Variable of an image against time, for which `read` needs `ProductSource.profiles`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,27 +73,22 @@ class KindFigures:
 
 
 def image_view(
-    name: str,
-    variables: tuple[str, ...],
-    read: Callable[..., Raster],
-    quantity: ImageQuantity,
-    along: str = "range",
+    kind: str, variable: str, quantity: ImageQuantity, along: str = "range"
 ) -> View[Raster]:
-    """Return the view of a quantity against time and range or altitude.
-
-    `read` is called with a product and ``profiles``, the profiles per column.
-    """
+    """Return the view of a variable of a kind against time and range or altitude."""
     return View(
-        name,
-        variables,
-        partial(_read_raster, read),
+        kind if kind == variable else f"{kind}-{variable.replace('_', '-')}",
+        raster_variables(variable, along),
+        partial(_read_raster, kind, variable, along),
         lambda rasters: [image_figure(rasters, quantity, along)],
-        image=True,
+        shows=variable,
     )
 
 
-def _read_raster(read: Callable[..., Raster], product: xr.Dataset, source: ProductSource) -> Raster:
-    return read(product, profiles=source.profiles)
+def _read_raster(
+    kind: str, variable: str, along: str, product: xr.Dataset, source: ProductSource
+) -> Raster:
+    return read_raster(product, quantity=variable, kind=kind, profiles=source.profiles, along=along)
 
 
 def figures_of(kind: str) -> KindFigures | None:

@@ -1,46 +1,94 @@
 """Panels as values: what a figure shows, without how it is drawn.
 
-`lidarops.figures.svg` draws them. Style names are classes of ``figure.css``: ``c0`` to ``c4`` are
-colours of series, ``d1`` to ``d4`` dashes; marks and dashes differ too, so that figures do not
-depend on colour alone.
+``figures.js`` draws them in the browser, `lidarops.figures.stills` as files. A style is a colour of
+`COLOURS` with ``d1`` to ``d5`` (dashes), ``thin``, ``thick``, ``hollow``, ``wide`` (a pale band) or
+``full`` (an opaque one). Marks and dashes differ too: figures do not depend on colour alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import StrEnum
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.figures.time_axis import Tick, TimeAxis
+from lidarops.figures.time_axis import Times, days, usual_step
 
 Floats = NDArray[np.float64]
 
+COLOURS: Final = {
+    "c0": ("#0072b2", "#56b4e9"),
+    "c1": ("#b84f00", "#f0a060"),
+    "c2": ("#007d5b", "#3fcfa3"),
+    "c3": ("#a84f83", "#e6a4c9"),
+    "c4": ("#6b6b00", "#d6d06a"),
+    "c5": ("#6a4fb3", "#b7a3f0"),
+    "ink": ("#1d2126", "#e4e7eb"),
+    "soft": ("#5b6470", "#a1abb7"),
+    "grid": ("#dfe3e8", "#353c45"),
+    "page": ("#ffffff", "#15181c"),
+    "good": ("#2a6f97", "#62a9d6"),
+    "care": ("#e0a100", "#d9a520"),
+    "reject": ("#b9bfc7", "#4a525c"),
+    "negative": ("#808080", "#808080"),
+}
+"""Colours of styles and of the first codes of images, on light and on dark pages."""
+BLANK: Final = 0
+"""Code of a block of an image without data, transparent."""
+REJECTED: Final = 1
+"""Code of a block that a quality bit rejects."""
+NEGATIVE: Final = 2
+"""Code of a usable block at or below zero, which a logarithmic scale cannot show."""
+_MINUTE: Final = 1.0 / 1440.0
+"""Day."""
+FIRST: Final = 3
+"""Code of the low end of the colour scale; 255 is the high end."""
 
-class Mark(Enum):
-    """Shape of a mark."""
 
-    DISC = auto()
-    SQUARE = auto()
-    TRIANGLE = auto()
-    DIAMOND = auto()
-    CROSS = auto()
-    DOWN = auto()
-    DASH = auto()
+class Mark(StrEnum):
+    """Shape of a mark, by its name in matplotlib."""
+
+    DISC = "o"
+    SQUARE = "s"
+    TRIANGLE = "^"
+    DIAMOND = "D"
+    CROSS = "x"
+    DOWN = "v"
+    DASH = "_"
 
 
-SERIES_MARKS = (Mark.DISC, Mark.SQUARE, Mark.TRIANGLE, Mark.DIAMOND)
+SERIES_MARKS: Final = (Mark.DISC, Mark.SQUARE, Mark.TRIANGLE, Mark.DIAMOND)
 """Marks of the series of a panel."""
 
 
-class Palette(Enum):
-    """Colours of an image. Both become lighter with the value."""
+class Palette(StrEnum):
+    """Colours of an image, by their name in matplotlib. Both become lighter with the value."""
 
-    SIGNAL = auto()
-    SIGNED = auto()
-    """Neutral in the middle."""
+    SIGNAL = "viridis"
+    SIGNED = "cividis"
+    """Grey in the middle; can be read with colour vision deficiency."""
+
+    @property
+    def anchors(self) -> list[str]:
+        """Colours at equal steps of the scale."""
+        return [f"#{colour}" for colour in _ANCHORS[self].split()]
+
+
+_ANCHORS: Final = {
+    Palette.SIGNAL: "440154 481567 482677 453781 404788 39568c 33638d 2d708e 287d8e 238a8d 1f968b"
+    " 20a387 29af7f 3cbb75 55c667 73d055 95d840 b8de29 dce319 fde725",
+    Palette.SIGNED: "00224e 123570 3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
+}
+
+
+class Tick(NamedTuple):
+    """A labelled position on an axis."""
+
+    x: float
+    label: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +101,8 @@ class Axis:
     log: bool = False
     ticks: tuple[Tick, ...] | None = None
     """Round values where None."""
-    breaks: tuple[float, ...] = ()
-    """Positions where a gap in time is cut out."""
+    time: bool = False
+    """Whether values are days since 1970, UTC."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +114,6 @@ class Curve:
     style: str = "c0"
     mark: Mark | None = None
     joined: bool = True
-    steps: bool = False
-    """Whether the line runs horizontally to the next point, then vertically."""
     label: str = ""
 
 
@@ -87,9 +133,16 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """Pixels that fill the panel, the first row on top; see `lidarops.figures.pixels`."""
+    """Blocks of values, each with a code of the colour scale that is the bar of the panel."""
 
-    pixels: NDArray[np.uint8]
+    codes: NDArray[np.uint8]
+    """(column, row) `BLANK`, `REJECTED`, `NEGATIVE`, or of `codes_of`."""
+    left: Floats
+    """(column,) Left edges, rising; between columns there may be gaps."""
+    right: Floats
+    """(column,)"""
+    edges: Floats
+    """(row + 1,) Rising edges of the rows along the vertical axis."""
     palette: Palette = Palette.SIGNAL
 
 
@@ -121,7 +174,7 @@ class Panel:
     note: str = ""
     """Why the panel is empty."""
     to_scale: bool = False
-    """Whether both axes have one scale, so that the height follows the width."""
+    """Whether both axes have one scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +186,6 @@ class Figure:
     """What the figure shows, in words."""
     panels: tuple[Panel, ...]
     beside: bool = False
-    above: tuple[Panel, ...] = ()
-    """Panels of a figure above it over the same times: its axis begins and ends below theirs."""
 
     @property
     def text(self) -> str:
@@ -142,12 +193,24 @@ class Figure:
         return f"{self.caption}. {self.words}."
 
 
-def time_panel_axis(axis: TimeAxis) -> Axis:
-    """Return the horizontal axis of panels over time."""
-    note = "; gaps cut out at the marks" if axis.broken else ""
-    return Axis(
-        f"time (UTC{note})", *axis.limits, ticks=tuple(axis.ticks(8)), breaks=tuple(axis.breaks)
-    )
+def time_axis(start: Times, stop: Times) -> Axis:
+    """Return the horizontal axis of panels over time, from the first start to the last stop."""
+    first, last = float(days(start.min())), float(days(stop.max()))
+    # A single profile without a length still needs a place.
+    return Axis("time (UTC)", first, last if last > first else first + _MINUTE, time=True)
+
+
+def axis_of_times(time: Times) -> Axis:
+    """Return the axis of profiles by their middles, with half the usual step at both ends."""
+    half = usual_step(np.sort(time)) / 2
+    return time_axis(time - half, time + half)
+
+
+def codes_of(shares: Floats) -> NDArray[np.uint8]:
+    """Return the codes of shares of the colour scale, 0 to 1; blank for NaN."""
+    inside = np.clip(np.nan_to_num(shares), 0.0, 1.0)
+    level = FIRST + np.rint(inside * (255 - FIRST)).astype(np.uint8)
+    return np.where(np.isfinite(shares), level, BLANK).astype(np.uint8)
 
 
 def finite(parts: Sequence[Floats]) -> Floats:

@@ -9,10 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.panels import Axis, Band, Figure, Panel, time_panel_axis
+from lidarops.figures.panels import Axis, Band, Figure, Panel, time_axis
 from lidarops.figures.raster import column_edges, column_starts, profile_bounds
 from lidarops.figures.series_data import blocks, quality_bits
-from lidarops.figures.time_axis import Tick, Times, time_axis
+from lidarops.figures.time_axis import Times, days
 from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -24,9 +24,6 @@ _COLUMNS: Final = 240
 READ_VALUES: Final = 2_000_000
 """Most flags in memory."""
 _HEIGHT: Final = 110
-_ROUNDING: Final = 1e-9
-"""Smaller shares come from rounding; one value of 1e8 is more."""
-_TICKS: Final = tuple(Tick(share, f"{100 * share:.0f}") for share in (0.0, 0.5, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,29 +74,25 @@ def read_quality(product: xr.Dataset) -> QualityOverTime | None:
 
 def quality_figure(quality: QualityOverTime) -> Figure:
     """Return a figure of the shares of good values, values to use with care, and others."""
-    axis = time_axis(
-        quality.start + (quality.stop - quality.start) / 2, (quality.start, quality.stop)
-    )
-    x = np.stack([axis.x(quality.start), axis.x(quality.stop)], axis=-1)
+    x = np.stack([days(quality.start), days(quality.stop)], axis=-1)
     # An area of its own for each column, so that nothing is drawn where nothing was measured.
     along = np.insert(x, 2, np.nan, axis=1).ravel()
 
     def steps(share: Floats) -> Floats:
-        return np.repeat(share, 3)
+        return np.repeat(100.0 * share, 3)
 
-    usable = steps(1.0 - quality.rejected)
-    # Its edge tells care from the others without colour: no edge where there is no such value.
-    care = np.where(usable - steps(quality.good) > _ROUNDING, usable, np.nan)
-    good, none, whole = steps(quality.good), np.zeros(along.size), np.ones(along.size)
+    usable = np.maximum(steps(1.0 - quality.rejected), steps(quality.good))
+    good, none, whole = steps(quality.good), np.zeros(along.size), np.full(along.size, 100.0)
     layers = (
-        Band(along, none, good, "full q-good", label="good"),
-        Band(along, good, care, "full q-care", label="use with care"),
-        Band(along, usable, whole, "full q-reject", label="do not use"),
+        Band(along, none, good, "full good", label="good"),
+        Band(along, good, usable, "full care", label="use with care"),
+        Band(along, usable, whole, "full reject", label="do not use"),
     )
-    y = Axis("values (%)", 0.0, 1.0, ticks=_TICKS)
+    y = Axis("values (%)", 0.0, 100.0)
     mean = quality.mean(quality.good), quality.mean(quality.rejected)
     words = (
         f"On average {percent(mean[0])} of the values good,"
         f" {percent(max(0.0, 1.0 - sum(mean)))} to use with care, {percent(mean[1])} not to use"
     )
-    return Figure("Quality over time", words, (Panel(time_panel_axis(axis), y, layers, _HEIGHT),))
+    axis = time_axis(quality.start, quality.stop)
+    return Figure("Quality over time", words, (Panel(axis, y, layers, _HEIGHT),))

@@ -23,11 +23,11 @@ Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
 """Sums are computed in double and kept in single precision, enough for an image."""
 
-COLUMNS: Final = 780
-"""Most columns of an image, about what the eye resolves across a figure."""
-ROWS: Final = 200
+COLUMNS: Final = 400
+"""Most columns of an image, but for those that gaps in time add."""
+ROWS: Final = 300
 """Most rows of an image."""
-_ALONG_TIME: Final = ("time", "background", "background_standard_error")
+_BACKGROUND: Final = ("background", "background_standard_error")
 TIME_BOUNDS: Final = "time_bnds"
 _TOUCHING: Final = 10.0
 """Columns touch across a pause of at most this many of their profiles that is no gap: one minute
@@ -161,30 +161,34 @@ def signal_reach(ratio: Floats, places: Floats) -> float:
     return float(places[visible[-1]]) if visible.size else 0.0
 
 
-def raster_variables(quantity: str) -> tuple[str, ...]:
+def raster_variables(quantity: str, along: str = "range") -> tuple[str, ...]:
     """Return the variables that `read_raster` reads, including optional ones."""
-    optional = (TIME_BOUNDS, "cloud_base_range", "altitude")
-    return (*_ALONG_TIME, "range", *_along_both(quantity), *optional)
+    optional = (TIME_BOUNDS, "cloud_base_range", "altitude", *_BACKGROUND)
+    return ("time", along, *_along_both(quantity), *optional)
 
 
 def _along_both(quantity: str) -> tuple[str, ...]:
     return quantity, f"{quantity}_standard_error", "quality_flag"
 
 
-def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int = 0) -> Raster:
+def read_raster(
+    product: xr.Dataset, *, quantity: str, kind: str, profiles: int = 0, along: str = "range"
+) -> Raster:
     """Reduce one quantity of a product to block means.
 
     Parameters
     ----------
     product : Dataset
-        Dimensions (time, range); may be lazy, because it is read in blocks.
+        May be lazy, because it is read in blocks.
     quantity : str
-        A variable of the product with a standard error.
+        A variable of the product, dims (time, `along`), with a standard error.
     kind : str
         Kind of the product, whose quality bits it has.
     profiles : int, optional
         Profiles per column; 0 for about `COLUMNS` columns. Columns neither extend across gaps in
         time nor touch there.
+    along : str, optional
+        Dimension across time, with its coordinate: ``range``, or ``altitude``.
 
     Returns
     -------
@@ -196,18 +200,18 @@ def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int 
     ProductError
         If a variable is missing or has other dimensions, or the product is empty.
     """
-    _check(product, quantity)
+    _check(product, quantity, along)
     time = product["time"].values.astype("datetime64[ns]")
     if np.any(time[1:] < time[:-1]):
         order = np.argsort(time, kind="stable")
         product, time = product.isel(time=order), time[order]
-    ranges = product["range"].values.astype(np.float64)
+    ranges = product[along].values.astype(np.float64)
     size = profiles or -(-time.size // COLUMNS)
     starts, stops = profile_bounds(product)
     columns = column_starts(starts, stops, size)
     rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
-    flags = flags_of(kind)
-    blocks = list(_reduced(product, quantity, flags, columns, rows))
+    read = [*_along_both(quantity)]
+    blocks = list(_reduced(product[read], quantity, flags_of(kind), columns, rows))
     background, background_error = _background(product, columns)
     start, stop = column_edges(starts, stops, columns)
     return Raster(
@@ -226,11 +230,15 @@ def read_raster(product: xr.Dataset, *, quantity: str, kind: str, profiles: int 
         background=background,
         background_error=background_error,
         clouds=_clouds(product, columns),
-        units=str(product[quantity].attrs.get("units", "")),
-        background_units=str(product["background"].attrs.get("units", "")),
-        bits=flags.raised(int(np.bitwise_or.reduce([block.bits for block in blocks]))),
+        units=_units(product, quantity),
+        background_units=_units(product, "background"),
+        bits=flags_of(kind).raised(int(np.bitwise_or.reduce([block.bits for block in blocks]))),
         altitude=_altitude(product, ranges),
     )
+
+
+def _units(product: xr.Dataset, name: str) -> str:
+    return str(product[name].attrs.get("units", "")) if name in product else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +260,7 @@ def _reduced(
     columns: NDArray[np.intp],
     rows: NDArray[np.intp],
 ) -> Iterator[_Block]:
-    bins = product.sizes["range"]
+    bins = product[quantity].shape[1]
     edges = [*columns, product.sizes["time"]]
     first = 0
     while first < columns.size:
@@ -306,8 +314,9 @@ def _mean_time(time: Times, columns: NDArray[np.intp]) -> Times:
 
 
 def _background(product: xr.Dataset, columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    value = product["background"].values.astype(np.float64)
-    error = product["background_standard_error"].values.astype(np.float64)
+    if not set(_BACKGROUND) <= set(product.variables):
+        return np.full(columns.size, np.nan), np.full(columns.size, np.nan)
+    value, error = (product[name].values.astype(np.float64) for name in _BACKGROUND)
     good = np.isfinite(value)
     count = np.add.reduceat(good.astype(np.float64), columns)
     total = np.add.reduceat(np.where(good, value, 0.0), columns)
@@ -369,11 +378,10 @@ def _altitude(product: xr.Dataset, ranges: Floats) -> tuple[float, float] | None
     return float(values[0] - slope * ranges[0]), float(slope)
 
 
-def _check(product: xr.Dataset, quantity: str) -> None:
-    dims: dict[str, tuple[str, ...]] = dict.fromkeys(_ALONG_TIME, ("time",))
-    dims |= {"range": ("range",)} | dict.fromkeys(_along_both(quantity), ("time", "range"))
-    require(product, dims)
-    if product.sizes["time"] < 1 or product.sizes["range"] < 2:
+def _check(product: xr.Dataset, quantity: str, along: str) -> None:
+    dims: dict[str, tuple[str, ...]] = {"time": ("time",), along: (along,)}
+    require(product, dims | dict.fromkeys(_along_both(quantity), ("time", along)))
+    if product.sizes["time"] < 1 or product.sizes[along] < 2:
         raise ProductError("holds no profile of at least 2 bins", field=quantity)
 
 

@@ -18,14 +18,15 @@ from lidarops.figures.panels import (
     Layer,
     Mark,
     Panel,
+    Tick,
+    axis_of_times,
     finite,
     number,
     percentile_axis,
     span_in_words,
-    time_panel_axis,
 )
 from lidarops.figures.series_data import TimeSeries, compare, normalised_error, thin
-from lidarops.figures.time_axis import Tick, TimeAxis, Times, segments, time_axis
+from lidarops.figures.time_axis import Times, days, segments
 from lidarops.figures.wording import counted, percent
 
 Floats = NDArray[np.float64]
@@ -69,9 +70,8 @@ def series_figures(
 ) -> Iterator[Figure]:
     """Yield figures of quantities against time, `SERIES` series in each, one panel per quantity."""
     for few in _some(series):
-        axis = time_axis(_times(few))
-        x = time_panel_axis(axis)
-        panels = [series_panel(x, axis, few, quantity) for quantity in quantities]
+        x = axis_of_times(_times(few))
+        panels = [series_panel(x, few, quantity) for quantity in quantities]
         words = [series_in_words(few, quantities[0])]
         for quantity, panel in zip(quantities, panels, strict=True):
             values = quantity.factor * finite([_usable(one, quantity.name) for one in few])
@@ -81,15 +81,13 @@ def series_figures(
         yield Figure(f"{caption} against time", "; ".join(words), tuple(panels))
 
 
-def series_panel(
-    x: Axis, axis: TimeAxis, series: Sequence[TimeSeries], quantity: Quantity
-) -> Panel:
+def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> Panel:
     """Return a quantity of up to `SERIES` series: unflagged values with errors, flags, truth."""
     name, factor = quantity.name, quantity.factor
     layers: list[Layer] = []
     for place, one in enumerate(series):
-        layers += _values(axis, one, quantity, place)
-    truths = [_truth(axis, one, quantity) for one in series]
+        layers += _values(one, quantity, place)
+    truths = [_truth(one, quantity) for one in series]
     known = [truth for truth in truths if np.isfinite(truth.y).any()]
     layers += [
         Curve(k.x, k.y, k.style, label="" if i else "simulated truth") for i, k in enumerate(known)
@@ -102,7 +100,7 @@ def series_panel(
         count = sum(int(mask.sum()) for mask in masks)
         if count:
             some = slice(None, None, -(-count // _FLAGGED))
-            at = np.concatenate([axis.x(one.time[m]) for one, m in zip(series, masks, strict=True)])
+            at = np.concatenate([days(one.time[m]) for one, m in zip(series, masks, strict=True)])
             value = np.concatenate(
                 [one.estimates[name].value[m] for one, m in zip(series, masks, strict=True)]
             )
@@ -116,19 +114,16 @@ def series_panel(
     return Panel(x, y, tuple(layers))
 
 
-def background_panel(
-    x: Axis, axis: TimeAxis, line: Quantity, time: Times, value: Floats, error: Floats
-) -> Panel:
+def background_panel(x: Axis, line: Quantity, time: Times, value: Floats, error: Floats) -> Panel:
     """Return a background against time with its standard error."""
-    layers = _line(axis, time, value, error, "c0", Mark.DISC, "")
+    layers = _line(time, value, error, "c0", Mark.DISC, "")
     return Panel(x, percentile_axis(line.label, [value]), tuple(layers), height=110)
 
 
 def score_figures(series: Sequence[TimeSeries], quantities: Sequence[str]) -> Iterator[Figure]:
     """Yield figures of (retrieved - truth) / standard error of unflagged values with a truth."""
     for few in _some(series):
-        axis = time_axis(_times(few))
-        x = time_panel_axis(axis)
+        x = axis_of_times(_times(few))
         words = []
         panels = []
         for quantity in quantities:
@@ -139,7 +134,7 @@ def score_figures(series: Sequence[TimeSeries], quantities: Sequence[str]) -> It
                     share = f"{percent(comparison.within_3)} of {comparison.count:,} within 3"
                     label = f"{one.label}: {share}"
                     words.append(f"{quantity} {label} standard errors")
-                    layers.append(_scores(axis, one, quantity, place, label))
+                    layers.append(_scores(one, quantity, place, label))
             if layers:
                 largest = float(np.abs(finite([_y(layer) for layer in layers])).max(initial=3.6))
                 panels.append(_score_panel(x, quantity, layers, 1.1 * largest))
@@ -152,7 +147,7 @@ def _y(layer: Layer) -> Floats:
     return layer.y if isinstance(layer, Curve) else np.array([])
 
 
-def _scores(axis: TimeAxis, one: TimeSeries, quantity: str, place: int, label: str) -> Curve:
+def _scores(one: TimeSeries, quantity: str, place: int, label: str) -> Curve:
     score = np.where(one.flag == 0, normalised_error(one, quantity), np.nan)
     known = np.flatnonzero(np.isfinite(score))
     # Values beyond 3 are always drawn, the others thinned.
@@ -160,7 +155,7 @@ def _scores(axis: TimeAxis, one: TimeSeries, quantity: str, place: int, label: s
     far = int((np.abs(score[known]) > _FAR_OFF).sum())
     label += f", {far:,} beyond {_FAR_OFF:g} drawn there" if far else ""
     values = np.clip(score[shown], -_FAR_OFF, _FAR_OFF)
-    x = axis.x(one.time[shown])
+    x = days(one.time[shown])
     return Curve(x, values, f"c{place}", SERIES_MARKS[place], joined=False, label=label)
 
 
@@ -177,13 +172,12 @@ def _score_panel(x: Axis, quantity: str, layers: Sequence[Layer], limit: float) 
     return Panel(x, y, (one, zero, *layers, *levels), height=150)
 
 
-def _values(axis: TimeAxis, one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
+def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
     drawn = thin(one, _POINTS)
     estimate = drawn.estimates[quantity.name]
     profiles = round(int((one.flag == 0).sum()) / max(drawn.time.size, 1))
     means = f", means of {profiles} profiles" if profiles > 1 else ""
     return _line(
-        axis,
         drawn.time,
         quantity.factor * estimate.value,
         quantity.factor * estimate.standard_error,
@@ -194,19 +188,19 @@ def _values(axis: TimeAxis, one: TimeSeries, quantity: Quantity, place: int) -> 
 
 
 def _line(
-    axis: TimeAxis, time: Times, value: Floats, error: Floats, style: str, mark: Mark, label: str
+    time: Times, value: Floats, error: Floats, style: str, mark: Mark, label: str
 ) -> list[Layer]:
     """Return values with bars and marks if they are few, else with a band."""
     few = time.size <= _BARS
-    x, y, wide = _with_gaps(time, axis, value, error)
+    x, y, wide = _with_gaps(time, value, error)
     band = Band(x, y - wide, y + wide, style, bars=few)
     return [band, Curve(x, y, style, mark if few else None, label=label)]
 
 
-def _truth(axis: TimeAxis, one: TimeSeries, quantity: Quantity) -> Curve:
+def _truth(one: TimeSeries, quantity: Quantity) -> Curve:
     truth = one.estimates[quantity.name].truth
     some = slice(None, None, -(-truth.size // _POINTS) or 1)
-    x, y = _with_gaps(one.time[some], axis, quantity.factor * truth[some])
+    x, y = _with_gaps(one.time[some], quantity.factor * truth[some])
     return Curve(x, y, "ink d1")
 
 
@@ -214,10 +208,10 @@ def _usable(one: TimeSeries, name: str) -> Floats:
     return np.asarray(one.estimates[name].value[one.flag == 0])
 
 
-def _with_gaps(time: Times, axis: TimeAxis, *values: Floats) -> tuple[Floats, ...]:
+def _with_gaps(time: Times, *values: Floats) -> tuple[Floats, ...]:
     """Return positions and values with NaN at gaps, so that no line crosses a gap."""
     cuts = [stretch.start for stretch in segments(time)][1:]
-    x = axis.x(time)
+    x = days(time)
     return np.insert(x, cuts, x[cuts]), *(np.insert(value, cuts, np.nan) for value in values)
 
 

@@ -5,7 +5,6 @@ A missing or unreadable product does not stop the report; it is listed as a prob
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,6 @@ from typing import Any, Final
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.figures import svg
 from lidarops.figures.any_kind import views_of
 from lidarops.figures.kind_figures import View
 from lidarops.figures.panels import Figure
@@ -28,28 +26,25 @@ from lidarops.netcdf.read import UNREADABLE, opened_product
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
 from lidarops.reports.reading import Compared, Group, Problem, Readers, Sources, reason
-from lidarops.system.files import write_atomically
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
-NARROW: Final = "narrow"
-"""Folder of the report with the same figures for a narrow place, which a page shows first."""
 _FLAG_ROWS: Final = 40
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A figure of the report."""
+    """A figure of the report, equal to itself only, because arrays have no single equality."""
 
-    file: str
-    """File name in the report folder, and in its folder `NARROW`."""
+    view: str
+    """Name of the view that drew it."""
+    figure: Figure
     instrument: str
     caption: str
     lacking: str
     """Why its products have no usable value; empty if they have."""
     words: str
     """Description, with channel and number of scenes."""
-    alt: str
 
 
 @dataclass(slots=True)
@@ -65,14 +60,12 @@ class Gallery:
     """Labels of channels that are not drawn because of the limit on figures."""
 
 
-def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
-    """Draw the figures of a run into a folder.
+def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Gallery:
+    """Return the figures of a run.
 
     Parameters
     ----------
     record : RunRecord
-    folder : Path
-        Existing folder for the SVG files.
     limit : int, optional
         Most figures of products. Comparisons with the truth are made for all products.
     workers : int, optional
@@ -84,7 +77,6 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
         One or more figures per instrument and channel, over all scenes.
     """
     gallery = Gallery(flags=_shares(record))
-    taken: Counter[str] = Counter()
     truth = _truth(record, gallery)
     products = sum(len(scene.products) for scene in record.scenes)
     with Readers(workers, products, truth) as readers:
@@ -99,11 +91,7 @@ def fill(record: RunRecord, folder: Path, *, limit: int = FIGURES, workers: int 
                 if contents and compares:
                     gallery.compared += _compared(view, contents, group)
                 for drawn in view.draw(contents) if contents and not full else ():
-                    file = _unique(f"{view.name}_{group.instrument}_{group.channel}", taken)
-                    write_atomically(folder / file, svg.file(drawn))
-                    (folder / NARROW).mkdir(exist_ok=True)
-                    write_atomically(folder / NARROW / file, svg.file(drawn, svg.NARROW))
-                    gallery.pictures.append(_picture(file, drawn, group))
+                    gallery.pictures.append(_picture(view.name, drawn, group))
     return gallery
 
 
@@ -113,11 +101,11 @@ def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterato
             yield Compared(group.instrument, group.channel, comparison)
 
 
-def _picture(file: str, drawn: Figure, group: Group) -> Picture:
+def _picture(view: str, drawn: Figure, group: Group) -> Picture:
     scenes = counted(len(group.members), "scene")
     words = f"{scenes}. {drawn.words}."
     caption = f"{drawn.caption}: {_title(group)}"
-    return Picture(file, group.instrument, caption, group.lacking, words, drawn.text)
+    return Picture(view, drawn, group.instrument, caption, group.lacking, words)
 
 
 def _title(group: Group) -> str:
@@ -220,12 +208,6 @@ def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
         gallery.problems.append(Problem(record.truth, reason(path, error)))
         return None
     return truth
-
-
-def _unique(name: str, taken: Counter[str]) -> str:
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name)[:100]
-    taken[plain] += 1
-    return f"{plain}.svg" if taken[plain] == 1 else f"{plain}_{taken[plain]}.svg"
 
 
 def comparisons_by_quantity(compared: Sequence[Compared]) -> Mapping[str, tuple[int, int, int]]:

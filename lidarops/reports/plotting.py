@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import LidarOpsError, ProductError
-from lidarops.figures.any_kind import views_of
-from lidarops.figures.kind_figures import ProductSource
+from lidarops.figures.any_kind import view_of, views_of
+from lidarops.figures.image_panels import ImageQuantity
+from lidarops.figures.kind_figures import ProductSource, View, image_view
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.netcdf.read import NETCDF_MAGIC, open_product, opened_product, reading
 from lidarops.raw.archive import open_archive
@@ -26,10 +28,70 @@ _COLOURS: Final = 5
 _STYLES: Final = ("", " d1", " d2", " d3", " d4")
 
 
-def draw_file(path: Path) -> tuple[Figure, ...]:
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What is drawn of a product; all of it where nothing is chosen."""
+
+    variable: str = ""
+    time: tuple[np.datetime64, np.datetime64] | None = None
+    """UTC."""
+    range: Span | None = None
+    """m."""
+    altitude: Span | None = None
+    """m."""
+
+
+ALL: Final = Selection()
+TYPES: Final = (".png", ".svg", ".pdf")
+"""Suffixes of figures as files."""
+
+
+def selection(variable: str, time: str, range_: str, altitude: str) -> Selection:
+    """Return what options choose: START/STOP, UTC, and LOW/HIGH, km.
+
+    Raises
+    ------
+    LidarOpsError
+        If an option cannot be read.
+    """
+    spans = _metres("range", range_), _metres("altitude", altitude)
+    return Selection(variable, _times(time), *spans)
+
+
+def _times(span: str) -> tuple[np.datetime64, np.datetime64] | None:
+    """Return the ends of a span of time; None for all times."""
+    try:
+        start, stop = (np.datetime64(end.removesuffix("Z"), "ns") for end in span.split("/"))
+    except ValueError:
+        if not span:
+            return None
+        raise LidarOpsError(
+            f"is no span of time: {span!r}", field="time", remedy="give START/STOP", wrong_use=True
+        ) from None
+    return start, stop
+
+
+def _metres(name: str, span: str) -> tuple[float, float] | None:
+    """Return the ends of a span in km, m; None for everything."""
+    try:
+        low, high = (1e3 * float(end) for end in span.split("/"))
+    except ValueError:
+        if not span:
+            return None
+        raise LidarOpsError(
+            f"is no span: {span!r}", field=name, remedy="give LOW/HIGH in km", wrong_use=True
+        ) from None
+    return low, high
+
+
+def draw_file(path: Path, chosen: Selection = ALL) -> tuple[Figure, ...]:
     """Return the figures of a raw file or product.
 
-    Those of a product are those of its page; those of a raw file, its channels against range.
+    Those of a product are those of its page, or that of a variable; those of a raw file, its
+    channels against range.
 
     Raises
     ------
@@ -43,31 +105,61 @@ def draw_file(path: Path) -> tuple[Figure, ...]:
         raise LidarOpsError(
             f"cannot be read: {error.strerror}", file=path, wrong_use=True
         ) from error
-    figures = tuple(_of_product(path) if magic in NETCDF_MAGIC else _of_raw(path))
+    figures = tuple(_of_product(path, chosen) if magic in NETCDF_MAGIC else _of_raw(path, chosen))
     if not figures:
         raise LidarOpsError("holds nothing that can be drawn", file=path)
     return figures
 
 
-def _of_product(path: Path) -> Iterator[Figure]:
-    kind = _kind(path)
-    if not kind:
-        raise ProductError(
-            "is no product of lidarops", file=path, remedy="plot draws raw files and products"
-        )
-    for view in views_of(kind):
-        with reading(path), open_product(path, view.variables) as product:
-            content = view.read(product, ProductSource())
+def _of_product(path: Path, chosen: Selection) -> Iterator[Figure]:
+    with opened_product(path, decode_times=False) as opened:
+        kind = str(opened.attrs.get("lidarops_kind", ""))
+        if not kind:
+            raise ProductError(
+                "is no product of lidarops", file=path, remedy="plot draws raw files and products"
+            )
+        views = [_view_of(opened, kind, chosen.variable)] if chosen.variable else views_of(kind)
+    for view in views:
+        names = {*view.variables, "time", "range", "altitude"}
+        with reading(path), open_product(path, names) as product:
+            content = view.read(_part(product, chosen, path), ProductSource())
         if content is not None:
             yield from view.draw([content])
 
 
-def _kind(path: Path) -> str:
-    with opened_product(path, decode_times=False) as opened:
-        return str(opened.attrs.get("lidarops_kind", ""))
+def _view_of(product: xr.Dataset, kind: str, name: str) -> View[Any]:
+    """Return the view of a variable: that of the kind, an image, or a series over time."""
+    if name not in product.data_vars or product[name].dims[:1] != ("time",):
+        raise ProductError("is no variable over time of the product", field=name, wrong_use=True)
+    for view in views_of(kind):
+        if view.shows == name:
+            return view
+    across = product[name].dims[1:]
+    if across in (("range",), ("altitude",)) and f"{name}_standard_error" in product:
+        label = str(product[name].attrs.get("long_name", name))
+        return image_view(kind, name, ImageQuantity(label, background=False), str(across[0]))
+    return view_of(kind, name)
 
 
-def _of_raw(path: Path) -> Iterator[Figure]:
+def _part(product: xr.Dataset, chosen: Selection, path: Path) -> xr.Dataset:
+    """Return the part of a product in the chosen spans."""
+    spans = {"time": chosen.time, "range": chosen.range, "altitude": chosen.altitude}
+    for name, span in spans.items():
+        if span is None:
+            continue
+        along = product.variables.get(name)
+        if along is None or along.ndim != 1:
+            raise ProductError(f"has no {name}", file=path, wrong_use=True)
+        inside = (along.values >= span[0]) & (along.values <= span[1])
+        if not inside.any():
+            raise ProductError("lies outside the product", field=name, file=path, wrong_use=True)
+        product = product.isel({along.dims[0]: inside})
+    return product
+
+
+def _of_raw(path: Path, chosen: Selection) -> Iterator[Figure]:
+    if chosen != ALL:
+        raise LidarOpsError("is a raw file, of which no part is drawn", file=path, wrong_use=True)
     raw = open_archive([path], header_position="ignore")
     for mode, what in (
         (DetectionMode.PHOTON, "photon counting"),

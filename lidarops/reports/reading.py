@@ -208,7 +208,7 @@ class Sources:
     def _tasks(self, group: Group, view: View[Content]) -> dict[str, ReadTask[Content | None]]:
         scenes = {product.path: scene for scene, product in group.members}
         source = ProductSource(group.instrument, group.channel)
-        if view.image:
+        if view.shows:
             # All products get the same resolution, which follows from their total length.
             lengths = self._lengths(group, scenes)
             scenes = {path: scenes[path] for path in lengths}

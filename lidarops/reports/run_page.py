@@ -17,6 +17,8 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from lidarops.errors import CatalogError
+from lidarops.figures import browser
+from lidarops.figures.panels import Figure
 from lidarops.figures.templates import environment, page_style
 from lidarops.figures.wording import duration, percent, size
 from lidarops.records import RunRecord, SceneOutcome
@@ -41,8 +43,8 @@ class RunReport:
     """Files of a report."""
 
     page: Path
-    quicklook: Path | None
-    """First figure of products; None if no figure could be drawn."""
+    quicklook: Figure | None
+    """First figure of products; None if there is none."""
 
 
 def build_report(
@@ -55,8 +57,8 @@ def build_report(
     record : RunRecord
         Any run, also one without scenes or with failed scenes only.
     folder : Path
-        Report folder; created if missing. Figures are files beside the page. Links are
-        relative, and the page needs neither network nor scripts.
+        Report folder; created if missing. The page holds the data of its figures, which the script
+        beside it draws. Links are relative, and the page needs no network.
     figures : int, optional
         Most figures of products.
     workers : int, optional
@@ -75,8 +77,9 @@ def build_report(
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        filled = gallery.fill(record, folder, limit=figures, workers=workers)
+        filled = gallery.fill(record, limit=figures, workers=workers)
         target = folder / INDEX
+        write_atomically(folder / browser.SCRIPT, browser.script())
         write_atomically(target, _render(record, folder, filled).encode())
     except OSError as error:
         raise CatalogError(
@@ -85,7 +88,7 @@ def build_report(
             remedy=f"make space or choose a folder you can write to, then lidarops report {folder}",
         ) from error
     pictures = filled.pictures
-    return RunReport(target, folder / pictures[0].file if pictures else None)
+    return RunReport(target, pictures[0].figure if pictures else None)
 
 
 def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
@@ -101,7 +104,6 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         outcome=run_tables.outcome_class(record),
         difference=difference(record, folder),
         changes=run_tables.changes(record),
-        narrow=gallery.NARROW,
         page_style=Markup(page_style()),  # noqa: S704 - it is a file of the package
         overview=_overview(pictures),
         findings=[
@@ -141,7 +143,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
 def _environment() -> Environment:
     own = environment("lidarops.reports")
     own.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
-    own.filters |= {"lacking": lacking, "source_hash": _source_hash}
+    own.filters |= {"lacking": lacking, "source_hash": _source_hash, "drawn": browser.inline}
     return own
 
 

@@ -20,11 +20,11 @@ import xarray as xr
 
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError
-from lidarops.figures import any_kind, svg
+from lidarops.figures import any_kind, browser
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
-from lidarops.figures.quality_panel import quality_figure, read_quality
+from lidarops.figures.quality_panel import QualityOverTime, quality_figure, read_quality
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -55,7 +55,7 @@ from lidarops.system.files import (
 from lidarops.system.processes import end_with_parent
 
 _FORMAT: Final = "lidarops site"
-_EMPTY: Final = "no figure of the product"
+_EMPTY: Final = "No figure of the product"
 _OURS: Final = ("product", "station", COPIES)
 """Folders that only the site writes to."""
 Part = TypeVar("Part")
@@ -100,10 +100,10 @@ def build_site(
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
 
-    Pages need neither server, network nor scripts. The page of a product depends only on the
-    product, except its links, which are written anew in each build. It is kept while the sha256 of
-    the product, the page and lidarops do not change. Equal archives give equal bytes, for any
-    number of workers.
+    Pages need neither server nor network; one script draws their figures. The page of a product
+    depends only on the product, except its links, which are written anew in each build. It is kept
+    while the sha256 of the product, the page and lidarops do not change. Equal archives give equal
+    bytes, for any number of workers.
 
     Parameters
     ----------
@@ -248,8 +248,9 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             lambda: read_values(opened, kind), "its values cannot be shown"
         )
         over_time, no_quality = _guarded(
-            lambda: _quality_figures(opened, figures), "its quality over time cannot be drawn"
+            lambda: read_quality(opened), "its quality over time cannot be drawn"
         )
+        figures = _with_quality(figures, over_time)
         station = attribute(opened, "lidarops_station")
         instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
@@ -257,7 +258,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             sha256=sha256,
             size=file.stat().st_size,
             page=page,
-            thumbnail=page.removesuffix(".html") + ".svg",
+            thumbnail=page.removesuffix(".html") + ".png",
             digests=(),
             campaign=product_contents.campaign(opened),
             station=station,
@@ -279,19 +280,12 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             profiles=quality.profiles,
             available=quality.available,
             lacking=quality.lacking,
-            alt=figures[0].text if figures else _EMPTY.capitalize(),
+            alt=figures[0].text if figures else _EMPTY,
             problem=_joined(problem, no_values, no_quality, origin.problem, _missing_flags(opened)),
         )
         contents = (
-            pages.product(
-                entry,
-                opened,
-                quality,
-                origin,
-                [*figures[:1], *(over_time or ()), *figures[1:]],
-                values or (),
-            ),
-            svg.thumbnail(figures[0] if figures else None, _EMPTY),
+            pages.product(entry, opened, quality, origin, figures, values or ()),
+            browser.thumbnail(figures[0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):
         _write(task.site, name, content)
@@ -306,15 +300,17 @@ def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
         return None, f"{failure}: {error}"
 
 
-def _quality_figures(opened: xr.Dataset, figures: Sequence[Figure]) -> list[Figure]:
-    """Return the figure of quality over time, if there are flags, aligned with the first one."""
-    quality = read_quality(opened)
+def _with_quality(figures: list[Figure], quality: QualityOverTime | None) -> list[Figure]:
+    """Return figures with the quality over time below the first, or after it."""
     if quality is None:
-        return []
-    figure = quality_figure(quality)
-    first = figures[0].panels if figures else ()
-    axis = figure.panels[0].x
-    return [replace(figure, above=first if first and first[-1].x.label == axis.label else ())]
+        return figures
+    shown = quality_figure(quality)
+    if not figures or not figures[0].panels[-1].x.time:
+        return [*figures[:1], shown, *figures[1:]]
+    first, (panel,) = figures[0], shown.panels
+    joined = (*first.panels, replace(panel, x=first.panels[-1].x))
+    words = f"{first.words}. {shown.words}"
+    return [replace(first, panels=joined, words=words), *figures[1:]]
 
 
 def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:
@@ -419,6 +415,7 @@ def _write_calendar(
                 write(name, pages.day(station, day, by_day, before, after))
     campaigns = sorted({entry.campaign for entry in entries})
     _write(site, "site.css", pages.style().encode())
+    _write(site, browser.SCRIPT, browser.script())
     _write(site, pages.INDEX, pages.index(entries, problems, campaigns, links, below))
     return expected
 
@@ -488,6 +485,6 @@ def _entry(item: dict[str, Any]) -> Entry:
     known = Entry(**(values | {"digests": tuple(item["digests"])}))
     # Page names follow from the product, not from a manifest that may have been edited.
     page = product_page(known.path)
-    if (known.page, known.thumbnail) != (page, page.removesuffix(".html") + ".svg"):
+    if (known.page, known.thumbnail) != (page, page.removesuffix(".html") + ".png"):
         raise ValueError(known.path)
     return known

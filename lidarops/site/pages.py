@@ -14,7 +14,7 @@ from typing import Any, Final
 import xarray as xr
 
 from lidarops import __version__
-from lidarops.figures import svg
+from lidarops.figures import browser
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment, page_style
@@ -46,9 +46,9 @@ ByDay = Mapping[str, Sequence[Entry]]
 
 @cache
 def style() -> str:
-    """Return the style sheet of the site, with that of figures."""
+    """Return the style sheet of the site."""
     own = files("lidarops.site").joinpath("templates", "site.css").read_text(encoding="utf-8")
-    return svg.style() + page_style() + own
+    return page_style() + own
 
 
 def _render(template: str, page: str, **context: Any) -> bytes:
@@ -90,7 +90,7 @@ def product(
         problem=entry.problem,
         lacking=entry.lacking,
         summary=summary,
-        figures=[(svg.inline(figure), figure.text) for figure in figures],
+        figures=[(browser.inline(figure), figure.text) for figure in figures],
         quality=quality,
         grade=entry.grade,
         quality_text=_quality(entry),
@@ -271,7 +271,7 @@ def index(
         trail=[],
         grades=list(ShareGrade),
         below=f"{below / 1e3:g} km",
-        map=station_map(_places(by_station)),
+        map=browser.inline(station_map(places)) if (places := _places(by_station)) else "",
         stac=links.catalog(INDEX),
         report=links.report(INDEX),
         licenses=sorted({entry.license for entry in entries if entry.license}),
@@ -314,8 +314,8 @@ def _station(key: str, entries: Sequence[Entry], *, matrix: bool) -> dict[str, A
 
 def _places(by_station: Mapping[str, Sequence[Entry]]) -> list[Place]:
     return [
-        Place(first.place, f"s-{slug(key)}", first.latitude, first.longitude)
-        for key, (first, *_) in by_station.items()
+        Place(first.place, first.latitude, first.longitude)
+        for first, *_ in by_station.values()
         if first.latitude is not None and first.longitude is not None
     ]
 

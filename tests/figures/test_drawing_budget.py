@@ -12,7 +12,7 @@ from support.products.drawn import views
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
-from lidarops.figures import svg
+from lidarops.figures import browser
 from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.raster import COLUMNS
 
@@ -55,7 +55,7 @@ def test_a_figure_of_a_long_product_is_small_and_soon_drawn(products, kind, name
     # CPU time, the least of five: another process may take the caches of the processor.
     for _ in range(5):
         begin = time.process_time()
-        sizes = [len(svg.file(figure)) for figure in view.draw([content])]
+        sizes = [len(browser.inline(figure)) for figure in view.draw([content])]
         seconds.append((time.process_time() - begin) / len(sizes))
     assert max(sizes) <= MOST_BYTES
     assert min(seconds) <= MOST_SECONDS

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from datetime import timedelta
 
 import numpy as np
 import pytest
 from support.products.fabricated import START, homogeneous, signal, times
 
-from lidarops.figures import quality_panel, svg
+from lidarops.figures import quality_panel
 from lidarops.figures.quality_panel import quality_figure, read_quality
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
@@ -37,7 +36,8 @@ def test_shares_are_those_of_the_flags(product):
     good, care, reject = panel.layers
     np.testing.assert_array_equal(good.high, care.low)
     np.testing.assert_array_equal(care.high, reject.low)
-    assert (reject.high == 1.0).all()
+    np.testing.assert_allclose(care.high[::3], 100.0 * (1.0 - rejected.mean(axis=1)))
+    assert (reject.high == 100.0).all()
 
 
 def test_many_profiles_become_means():
@@ -60,25 +60,6 @@ def test_the_words_are_of_all_values_whatever_the_columns():
     quality = read_quality(made)
     assert quality.profiles.tolist() == [*[2] * 125, 1]
     assert f"{100 * 250 / 251:.1f} % of the values good" in quality_figure(quality).words
-
-
-def test_values_to_use_with_care_have_an_edge_where_there_are_any():
-    made = signal(times(START, 10, 60.0), bins=49).assign_attrs(lidarops_kind="signal")
-    made["quality_flag"][:] = 0
-    for profile in range(10):
-        made["quality_flag"].values[profile, 4 * profile :] = int(Quality.SATURATED)
-    made["quality_flag"].values[4:6, :5] = int(Quality.PILE_UP)
-    figure = quality_figure(read_quality(made))
-    path, _ = re.findall(r'class="band full q-care" d="([^"]*)"', svg.file(figure).decode())
-    assert path.count("Z") == 2
-
-
-@pytest.mark.parametrize("css", ["q-good", "q-care", "q-reject"])
-def test_qualities_have_colours_of_their_own_in_dark_mode(css):
-    light, _, rest = svg.style().partition("@media (prefers-color-scheme: dark)")
-    parts = (light, rest.partition("\n}")[0])
-    colours = [re.search(rf"\.{css} {{ color: (#\w+);", part)[1] for part in parts]
-    assert colours[0] != colours[1]
 
 
 def test_nothing_is_drawn_in_a_gap():

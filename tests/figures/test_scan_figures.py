@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import xarray as xr
-from support.products.drawn import figures, image, labelled
-from support.products.fabricated import CHANNEL, START, Archive, outcome, run_record, times
+from support.products.drawn import figures, images, labelled
+from support.products.fabricated import START, Archive, outcome, run_record, times
 
 from lidarops.errors import ProductError
-from lidarops.figures.panels import Curve
+from lidarops.figures.panels import FIRST, Curve
+from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.products.multiangle import figure_data
@@ -503,11 +506,11 @@ class TestResiduals:
         panel, below = residual_figure(product).panels
         limit = panel.bar.high
         assert panel.bar.low == -limit < 0
-        shares = (image(panel)[::-1].astype(float) - 4) / 251
-        middles = (read.edges[1:] + read.edges[:-1]) / 2e3
-        rows = ((middles - panel.y.low) / (panel.y.high - panel.y.low) * len(shares)).astype(int)
+        (image,) = images(panel)
+        shares = (image.codes.T.astype(float) - FIRST) / (255 - FIRST)
         expected = np.clip(0.5 + 0.5 * read.mean / limit, 0, 1)
-        np.testing.assert_allclose(shares[rows], expected, atol=0.003)
+        np.testing.assert_allclose(shares, expected, atol=0.003)
+        np.testing.assert_array_equal(image.edges, read.edges / 1e3)
         single, mean = below.layers
         np.testing.assert_allclose(single.y, read.rms)
         np.testing.assert_allclose(mean.y, read.rms_of_mean)
@@ -538,7 +541,7 @@ class TestResiduals:
 class TestImage:
     def test_extinction_in_km_over_altitude(self):
         product = multiangle()
-        (figure,) = figures("multiangle", "multiangle", [product])
+        (figure,) = figures("multiangle", "multiangle-total-extinction", [product])
         (panel,) = figure.panels
         assert panel.y.label == "altitude (km)"
         assert panel.y.low == pytest.approx((ALTITUDE[0] - 25) / 1e3)
@@ -549,21 +552,21 @@ class TestImage:
 
     def test_many_cycles_become_columns_of_means(self):
         product = multiangle(cycles=60)
-        raster = figure_data.read_extinction(product, profiles=20)
+        raster = READERS["image"](product, profiles=20)
         assert raster.mean.shape == (3, ALTITUDE.size)
         np.testing.assert_allclose(
-            raster.mean[0, 10], 1e3 * product["total_extinction"].values[:20, 10].mean(), rtol=1e-6
+            raster.mean[0, 10], product["total_extinction"].values[:20, 10].mean(), rtol=1e-6
         )
-        assert raster.units == "km-1"
+        assert raster.units == "m-1"
 
     def test_one_cycle_is_enough(self):
-        assert figures("multiangle", "multiangle", [multiangle(cycles=1)])
+        assert figures("multiangle", "multiangle-total-extinction", [multiangle(cycles=1)])
 
 
 READERS = {
     "profile": figure_data.clearest_cycle,
     "residuals": figure_data.read_residuals,
-    "image": figure_data.read_extinction,
+    "image": partial(read_raster, quantity="total_extinction", kind="multiangle", along="altitude"),
 }
 NEEDED = {
     "profile": (
@@ -597,12 +600,11 @@ class TestRefusal:
         with pytest.raises(ProductError, match="quality_flag"):
             READERS[reader](product)
 
-    @pytest.mark.parametrize("reader", ["profile", "image"])
-    def test_other_units_are_refused(self, reader):
+    def test_other_units_are_refused(self):
         product = multiangle(cycles=2)
         product["total_extinction"].attrs["units"] = "km-1"
         with pytest.raises(ProductError, match="km-1"):
-            READERS[reader](product)
+            READERS["profile"](product)
 
 
 class TestGallery:
@@ -614,24 +616,23 @@ class TestGallery:
             path = str(tmp_path / "truth.nc")
             truth.to_netcdf(path)
         scene = outcome("s", products=records, instrument="plain-scanner")
-        folder = tmp_path / "report"
-        folder.mkdir()
-        return gallery.fill(run_record(archive.root, [scene], truth=path), folder), folder
+        return gallery.fill(run_record(archive.root, [scene], truth=path))
 
     def test_three_figures_of_every_channel_with_the_truth(self, tmp_path):
         product = multiangle()
-        made, folder = self.run(tmp_path, {"a.nc": product}, truth_of(product))
+        made = self.run(tmp_path, {"a.nc": product}, truth_of(product))
         assert not made.problems
-        assert [picture.file for picture in made.pictures] == [
-            f"{kind}_plain-scanner_{CHANNEL}.svg"
-            for kind in ("multiangle", "scan-profile", "scan-residuals")
+        assert [picture.view for picture in made.pictures] == [
+            "multiangle-total-extinction",
+            "scan-profile",
+            "scan-residuals",
         ]
-        assert "truth at zenith angle" in (folder / made.pictures[1].file).read_text()
+        assert labelled(made.pictures[1].figure.panels[0], "truth at zenith angle")
         assert made.flags
 
     def test_an_unreadable_product_is_listed_once_and_the_next_is_drawn(self, tmp_path):
         broken = multiangle().drop_vars(["vertical_optical_depth", "residual"])
-        made, _ = self.run(tmp_path, {"a.nc": broken, "b.nc": multiangle()})
+        made = self.run(tmp_path, {"a.nc": broken, "b.nc": multiangle()})
         assert [problem.path for problem in made.problems] == ["a.nc"]
         assert "vertical_optical_depth" in made.problems[0].reason
         assert len(made.pictures) == 3
@@ -642,6 +643,6 @@ class TestGallery:
             MultiAngleQuality.NO_LEVERAGE | MultiAngleQuality.NO_RESIDUAL
         )
         product["vertical_optical_depth"][:] = np.nan
-        made, _ = self.run(tmp_path, {"a.nc": product})
+        made = self.run(tmp_path, {"a.nc": product})
         assert not made.problems
-        assert [figure.file.partition("_")[0] for figure in made.pictures] == ["multiangle"]
+        assert [picture.view for picture in made.pictures] == ["multiangle-total-extinction"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from support.products.drawn import figures, image
+from support.products.drawn import figures, pixels
 
-from lidarops.figures import pixels
 from lidarops.figures.kind_figures import ProductSource
+from lidarops.figures.panels import BLANK, codes_of
 from lidarops.products.multiangle.scan_images import read_scan_image
 
 STATION = 180.0
@@ -45,15 +45,16 @@ def drawn(product):
 def level(panel, signal):
     """Return the pixel of a signal."""
     low, high = np.log([panel.bar.low, panel.bar.high])
-    return int(pixels.steps(np.array([(np.log(signal) - low) / (high - low)]))[0])
+    return int(codes_of(np.array([(np.log(signal) - low) / (high - low)]))[0])
 
 
 def pixel(panel, x, y):
     """Return the pixel at a place, km."""
-    rows, columns = image(panel).shape
+    shown = pixels(panel)
+    rows, columns = shown.shape
     column = int((x - panel.x.low) / (panel.x.high - panel.x.low) * columns)
     row = int((panel.y.high - y) / (panel.y.high - panel.y.low) * rows)
-    return int(image(panel)[row, column])
+    return int(shown[row, column])
 
 
 @pytest.mark.parametrize("opposite", [False, True])
@@ -66,7 +67,7 @@ def test_a_range_height_image_has_each_signal_along_its_beam(opposite):
         for height in (0.55, 1.55, 2.55):
             place = side * height / np.tan(np.radians(elevation))
             assert pixel(panel, place, height) == level(panel, 1.0 + number)
-    assert pixel(panel, 0.0, 2.0) == pixels.BLANK
+    assert pixel(panel, 0.0, 2.0) == BLANK
     assert f"azimuth {242 if opposite else 62}°" in panel.x.label
 
 
@@ -91,7 +92,7 @@ def test_the_map_of_a_volume_has_each_signal_toward_its_azimuth():
     for number, azimuth in enumerate(azimuths):
         east, north = 8.0 * np.sin(np.radians(azimuth)), 8.0 * np.cos(np.radians(azimuth))
         assert pixel(panel, east, north) == level(panel, 4 * number + 1)
-    assert pixel(panel, -2.0, 0.0) == pixels.BLANK
+    assert pixel(panel, -2.0, 0.0) == BLANK
 
 
 def test_the_map_holds_the_whole_sector_of_each_beam():

@@ -53,7 +53,7 @@ def many(archive: Archive, tmp_path: Path) -> RunRecord:
         scenes.append(outcome(f"horizontal_{number}", products=products, inputs=inputs))
     (archive.root / "e2.nc").unlink()
     (archive.root / "s3.nc").write_bytes(b"nonsense")
-    xr.open_dataset(archive.root / "s4.nc").load().drop_vars("background").to_netcdf(
+    xr.open_dataset(archive.root / "s4.nc").load().drop_vars("signal_standard_error").to_netcdf(
         archive.root / "s4.nc"
     )
     truth = tmp_path / "truth.nc"

@@ -143,7 +143,7 @@ def _report(folder: Path) -> Gallery:
     ]
     run = fab.run_record(archive.root, [fab.outcome("a_1", fab.START, products=tuple(records))])
     assert run_page.build_report(run, folder / "report").page.is_file()
-    gallery = fill(run, folder / "report")
+    gallery = fill(run)
     assert not gallery.problems
     return gallery
 
@@ -151,24 +151,24 @@ def _report(folder: Path) -> Gallery:
 def test_without_figures_the_main_variable_is_shown(register: Register, tmp_path: Path) -> None:
     register()
     text = _page(tmp_path / "out")
-    assert text.count('<svg class="fig wide"') == 2
+    assert text.count('<div class="fig"') == 1
     assert "Extinction coefficient of molecules and particles against time" in text
     first, second, third = _report(tmp_path).pictures
-    assert first.file.startswith("homogeneous_")
-    assert second.file.startswith("smooth_")
-    assert "against time" in second.alt
-    assert third.file.startswith("wind_"), "a kind that is not installed comes last"
+    assert first.view == "homogeneous"
+    assert second.view == "smooth"
+    assert "against time" in second.caption
+    assert third.view == "wind", "a kind that is not installed comes last"
 
 
 def test_figures_are_those_of_the_kind(register: Register, tmp_path: Path) -> None:
     register(figures=FIGURES)
     text = _page(tmp_path / "out")
-    assert text.count('<svg class="fig wide"') == 2
+    assert text.count('<div class="fig"') == 2
     assert "A smooth figure" in text
     _, figure, _ = _report(tmp_path).pictures
-    assert figure.file.startswith("even_")
+    assert figure.view == "even"
     assert figure.caption.startswith("A smooth figure: ")
-    assert figure.alt.endswith("Of 40 times.")
+    assert figure.words.endswith("Of 40 times.")
 
 
 def test_means_follow_its_budget(

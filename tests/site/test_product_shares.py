@@ -15,7 +15,7 @@ from lidarops.site.product_entry import Entry, ShareGrade, mean_availability
 
 def entry(available: int, profiles: int = 100, kind: str = "raman", lacking: str = "") -> Entry:
     return Entry(
-        path="odesa/lidar/x.nc", sha256="", size=1, page="product/odesa/x.html", thumbnail="x.svg",
+        path="odesa/lidar/x.nc", sha256="", size=1, page="product/odesa/x.html", thumbnail="x.png",
         digests=(), campaign="odesa", station="odesa", place="Odesa", instrument="lidar",
         name="Lidar", kind=kind, channel="photon_355o", light="355 nm", latitude=None,
         longitude=None, altitude=None, license="", start="2026-03-01T10:00:00",

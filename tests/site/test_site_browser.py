@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import xarray as xr
 from support.archives.site_archive import CHROMIUM, add_unknown, browser, small_archive
 from support.products import fabricated as fab
 from support.products.fabricated import START
@@ -203,6 +206,14 @@ def test_images_are_drawn_and_thumbnails_load(site: Path, watched: Watched) -> N
         _until(watched.page, "[...document.images].every(i => i.complete)")
         widths = watched.page.evaluate("[...document.images].map(i => i.naturalWidth)")
         assert all(width > 0 for width in widths), file
+        watched.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        for figure in watched.page.locator("div.fig").all():
+            figure.scroll_into_view_if_needed()
+        _until(
+            watched.page,
+            "[...document.querySelectorAll('div.fig')]"
+            ".every(f => f.querySelector('canvas')?.height > 150)",
+        )
     _quiet(watched)
 
 
@@ -233,6 +244,7 @@ def test_axe_finds_nothing(site: Path, chromium: Any, scheme: str, width: int) -
     for name, file in _pages(site).items():
         page.goto(file.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+        page.wait_for_timeout(300)
         page.add_script_tag(path=AXE)
         result = page.evaluate("axe.run()")
         assert len(result["passes"]) > 10
@@ -279,11 +291,57 @@ def visitor(site: Path, watched: Watched) -> Visitor:
     return Visitor(watched.page)
 
 
-def test_find_the_extinction_at_a_time_as_a_number(visitor: Visitor) -> None:
+def drawn(page: Any) -> Any:
+    """Return the first figure of a page, drawn."""
+    canvas = page.locator("div.fig canvas").first
+    canvas.scroll_into_view_if_needed()
+    _until(page, "document.querySelector('div.fig canvas').height > 200")
+    return canvas
+
+
+def test_find_the_extinction_at_a_time_as_a_number(site: Path, visitor: Visitor) -> None:
     visitor.product("Extinction of homogeneous sections")
-    row = visitor.page.get_by_role("row", name="2026-03-01 10:20")
-    number, _, error = row.get_by_role("cell").first.inner_text().partition(" \u00b1 ")
-    assert float(number) > float(error) > 0
+    size = drawn(visitor.page).bounding_box()
+    visitor.page.mouse.move(size["x"] + size["width"] / 2, size["y"] + 150)
+    words = visitor.page.locator("div.fig output").first.inner_text()
+    time, number, error = re.search(
+        r"2026-03-01 (10:\d5):00 UTC, total extinction ([\d.]+) km.¹ ± ([\d.]+)", words
+    ).groups()
+    file = next(site.parent.glob("products/**/homogeneous/**/*20260301*.nc"))
+    with xr.open_dataset(file) as product:
+        one = product.sel(time=f"2026-03-01T{time}", method="nearest")
+        shown = 1e3 * one["total_extinction"].values
+        errors = 1e3 * one["total_extinction_standard_error"].values
+    place = int(np.nanargmin(np.abs(shown - float(number))))
+    assert float(number) == pytest.approx(shown[place], rel=0.01)
+    assert float(error) == pytest.approx(errors[place], rel=0.1)
+
+
+def test_a_figure_is_read_and_zoomed_by_keyboard_and_mouse(visitor: Visitor) -> None:
+    page = visitor.product("Backscatter of elastic profiles").page
+    canvas, words = drawn(page), page.locator("div.fig output").first
+    canvas.focus()
+    page.keyboard.press("ArrowRight")
+    assert "aerosol backscatter" in words.inner_text()
+    first = words.inner_text()
+    page.keyboard.press("ArrowUp")
+    assert words.inner_text() != first
+    show_all = page.get_by_role("button", name="Show all").first
+    assert not show_all.is_visible()
+    for zoom in ("key", "mouse"):
+        before = canvas.screenshot()
+        if zoom == "key":
+            page.keyboard.press("+")
+        else:
+            size = canvas.bounding_box()
+            page.mouse.move(size["x"] + 200, size["y"] + 100)
+            page.mouse.down()
+            page.mouse.move(size["x"] + 400, size["y"] + 200)
+            page.mouse.up()
+        assert canvas.screenshot() != before
+        assert show_all.is_visible()
+        canvas.press("Escape")
+        assert not show_all.is_visible()
 
 
 def test_find_out_whether_it_was_cloudy(visitor: Visitor) -> None:
@@ -319,6 +377,18 @@ def test_find_how_to_open_all_values(visitor: Visitor) -> None:
     assert visitor.reads('xarray.open_dataset("odesa_lidar-1_elastic_photon_532o_')
 
 
+def test_download_values_as_a_table(visitor: Visitor) -> None:
+    visitor.product("Backscatter of elastic profiles")
+    with visitor.page.expect_download() as download:
+        visitor.click("Save values as CSV", "button")
+    rows = Path(download.value.path()).read_text(encoding="utf-8").splitlines()
+    assert rows[0] == "time (UTC),range (km),aerosol backscatter (Mm⁻¹ sr⁻¹)"
+    time, place, number = rows[40].split(",")
+    assert time.startswith("2026-03-01T10:")
+    assert 0.0 < float(place) < 1.0
+    assert float(number or 1.0) > 0.0
+
+
 def test_go_to_the_next_day_of_a_channel(visitor: Visitor) -> None:
     visitor.product("Backscatter of elastic profiles").click("2026-03-02 10:00 UTC")
     assert visitor.reads("2026-03-02, 10:00 to")
@@ -332,8 +402,7 @@ def test_go_to_another_channel_or_kind_of_the_same_time(visitor: Visitor) -> Non
 
 def test_find_where_the_station_is_and_its_data(visitor: Visitor) -> None:
     assert visitor.reads("46.44\u00b0 N, 30.76\u00b0 E")
-    visitor.page.locator("svg.map a").first.click()
-    assert visitor.page.evaluate("location.hash") == "#s-odesa"
+    assert "Одеса, hill at 46.44° north" in drawn(visitor.page).get_attribute("aria-label")
 
 
 def test_see_one_kind_only(visitor: Visitor) -> None:

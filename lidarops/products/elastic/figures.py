@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -25,7 +24,6 @@ from lidarops.figures.panels import (
     percentile_axis,
     span_in_words,
 )
-from lidarops.figures.raster import raster_variables, read_raster
 from lidarops.figures.series_data import require
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import utc
@@ -222,15 +220,7 @@ def _reference(profile: Profile, x: Axis) -> Band:
 
 FIGURES: Final = KindFigures(
     (
-        *(
-            image_view(
-                f"elastic-{name.replace('_', '-')}",
-                raster_variables(name),
-                partial(read_raster, quantity=name, kind="elastic"),
-                image,
-            )
-            for name, image in _IMAGES.items()
-        ),
+        *(image_view("elastic", name, image) for name, image in _IMAGES.items()),
         View(
             "profile",
             PROFILE_VARIABLES,

@@ -1,4 +1,4 @@
-"""Multi-angle products as plain arrays: profiles, residuals and extinction, with the truth."""
+"""Multi-angle products as plain arrays: profiles with the truth, and residuals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
-from lidarops.figures.raster import TIME_BOUNDS, Raster, bin_edges, read_raster
+from lidarops.figures.raster import bin_edges
 from lidarops.figures.series_data import quality_bits, require
 from lidarops.figures.time_axis import usual_step
 from lidarops.kinds import flags_of
@@ -39,8 +39,6 @@ CYCLE_VARIABLES: Final = (
     "wavelength",
 )
 """Variables that `clearest_cycle` reads."""
-EXTINCTION_VARIABLES: Final = (*_PROFILES, TIME_BOUNDS)
-"""Variables that `read_extinction` needs."""
 _OF_RESIDUALS: Final = {
     "time": ("time",),
     "altitude": ("altitude",),
@@ -445,41 +443,3 @@ def _side(azimuth: float, azimuths: list[float]) -> tuple[int, float]:
             return index, -1.0
     azimuths.append(azimuth)
     return len(azimuths) - 1, 1.0
-
-
-# Extinction over time ------------------------------------------------------------------------
-
-
-def read_extinction(product: xr.Dataset, *, profiles: int = 0) -> Raster:
-    """Reduce the extinction of a product to block means over time and altitude.
-
-    Parameters
-    ----------
-    product : Dataset
-        Kind ``multiangle``; may be lazy.
-    profiles : int, optional
-        Cycles per column; 0 for about `lidarops.figures.raster.COLUMNS` columns.
-
-    Returns
-    -------
-    Raster
-        In km-1, with altitude instead of range and without background.
-
-    Raises
-    ------
-    ProductError
-        If a variable is missing or has other dimensions or units, or the product is empty.
-    """
-    _check_profiles(product)
-    unknown = ("time", np.full(product.sizes["time"], np.nan))
-    extinction = product[["total_extinction", "total_extinction_standard_error"]] * 1e3
-    drawn = (
-        extinction.assign(quality_flag=product["quality_flag"])
-        .drop_vars([name for name in extinction.coords if name not in ("time", "altitude")])
-        .rename(altitude="range")
-        .assign(background=unknown, background_standard_error=unknown)
-    )
-    drawn["total_extinction"].attrs["units"] = "km-1"
-    if TIME_BOUNDS in product.variables:
-        drawn[TIME_BOUNDS] = product[TIME_BOUNDS]
-    return read_raster(drawn, quantity="total_extinction", kind="multiangle", profiles=profiles)

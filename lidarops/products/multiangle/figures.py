@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures import pixels
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, ProductSource, View, image_view
 from lidarops.figures.panels import (
@@ -22,24 +21,23 @@ from lidarops.figures.panels import (
     Mark,
     Palette,
     Panel,
+    Tick,
+    codes_of,
     finite,
     number,
     percentile_axis,
     span_in_words,
 )
 from lidarops.figures.series_panels import Quantity
-from lidarops.figures.time_axis import Tick
 from lidarops.figures.wording import counted, utc
 from lidarops.kinds import flags_of
 from lidarops.products.multiangle.figure_data import (
     CYCLE_VARIABLES,
-    EXTINCTION_VARIABLES,
     QUANTITIES,
     RESIDUAL_VARIABLES,
     ScanProfile,
     ScanResiduals,
     clearest_cycle,
-    read_extinction,
     read_residuals,
 )
 from lidarops.products.multiangle.scan_images import (
@@ -54,7 +52,7 @@ _SCALES: Final = {
     "vertical_optical_depth": (1.0, "vertical optical depth from the lidar"),
     "total_extinction": (1e3, "total extinction (km⁻¹)"),
 }
-_EXTINCTION: Final = ImageQuantity("total extinction", units="km⁻¹", limits=(0.01, 10.0))
+_EXTINCTION: Final = ImageQuantity("total extinction", 1e3, "km⁻¹", limits=(0.01, 10.0))
 """From clean air at the ground to fog."""
 _HEIGHT: Final = 366
 _MARKS: Final = 30
@@ -68,7 +66,7 @@ _LEAST: Final = 0.01
 _BEAM_TICKS: Final = 24
 _NAMED_PLANES: Final = 8
 _MAP: Final = 306
-"""Height of the map of residuals, and its number of pixels."""
+"""Height of the map of residuals."""
 
 
 def _read_cycle(product: xr.Dataset, source: ProductSource) -> ScanProfile | None:
@@ -196,9 +194,13 @@ def _draw_residuals(contents: Sequence[ScanResiduals]) -> list[Figure]:
     )
     x = Axis(_beam_label(residuals), -0.5, beams.size - 0.5, ticks=ticks)
     y = Axis("altitude (km)", float(residuals.edges[0]) / 1e3, float(residuals.edges[-1]) / 1e3)
-    altitude = 1e3 * (y.high - (np.arange(_MAP) + 0.5) / _MAP * (y.high - y.low))
-    rows = np.searchsorted(residuals.edges, altitude) - 1
-    image = Image(pixels.steps(0.5 + 0.5 * residuals.mean / limit)[rows], Palette.SIGNED)
+    image = Image(
+        codes_of(0.5 + 0.5 * residuals.mean.T / limit),
+        beams - 0.5,
+        beams + 0.5,
+        residuals.edges / 1e3,
+        Palette.SIGNED,
+    )
     planes = [
         Curve(np.full(2, cut + 0.5), np.array([y.low, y.high]), "ink thin")
         for cut in np.flatnonzero(np.diff(residuals.plane))
@@ -282,7 +284,7 @@ def _sides(residuals: ScanResiduals) -> str:
 
 FIGURES: Final = KindFigures(
     (
-        image_view("multiangle", EXTINCTION_VARIABLES, read_extinction, _EXTINCTION, "altitude"),
+        image_view("multiangle", "total_extinction", _EXTINCTION, "altitude"),
         View("scan-profile", CYCLE_VARIABLES, _read_cycle, _draw_cycle, first=True),
         View("scan-image", VARIABLES, read_scan_image, draw_scan_images, first=True),
         View("scan-residuals", RESIDUAL_VARIABLES, _read_residuals, _draw_residuals, first=True),

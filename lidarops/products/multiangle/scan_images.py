@@ -10,9 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures import pixels
 from lidarops.figures.kind_figures import ProductSource
-from lidarops.figures.panels import Axis, Curve, Figure, Image, Layer, Mark, Panel, finite
+from lidarops.figures.panels import Axis, Curve, Figure, Image, Layer, Mark, Panel, codes_of, finite
 from lidarops.figures.series_data import require
 from lidarops.figures.wording import counted, utc
 from lidarops.retrieve.multiangle.scan_cycles import vertical_planes
@@ -32,10 +31,11 @@ VARIABLES: Final = (
     "residual",
 )
 """Variables that `read_scan_image` needs."""
-_WIDTH: Final = 560
-"""Pixels of a row of an image."""
+_WIDTH: Final = 400
+"""Columns of an image."""
 _RHI_HEIGHT: Final = 170
 _PPI_HEIGHT: Final = 420
+_PPI_ROWS: Final = 300
 _MOST_PLANES: Final = 4
 _FEWEST_AZIMUTHS: Final = 3
 """Beams at one elevation that make a map."""
@@ -176,7 +176,7 @@ def _range_height(image: ScanImage, beams: Indices, ends: tuple[float, float]) -
         max(float(reached.max()), 1.0) / 1e3,
     )
     y = Axis("height (km)", 0.0, top / 1e3)
-    along, up = _pixels(x, _WIDTH), _pixels(y, _RHI_HEIGHT)[::-1, np.newaxis]
+    along, up = _pixels(x, _WIDTH), _pixels(y, _RHI_HEIGHT)[:, np.newaxis]
     angle = np.degrees(np.arctan2(along, up))
     nearest = _nearest(angle, side * zenith)
     panel = _panel(image, beams, nearest, up * np.ones_like(angle), (x, y), ends)
@@ -202,7 +202,7 @@ def _plan_position(image: ScanImage, beams: Indices, ends: tuple[float, float]) 
             strict=True,
         )
     )
-    east, north = _pixels(x, _WIDTH), _pixels(y, _PPI_HEIGHT)[::-1, np.newaxis]
+    east, north = _pixels(x, _WIDTH), _pixels(y, _PPI_ROWS)[:, np.newaxis]
     turn = np.degrees(np.arctan2(east, north)) % 360.0
     nearest = _nearest(turn, image.azimuth[beams], period=360.0)
     middle = beams[0]
@@ -257,7 +257,10 @@ def _panel(
     low, high = np.log(ends)
     share = (value - low) / (high - low)
     bar = Axis("range-corrected signal", *ends, log=True)
-    return Panel(*axes, (Image(pixels.steps(share)),), height=size, bar=bar)
+    x, up = (
+        np.linspace(axis.low, axis.high, n + 1) for axis, n in zip(axes, share.T.shape, strict=True)
+    )
+    return Panel(*axes, (Image(codes_of(share.T), x[:-1], x[1:], up),), height=size, bar=bar)
 
 
 def _top(image: ScanImage, beams: Indices) -> float:

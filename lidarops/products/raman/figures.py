@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -22,7 +21,6 @@ from lidarops.figures.panels import (
     percentile_axis,
     span_in_words,
 )
-from lidarops.figures.raster import raster_variables, read_raster
 from lidarops.figures.series_data import require
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import utc
@@ -126,15 +124,7 @@ def _panel(profile: _Profile, name: str, label: str, scale: float, y: Axis) -> P
 
 FIGURES: Final = KindFigures(
     (
-        *(
-            image_view(
-                f"raman-{name}",
-                raster_variables(name),
-                partial(read_raster, quantity=name, kind="raman"),
-                image,
-            )
-            for name, image in _IMAGES.items()
-        ),
+        *(image_view("raman", name, image) for name, image in _IMAGES.items()),
         View("profile", ("time", "range", *_ALONG_BOTH), _read, _draw, first=True),
     ),
     preferred="aerosol_extinction",
