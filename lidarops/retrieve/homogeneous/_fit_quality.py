@@ -7,7 +7,6 @@ hardly affects; the tests allow for the scatter of that estimate.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -68,18 +67,6 @@ class _Limits(NamedTuple):
     """Share of the values beyond `_FAR` standard errors by the scatter of the noise."""
 
 
-@dataclass(frozen=True, slots=True)
-class CountMoments:
-    """Poisson noise of the bins of each profile, (profile,) each."""
-
-    fewest: Array
-    """Expected counts of the darkest bin."""
-    inverse: Array
-    """Mean of the inverse expected counts."""
-    inverse_square: Array
-    """Mean of their inverse squares."""
-
-
 def judge_fit(
     fit: PathEstimate, problem: PathProblem, *, unknowns: int, added_variance: Array
 ) -> Verdict:
@@ -96,7 +83,6 @@ def judge_fit(
     """
     known_variance, bins = problem.known_variance, problem.range.size
     bin_width = np.ptp(problem.range) / (bins - 1) if bins > 1 else 1.0
-    counts = _count_moments(problem)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         noise = np.ones_like(fit.status)
         if not known_variance:
@@ -105,8 +91,8 @@ def judge_fit(
         mean_noise = noise * problem.correlation_length
         reduced = fit.misfit / _residual_dof(fit.bins, unknowns) / noise
         limits = _limits(fit, unknowns, known_variance=known_variance)
-        if counts is not None:
-            limits = _limits_of_counts(limits, fit.bins, counts, unknowns)
+        if problem.exposure is not None:
+            _allow_for_counts(limits, fit, reduced, problem, unknowns)
         variance = fit.extinction_variance * mean_noise * limits.widening**2 + added_variance
         # Where the signal dies within a bin, the error is that of the transmission of one bin.
         scale = np.minimum(fit.extinction + 1.0 / fit.mean_range, 0.5 / bin_width)
@@ -134,21 +120,6 @@ def judge_fit(
     quality[fit.status == EMPTY] |= np.int32(Quality.INPUT_MISSING)
     quality[(fit.bins > 0) & (fit.bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
     return Verdict(noise, limits.widening, relative_error, reduced, quality)
-
-
-def _count_moments(problem: PathProblem) -> CountMoments | None:
-    """Return the moments of the counts of the used bins; None where the noise is normal."""
-    if problem.exposure is None:
-        return None
-    expected = problem.noise * problem.exposure[:, np.newaxis] ** 2
-    counts = np.where(np.isfinite(problem.power), expected, np.nan)
-    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
-        # Profiles without bins have no moments.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        counts[~(counts > 0.0)] = np.nan
-        return CountMoments(
-            np.nanmin(counts, axis=1), np.nanmean(1.0 / counts, 1), np.nanmean(counts**-2.0, 1)
-        )
 
 
 def _residual_dof(bins: Array, unknowns: int) -> Array:
@@ -195,23 +166,36 @@ def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limit
     return _Limits(*(limit[kind] for limit in limits))
 
 
-def _limits_of_counts(limits: _Limits, bins: Array, counts: CountMoments, unknowns: int) -> _Limits:
-    """Return limits with the same rates for Poisson noise, whose tail is longer than a normal one.
+def _allow_for_counts(
+    limits: _Limits, fit: PathEstimate, reduced: Array, problem: PathProblem, unknowns: int
+) -> None:
+    """Raise limits that a profile exceeds to those with the same rates for Poisson noise.
 
-    The largest residual has the quantile of the counts of the darkest bin. Chi-square has the
-    mean 1, the variance 2 + 1/N and the third cumulant 8 + 22/N + 1/N^2 of a bin with N counts,
-    and the quantile of the shifted gamma distribution with the same three.
+    Its tail is longer than a normal one. The largest residual has the quantile of the counts of the
+    darkest bin. Chi-square has the mean 1, the variance 2 + 1/N and the third cumulant
+    8 + 22/N + 1/N^2 of a bin with N counts, and the quantile of the shifted gamma distribution with
+    the same three.
     """
-    rate, mean = 0.5 * THRESHOLDS.false_alarm, counts.fewest
-    highest = np.ceil(special.pdtrik(1.0 - rate / np.maximum(bins, 1.0), mean))
-    dof = _residual_dof(bins, unknowns)
-    variance = (2.0 + counts.inverse) * dof
-    shape = 4.0 * variance**3 / ((8.0 + 22.0 * counts.inverse + counts.inverse_square) * dof) ** 2
+    doubted = np.flatnonzero((reduced > limits.misfit) | (fit.largest > limits.outlier))
+    if not doubted.size:
+        return
+    noise, exposure = problem.noise, np.asarray(problem.exposure)
+    counts = noise[doubted % len(noise)] * exposure[doubted % len(exposure), np.newaxis] ** 2
+    used = np.isfinite(problem.power[doubted]) & (counts > 0.0)
+    fewest = np.min(counts, axis=-1, where=used, initial=np.inf)
+    bins = np.maximum(used.sum(axis=-1), 1)
+    inverse = np.sum(1.0 / counts, axis=-1, where=used) / bins
+    inverse_square = np.sum(counts**-2.0, axis=-1, where=used) / bins
+    rate, dof = 0.5 * THRESHOLDS.false_alarm, _residual_dof(fit.bins[doubted], unknowns)
+    highest = np.ceil(special.pdtrik(1.0 - rate / bins, fewest))
+    variance = (2.0 + inverse) * dof
+    shape = 4.0 * variance**3 / ((8.0 + 22.0 * inverse + inverse_square) * dof) ** 2
     above = (special.gammaincinv(shape, 1.0 - rate) - shape) / np.sqrt(shape)
-    return limits._replace(
-        outlier=np.fmax(limits.outlier, (highest - mean) / np.sqrt(mean)),
-        misfit=np.fmax(limits.misfit, 1.0 + above * np.sqrt(variance) / dof),
-    )
+    for limit, raised in (
+        (limits.outlier, (highest - fewest) / np.sqrt(fewest)),
+        (limits.misfit, 1.0 + above * np.sqrt(variance) / dof),
+    ):
+        limit[doubted] = np.fmax(limit[doubted], raised)
 
 
 def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[Array, ...]:

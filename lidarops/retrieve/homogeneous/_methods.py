@@ -1,20 +1,14 @@
-"""Solvers of the homogeneous path, one for each method.
+"""Solvers of the homogeneous path, one for each method."""
 
-Where a background comes from elsewhere, `propagate` carries its noise into the fit above it.
-"""
-
-# ruff: noqa: FBT001 - compiled functions take no keyword-only arguments
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import numpy as np
 
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult, solve_cubic
-from lidarops.retrieve.common.arrays import HUGE, Array, Block, Flags, frozen
-from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.arrays import HUGE, Array, Flags, frozen
 from lidarops.retrieve.homogeneous import _direct
 from lidarops.retrieve.homogeneous._fit_quality import curved_widening, judge_fit
 from lidarops.retrieve.homogeneous._problem import (
@@ -43,7 +37,8 @@ def solve_by_linearization(problem: PathProblem) -> HomogeneousResult:
     """Solve by one linear step from the prior extinction."""
     prior = np.zeros(1) if problem.extinction is None else problem.extinction
     fit = _estimate(problem, prior, _direct.PRIOR)
-    shifts = _neglected_shifts(problem, prior, fit.extinction, fit.amplitude)
+    # What one step neglects is about what another one would add.
+    shifts = (fit.background_shift, fit.amplitude_shift, fit.extinction_shift)
     with np.errstate(over="ignore", invalid="ignore"):
         added = tuple(shift**2 for shift in shifts)
     return _solution(fit, problem, added=added)
@@ -62,10 +57,9 @@ def solve_with_known_background(problem: PathProblem) -> HomogeneousResult:
     background = np.zeros(1) if problem.background is None else problem.background
     variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
     fit = _estimate(problem, background)
-    spread = _propagated(problem, fit, np.zeros((1, problem.range.size)))
     with np.errstate(over="ignore", invalid="ignore"):
-        by_slopes = (spread[f"{name}_slope"] for name in ("amplitude", "extinction"))
-        added = (variance, *(variance * slope**2 for slope in by_slopes))
+        by_slopes = (variance * slope**2 for slope in (fit.amplitude_slope, fit.extinction_slope))
+        added = (variance, *by_slopes)
     return _solution(fit, problem, unknowns=2, added=added)
 
 
@@ -87,38 +81,54 @@ def solve_by_cubic(problem: PathProblem) -> HomogeneousResult:
 def _fit_above(
     problem: PathProblem, estimate: BackgroundResult, gradients: Array
 ) -> HomogeneousResult:
-    """Fit amplitude and extinction above a background that depends on the same power."""
-    background = estimate.background
+    """Fit amplitude and extinction above a background that depends on the same power.
+
+    `gradients`, (profile or 1, bin), are the derivatives of the background by the power, through
+    which noise is propagated to first order.
+    """
+    background, near = estimate.background, problem.range[0]
     fit = _estimate(problem, background)
-    spread = _propagated(problem, fit, gradients)
+    length, middle = np.ptp(problem.range), 0.5 * (near + problem.range[-1])
+    with np.errstate(all="ignore"):
+        weights = _weights(problem)
+        decay = np.exp(-2.0 * fit.extinction[:, np.newaxis] * problem.range)
+        signal = fit.amplitude[:, np.newaxis] * decay / problem.range**2
+        pull = weights * signal
+        norm, lever = _row_sum(pull * signal), -2.0 * problem.range
+        lever = lever - (_row_sum(lever * pull * signal) / norm)[:, np.newaxis]
+        centroid = np.asarray(near + 0.5 * lever[:, 0])
+        # Without the background, then through it.
+        extinction = lever * pull / _row_sum(lever**2 * pull * signal)[:, np.newaxis]
+        logarithm = pull / norm[:, np.newaxis] + 2.0 * centroid[:, np.newaxis] * extinction
+        extinction = extinction + fit.extinction_slope[:, np.newaxis] * gradients
+        logarithm = logarithm + fit.amplitude_slope[:, np.newaxis] * gradients
+        used = weights > 0.0
+        bent = _row_sum(np.where(used, gradients * signal, 0.0) * (problem.range - middle) ** 2)
+        variance = np.where(used, 1.0 / weights, 0.0)
+    bend = bent / length
     fit = replace(
         fit,
         status=np.where(np.isnan(background), np.nan, fit.status),
         background=background,
-        background_variance=spread["background_variance"],
+        background_variance=_row_sum(gradients**2 * variance),
         background_slope_variance=np.zeros(1),
-        amplitude_relative_variance=spread["amplitude_relative_variance"],
-        extinction_variance=spread["extinction_variance"],
-        background_bend=spread["background_bend"],
-        extinction_bend=fit.extinction_bend
-        + spread["extinction_slope"] * spread["background_bend"],
+        amplitude_relative_variance=_row_sum(logarithm**2 * variance),
+        extinction_variance=_row_sum(extinction**2 * variance),
+        background_bend=bend,
+        extinction_bend=fit.extinction_bend + fit.extinction_slope * bend,
     )
     return _solution(fit, problem, quality=estimate.quality)
 
 
-def _propagated(problem: PathProblem, fit: PathEstimate, gradients: Array) -> Block:
-    out = np.zeros(fit.extinction.size, PROPAGATED)
-    propagate(
-        frozen(problem.power),
-        frozen(problem.noise),
-        problem.known_variance,
-        frozen(fit.extinction),
-        frozen(fit.amplitude),
-        frozen(problem.range),
-        frozen(gradients),
-        out,
-    )
-    return out
+def _weights(problem: PathProblem) -> Array:
+    """Return the weights of all bins, 0 of those that are left out."""
+    weights = 1.0 / problem.noise if problem.known_variance else problem.noise
+    usable = (np.abs(problem.power) < HUGE) & (weights > 0.0) & (weights < HUGE)
+    return np.where(usable, weights, 0.0)
+
+
+def _row_sum(values: Array) -> Array:
+    return np.asarray(values.sum(axis=-1))
 
 
 def _estimate(problem: PathProblem, given: Array, kind: int = _direct.BACKGROUND) -> PathEstimate:
@@ -131,8 +141,8 @@ def _estimate(problem: PathProblem, given: Array, kind: int = _direct.BACKGROUND
     # Relative rounding of the power and of the kernels, as a standard deviation.
     rounding = 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(float).eps)
     noise = (frozen(problem.noise), problem.known_variance, rounding)
-    _direct.solve_path(frozen(problem.power), *noise, frozen(given), kind, grid, table)
-    return PathEstimate(**{name: table[name] for name in COLUMNS})
+    _direct.solve_path(frozen(problem.power), noise, frozen(given), kind, grid, table)
+    return PathEstimate(**{name: np.ascontiguousarray(table[name]) for name in COLUMNS})
 
 
 def _solution(
@@ -185,160 +195,3 @@ def _solution(
         valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
         quality=verdict.quality | quality,
     )
-
-
-def _neglected_shifts(
-    problem: PathProblem, prior: Array, extinction: Array, amplitude: Array
-) -> tuple[Array, Array, Array]:
-    """Return the shifts of the parameters by the second-order term that one step neglects.
-
-    With the step t in extinction and the coefficient b of the shape phi, the term is
-    ``2 b t^2 (x - x_c)^2 phi``, x_c being the centroid of information.
-
-    Parameters
-    ----------
-    problem : PathProblem
-    prior : (profile or 1,) float
-        m-1.
-    extinction, amplitude : (profile,) float
-        m-1, power times m2: the result of one step.
-
-    Returns
-    -------
-    (profile,) float
-        Shifts of the background, of the logarithm of the amplitude and of the extinction.
-    """
-    near, length = problem.range[0], max(float(problem.range[-1] - problem.range[0]), 1.0)
-    x = (problem.range - near) / length
-    with np.errstate(all="ignore"):
-        weights = 1.0 / problem.noise if problem.known_variance else problem.noise
-        usable = np.isfinite(problem.power) & (weights > 0.0) & np.isfinite(weights)
-        weights = np.where(usable, weights, 0.0)
-        total = weights.sum(axis=-1)
-
-        def mean(values: Array) -> Array:
-            return np.asarray((weights * values).sum(axis=-1) / total)
-
-        def share(values: Array, of: Array) -> Array:
-            return mean(values * of) / mean(of * of)
-
-        shape = np.exp(-2.0 * prior[:, np.newaxis] * length * x) * (near / problem.range) ** 2
-        shape_mean = mean(shape)
-        centred = shape - shape_mean[:, np.newaxis]
-        centroid = mean(centred * shape * x) / mean(centred * centred)
-        distance = x - centroid[:, np.newaxis]
-        slope = -2.0 * distance * shape
-        slope_mean = mean(slope)
-        slope = slope - slope_mean[:, np.newaxis]
-        # The coefficient at the first bin, with the fitted extinction: of second order already.
-        height = amplitude / near**2 * np.exp(-2.0 * extinction * near)
-        step = (extinction - prior) * length
-        neglected = (2.0 * height * step**2)[:, np.newaxis] * distance**2 * shape
-        level = mean(neglected)
-        neglected = neglected - level[:, np.newaxis]
-        along_slope, along_shape = share(neglected, slope), share(neglected, centred)
-        background = level - along_shape * shape_mean - along_slope * slope_mean
-        shift = (along_slope - step * along_shape) / height
-        logarithm = along_shape / height + 2.0 * (centroid + near / length) * shift
-    return background, logarithm, shift / length
-
-
-PROPAGATED: Final = np.dtype(
-    [
-        (name, np.float64)
-        for name in (
-            "background_variance",
-            "amplitude_relative_variance",
-            "extinction_variance",
-            "amplitude_slope",
-            "extinction_slope",
-            "background_bend",
-        )
-    ]
-)
-
-
-@compiled
-def fill_linear_weights(power: Any, noise: Array, is_variance: bool, weights: Array) -> None:
-    for i in range(weights.size):
-        weight = 1.0 / noise[i] if is_variance else noise[i]
-        usable = abs(np.float64(power[i])) < HUGE and 0.0 < weight < HUGE
-        weights[i] = weight if usable else 0.0
-
-
-@compiled
-def _propagate_profile(
-    b: float,
-    phi: Array,
-    range_: Array,
-    weights: Array,
-    gradient: Array,
-    row: Any,
-) -> None:
-    """Fill the random variances of one profile, and its derivatives by the background."""
-    norm = moment = 0.0
-    for i in range(phi.size):
-        norm += phi[i] * phi[i] * weights[i]
-        moment += phi[i] * phi[i] * weights[i] * range_[i]
-    centroid = moment / norm
-    slope = whole = tilted = 0.0
-    for i in range(phi.size):
-        lever = -2.0 * (range_[i] - centroid)
-        slope += lever * lever * phi[i] * phi[i] * weights[i]
-        whole += phi[i] * weights[i]
-        tilted += lever * phi[i] * weights[i]
-    row.extinction_slope = -tilted / (b * slope)
-    row.amplitude_slope = -whole / (b * norm) + 2.0 * centroid * row.extinction_slope
-    length, middle = range_[-1] - range_[0], 0.5 * (range_[0] + range_[-1])
-    for i in range(phi.size):
-        if weights[i] == 0.0:
-            continue
-        row.background_bend += gradient[i] * b * phi[i] * (range_[i] - middle) ** 2 / length
-        weighted = phi[i] * weights[i]
-        lever = -2.0 * (range_[i] - centroid)
-        extinction_gradient = lever * weighted / (b * slope)
-        logarithm_gradient = weighted / (b * norm) + 2.0 * centroid * extinction_gradient
-        extinction_gradient += row.extinction_slope * gradient[i]
-        logarithm_gradient += row.amplitude_slope * gradient[i]
-        row.background_variance += gradient[i] * gradient[i] / weights[i]
-        row.amplitude_relative_variance += logarithm_gradient * logarithm_gradient / weights[i]
-        row.extinction_variance += extinction_gradient * extinction_gradient / weights[i]
-
-
-@compiled
-def propagate(
-    power: Any,
-    noise: Array,
-    is_variance: bool,
-    extinction: Array,
-    amplitude: Array,
-    range_: Array,
-    gradients: Array,
-    out: Any,
-) -> None:
-    """Propagate noise to first order, through a background that depends on the power too.
-
-    Parameters
-    ----------
-    power : (profile, bin) float32 or float64
-    noise : (profile or 1, bin) float64
-        Variances or weights, as in the fit.
-    is_variance : bool
-    extinction, amplitude : (profile,) float
-        m-1, power times m2: from the weighted fit to the power less the background.
-    range_ : (bin,) float
-        m.
-    gradients : (profile or 1, bin) float64
-        Derivatives of the background with respect to the power.
-    out : (profile,) `PROPAGATED`
-        In: 0. Receives variances; the derivatives of the logarithm of the amplitude and of the
-        extinction with respect to the background; and the change of the background by a signal
-        bent by ``(x - 1/2)^2``, times the length of the section.
-    """
-    start, phi, weights = range_[0], np.empty(range_.size), np.empty(range_.size)
-    for k in range(extinction.size):
-        for i in range(phi.size):
-            phi[i] = (start / range_[i]) ** 2 * math.exp(-2.0 * extinction[k] * (range_[i] - start))
-        b = amplitude[k] * math.exp(-2.0 * extinction[k] * start) / start**2
-        fill_linear_weights(power[k], noise[k % noise.shape[0]], is_variance, weights)
-        _propagate_profile(b, phi, range_, weights, gradients[k % gradients.shape[0]], out[k])

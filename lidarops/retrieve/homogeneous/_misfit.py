@@ -9,16 +9,24 @@ from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
-    ProjectionScratch,
+    Scratch,
     Sums,
     evaluate,
     inlined,
-    largest_of,
+    largest_energy,
     summing,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 _Triple = tuple[float, float, float]
+
+
+class Left(NamedTuple):
+    """Products of the residuals with level, shape and slope of the model."""
+
+    level: float
+    shape: float
+    slope: float
 
 
 class _TestShapes(NamedTuple):
@@ -36,8 +44,19 @@ class _TestShapes(NamedTuple):
     square_norm: float
 
 
+class _Residuals(NamedTuple):
+    """Weighted sums of the residuals, times powers of phi and of x."""
+
+    energy: float
+    level: float
+    shape: float
+    lever: float
+    bend: float
+    square: float
+
+
 @summing
-def _sum_test_shapes(x: Array, w: Array, phi: Array, p: Point) -> _TestShapes:
+def _test_shapes(x: Array, w: Array, phi: Array, p: Point, free: float) -> _TestShapes:
     b0 = b1 = b2 = q0 = q1 = q2 = bb = bq = qq = 0.0
     for i in range(phi.size):
         lever, first, square = x[i] - p.centroid, w[i] * phi[i], phi[i] * phi[i]
@@ -51,67 +70,61 @@ def _sum_test_shapes(x: Array, w: Array, phi: Array, p: Point) -> _TestShapes:
         bb += bent * phi[i] * lever * lever
         bq += bent * square
         qq += weighted_square * square
+    mean_phi, mean_slope = free * p.mean_phi, free * p.mean_slope
     return _TestShapes(
-        (b0, b1 - p.mean_phi * b0, -2.0 * b2 - p.mean_t * b0),
-        (q0, q1 - p.mean_phi * q0, -2.0 * q2 - p.mean_t * q0),
+        (b0, b1 - mean_phi * b0, -2.0 * b2 - mean_slope * b0),
+        (q0, q1 - mean_phi * q0, -2.0 * q2 - mean_slope * q0),
         bb,
         bq,
         qq,
     )
 
 
-class _Residuals(NamedTuple):
-    """Weighted sums over the residuals."""
-
-    energy: float
-    model: _Triple
-    """Products with level, shape and slope."""
-    bent: float
-    square: float
-
-
 @summing
-def _sum_residuals(g: Grid, s: ProjectionScratch, fit: Point, p: Point) -> _Residuals:
-    """Fill the squared residuals in units of the noise; return the sums of the residuals."""
-    energy = level = shape = slope = bent = square = 0.0
-    above = fit.mean_z - fit.b * fit.mean_phi
+def _sum_residuals(g: Grid, s: Scratch, p: Point) -> _Residuals:
+    """Fill the residuals, and return their sums."""
+    energy = level = shape = lever = bend = square = 0.0
     for i in range(s.z.size):
-        phi, lever = s.phi[i], g.x[i] - p.centroid
-        residual = s.z[i] - above - fit.b * phi
+        phi, x = s.phi[i], g.x[i]
+        residual = s.z[i] - p.level - p.b * phi
+        s.residual[i] = residual
         pull = s.w[i] * residual
-        s.residual[i] = pull * residual
         energy += pull * residual
         level += pull
         pull *= phi
         shape += pull
         square += pull * phi
-        pull *= lever
-        slope += pull
-        bent += pull * lever
-    model = (level, shape - p.mean_phi * level, -2.0 * slope - p.mean_t * level)
-    return _Residuals(energy, model, bent, square)
+        lever += pull * x
+        bend += pull * x * x
+    return _Residuals(energy, level, shape, lever, bend, square)
 
 
 @inlined
-def _fill_residuals(s: ProjectionScratch, fit: Point) -> None:
-    """Fill the residuals in units of the noise."""
-    above = fit.mean_z - fit.b * fit.mean_phi
-    for i in range(s.z.size):
-        s.residual[i] = math.sqrt(s.w[i]) * (s.z[i] - above - fit.b * s.phi[i])
+def _left(r: _Residuals, p: Point, free: float) -> Left:
+    return Left(
+        r.level,
+        r.shape - free * p.mean_phi * r.level,
+        -2.0 * (r.lever - p.centroid * r.shape) - free * p.mean_slope * r.level,
+    )
 
 
 @summing
-def _second_differences(s: ProjectionScratch, spacing: int) -> tuple[float, float]:
-    """Sum the squared second differences of residuals that many bins apart; count them."""
+def _second_differences(s: Scratch, spacing: int) -> tuple[float, float]:
+    """Sum the squared second differences of residuals that many bins apart; count them.
+
+    In units of the noise: the residuals become those.
+    """
+    for i in range(s.w.size):
+        s.residual[i] *= math.sqrt(s.w[i])
     total = terms = 0.0
     # Slices: an index that might be negative keeps a loop from vectorising.
     last, middle = s.residual[2 * spacing :], s.residual[spacing:]
-    used_last, used_middle = s.used[2 * spacing :], s.used[spacing:]
+    used_last, used_middle = s.w[2 * spacing :], s.w[spacing:]
     for i in range(last.size):
         difference = last[i] - 2.0 * middle[i] + s.residual[i]
-        valid = used_last[i] * used_middle[i] * s.used[i]
-        total += valid * difference * difference
-        terms += valid
+        valid = (used_last[i] > 0.0) & (used_middle[i] > 0.0) & (s.w[i] > 0.0)
+        total += difference * difference if valid else 0.0
+        terms += 1.0 if valid else 0.0
     return total, terms
 
 
@@ -131,16 +144,19 @@ def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, f
     Both are orthogonalised against the model, and the square against the bent signal.
     """
     energy = count = shared = 0.0
+    left = _left(r, p, 1.0)
+    model = (left.level, left.shape, left.slope)
     per = (1.0 / w0, 1.0 / p.norm, 1.0 / p.slope_norm)
     norm = _remainder(t.bent_norm, t.bent, t.bent, per)
-    pulled = _remainder(r.bent, t.bent, r.model, per)
+    bent = r.bend - p.centroid * (2.0 * r.lever - p.centroid * r.shape)
+    pulled = _remainder(bent, t.bent, model, per)
     if norm > THRESHOLDS.independent * t.bent_norm:
         energy += pulled * pulled / norm
         count += 1.0
         shared = _remainder(t.shared, t.bent, t.square, per) / norm
     norm = _remainder(t.square_norm, t.square, t.square, per) - shared * shared * norm
     if norm > THRESHOLDS.independent * t.square_norm:
-        along = _remainder(r.square, t.square, r.model, per) - shared * pulled
+        along = _remainder(r.square, t.square, model, per) - shared * pulled
         energy += along * along / norm
         count += 1.0
     return energy, count
@@ -155,50 +171,32 @@ def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Any) -
     """
     level, shape, slope = t.bent
     across = slope / p.slope_norm
-    row.background_bend = free * level / w0 - shape / p.norm * p.mean_phi - across * p.mean_t
+    row.background_bend = free * (level / w0 - shape / p.norm * p.mean_phi - across * p.mean_slope)
     row.extinction_bend = across + 0.5 - p.centroid
 
 
 @inlined
-def describe_bend_given(p: Point, row: Any) -> None:
-    """Overwrite the same for a given extinction, which absorbs neither bend nor slope.
-
-    The slope is as large as that of the bend at either end, and independent of it.
-    """
-    bent = row.background_bend + row.extinction_bend * p.mean_t
-    row.background_bend = math.hypot(bent, 0.5 * p.mean_t)
-    row.extinction_bend = 0.0
-
-
-@inlined
 def judge_residuals(
-    g: Grid,
-    s: ProjectionScratch,
-    p: Point,
-    tau: float,
-    sums: Sums,
-    noise_spacing: int,
-    row: Any,
-) -> _Triple:
+    g: Grid, s: Scratch, p: Point, sums: Sums, noise_spacing: int, row: Any
+) -> Left:
     """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal.
 
-    A spacing of 0 stands for a known variance. Returns the products of the residuals with level,
-    shape and slope.
+    A spacing of 0 stands for a known variance.
     """
     w0, free = sums.weight, sums.free
-    shapes = _sum_test_shapes(g.x, s.w, s.phi, p)
+    shapes = _test_shapes(g.x, s.w, s.phi, p, free)
     _describe_bend(shapes, p, w0, free, row)
-    full = p
-    if free == 0.0:
-        # The test shapes are orthogonal to the background even where it is given.
-        full = evaluate(tau, g, s, Sums(sums.bins, w0, sums.value, sums.square, 1.0))
-        shapes = _sum_test_shapes(g.x, s.w, s.phi, full)
-    residuals: _Residuals = _sum_residuals(g, s, p, full)
+    residuals = _sum_residuals(g, s, p)
     row.misfit = residuals.energy
-    row.largest = math.sqrt(largest_of(s.residual))
-    row.trend, row.trend_count = _trend(shapes, residuals, full, w0)
+    row.largest = math.sqrt(largest_energy(s.w, s.residual))
+    if free > 0.0:
+        row.trend, row.trend_count = _trend(shapes, residuals, p, w0)
+    else:
+        # The test shapes are orthogonal to the background even where it is given.
+        full = evaluate(p.tau, g, s, Sums(sums.bins, w0, sums.value, sums.square, 1.0))
+        shapes = _test_shapes(g.x, s.w, s.phi, full, 1.0)
+        row.trend, row.trend_count = _trend(shapes, residuals, full, w0)
     row.second_differences, row.difference_count = 0.0, 0.0
     if noise_spacing > 0:
-        _fill_residuals(s, p)
         row.second_differences, row.difference_count = _second_differences(s, noise_spacing)
-    return residuals.model
+    return _left(residuals, p, free)

@@ -55,6 +55,15 @@ class PathEstimate:
     """Weighted, m."""
     bounded: Array
     """1 where the extinction lies at a bound."""
+    amplitude_slope: Array
+    """Derivative of the logarithm of the amplitude by a given background."""
+    extinction_slope: Array
+    """The same of the extinction."""
+    background_shift: Array
+    """Change by another linear step, of a fit from a prior."""
+    amplitude_shift: Array
+    """The same, of the logarithm of the amplitude."""
+    extinction_shift: Array
     background_bend: Array
     """Change of the background by a signal bent by ``(x - 1/2)^2`` in relative terms, x from 0 to 1
     along the section; unit of the power times the length of the section."""

@@ -16,35 +16,29 @@ from typing import Any, Final, NamedTuple
 import numba
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Integers, frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Integers, frozen
 
 NODES: Final = 24
+"""Extinctions of the search."""
 _WIDEST_SCALE: Final = 0.3
-GROUPED: Final = 4
-_MOST_SINGLE: Final = 128
-"""Profiles with more bins are searched on the first `BLOCK` bins and on sums over groups of
-`GROUPED` bins beyond."""
-BLOCK: Final = 16
+BLOCK: Final = 8
 """Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
+GROUP: Final = 4
+"""The search runs on the bins of the first block and on sums over as many bins beyond."""
 
-# Reassociation lets sums vectorise; NaN and infinity keep their meaning. Functions that may be
-# reassociated have to be inlined: see `lidarops.retrieve.background._shape_fit`.
-_SUMS: Final = {"reassoc", "contract", "nsz"}
 # Forced inlining lets functions share loops. Without the runtime they cannot allocate, and count no
 # references to arrays, which takes longer than a loop.
-_INLINED: Final[dict[str, Any]] = {
+_BARE: Final[dict[str, Any]] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "forceinline": True,
+    "_nrt": False,
 }
-_BARE: Final[dict[str, Any]] = {**_INLINED, "_nrt": False}
-allocating = numba.njit(**_INLINED)
 inlined = numba.njit(**_BARE)
-fusing = numba.njit(**_BARE, fastmath={"contract"})
-"""Compile a sum in the order of its terms, each added by one fused multiplication."""
-summing = numba.njit(**_BARE, fastmath=_SUMS)
-finding = numba.njit(**_BARE, fastmath={*_SUMS, "nnan"})
+# Functions that may be reassociated have to be inlined: see
+# `lidarops.retrieve.common.compiled_code.summing`.
+summing = numba.njit(**_BARE, fastmath={"reassoc", "contract", "nsz"})
 
 
 class Grid(NamedTuple):
@@ -61,9 +55,9 @@ class Grid(NamedTuple):
     spacing: float
     scale: float
     shapes: Array
-    """(2, bin, node): phi of every node, and its square."""
+    """(2, node, bin): phi of every node, and its square."""
     group_shapes: Array
-    """(2, group, node): phi averaged over groups of bins, and its square."""
+    """(2, node, group): phi averaged over groups of bins, and its square."""
     start: float
     """R_0, m."""
     length: float
@@ -72,31 +66,21 @@ class Grid(NamedTuple):
     """(profile or 1,): bins from one to the next of a second difference, which gives the noise."""
 
 
-class ProjectionScratch(NamedTuple):
+class Scratch(NamedTuple):
+    """Arrays of one profile, (bin,) each but the last."""
+
     given: Array
     """Weights by the noise alone, 0 where it is not usable."""
-    rows: Array
-    """(2, bin): weights, 0 where the power is not usable either, and weights times values."""
     w: Array
-    """The first of them."""
-    wz: Array
-    """The second."""
+    """Weights, 0 where the power is not usable either."""
     z: Array
+    """Values, 0 where not usable."""
     phi: Array
-    shape: Array
-    """phi, weighted."""
-    square: Array
-    """Its square, weighted."""
-    signal: Array
-    """phi times the weighted values."""
-    lever: Array
-    ones: Array
     residual: Array
-    used: Array
+    groups: Array
+    """(2, group): sums of weights, and of weights times values."""
     products: Array
     """(3, node)."""
-    groups: Array
-    """(2, group): sums of `rows` over groups of bins."""
 
 
 class Sums(NamedTuple):
@@ -112,15 +96,23 @@ class Sums(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The linear fit at one extinction, and the derivatives of its objective."""
+    """The linear fit at one extinction, and the derivatives of its objective.
 
+    The slope is the derivative of the shape by tau about the centroid, ``-2 (x - centroid) phi``.
+    """
+
+    tau: float
+    level: float
+    """The background."""
     b: float
-    mean_z: float
     mean_phi: float
-    mean_t: float
+    mean_slope: float
     centroid: float
+    """Of the information: about it, amplitude and extinction are uncorrelated."""
     norm: float
+    """Weighted square of the shape, without its mean where the background is fitted."""
     slope_norm: float
+    """The same of the slope."""
     gradient: float
     gauss: float
     """The curvature but for what the residuals add."""
@@ -141,12 +133,13 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integer
     noise_spacing : (profile or 1,) int
         Bins; beyond it, noise is independent.
     """
-    length = float(range_[-1] - range_[0]) if range_.size > 1 else 1.0
+    bins = range_.size
+    length = float(range_[-1] - range_[0]) if bins > 1 else 1.0
     x = (range_ - range_[0]) / length
-    step = 1.0 / max(range_.size - 1, 1)
+    step = 1.0 / max(bins - 1, 1)
     rounding = 4.0 * np.finfo(np.float64).eps * range_[-1] / length
-    uniform = bool(np.all(np.abs(x - step * np.arange(range_.size)) <= rounding))
-    x = np.concatenate([x, np.ones(-range_.size % BLOCK)])
+    uniform = bool(np.all(np.abs(x - step * np.arange(bins)) <= rounding))
+    x = np.concatenate([x, np.ones(-bins % BLOCK)])
     lowest, highest = bounds[0] * length, bounds[1] * length
     # In a thin section the slope of the shape vanishes at tau = -L / R: nodes are finer there.
     scale = min(_WIDEST_SCALE, _WIDEST_SCALE * length / float(range_[0]))
@@ -154,11 +147,11 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integer
     nodes = scale * np.sinh(np.linspace(first, last, NODES))
     nodes[0], nodes[-1] = lowest, highest
     envelope = (range_[0] / (range_[0] + length * x)) ** 2
-    shapes = np.exp(-2.0 * nodes * x[:, np.newaxis]) * envelope[:, np.newaxis]
-    groups = shapes
-    if range_.size > _MOST_SINGLE:
-        far = shapes[BLOCK:].reshape(-1, GROUPED, NODES).mean(axis=1)
-        groups = np.concatenate([shapes[:BLOCK], far])
+    firsts = [*range(BLOCK), *range(BLOCK, x.size, GROUP)]
+    real = (np.arange(x.size) < bins)[:, np.newaxis]
+    shapes = np.exp(-2.0 * nodes * x[:, np.newaxis]) * envelope[:, np.newaxis] * real
+    widths = np.maximum(np.add.reduceat(1.0 * real, firsts), 1.0)
+    group_shapes = np.add.reduceat(shapes, firsts) / widths
     return Grid(
         x=x,
         envelope=envelope,
@@ -167,76 +160,91 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integer
         first=first,
         spacing=(last - first) / (NODES - 1),
         scale=scale,
-        shapes=np.stack([shapes, shapes**2]),
-        group_shapes=np.stack([groups, groups**2]),
+        shapes=np.ascontiguousarray([shapes.T, shapes.T**2]),
+        group_shapes=np.ascontiguousarray([group_shapes.T, group_shapes.T**2]),
         start=float(range_[0]),
         length=length,
         noise_spacing=frozen(noise_spacing),
     )
 
 
-@allocating
-def make_scratch(g: Grid) -> ProjectionScratch:
-    n, rows = g.x.size, np.zeros((2, g.x.size))
-    return ProjectionScratch(
-        np.zeros(n),
-        rows,
-        rows[0],
-        rows[1],
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.ones(n),
-        np.zeros(n),
-        np.zeros(n),
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def make_scratch(g: Grid) -> Scratch:
+    """Return the arrays of a profile."""
+    bins = g.x.size
+    return Scratch(
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros(bins),
+        np.zeros((2, g.group_shapes.shape[2])),
         np.zeros((3, NODES)),
-        np.zeros((2, g.group_shapes.shape[1])),
     )
-
-
-@finding
-def largest_of(values: Array) -> float:
-    """Return the largest absolute value of an array of whole blocks."""
-    a = b = c = d = 0.0
-    # Four maxima side by side do not wait for each other.
-    step = values.size // 4
-    second, third, fourth = values[step:], values[2 * step :], values[3 * step :]
-    for i in range(step):
-        a = max(a, abs(values[i]))
-        b = max(b, abs(second[i]))
-        c = max(c, abs(third[i]))
-        d = max(d, abs(fourth[i]))
-    return max(a, b, c, d)
 
 
 @inlined
 def power_of_two(value: float) -> float:
+    """Return the power of two next above a value."""
     return math.ldexp(1.0, math.frexp(value)[1])
 
 
+@summing
+def weigh(noise: Array, is_variance: bool, s: Scratch) -> float:  # noqa: FBT001 - compiled
+    """Fill the weights of a row of noise, and return their unit, a power of two."""
+    total = 0.0
+    for i in range(noise.size):
+        weight = 1.0 / noise[i] if is_variance else noise[i]
+        weight = weight if (weight > 0.0) & (weight < HUGE) else 0.0
+        s.given[i] = weight
+        total += weight
+    unit: float = power_of_two(total / noise.size)
+    for i in range(noise.size):
+        s.given[i] *= 1.0 / unit
+    return unit
+
+
+@summing
+def load(power: Any, reference: float, s: Scratch) -> tuple[float, float, float]:
+    """Copy a profile less its reference, 0 where not usable.
+
+    Returns the number of usable bins, their weight and the sum of their absolute values.
+    """
+    count = total = size = 0.0
+    for i in range(power.size):
+        value = np.float64(power[i])
+        usable = (abs(value) < HUGE) & (s.given[i] > 0.0)
+        s.w[i] = s.given[i] if usable else 0.0
+        s.z[i] = value - reference if usable else 0.0
+        count += 1.0 if usable else 0.0
+        total += s.w[i]
+        size += abs(s.z[i])
+    return count, total, size
+
+
 @inlined
-def scale_in_place(values: Array, factor: float) -> None:
-    for i in range(values.size):
-        values[i] *= factor
+def largest_energy(w: Array, values: Array) -> float:
+    """Return the largest weighted square of a profile."""
+    a = b = c = d = 0.0
+    # Four maxima side by side do not wait for each other.
+    for i in range(0, w.size, 4):
+        a = max(a, w[i] * values[i] * values[i])
+        b = max(b, w[i + 1] * values[i + 1] * values[i + 1])
+        c = max(c, w[i + 2] * values[i + 2] * values[i + 2])
+        d = max(d, w[i + 3] * values[i + 3] * values[i + 3])
+    return max(a, b, c, d)
 
 
 @summing
-def product(a: Array, b: Array) -> float:
-    total = 0.0
-    for i in range(a.size):
-        total += a[i] * b[i]
-    return total
-
-
-@summing
-def total_of(values: Array) -> float:
-    total = 0.0
-    for i in range(values.size):
-        total += values[i]
-    return total
+def rescale(s: Scratch, factor: float) -> tuple[float, float]:
+    """Scale a profile, and return the weighted sums of its values and of their squares."""
+    total = squares = 0.0
+    for i in range(s.z.size):
+        s.z[i] *= factor
+        weighted = s.w[i] * s.z[i]
+        total += weighted
+        squares += weighted * s.z[i]
+    return total, squares
 
 
 @inlined
@@ -249,77 +257,93 @@ def _fill_shape(tau: float, g: Grid, phi: Array) -> None:
     decay = math.exp(-2.0 * tau * g.step)
     e2 = decay * decay
     e4 = e2 * e2
-    e8 = e4 * e4
-    # Powers of the decay over the bins of half a block, each a product of the powers of two.
     powers = (1.0, decay, e2, decay * e2, e4, decay * e4, e2 * e4, decay * e2 * e4)
     factor = 1.0
     for start in range(0, phi.size, BLOCK):
-        half = start + BLOCK // 2
-        for i in range(BLOCK // 2):
+        for i in range(BLOCK):
             phi[start + i] = factor * powers[i] * g.envelope[start + i]
-            phi[half + i] = factor * (powers[i] * e8) * g.envelope[half + i]
-        factor *= e8 * e8
+        factor *= e4 * e4
 
 
-@fusing
-def _in_lanes(a: Array, b: Array) -> float:
-    """Return the product of two arrays of whole blocks, summed in eight lanes side by side."""
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
-    for i in range(0, a.size, 8):
-        s0 += a[i] * b[i]
-        s1 += a[i + 1] * b[i + 1]
-        s2 += a[i + 2] * b[i + 2]
-        s3 += a[i + 3] * b[i + 3]
-        s4 += a[i + 4] * b[i + 4]
-        s5 += a[i + 5] * b[i + 5]
-        s6 += a[i + 6] * b[i + 6]
-        s7 += a[i + 7] * b[i + 7]
-    return ((s0 + s4) + (s2 + s6)) + ((s1 + s5) + (s3 + s7))
-
-
-@inlined
-def _moments(term: Array, g: Grid, s: ProjectionScratch) -> tuple[float, float, float]:
-    """Return the sums of an array, times 1, x and x^2."""
-    for i in range(term.size):
-        s.lever[i] = term[i] * g.x[i]
-    return _in_lanes(term, s.ones), _in_lanes(s.lever, s.ones), _in_lanes(s.lever, g.x)
-
-
-@inlined
-def evaluate(tau: float, g: Grid, s: ProjectionScratch, sums: Sums) -> Point:
-    """Return the linear fit at one extinction, from one pass over the bins."""
-    w0, wz, free = sums.weight, sums.value, sums.free
-    _fill_shape(tau, g, s.phi)
+@summing
+def _moments(g: Grid, s: Scratch) -> tuple[float, ...]:
+    """Return the weighted sums of phi, phi^2 and phi z, each times 1, x and x^2."""
+    q0 = q1 = q2 = p0 = p1 = p2 = y0 = y1 = y2 = 0.0
     for i in range(s.phi.size):
-        s.shape[i] = s.phi[i] * s.w[i]
-        s.square[i] = s.shape[i] * s.phi[i]
-        s.signal[i] = s.phi[i] * s.wz[i]
-    q0, q1, q2 = _moments(s.shape, g, s)
-    p0, p1, p2 = _moments(s.square, g, s)
-    y0, y1, y2 = _moments(s.signal, g, s)
-    mean_phi, mean_z = free * q0 / w0, free * wz / w0
-    norm = p0 - q0 * mean_phi
-    # About the information centroid, amplitude and extinction are uncorrelated.
-    centroid = (p1 - mean_phi * q1) / norm
-    mean_t = -2.0 * free * (q1 - centroid * q0) / w0
-    along = y0 - mean_phi * wz
+        x, phi, z = g.x[i], s.phi[i], s.z[i]
+        shape = s.w[i] * phi
+        lever = shape * x
+        bend = lever * x
+        q0 += shape
+        q1 += lever
+        q2 += bend
+        p0 += shape * phi
+        p1 += lever * phi
+        p2 += bend * phi
+        y0 += shape * z
+        y1 += lever * z
+        y2 += bend * z
+    return q0, q1, q2, p0, p1, p2, y0, y1, y2
+
+
+@inlined
+def evaluate(tau: float, g: Grid, s: Scratch, sums: Sums) -> Point:
+    """Return the linear fit at one extinction, from one pass over the bins."""
+    w0, free = sums.weight, sums.free
+    _fill_shape(tau, g, s.phi)
+    q0, q1, q2, p0, p1, p2, y0, y1, y2 = _moments(g, s)
+    mean_phi, mean_z = q0 / w0, free * sums.value / w0
+    norm = p0 - free * q0 * mean_phi
+    centroid = (p1 - free * mean_phi * q1) / norm
+    mean_slope = -2.0 * (q1 - centroid * q0) / w0
+    along = y0 - mean_z * q0
     b = along / norm
     # Residuals have no product with level and shape.
-    level = mean_z - b * mean_phi
+    level = mean_z - free * b * mean_phi
     first = y1 - level * q1 - b * p1
     second = y2 - level * q2 - b * p2
     rt, rh = -2.0 * first, 4.0 * (second - 2.0 * centroid * first)
-    tt = 4.0 * (p2 - centroid * (2.0 * p1 - centroid * p0)) - w0 * mean_t * mean_t
+    tt = 4.0 * (p2 - centroid * (2.0 * p1 - centroid * p0)) - free * w0 * mean_slope * mean_slope
+    energy = sums.square - mean_z * sums.value - b * along
+    gauss = b * b * tt
+    curvature = gauss - rt * rt / norm - b * rh
     return Point(
-        b,
-        mean_z,
-        mean_phi,
-        mean_t,
-        centroid,
-        norm,
-        tt,
-        b * rt,
-        b * b * tt,
-        b * b * tt - rt * rt / norm - b * rh,
-        sums.square - mean_z * wz - b * along,
+        tau, level, b, mean_phi, mean_slope, centroid, norm, tt, b * rt, gauss, curvature, energy
     )
+
+
+@inlined
+def at(p: Point, level: float, b: float) -> Point:
+    """Return a point with another background and amplitude."""
+    return Point(
+        p.tau,
+        level,
+        b,
+        p.mean_phi,
+        p.mean_slope,
+        p.centroid,
+        p.norm,
+        p.slope_norm,
+        p.gradient,
+        p.gauss,
+        p.curvature,
+        p.energy,
+    )
+
+
+@summing
+def mean_place(x: Array, w: Array, weight: float) -> float:
+    """Return the weighted mean of x."""
+    total = 0.0
+    for i in range(x.size):
+        total += w[i] * x[i]
+    return total / weight
+
+
+@summing
+def total_of(values: Array) -> float:
+    """Return the sum of an array."""
+    total = 0.0
+    for i in range(values.size):
+        total += values[i]
+    return total
