@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from typing import Final
 
 SPEED_OF_LIGHT: Final = 299_792_458.0
@@ -55,6 +56,8 @@ KNOWN_SHAPE_PAPERS: Final = f"{LEAST_SQUARES_PAPER}\n{LIDAR_EQUATION_PAPER}"
 """Of a background fitted with the shape of clean air, for the products in which that runs."""
 STEEPEST: Final = 80.0
 """degree; largest zenith angle at which a beam reaches aerosol-free air."""
+DARK_REACH: Final = timedelta(hours=24)
+"""Longest time between a scene and the dark files that it uses."""
 FIXED: Final = 0.05
 """degree; largest difference between the zenith angles of the files of a fixed beam."""
 LEAST_SPREAD: Final = 5.0

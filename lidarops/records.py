@@ -41,6 +41,16 @@ GLUED: Final = "glued_"
 """Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
 
 
+def is_glued(channel: str) -> bool:
+    """Return whether a channel is glued from two channels of the files, by its name."""
+    return channel.startswith(GLUED)
+
+
+def mode_of_signal(channel: str, mode: str) -> DetectionMode:
+    """Return how the signal of a channel is stated: glued ones as counted, others as detected."""
+    return DetectionMode.PHOTON if is_glued(channel) else DetectionMode(mode)
+
+
 def glued_parts(glued: str) -> tuple[str, str]:
     """Return the names of the analog and the photon-counting channel of a glued channel."""
     label = glued.removeprefix(GLUED)
@@ -49,7 +59,7 @@ def glued_parts(glued: str) -> tuple[str, str]:
 
 def file_channels(channel: str) -> tuple[str, ...]:
     """Return the channels of the files that a channel is made from."""
-    return glued_parts(channel) if channel.startswith(GLUED) else (channel,)
+    return glued_parts(channel) if is_glued(channel) else (channel,)
 
 
 class Role(StrEnum):
@@ -227,8 +237,21 @@ class Scene:
         return self.granules[0].layout if self.granules else ()
 
 
+class _Entry:
+    """What entries of a plan have in common, whether they run or are left out."""
+
+    __slots__ = ()
+    name: str
+    product: str
+
+    @property
+    def is_product(self) -> bool:
+        """Whether the entry is a product itself, and no step on the way to it."""
+        return self.name == self.product
+
+
 @dataclass(frozen=True, slots=True)
-class PlannedStep:
+class PlannedStep(_Entry):
     """One step of a plan, with its settings and the reason why it runs."""
 
     name: str
@@ -251,7 +274,7 @@ class PlannedStep:
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
+class LeftOut(_Entry):
     """One step that a plan leaves out, and the reason."""
 
     name: str
@@ -288,6 +311,11 @@ class Plan:
     scene: str
     steps: tuple[PlannedStep, ...]
     left_out: tuple[LeftOut, ...]
+
+    @property
+    def products(self) -> tuple[PlannedStep, ...]:
+        """Steps that are products."""
+        return tuple(step for step in self.steps if step.is_product)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the plan as plain JSON types."""

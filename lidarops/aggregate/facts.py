@@ -23,7 +23,7 @@ from lidarops.netcdf.context import RECORDERS
 from lidarops.netcdf.read import changed, opened_product
 from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
-from lidarops.records import GLUED, DetectionMode, Verdicts
+from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
 
 FOLDER: Final = "aggregates"
@@ -62,7 +62,7 @@ class Header:
     @property
     def counting(self) -> DetectionMode:
         """How the signal is stated: glued ones as counted."""
-        return DetectionMode.PHOTON if self.channel.startswith(GLUED) else DetectionMode(self.mode)
+        return mode_of_signal(self.channel, self.mode)
 
     @property
     def group(self) -> Group:

@@ -211,9 +211,9 @@ def _needs(plan: Plan) -> Iterator[str]:
         names = [
             other.name if other.channel in ("", step.channel) else f"{other.channel}/{other.name}"
             for other in others
-            if other.name != other.product
+            if not other.is_product
         ]
-        compared = [other.channel for other in others if other.name == other.product]
+        compared = [other.channel for other in others if other.is_product]
         words = {"after": names, "compared with": compared}
         yield "; ".join(f"{word} {', '.join(those)}" for word, those in words.items() if those)
 

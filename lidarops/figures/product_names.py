@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from lidarops.records import GLUED
+from lidarops.records import GLUED, is_glued
 
 UNKNOWN: Final = "unknown"
 
@@ -21,7 +21,7 @@ def light_in_words(product: xr.Dataset) -> str:
     """Return wavelength and detection of the channel in words; empty if unknown."""
     wavelength = scalar(product, "wavelength")
     words = "" if wavelength is None else f"{wavelength:g} {product['wavelength'].attrs['units']}"
-    glued = attribute(product, "lidarops_channel").startswith(GLUED)
+    glued = is_glued(attribute(product, "lidarops_channel"))
     mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
     return ", ".join(filter(None, (words, mode)))
 

@@ -20,7 +20,15 @@ from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import product_id, writing_time
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
 from lidarops.raw.header import POLARISATIONS, label_of
-from lidarops.records import GLUED, DetectionMode, Provenance, Role, Stamp, UnusedFile
+from lidarops.records import (
+    GLUED,
+    DetectionMode,
+    Provenance,
+    Role,
+    Stamp,
+    UnusedFile,
+    is_glued,
+)
 
 RECORDERS: Final = "lidarops_recorder"
 UNUSED_INPUTS: Final = "lidarops_unused_inputs"
@@ -75,7 +83,7 @@ class Context:
     @property
     def detection(self) -> str:
         """``analog``, ``photon``, or ``glued`` of both."""
-        return GLUED.rstrip("_") if self.channel.startswith(GLUED) else self.mode.value
+        return GLUED.rstrip("_") if is_glued(self.channel) else self.mode.value
 
 
 def product_path(context: Context) -> str:
@@ -273,7 +281,7 @@ def _processing(context: Context) -> dict[str, Any]:
         RECORDERS: ", ".join(
             step.settings["recorder"]
             for step in provenance.plan.steps
-            if step.settings.get("recorder") and not step.channel.startswith(GLUED)
+            if step.settings.get("recorder") and not is_glued(step.channel)
         ),
         "lidarops_polarisation": POLARISATIONS.get(label_of(context.channel)[-1:], ""),
         "lidarops_plan_sha256": provenance.plan.hash,

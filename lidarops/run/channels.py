@@ -18,13 +18,13 @@ from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.store import Store
 from lidarops.raw.header import Layout, label_of, named_layout, recorder_names
 from lidarops.records import (
-    GLUED,
     FactsNote,
     FileNote,
     Granule,
     Holding,
     Unmet,
     glued_parts,
+    is_glued,
 )
 from lidarops.scene.case import ABSENT, LAG_STEP, UNMATCHED, missing_channels, named_channels
 
@@ -48,7 +48,7 @@ def unused_lidar_ratios(
     instrument : Instrument
     """
     named = named_channels(instrument.products.requested)
-    for glued in [name for name in named if name.startswith(GLUED)]:
+    for glued in [name for name in named if is_glued(name)]:
         analog, photon = glued_parts(glued)
         of_analog, of_photon = (_has_lidar_ratio(facts, part) for part in (analog, photon))
         if of_analog and not of_photon and analog not in named:

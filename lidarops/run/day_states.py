@@ -15,13 +15,13 @@ from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.model import OPERATION, Campaign
 from lidarops.catalog.store import RecordedProduct, Store, Verdict
+from lidarops.constants import DARK_REACH
 from lidarops.errors import AncillaryError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.records import Role, UnusedFile, day_of, digest, first_of_month
 from lidarops.run.channels import ChannelNames
 from lidarops.run.options import Selection, requested_kinds
 from lidarops.run.outlying_headers import NEAR_DAYS
-from lidarops.run.scenes import DARK_REACH
 from lidarops.run.unused_files import RefusedFile, dated
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of

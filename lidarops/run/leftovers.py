@@ -18,7 +18,16 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.sources import path_pattern
 from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import path_of_product
-from lidarops.records import GLUED, FactsNote, Granule, LostFiles, Plan, Role, Scene, UnusedFile
+from lidarops.records import (
+    FactsNote,
+    Granule,
+    LostFiles,
+    Plan,
+    Role,
+    Scene,
+    UnusedFile,
+    is_glued,
+)
 from lidarops.run.options import requested_products
 from lidarops.run.scenes import Cut, parse_scene_id
 from lidarops.scene import dependence
@@ -102,7 +111,7 @@ def unmade_products(campaign: Campaign, planned: Iterable[Planned]) -> dict[str,
     unmade = {}
     for owner in (*campaign.instruments, *campaign.networks):
         steps = [step for plan in plans[owner] for step in plan.steps]
-        made = {(step.product, step.channel) for step in steps if step.name == step.product}
+        made = {(step.product, step.channel) for step in steps if step.is_product}
         for kind, channel in requested_products(campaign, owner):
             if any(kind == name and channel in ("", other) for name, other in made):
                 continue
@@ -240,7 +249,7 @@ def _requests(campaign: Campaign, product: RecordedProduct) -> bool:
         return joint is not None and joint.channel == product.channel
     owner = campaign.instruments.get(name)
     settings = None if owner is None else owner.products.requested.get(product.kind)
-    of_files = not product.channel.startswith(GLUED)
+    of_files = not is_glued(product.channel)
     return settings is not None and settings.covers(product.channel, of_files=of_files)
 
 

@@ -27,7 +27,7 @@ from operator import attrgetter
 from typing import Final
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
-from lidarops.constants import LEAST_SPREAD
+from lidarops.constants import DARK_REACH, LEAST_SPREAD
 from lidarops.errors import RetrievalInputError, SceneError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.records import (
@@ -41,8 +41,6 @@ from lidarops.records import (
     day_of,
 )
 
-DARK_REACH: Final = timedelta(hours=24)
-"""Longest time between a scene and the dark files that it uses."""
 STAMP: Final = "%Y%m%dT%H%M%S"
 """Format of the start time in the id of a scene."""
 MONTH: Final = "-month"

@@ -17,8 +17,9 @@ from typing import Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import DatedFile
+from lidarops.constants import DARK_REACH
 from lidarops.records import Granule, Role, Scene, UnusedFile
-from lidarops.run.scenes import DARK_REACH, window_at
+from lidarops.run.scenes import window_at
 
 MOST_IN_DOUBT: Final = 10
 """Dark files of unknown time that a scene names; all those of an archive may be refused."""

@@ -18,7 +18,6 @@ from lidarops.errors import SceneError
 from lidarops.kinds import kinds
 from lidarops.raw.header import label_of
 from lidarops.records import (
-    GLUED,
     ChannelLayout,
     DetectionMode,
     LeftOut,
@@ -26,6 +25,7 @@ from lidarops.records import (
     Scene,
     file_channels,
     glued_parts,
+    is_glued,
 )
 from lidarops.settings import ChannelProduct, SettingsModel
 
@@ -121,6 +121,8 @@ class ChannelCase(Generic[R_co]):
 READ_STEP: Final = "read"
 LAG_STEP: Final = "lag"
 """Names of steps, for commands that need no plan and should not load the steps."""
+NO_DARK: Final = "dark_files"
+"""Name of the rule that leaves out the dark signal for want of dark files."""
 ABSENT: Final = "channel_present"
 UNMATCHED: Final = "facts_fit"
 """Rules that leave out what the files lack."""
@@ -160,7 +162,7 @@ def prepared_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, 
 
 def counted_channels(steps: Iterable[PlannedStep], channel: str) -> tuple[str, ...]:
     """Return the channels of the files from which the products of a channel are made."""
-    return tuple(name for name in prepared_channels(steps, channel) if not name.startswith(GLUED))
+    return tuple(name for name in prepared_channels(steps, channel) if not is_glued(name))
 
 
 def product_channel(
@@ -177,7 +179,7 @@ def estimated_against(
 
     Empty where none is requested, or the files hold none with the same bin width.
     """
-    if channel.mode is not DetectionMode.PHOTON or channel.name.startswith(GLUED):
+    if channel.mode is not DetectionMode.PHOTON or is_glued(channel.name):
         return ""
     if channel_facts(facts, channel.name).dead_time != "estimate":
         return ""
@@ -206,7 +208,7 @@ def joined_layout(
     """
     present = {channel.name: channel for channel in layout}
     glued = []
-    for name in sorted({name for name in names if name.startswith(GLUED)}):
+    for name in sorted({name for name in names if is_glued(name)}):
         analog, photon = (present.get(part) for part in glued_parts(name))
         if analog and photon and analog.bin_width == photon.bin_width:
             glued.append(replace(photon, name=name, bins=min(analog.bins, photon.bins)))
@@ -287,7 +289,7 @@ def missing_channels(
 
 
 def _instead(name: str, present: Mapping[str, ChannelLayout]) -> str:
-    if name.startswith(GLUED) and set(glued_parts(name)) <= set(present):
+    if is_glued(name) and set(glued_parts(name)) <= set(present):
         analog, photon = glued_parts(name)
         return f"give the lag to {analog}, and dead time and lidar ratio to {photon}"
     return f"they hold {_held(name, present)}"
@@ -301,7 +303,7 @@ def _held(missing: str, present: Mapping[str, ChannelLayout]) -> str:
 
 
 def _why_absent(name: str, present: Mapping[str, ChannelLayout], recorder: str | None) -> str:
-    if name.startswith(GLUED):
+    if is_glued(name):
         parts = glued_parts(name)
         if set(parts) <= set(present):
             widths = [f"{present[part].bin_width:g} m" for part in parts]

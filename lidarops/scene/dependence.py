@@ -24,7 +24,7 @@ from lidarops.records import (
     Scene,
     UnusedFile,
 )
-from lidarops.scene.case import READ_STEP, sources
+from lidarops.scene.case import NO_DARK, READ_STEP, sources
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
@@ -46,15 +46,14 @@ _FILES: Final = {
 
 def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
     """Return kind and channel of the products that a step reads."""
-    reads = kinds()[step.product].reads if step.name == step.product else ()
+    reads = kinds()[step.product].reads if step.is_product else ()
     parts = (need.rpartition("/") for need in step.needs) if reads else ()
     return tuple((name, channel or step.channel) for channel, _, name in parts if name in reads)
 
 
 def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
     """Return kind and channel of the products that a plan makes, in its order."""
-    steps = (step for step in plan.steps if step.name == step.product)
-    return tuple(dict.fromkeys((step.name, step.channel) for step in steps))
+    return tuple(dict.fromkeys((step.name, step.channel) for step in plan.products))
 
 
 def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
@@ -76,7 +75,7 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     waiting = [
         place
         for place, entry in enumerate(entries)
-        if entry.name == entry.product and (entry.name, entry.channel) in products
+        if entry.is_product and (entry.name, entry.channel) in products
     ]
     reached: set[int] = set()
     while waiting:
@@ -89,7 +88,7 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     # A channel is read for the products and channels that are left.
     readers = defaultdict[str, set[tuple[bool, str]]](set)
     for step in steps:
-        if step.name == step.product:
+        if step.is_product:
             readers[step.channel].add((False, step.name))
         for channel in sources(step):
             readers[channel].add((True, step.channel))
@@ -188,7 +187,7 @@ def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     if not reads_files(plan):
         return ()
     dark = any(step.name == "dark" for step in plan.steps) or any(
-        omission.name == "dark" and omission.number == 0.0 for omission in plan.left_out
+        omission.rule == NO_DARK for omission in plan.left_out
     )
     return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
 

@@ -13,7 +13,7 @@ import xarray as xr
 from lidarops.campaign.model import channel_facts
 from lidarops.records import glued_parts
 from lidarops.retrieve.signal import labeled_gluing
-from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, enough_bins, profile_groups
+from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, ChannelLag, enough_bins, profile_groups
 from lidarops.scene.case import LAG_STEP, ChannelCase, Entry, lag_is_unknown
 from lidarops.scene.profiles import ChannelSignal, FileProfiles, GluedProfiles
 from lidarops.settings import SettingsModel, quantity
@@ -79,7 +79,7 @@ def glue(settings: GlueSettings, signal: ChannelSignal, *, estimated: bool) -> G
         for part in (settings.analog, settings.photon)
     )
     archive = signal.source.archive
-    lag = labeled_gluing.ChannelLag(labeled_gluing.range_lag(analog.range, photon.range))
+    lag = ChannelLag(labeled_gluing.range_lag(analog.range, photon.range))
     if estimated:
         lag = labeled_gluing.estimate_lag(_groups(archive, analog, photon), known=lag.bins)
 

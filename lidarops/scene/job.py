@@ -63,7 +63,7 @@ class Job:
 def nothing_to_do(plan: Plan) -> str:
     """Return why a plan makes no product: omissions of requested steps, those of products first."""
     requested = [omission for omission in plan.left_out if omission.rule != REQUEST]
-    omissions = sorted(requested or plan.left_out, key=lambda left: left.name != left.product)
+    omissions = sorted(requested or plan.left_out, key=lambda left: not left.is_product)
     reasons = dict.fromkeys(
         f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
     )

@@ -79,7 +79,7 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
     members = {member.instrument: member for member in scene.members}
     for step in plan.steps:
         work = Workload(members.get(step.instrument, scene), step.channel)
-        if step.name == step.product:
+        if step.is_product:
             known = making(step.product, Making)
             settings = product_settings(plan.steps, step.product, step.channel)
             held[step.channel] += known.held(settings, work)
@@ -87,14 +87,13 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
         elif not step.product:
             held[step.channel] += _held_by_stage(step, work)
     files = len(scene.granules) + len(scene.dark)
-    products = [step for step in plan.steps if step.name == step.product]
-    compared = [held[step.channel] for step in products if kinds()[step.product].common]
+    compared = [held[step.channel] for step in plan.products if kinds()[step.product].common]
     # Channels are processed one after the other.
-    channels = [prepared_channels(plan.steps, step.channel) for step in products]
+    channels = [prepared_channels(plan.steps, step.channel) for step in plan.products]
     most = max((sum(held[name] for name in names) for names in channels), default=0.0)
     return SceneMemory(
         held=OF_A_FILE * files + most + OF_A_RESULT * sum(compared),
-        profile=float(_COUNT * _most_bins(scene, plan, products)),
+        profile=float(_COUNT * _most_bins(scene, plan)),
         together=together,
         profiles=max((len(member.granules) for member in scene.members or (scene,)), default=0),
     )
@@ -114,7 +113,7 @@ def _held_by_stage(step: PlannedStep, work: Workload) -> float:
             return 0.0
 
 
-def _most_bins(scene: Scene, plan: Plan, products: list[PlannedStep]) -> int:
+def _most_bins(scene: Scene, plan: Plan) -> int:
     """Return the largest number of bins that a profile of a product is made from."""
     layouts = [
         {channel.name: channel.bins for channel in member.layout}
@@ -123,7 +122,7 @@ def _most_bins(scene: Scene, plan: Plan, products: list[PlannedStep]) -> int:
     return max(
         (
             sum(bins.get(name, 0) for name in counted_channels(plan.steps, step.channel))
-            for step in products
+            for step in plan.products
             for bins in layouts
         ),
         default=0,

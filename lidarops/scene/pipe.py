@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -18,8 +18,13 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
-from lidarops.records import GLUED, DetectionMode, Granule, LeftOut, PlannedStep, Role
+from lidarops.constants import (
+    DARK_REACH,
+    DEAD_TIME_UNCERTAINTY,
+    DEFAULT_DEAD_TIME,
+    LICEL_RANGE_PER_MICROSECOND,
+)
+from lidarops.records import DetectionMode, Granule, LeftOut, PlannedStep, Role, is_glued
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
@@ -28,6 +33,7 @@ from lidarops.retrieve.signal.lag import enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.scene import gluing
 from lidarops.scene.case import (
+    NO_DARK,
     READ_STEP,
     REQUEST,
     ChannelCase,
@@ -42,6 +48,8 @@ from lidarops.settings import SettingsModel, quantity
 
 Array = npt.NDArray[np.float64]
 
+_NEAR_THE_SCENE: Final = f"within {DARK_REACH / timedelta(hours=1):g} h of the scene"
+_ASSUMED_DEAD_TIME: Final = f"{1e9 * DEFAULT_DEAD_TIME:g} ns"
 NO_WAVELENGTH: Final = "the wavelength in the header is implausible, and no facts give one"
 
 
@@ -128,7 +136,7 @@ def plan_dark(case: ChannelCase[Any]) -> Entry:
     if not count:
         refused = any(file.role is Role.DARK for file in case.scene.unused)
         which = "dark files that can be used" if refused else "dark files"
-        return case.leave("dark", f"no {which} within 24 h of the scene", number=0.0)
+        return case.leave("dark", f"no {which} {_NEAR_THE_SCENE}", number=0.0, rule=NO_DARK)
     times = sorted(granule.start for granule in case.scene.dark if granule.start)
     profiles = [granule.start for granule in case.scene.granules if granule.start]
     enclosed = times[0] < max(profiles) and min(profiles) < times[-1]
@@ -143,7 +151,7 @@ def plan_dark(case: ChannelCase[Any]) -> Entry:
         use, method = "one session, used for all profiles", "nearest"
     order = _order_in_words(times, min(profiles), max(profiles))
     files = "1 dark file" if count == 1 else f"{count} dark files"
-    reason = f"{files} within 24 h of the scene, {order}: {use}"
+    reason = f"{files} {_NEAR_THE_SCENE}, {order}: {use}"
     settings = DarkSettings(files=count, method=method)
     return case.run("dark", reason, settings, needs=("read",), number=float(count))
 
@@ -189,7 +197,8 @@ def plan_dead_time(case: ChannelCase[Any]) -> Entry:
     if case.channel.mode is not DetectionMode.PHOTON:
         return case.leave("dead_time", "analog detection has no dead time")
     if dead_time is None:
-        reason = "the campaign gives no dead_time; pile-up is flagged for an assumed 4 ns"
+        pile_up = f"pile-up is flagged for an assumed {_ASSUMED_DEAD_TIME}"
+        reason = f"the campaign gives no dead_time; {pile_up}"
         return case.leave("dead_time", reason)
     if dead_time == "estimate":
         return _plan_estimate(case)
@@ -226,7 +235,8 @@ def _estimate_dead_time(signal: ChannelSignal, analog: ChannelSignal, lag: str |
         signal.notes.append(
             f"dead_time: estimate of {signal.channel}: the data give none against"
             f" {analog.channel}, so that pile-up is not corrected, and flagged for an"
-            " assumed 4 ns; give dead_time in s, as the data sheet of the counter states it"
+            f" assumed {_ASSUMED_DEAD_TIME}; give dead_time in s, as the data sheet of the counter"
+            " states it"
         )
     else:
         signal.dead_time = estimate.dead_time
@@ -369,7 +379,7 @@ def plan_stages(case: ChannelCase[Any]) -> list[Entry]:
 
     Only that it is not read, if no product needs the channel.
     """
-    reading, *others = _OF_GLUED if case.channel.name.startswith(GLUED) else _OF_FILES
+    reading, *others = _OF_GLUED if is_glued(case.channel.name) else _OF_FILES
     read = PIPE[reading](case)
     if isinstance(read, LeftOut):
         return [read]

@@ -19,7 +19,7 @@ from lidarops.campaign.model import (
 )
 from lidarops.kinds import Scope, kinds, kinds_of
 from lidarops.netcdf.context import product_of_path
-from lidarops.records import GLUED, LeftOut, Plan, PlannedStep, Scene, file_channels
+from lidarops.records import LeftOut, Plan, PlannedStep, Scene, file_channels, is_glued
 from lidarops.scene.case import (
     NO_PRODUCT,
     NOT_REQUESTED,
@@ -112,7 +112,7 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
 def _made(entries: Iterable[Entry]) -> dict[ProductKey, None]:
     """Return kind and channel of the products that run."""
     steps = (entry for entry in entries if isinstance(entry, PlannedStep))
-    return {(step.name, step.channel): None for step in steps if step.name == step.product}
+    return {(step.name, step.channel): None for step in steps if step.is_product}
 
 
 def _cases(
@@ -166,9 +166,7 @@ def _month_entries(scene: Scene, campaign: Campaign) -> Entries:
     for kind in kinds_of(Scope.MONTH):
         if settings := requested.get(kind.name):
             own = [channel for read, channel in held if read in kind.reads]
-            present = [
-                name for name in own if settings.covers(name, of_files=not name.startswith(GLUED))
-            ]
+            present = [name for name in own if settings.covers(name, of_files=not is_glued(name))]
             for name in dict.fromkeys([*settings.named, *present]):
                 case = ChannelCase(
                     scene,
@@ -196,7 +194,7 @@ def _derived_entries(
         return
     needs = (name if channel == own else f"{channel}/{name}" for name, channel in read)
     for entry in making(kind.name, Derivation).needs(case):
-        if isinstance(entry, PlannedStep) and entry.name == entry.product:
+        if isinstance(entry, PlannedStep) and entry.is_product:
             yield replace(entry, needs=(*entry.needs, *needs))
         else:
             yield entry
@@ -233,7 +231,7 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
     wavelengths = {s.channel: s.settings["wavelength"] for s in steps if s.name == READ_STEP}
     alike: defaultdict[tuple[str, float], list[str]] = defaultdict(list)
     for step in steps:
-        kind = kinds()[step.product] if step.name == step.product else None
+        kind = kinds()[step.product] if step.is_product else None
         if kind and kind.common and not kind.reads:
             alike[kind.name, wavelengths[step.channel]].append(step.channel)
     linked: list[Entry] = []
@@ -241,8 +239,7 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
         if isinstance(entry, LeftOut):
             linked.append(entry)
             continue
-        is_product = entry.name == entry.product
-        read = kinds()[entry.product].reads if is_product else ()
+        read = kinds()[entry.product].reads if entry.is_product else ()
         needs = []
         for need in entry.needs:
             channel, _, name = need.rpartition("/")

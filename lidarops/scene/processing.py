@@ -28,8 +28,6 @@ from lidarops.netcdf.read import opened_product
 from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
-    GLUED,
-    DetectionMode,
     Disagreement,
     Grade,
     Granule,
@@ -40,6 +38,7 @@ from lidarops.records import (
     Scene,
     SceneOutcome,
     file_channels,
+    mode_of_signal,
 )
 from lidarops.scene.agreement import Retrieved, compare_channels
 from lidarops.scene.case import (
@@ -265,7 +264,7 @@ class _Instrument(_Work):
     def products(self) -> None:
         """Make the products of all channels."""
         steps = self.job.plan.steps
-        products = [step for step in steps if step.name == step.product]
+        products = self.job.plan.products
         derived = [step for step in products if read_products(step)]
         channels = dict.fromkeys(step.channel for step in products if step not in derived)
         compared: list[Retrieved] = []
@@ -296,7 +295,7 @@ class _Instrument(_Work):
         with opened_product(first, in_parts=True, decode_cf=False) as product:
             wavelength = float(product["wavelength"]) * 1e-9
             stated = product.attrs["lidarops_detection_mode"]
-        mode = DetectionMode.PHOTON if step.channel.startswith(GLUED) else DetectionMode(stated)
+        mode = mode_of_signal(step.channel, stated)
         channel = product_channel(step.channel, mode, wavelength)
         context = product_context(job, self.scene, kind, channel, wavelength, self.inputs)
         settings = product_settings(job.plan.steps, kind, step.channel)
@@ -381,7 +380,7 @@ class _Network(_Work):
     def products(self) -> None:
         """Make the products of the network."""
         plan = self.job.plan
-        for step in [step for step in plan.steps if step.name == step.product]:
+        for step in plan.products:
             members = list(self._members(step))
             settings = product_settings(plan.steps, step.product, step.channel)
             stream = making(step.product, NetworkRetrieval).stream(settings, members)

@@ -19,6 +19,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
+from lidarops.retrieve.signal.lag import ChannelLag
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Indices = npt.NDArray[np.int64]
@@ -131,7 +132,7 @@ class GluedProfiles:
         self,
         analog: FileProfiles,
         photon: FileProfiles,
-        lag: labeled_gluing.ChannelLag,
+        lag: ChannelLag,
         slope: Callable[[], labeled_gluing.Slope],
     ) -> None:
         self._analog, self._photon, self._lag, self._slope = analog, photon, lag, slope

@@ -206,7 +206,7 @@ def streams_of(steps: Sequence[PlannedStep], signal: ChannelSignal) -> dict[str,
             product_settings(steps, step.product, channel), signal
         )
         for step in steps
-        if step.channel == channel and step.name == step.product and not kinds()[step.product].reads
+        if step.channel == channel and step.is_product and not kinds()[step.product].reads
     }
 
 

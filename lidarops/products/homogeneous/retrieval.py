@@ -15,7 +15,7 @@ from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.flags import Quality
 from lidarops.products.homogeneous import HomogeneousSettings, Method
 from lidarops.products.homogeneous.variables import LAYOUT
-from lidarops.records import GLUED, DetectionMode
+from lidarops.records import DetectionMode, is_glued
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -146,7 +146,7 @@ def _needs(case: Case) -> Entries:
 
     Of those that lie within the bins, along a nearly level path.
     """
-    if case.channel.name.startswith(GLUED):
+    if is_glued(case.channel.name):
         reason = "not made of glued channels: each record is fitted with its own background"
         yield case.leave("homogeneous", reason, rule="channel_present")
         return

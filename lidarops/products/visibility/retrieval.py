@@ -26,7 +26,7 @@ from lidarops.products.visibility.network import (
     crossings,
 )
 from lidarops.products.visibility.variables import LAYOUT
-from lidarops.records import GLUED, DetectionMode, LeftOut, PlannedStep, file_channels
+from lidarops.records import DetectionMode, LeftOut, PlannedStep, file_channels, is_glued
 from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
@@ -74,7 +74,7 @@ def _window(case: Case, farthest: float) -> Entry:
     Some bins are not needed in photon counting beyond the farthest crossing, given in m.
     """
     rule, channel = "member_window", case.channel
-    if channel.name.startswith(GLUED) or channel.mode is not DetectionMode.PHOTON:
+    if is_glued(channel.name) or channel.mode is not DetectionMode.PHOTON:
         return case.leave(WINDOW, ANALOG_NOISE, rule=rule)
     if case.all_steps:
         return case.leave(WINDOW, ALL_STEPS, rule=rule)

@@ -23,13 +23,13 @@ from lidarops.retrieve.signal.counts_to_signal import (
 )
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.gluing import GluedSignal, glue
-from lidarops.retrieve.signal.lag import LagEstimate, estimate_lag, shift_signal
+from lidarops.retrieve.signal.lag import ChannelLag, estimate_lag, shift_signal
 
 __all__ = [
     "Averages",
+    "ChannelLag",
     "DarkSignals",
     "GluedSignal",
-    "LagEstimate",
     "RunningMean",
     "Signal",
     "analog_signal",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +21,7 @@ from lidarops.retrieve.signal.labeled import (
     analog_alone,
     baseline_error,
 )
+from lidarops.retrieve.signal.lag import ChannelLag
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Slope = tuple[float, float]
@@ -44,15 +44,6 @@ _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 def range_lag(analog_range: Array, photon_range: Array) -> float:
     """Return the lag of analog behind photon counting in bins, as given by their ranges in m."""
     return float((photon_range[0] - analog_range[0]) / (photon_range[1] - photon_range[0]))
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelLag:
-    """Lag of analog behind photon counting."""
-
-    bins: float = 0.0
-    standard_error: float = math.nan
-    """Bins; NaN where the lag is not estimated."""
 
 
 NO_LAG: Final = ChannelLag()
@@ -86,9 +77,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]], *, known: float) -> Chan
     estimate = _lag.estimate_lag(
         (analog[:, : photon.shape[-1]], photon[:, : analog.shape[-1]]) for analog, photon in groups
     )
-    if not estimate.significant:
-        return ChannelLag(known)
-    return ChannelLag(estimate.lag, estimate.standard_error)
+    return estimate if estimate.significant else ChannelLag(known)
 
 
 def glue(

@@ -30,18 +30,20 @@ profile keeps 1 - 1/n of its noise."""
 
 
 @dataclass(frozen=True, slots=True)
-class LagEstimate:
-    """Lag of the analog signal behind photon counting in bins."""
+class ChannelLag:
+    """Lag of the analog signal behind photon counting, known or estimated."""
 
-    lag: float
-    """Bins; positive where analog shows a cloud farther than photon counting. NaN without any
+    bins: float = 0.0
+    """Positive where analog shows a cloud farther than photon counting. NaN without any
     correlation."""
-    standard_error: float
-    """Bins: scatter of parts of the range, and the systematic error by the peak's width."""
-    confidence: float
-    """Probability that noise without a common cause has no peak as high as this one."""
-    significant: bool
-    """The confidence is at least 99.9 %, and the peak is not at the largest lag."""
+    standard_error: float = math.nan
+    """Bins: scatter of parts of the range, and the systematic error by the peak's width. NaN where
+    the lag is not estimated."""
+    confidence: float = math.nan
+    """Probability that noise without a common cause has no peak as high as that of the estimate."""
+    significant: bool = False
+    """Whether it is estimated, with a confidence of at least 99.9 % and a peak that is not at the
+    largest lag."""
 
 
 def profile_groups(profiles: int) -> list[slice]:
@@ -51,7 +53,7 @@ def profile_groups(profiles: int) -> list[slice]:
     return [slice(int(first), int(last)) for first, last in itertools.pairwise(edges)]
 
 
-def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
+def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> ChannelLag:
     r"""Return the lag of analog behind photon counting from the correlation of their noise.
 
     Both record the same photoelectrons, so their shot noise is correlated at the lag and nowhere
@@ -73,7 +75,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
 
     Returns
     -------
-    LagEstimate
+    ChannelLag
         The standard error includes the scatter and the distance to the centroid of 4 bins,
         because a recorder may ring or spread a photoelectron over more than two bins.
 
@@ -108,8 +110,8 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> LagEstimate:
     deviation = estimates - estimates.mean()
     scatter = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
     confidence, defined = _confidence(total, lag), bool(np.isfinite(lag))
-    return LagEstimate(
-        lag=float(lag),
+    return ChannelLag(
+        bins=float(lag),
         standard_error=float(np.hypot(scatter, systematic)) if defined else math.nan,
         confidence=confidence,
         significant=defined and confidence >= THRESHOLDS.confidence and not at_end,

@@ -259,7 +259,7 @@ def test_a_real_station_is_glued_after_lag_correction(data_root, wavelength):
         "photon_variance": oracle.smooth(photon, range_) / (600 * 0.05),
     }
     counted = photon - sky[:, np.newaxis]
-    for bins in (0.0, estimate.lag):
+    for bins in (0.0, estimate.bins):
         moved, _ = lag.shift_signal(clean, bins)
         moved -= moved[:, 3500:3950].mean(axis=1, keepdims=True)
         results.append(glue(moved, counted, range_, **variances, photon_background=sky))

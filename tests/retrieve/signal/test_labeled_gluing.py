@@ -14,7 +14,7 @@ from lidarops.retrieve.signal.labeled import (
     correct_for_range,
     counts_per_power,
 )
-from lidarops.retrieve.signal.labeled_gluing import ChannelLag
+from lidarops.retrieve.signal.lag import ChannelLag
 
 DIMS = ("time", "range")
 BIN = 7.5

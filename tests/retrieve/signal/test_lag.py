@@ -35,7 +35,7 @@ def test_a_known_lag_is_estimated(true_lag):
     estimate = lag_of(*recorded(rng, true_lag))
     assert estimate.significant
     assert estimate.confidence > 0.9999
-    assert abs(estimate.lag - true_lag) < 3.0 * estimate.standard_error
+    assert abs(estimate.bins - true_lag) < 3.0 * estimate.standard_error
     assert estimate.standard_error < 0.1
 
 
@@ -44,7 +44,7 @@ def test_the_standard_error_covers_the_scatter():
     deviations, errors = [], []
     for _ in range(60):
         estimate = lag_of(*recorded(rng, 8.3, profiles=3, electronics=10.0))
-        deviations.append(estimate.lag - 8.3)
+        deviations.append(estimate.bins - 8.3)
         errors.append(estimate.standard_error)
     deviations, errors = np.array(deviations), np.array(errors)
     assert abs(deviations.mean()) < 4.0 * deviations.std() / np.sqrt(60) + 0.01
@@ -56,7 +56,7 @@ def test_one_profile_is_enough():
     rng = np.random.default_rng(3)
     estimate = lag_of(*recorded(rng, 6.4, profiles=1))
     assert estimate.significant
-    assert abs(estimate.lag - 6.4) < 3.0 * estimate.standard_error
+    assert abs(estimate.bins - 6.4) < 3.0 * estimate.standard_error
 
 
 def test_noise_without_a_common_cause_has_no_lag():
@@ -90,10 +90,10 @@ def test_gaps_dead_channels_and_spikes_do_not_mislead():
     photon[:, 705] = 1e6 * rng.normal(size=12)
     estimate = lag_of(analog, photon)
     assert estimate.significant
-    assert abs(estimate.lag - 8.6) < 3.0 * estimate.standard_error
+    assert abs(estimate.bins - 8.6) < 3.0 * estimate.standard_error
     for dead in (np.full(photon.shape, np.nan), np.zeros(photon.shape)):
         without_signal = lag_of(analog, dead)
-        assert np.isnan(without_signal.lag)
+        assert np.isnan(without_signal.bins)
         assert np.isnan(without_signal.standard_error)
         assert without_signal.confidence == 0.0
         assert not without_signal.significant
@@ -106,7 +106,7 @@ def test_groups_one_after_another_give_the_bits_of_all_profiles():
     whole = lag_of(analog, photon)
     parts = lag.estimate_lag((analog[rows], photon[rows]) for rows in groups)
     assert parts == whole
-    assert abs(whole.lag - 5.3) < 3.0 * whole.standard_error
+    assert abs(whole.bins - 5.3) < 3.0 * whole.standard_error
 
 
 def test_a_real_station(data_root):
@@ -117,12 +117,12 @@ def test_a_real_station(data_root):
     assert {d.bin_shift for d in headers[0].channels if d.name in names} == {0.0}
     estimate = lag_of(*(values[name] for name in names))
     assert estimate.significant
-    assert abs(estimate.lag - 8.6) < 0.2
+    assert abs(estimate.bins - 8.6) < 0.2
     assert estimate.standard_error < 0.2
     for profiles in (slice(0, 8), slice(8, 16)):
         estimate_of_half = lag_of(*(values[name][profiles] for name in names))
         assert estimate_of_half.significant
-        assert abs(estimate_of_half.lag - estimate.lag) < 0.05
+        assert abs(estimate_of_half.bins - estimate.bins) < 0.05
     assert not lag_of(values[names[0]][1:], values[names[1]][:-1]).significant
 
 
@@ -179,11 +179,11 @@ def test_the_estimated_lag_aligns_the_signals():
     rng = np.random.default_rng(11)
     analog, photon = recorded(rng, 8.6)
     estimate = lag_of(analog, photon)
-    moved, _ = lag.shift_signal(analog, estimate.lag)
+    moved, _ = lag.shift_signal(analog, estimate.bins)
     remaining = lag_of(moved, photon)
     assert remaining.significant
-    assert abs(remaining.lag) < 3.0 * remaining.standard_error
-    assert abs(remaining.lag) < 0.3
+    assert abs(remaining.bins) < 3.0 * remaining.standard_error
+    assert abs(remaining.bins) < 0.3
 
 
 @pytest.mark.parametrize(

@@ -292,7 +292,7 @@ def _lag(shift: int | None) -> Answer:
     shifted = rng.standard_normal((40, 1200)) if shift is None else np.roll(common, shift, axis=-1)
     estimate = lag_of(shifted + 0.5 * rng.standard_normal(common.shape), common)
     quality = np.where(estimate.significant, np.int32(0), np.int32(Quality.NO_GLUING))
-    values = {"lag": estimate.lag, "lag_standard_error": estimate.standard_error}
+    values = {"lag": estimate.bins, "lag_standard_error": estimate.standard_error}
     return Answer(values, np.atleast_1d(quality).astype(np.int32))
 
 
