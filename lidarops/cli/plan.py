@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -104,48 +104,37 @@ def _plan(
     from lidarops.catalog.store import Store
     from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.options import selects_no_scene
-    from lidarops.scene.memory import scene_memory
 
     findings = survey(settings, selection=selection, wait=wait)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
+    earlier = earlier_problems(settings, selection)
     scenes = []
     count = to_be_made = 0
     failed = False
-    earlier = failed_before, unusable = earlier_problems(settings, selection)
     for judged in judgements:
         count += 1
         to_be_made += bool(judged.stale)
-        failed |= not judged.planned
+        failed |= judged.held or not judged.planned
         if judged.due or judged.held:
             for problems in earlier:
                 problems.pop(judged.scene.id, None)
-        failed |= judged.held
-        memory = {
-            "to_be_made": scene_memory(judged.scene, judged.needed()).total,
-            "everything": scene_memory(judged.scene, judged.requested).total,
-        }
         if as_json:
-            scenes.append({**_plain(judged), "estimated_memory_bytes": memory})
-            continue
-        needs = f"about {memory['to_be_made' if stale else 'everything'] / 1e6:.0f} MB of memory"
-        if everything:
-            _show_all(judged, needs, plan=not stale)
+            scenes.append(_plain(judged))
         else:
-            _show_scene(judged, needs, plan=not stale)
-        _show_kept(judged)
+            _show_judged(judged, stale=stale, everything=everything)
     no_scene = not count and selects_no_scene(settings, selection)
+    lacking = settings.metadata.lacking
     if as_json:
-        no_scene_found = {"no_scene_selected": no_scene}
         document = {
             "scenes": scenes,
-            **no_scene_found,
-            "failed_before": failed_before,
-            "without_a_usable_value": list(unusable),
+            "no_scene_selected": no_scene,
+            "failed_before": earlier[0],
+            "without_a_usable_value": list(earlier[1]),
             "refused_files": {granule.path: granule.reason for granule in refused},
             **findings_document(findings),
-            "lacking_metadata": list(settings.metadata.lacking),
+            "lacking_metadata": list(lacking),
         }
         typer.echo(json.dumps(document, indent=2))
     else:
@@ -153,18 +142,45 @@ def _plan(
             say(NO_SCENE)
         _show_refused([granule.reason for granule in refused])
         show_findings(findings)
-        if settings.metadata.lacking:
-            names = ", ".join(settings.metadata.lacking)
-            say_wrapped(f"metadata of the campaign: products will lack {names}", "")
-        unchanged = "not tried again, because nothing has changed"
-        show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed_before.items())
-        title = f"Without a usable value; {unchanged}"
-        show_rows(title, ("scene", "problem"), unusable.items())
+        _show_rest(lacking, *earlier)
         # With --stale, fresh scenes are not judged.
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
     exit_with_status(failed=failed or bool(refused) or any(earlier) or findings.failed)
+
+
+def _show_rest(
+    lacking: Sequence[str], failed: Mapping[str, str], unusable: Mapping[str, str]
+) -> None:
+    """Print the metadata that are lacking, and the scenes that are not tried again."""
+    if lacking:
+        names = ", ".join(lacking)
+        say_wrapped(f"metadata of the campaign: products will lack {names}", "")
+    unchanged = "not tried again, because nothing has changed"
+    show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed.items())
+    title = f"Without a usable value; {unchanged}"
+    show_rows(title, ("scene", "problem"), unusable.items())
+
+
+def _memory(judged: Judgement) -> dict[str, float]:
+    """Return the memory that a scene needs, in bytes, for what is to be made and for everything."""
+    from lidarops.scene.memory import scene_memory
+
+    return {
+        "to_be_made": scene_memory(judged.scene, judged.needed()).total,
+        "everything": scene_memory(judged.scene, judged.requested).total,
+    }
+
+
+def _show_judged(judged: Judgement, *, stale: bool, everything: bool) -> None:
+    memory = _memory(judged)["to_be_made" if stale else "everything"]
+    needs = f"about {memory / 1e6:.0f} MB of memory"
+    if everything:
+        _show_all(judged, needs, plan=not stale)
+    else:
+        _show_scene(judged, needs, plan=not stale)
+    _show_kept(judged)
 
 
 def _show_all(judged: Judgement, needs: str, *, plan: bool) -> None:
@@ -238,13 +254,16 @@ def _settings(step: PlannedStep) -> Iterator[str]:
 
 
 def _show_stale(title: str, judged: Judgement) -> None:
-    rows = list(
-        _grouped((product.kind, product.reason, product.channel) for product in judged.stale)
-    )
+    rows = _stale_rows(judged)
     if judged.failure:
         unchanged = "not tried again, because nothing has changed: " if judged.held else ""
         rows.append(("none", "", f"{unchanged}{judged.failure.error}"))
     show_rows(f"{title}: to be made", ("product", "channels", "reason"), rows)
+
+
+def _stale_rows(judged: Judgement) -> list[tuple[str, str, str]]:
+    """Return kind, channels and reason of what is to be made."""
+    return list(_grouped((made.kind, made.reason, made.channel) for made in judged.stale))
 
 
 def _show_kept(judged: Judgement) -> None:
@@ -283,6 +302,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
         "fresh": judged.fresh,
         "failure": asdict(judged.failure) if judged.failure else None,
         "held": judged.held,
+        "estimated_memory_bytes": _memory(judged),
     }
 
 
@@ -303,9 +323,7 @@ def _show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
     plan : bool
         Whether steps are shown; a scene without anything to be made is left out otherwise.
     """
-    stale = list(
-        _grouped((product.kind, product.reason, product.channel) for product in judged.stale)
-    )
+    stale = _stale_rows(judged)
     if not plan and not stale and not judged.failure:
         return
     say_wrapped(f"{_scene_title(judged)}, plan {judged.requested.hash[:12]}", "")
@@ -344,7 +362,7 @@ def _say_steps(plan: Plan) -> None:
     shown = {*kinds(), READ_STEP}
     others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:
-        say_wrapped(f"left out, of some channels: {', '.join(others)}", "  ")
+        say_wrapped(f"skipped for some channels: {', '.join(others)}", "  ")
 
 
 def _show_refused(reasons: Sequence[str]) -> None:
@@ -361,7 +379,7 @@ def _show_refused(reasons: Sequence[str]) -> None:
 
 
 def _grouped(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
-    """Yield name, channels and text for lines of name, text and channel, _grouped by name."""
+    """Yield name, channels and text for lines of name, text and channel, grouped by name."""
     channels: dict[str, dict[str, dict[str, None]]] = {}
     for name, text, channel in lines:
         channels.setdefault(name, {}).setdefault(text, {})[channel] = None

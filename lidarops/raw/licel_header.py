@@ -208,16 +208,7 @@ def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> H
 
 
 def _parse(buffer: bytes, file: str, size: int) -> Header:
-    ends = _line_ends(buffer, 0, 3)
-    first, second, third = (
-        buffer[start:end].decode("latin-1")
-        for start, end in zip((0, ends[0] + 2, ends[1] + 2), ends, strict=True)
-    )
-    scan = None
-    if _SCAN.fullmatch(third):
-        scan = ScanGrid(*(_number(token, "grid of the scan") for token in third.split()))
-        ends += _line_ends(buffer, ends[2] + 2, 1)
-        third = buffer[ends[2] + 2 : ends[3]].decode("latin-1")
+    first, second, third, scan, block_start = _first_lines(buffer)
     dates = _DATES.search(second)
     if dates is None:
         raise RawFormatError(
@@ -226,17 +217,8 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     start, stop = _moments(dates)
     place, notes = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, unknown = _parse_lasers(third)
-    block_start = ends[-1] + 2
-    block_end = _line_ends(buffer, block_start, number)[-1] + 2
+    block_end = _dataset_lines_end(buffer, block_start, number)
     data_start = block_end + 2
-    if buffer[block_end:data_start] != b"\r\n":
-        if len(buffer) < data_start:
-            raise IncompleteHeaderError("the file ends inside the header", field="empty line")
-        _refuse_export(buffer[block_end:])
-        raise RawFormatError(
-            "no empty line follows the dataset lines: the number of datasets in line 3 is wrong",
-            field="number of datasets",
-        )
     block = buffer[block_start:block_end]
     parse = _parse_datasets if len(block) <= _CACHED_BLOCK else _parse_datasets.__wrapped__
     try:
@@ -250,10 +232,6 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     channels = _channels(datasets)
     if any(len(channel.places) > 1 for channel in channels):
         notes += ("channels have two memories: counts and shots of both are added",)
-    rate = max(laser.repetition_rate for laser in lasers)
-    if stop <= start:
-        shots = max((channel.shots for channel in channels), default=0)
-        stop = start + timedelta(seconds=shots / rate) if rate > 0.0 else start
     site = second[: dates.start()].strip()
     zenith, azimuth, doubt = _pointing(
         place["zenith_as_written"], place["azimuth_as_written"], scan
@@ -264,7 +242,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         path=file or first.strip(),
         size=size,
         start=start,
-        stop=stop,
+        stop=_stop_by_shots(start, channels, lasers) if stop <= start else stop,
         zenith_angle=zenith,
         azimuth=azimuth,
         notes=notes + dataset_notes,
@@ -281,6 +259,44 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         data_start=data_start,
         source=buffer[:data_start],
     )
+
+
+def _first_lines(buffer: bytes) -> tuple[str, str, str, ScanGrid | None, int]:
+    """Return lines 1, 2 and 3, the grid of a scan between the last two, and where line 4 starts."""
+    ends = _line_ends(buffer, 0, 3)
+    first, second, third = (
+        buffer[start:end].decode("latin-1")
+        for start, end in zip((0, ends[0] + 2, ends[1] + 2), ends, strict=True)
+    )
+    scan = None
+    if _SCAN.fullmatch(third):
+        scan = ScanGrid(*(_number(token, "grid of the scan") for token in third.split()))
+        ends += _line_ends(buffer, ends[2] + 2, 1)
+        third = buffer[ends[2] + 2 : ends[3]].decode("latin-1")
+    return first, second, third, scan, ends[-1] + 2
+
+
+def _dataset_lines_end(buffer: bytes, start: int, number: int) -> int:
+    """Return the end of that many dataset lines, which an empty line must follow."""
+    end = _line_ends(buffer, start, number)[-1] + 2
+    if buffer[end : end + 2] == b"\r\n":
+        return end
+    if len(buffer) < end + 2:
+        raise IncompleteHeaderError("the file ends inside the header", field="empty line")
+    _refuse_export(buffer[end:])
+    raise RawFormatError(
+        "no empty line follows the dataset lines: the number of datasets in line 3 is wrong",
+        field="number of datasets",
+    )
+
+
+def _stop_by_shots(
+    start: datetime, channels: tuple[Dataset, ...], lasers: tuple[Laser, ...]
+) -> datetime:
+    """Return when the shots of the channels have been fired; the start where no rate is stated."""
+    rate = max(laser.repetition_rate for laser in lasers)
+    shots = max((channel.shots for channel in channels), default=0)
+    return start + timedelta(seconds=shots / rate) if rate > 0.0 else start
 
 
 # All but name, times, place, lasers and weather; the same in many files.
