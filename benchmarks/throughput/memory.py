@@ -199,7 +199,7 @@ def write_files(folder: Path, size: float) -> int:
         "shots": _SHOTS,
     }
     kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
-    datasets = [licel.new_dataset(kind=kind, **layout) for kind in kinds]
+    datasets = [licel.new_dataset(licel.Recorder(kind), **layout) for kind in kinds]
     counts = _counts()
     number = round(size * 1e6 / (4 * BINS * len(kinds)))
     dark = max(1, round(_DARK_SHARE * number))
@@ -208,13 +208,9 @@ def write_files(folder: Path, size: float) -> int:
         name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
         header = licel.new_header(
             name=name,
-            site="Here",
+            place=licel.Place("Here", 100, 10, 50, _ZENITH_ANGLES[index % len(_ZENITH_ANGLES)]),
             start=start,
             stop=start + _INTERVAL,
-            altitude=100,
-            longitude=10,
-            latitude=50,
-            zenith_angle=_ZENITH_ANGLES[index % len(_ZENITH_ANGLES)],
             datasets=datasets,
             lasers=[Laser(_SHOTS, 20), Laser(0, 0)],
         )

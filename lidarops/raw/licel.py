@@ -19,7 +19,7 @@ import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,8 @@ __all__ = [
     "Header",
     "HeaderOrder",
     "Laser",
+    "Place",
+    "Recorder",
     "ScanGrid",
     "encode",
     "format_header",
@@ -150,31 +152,64 @@ def read_counts(
     return header, counts
 
 
+class Recorder(NamedTuple):
+    """How a channel is recorded."""
+
+    kind: DatasetKind = DatasetKind.ANALOG
+    """``DatasetKind.ANALOG`` or ``DatasetKind.PHOTON`` for a signal channel."""
+    device: str | None = None
+    """By default ``BT0`` (analog) or ``BC0`` (photon counting)."""
+    high_voltage: float = 0.0
+    """V; written in whole volts."""
+    adc_bits: int = 12
+    """Written as 0 for photon counting."""
+    input_range: float = 0.5
+    """V, analog; in whole millivolts."""
+    discriminator: float = 3.1746e-3
+    """V, photon counting; written in mV with four decimals."""
+    bin_shift: float = 0.0
+    """Bins; written with three decimals."""
+
+
+class Place(NamedTuple):
+    """Where a lidar stands and points, and the weather there: line 2 of a header."""
+
+    site: str
+    altitude: float
+    """m; written in whole metres."""
+    longitude: float
+    """degree; one decimal, four in a scan of Raymetrics, or six in the extended dialect."""
+    latitude: float
+    """As the longitude."""
+    zenith_angle: float = 0.0
+    """degree; whole degrees except in the extended dialect. Raymetrics writes -90 for vertical, and
+    in a scan the elevation, negative upwards, with one decimal."""
+    azimuth: float | None = None
+    """degree; makes the dialect extended, unless a scan is given; both need it."""
+    temperature: float | None = None
+    """K; makes the dialect raymetrics, which needs it, and the pressure."""
+    pressure: float | None = None
+    """Pa."""
+
+
 def new_dataset(
+    recorder: Recorder,
     *,
-    kind: DatasetKind = DatasetKind.ANALOG,
     wavelength: float,
     bins: int,
     bin_width: float,
     shots: int,
     polarisation: str = "o",
     laser: int = 1,
-    high_voltage: float = 0.0,
-    adc_bits: int = 12,
-    input_range: float = 0.5,
-    discriminator: float = 3.1746e-3,
-    device: str | None = None,
-    active: bool = True,
     laser_polarisation: int = 1,
-    bin_shift: float = 0.0,
+    active: bool = True,
     comment: str = "",
 ) -> Dataset:
     """Build a dataset line from numbers.
 
     Parameters
     ----------
-    kind : DatasetKind
-        ``DatasetKind.ANALOG`` or ``DatasetKind.PHOTON`` for a signal channel.
+    recorder : Recorder
     wavelength : float
         m; written in whole nm (5.32e-5 gives the mistyped ``53200.o`` of some files).
     bins : int
@@ -184,19 +219,7 @@ def new_dataset(
     polarisation : str
         o, p, s, r or l.
     laser, laser_polarisation : int
-    high_voltage : float
-        V; written in whole volts.
-    adc_bits : int
-        Written as 0 for photon counting.
-    input_range : float
-        V, analog; in whole millivolts.
-    discriminator : float
-        V, photon counting; written in mV with four decimals.
-    device : str, optional
-        By default ``BT0`` (analog) or ``BC0`` (photon counting).
     active : bool
-    bin_shift : float
-        Bins; written with three decimals.
     comment : str
 
     Returns
@@ -209,48 +232,42 @@ def new_dataset(
     RawFormatError
         If a number does not fit the format.
     """
+    kind = recorder.kind
     analog = kind in {DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED}
-    thousandths = round(bin_shift * 1000)
+    thousandths = round(recorder.bin_shift * 1000)
     tokens = [
         f"{active:d}",
         f"{kind:d}",
         f"{laser:d}",
         f"{bins:05d}",
         f"{laser_polarisation:d}",
-        f"{high_voltage:04.0f}",
+        f"{recorder.high_voltage:04.0f}",
         _four_characters(bin_width),
         f"{round(wavelength * 1e9):05d}.{polarisation}",
         "0 0",
         f"{thousandths // 1000:02d}",
         f"{thousandths % 1000:03d}",
-        f"{adc_bits if analog else 0:02d}",
+        f"{recorder.adc_bits if analog else 0:02d}",
         f"{shots:06d}",
-        f"{input_range:.3f}" if analog else f"{discriminator * 1e3:.4f}",
-        device or ("BT0" if analog else "BC0"),
+        f"{recorder.input_range:.3f}" if analog else f"{recorder.discriminator * 1e3:.4f}",
+        recorder.device or ("BT0" if analog else "BC0"),
         comment,
     ]
     dataset = parse_dataset(_line(*tokens))
     _compare("device", tokens[-2], dataset.device)
     if analog:
-        _compare("input range", round(input_range, 9), dataset.input_range)
+        _compare("input range", round(recorder.input_range, 9), dataset.input_range)
     return dataset
 
 
 def new_header(
     *,
     name: str,
-    site: str,
+    place: Place,
     start: datetime,
     stop: datetime,
-    altitude: float,
-    longitude: float,
-    latitude: float,
     datasets: Sequence[Dataset],
     lasers: Sequence[Laser],
-    zenith_angle: float = 0.0,
-    azimuth: float | None = None,
-    temperature: float | None = None,
-    pressure: float | None = None,
     custom: str | None = None,
     timestamp: int | None = None,
     scan: ScanGrid | None = None,
@@ -262,24 +279,13 @@ def new_header(
     ----------
     name : str
         File name for line 1.
-    site : str
+    place : Place
     start, stop : datetime
         Aware; written in UTC, in whole seconds.
-    altitude : float
-        m; written in whole metres.
-    longitude, latitude : float
-        degree; one decimal, four in a scan of Raymetrics, or six in the extended dialect.
     datasets : sequence of Dataset
         From `new_dataset` or a parsed header.
     lasers : sequence of Laser
         Two or three: shots and repetition rate in Hz.
-    zenith_angle : float
-        degree; whole degrees except in the extended dialect. Raymetrics writes -90 for vertical,
-        and in a scan the elevation, negative upwards, with one decimal.
-    azimuth : float, optional
-        degree; makes the dialect extended, unless a scan is given; both need it.
-    temperature, pressure : float, optional
-        K and Pa; make the dialect raymetrics, which needs both.
     custom : str, optional
         Quoted text; makes the dialect extended.
     timestamp : int, optional
@@ -300,29 +306,19 @@ def new_header(
         If a number does not fit the dialect.
     """
     if dialect is None:
-        weather = temperature is not None or pressure is not None
-        classic = azimuth is None and custom is None
+        weather = place.temperature is not None or place.pressure is not None
+        classic = place.azimuth is None and custom is None
         dialect = "raymetrics" if weather else "classic" if classic else "extended"
     if scan is not None and dialect != "raymetrics":
         raise RawFormatError("needs the raymetrics dialect", field="grid of the scan")
-    place = _place(
-        dialect if scan is None else "scan",
-        altitude=altitude,
-        longitude=longitude,
-        latitude=latitude,
-        zenith_angle=zenith_angle,
-        azimuth=azimuth,
-        temperature=None if temperature is None else temperature - _ICE_POINT,
-        pressure=None if pressure is None else pressure / 100.0,
-    )
     text = b"".join(
         [
             _line(name),
             _line(
-                site if dialect == "raymetrics" else f"{site:<8}",
+                place.site if dialect == "raymetrics" else f"{place.site:<8}",
                 _utc(start, "start"),
                 _utc(stop, "stop"),
-                place,
+                _place(dialect if scan is None else "scan", place),
                 "" if custom is None else f'"{custom}"',
             ),
             *([] if scan is None else [_scan_line(scan)]),
@@ -333,10 +329,10 @@ def new_header(
     )
     size = len(text) + sum(4 * dataset.bins + 2 for dataset in datasets if dataset.active)
     header = parse_header(text, file=name, size=size)
-    _compare("site", site.strip(), header.site)
+    _compare("site", place.site.strip(), header.site)
     _compare("custom text", custom, header.custom)
     _compare("grid of the scan", scan, header.scan)
-    _compare("zenith angle", round(zenith_angle, 6), header.zenith_as_written)
+    _compare("zenith angle", round(place.zenith_angle, 6), header.zenith_as_written)
     _compare("datasets", len(datasets), len(header.datasets))
     return header
 
@@ -436,8 +432,14 @@ def _four_characters(width: float) -> str:
     return text
 
 
-def _place(form: str, **values: float | None) -> str:
+def _place(form: str, place: Place) -> str:
     """Return what line 2 holds after the dates, with the values that the form has places for."""
+    values = place._asdict()
+    del values["site"]
+    if place.temperature is not None:
+        values["temperature"] = place.temperature - _ICE_POINT
+    if place.pressure is not None:
+        values["pressure"] = place.pressure / 100.0
     for name, value in values.items():
         if (value is not None) != (f"{{{name}:" in _PLACES[form]):
             if value is None:

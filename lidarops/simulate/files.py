@@ -20,7 +20,16 @@ from lidarops.campaign.simulated_instrument import (
     PhotonCounter,
 )
 from lidarops.constants import LICEL_DISCRIMINATOR_STEP
-from lidarops.raw.licel import Dataset, DatasetKind, Header, encode, new_dataset, new_header
+from lidarops.raw.licel import (
+    Dataset,
+    DatasetKind,
+    Header,
+    Place,
+    Recorder,
+    encode,
+    new_dataset,
+    new_header,
+)
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.analog import digitise
 from lidarops.simulate.atmosphere import (
@@ -223,24 +232,22 @@ class Simulator:
         dialect = site.dialect
         start = planned.start + planned.clock_error
         scan = scan_grid(site.scan.cycle()) if site.scan is not None and dialect.scans else None
-        longitude, latitude = site.written_position
-        temperature, pressure = dialect.weather
         return new_header(
             name=planned.name,
-            site=dialect.site_of(site.instrument.station, site.station.name),
+            place=Place(
+                dialect.site_of(site.instrument.station, site.station.name),
+                site.station.altitude,
+                *site.written_position,
+                dialect.written_zenith(conditions.zenith_angle, scan),
+                conditions.azimuth if dialect.holds_azimuth else None,
+                *dialect.weather,
+            ),
             start=start,
             stop=start + planned.duration if scan is None else start,
-            altitude=site.station.altitude,
-            longitude=longitude,
-            latitude=latitude,
-            zenith_angle=dialect.written_zenith(conditions.zenith_angle, scan),
-            azimuth=conditions.azimuth if dialect.holds_azimuth else None,
             scan=scan,
             datasets=self._dataset_lines(acquisition),
             lasers=dialect.lasers(acquisition.shots, acquisition.repetition_rate),
             dialect=dialect.layout,
-            temperature=temperature,
-            pressure=pressure,
         )
 
     def _dataset_lines(self, acquisition: Acquisition) -> tuple[Dataset, ...]:
@@ -259,30 +266,30 @@ class Simulator:
     ) -> Dataset:
         """Return the line of a recorder of detector `number`."""
         detector, dialect = self.site.simulated.detectors[number], self.site.dialect
-        recorded: dict[str, Any]
         if mode is DetectionMode.ANALOG and detector.analog is not None:
-            recorded = {
-                "kind": DatasetKind.ANALOG,
-                "device": f"BT{number}",
-                "adc_bits": detector.analog.adc_bits,
-                "input_range": detector.analog.adc_range * 1e-3,
-            }
+            recorder = Recorder(
+                DatasetKind.ANALOG,
+                f"BT{number}",
+                detector.high_voltage,
+                adc_bits=detector.analog.adc_bits,
+                input_range=detector.analog.adc_range * 1e-3,
+            )
         else:
             level = (detector.photon or PhotonCounter()).discriminator_level
-            recorded = {
-                "kind": DatasetKind.PHOTON,
-                "device": f"BC{number}",
-                "discriminator": level * LICEL_DISCRIMINATOR_STEP,
-            }
+            recorder = Recorder(
+                DatasetKind.PHOTON,
+                f"BC{number}",
+                detector.high_voltage,
+                discriminator=level * LICEL_DISCRIMINATOR_STEP,
+            )
         dataset = new_dataset(
+            recorder,
             wavelength=detector.wavelength * 1e-9,
             polarisation=detector.polarisation,
             bins=bins,
             bin_width=bin_width,
             shots=shots,
             laser=dialect.laser,
-            high_voltage=detector.high_voltage,
-            **recorded,
         )
         return dialect.written_dataset(dataset)
 

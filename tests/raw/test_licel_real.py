@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.licel_lines import new_dataset, new_header
 from support.licel_strategies import naive_physical, naive_read
 from support.physical import read_physical
 
@@ -35,7 +36,7 @@ def files(data_root) -> list[Path]:
 def rebuild(header: licel.Header) -> licel.Header:
     """Return the same header, rebuilt from its numbers."""
     datasets = [
-        licel.new_dataset(
+        new_dataset(
             kind=d.kind,
             wavelength=int(d.wavelength_label[:5]) * 1e-9,
             bins=d.bins,
@@ -54,7 +55,7 @@ def rebuild(header: licel.Header) -> licel.Header:
         )
         for d in header.datasets
     ]
-    return licel.new_header(
+    return new_header(
         name=header.name,
         site=header.site,
         start=header.start,

@@ -12,6 +12,7 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.cases import each
+from support.licel_lines import new_dataset, new_header
 from support.licel_strategies import datasets, files, headers, naive_read, raw_file
 
 from lidarops.errors import RawFormatError
@@ -102,12 +103,12 @@ def new(**changes) -> licel.Header:
         "datasets": [dataset()],
         "lasers": [licel.Laser(101, 10), licel.Laser(101, 0)],
     }
-    return licel.new_header(**(arguments | changes))
+    return new_header(**(arguments | changes))
 
 
 def dataset(**changes) -> licel.Dataset:
     arguments = {"wavelength": 532e-9, "bins": 4, "bin_width": 7.5, "shots": 101}
-    return licel.new_dataset(**(arguments | changes))
+    return new_dataset(**(arguments | changes))
 
 
 def test_new_header_is_what_licel_writes():

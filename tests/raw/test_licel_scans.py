@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.cases import each
+from support.licel_lines import new_header
 from support.licel_strategies import naive_read, raw_file
 
 from lidarops.errors import RawFormatError
@@ -245,7 +246,7 @@ def test_real_scans_are_written_again_byte_by_byte(data_root):
         content = path.read_bytes()
         header, counts = licel.read_counts(path)
         assert licel.encode(header, counts) == content
-        text = licel.new_header(
+        text = new_header(
             name=header.name,
             site=header.site,
             start=header.start,

@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from lidarops.raw import licel
+from support.licel_lines import new_dataset, new_header
 
 ANALOG = " 1 0 1 00004 1 0800 7.50 00532.p 0 0 00 000 12 000101 0.500 BT0"
 PHOTON = " 1 1 1 00004 1 0800 7.50 00532.p 0 0 00 000 00 000101 0.7937 BC0"
@@ -70,7 +71,7 @@ WORDS = st.text(st.sampled_from("abcXYZ019_-"), min_size=1, max_size=12)
 
 @st.composite
 def datasets(draw, kinds=SIGNALS, active=ACTIVE):
-    return licel.new_dataset(
+    return new_dataset(
         kind=draw(kinds),
         wavelength=draw(st.sampled_from([355, 387, 532, 607, 1064, 1550, 53200])) * 1e-9,
         bins=draw(st.integers(1, 40)),
@@ -116,7 +117,7 @@ def headers(draw, datasets=DATASETS):
         st.datetimes(datetime(1990, 1, 1), datetime(2060, 1, 1), timezones=st.just(UTC))  # noqa: DTZ001
     ).replace(microsecond=0)
     laser = st.builds(licel.Laser, st.integers(0, 9_999_999), st.integers(0, 9999))
-    return licel.new_header(
+    return new_header(
         name=draw(WORDS),
         site=" ".join(draw(st.lists(WORDS, min_size=1, max_size=2))),
         start=start,

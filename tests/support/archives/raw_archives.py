@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarops.raw import licel
 from support import factories
+from support.licel_lines import new_dataset, new_header
 
 
 def content(
@@ -26,7 +27,7 @@ def content(
     """Return a file with an analog and a photon channel that starts so long after midnight."""
     start: datetime = factories.DAY + timedelta(minutes=minutes)
     common: dict[str, Any] = {"wavelength": 532e-9, "bins": bins, "bin_width": 7.5, "shots": 600}
-    header = licel.new_header(
+    header = new_header(
         name="h2630100.000000",
         site=site,
         start=start,
@@ -37,8 +38,8 @@ def content(
         zenith_angle=zenith_angle,
         azimuth=azimuth,
         datasets=[
-            licel.new_dataset(kind=licel.DatasetKind.ANALOG, **common),
-            licel.new_dataset(kind=licel.DatasetKind.PHOTON, **common),
+            new_dataset(kind=licel.DatasetKind.ANALOG, **common),
+            new_dataset(kind=licel.DatasetKind.PHOTON, **common),
         ],
         lasers=[licel.Laser(600, 10), licel.Laser(0, 0)],
     )

@@ -14,6 +14,7 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.raw import licel
 from support import factories
 from support.archives import raw_archives
+from support.licel_lines import new_dataset, new_header
 
 DAY = 1440
 BINS = 400
@@ -68,7 +69,7 @@ def content(minutes: float, recorders: tuple[str, ...]) -> bytes:
     """Return a file that starts so long after midnight."""
     start = factories.DAY + timedelta(minutes=minutes)
     common: dict[str, Any] = {"wavelength": 532e-9, "bins": BINS, "bin_width": 7.5, "shots": 600}
-    header = licel.new_header(
+    header = new_header(
         name="h2630100.000000",
         site="Coast",
         start=start,
@@ -78,7 +79,7 @@ def content(minutes: float, recorders: tuple[str, ...]) -> bytes:
         longitude=30.7,
         zenith_angle=0.0,
         datasets=[
-            licel.new_dataset(
+            new_dataset(
                 kind=licel.DatasetKind.PHOTON if name[1] == "C" else licel.DatasetKind.ANALOG,
                 device=name,
                 **common,
