@@ -313,13 +313,11 @@ def invert_particles(
     return inversion.invert_elastic(
         power,
         sky.range,
-        molecular_backscatter=sky.molecular_backscatter,
-        molecular_extinction=sky.molecular_extinction,
-        lidar_ratio=LIDAR_RATIO,
-        reference=edges,
+        air=inversion.Air(sky.molecular_backscatter, sky.molecular_extinction),
+        lidar_ratio=inversion.LidarRatio(LIDAR_RATIO),
+        reference=inversion.Reference(edges, relative_error=reference_error),
         variance=noise,
         background_standard_error=background_error,
-        reference_relative_error=reference_error,
     )
 
 

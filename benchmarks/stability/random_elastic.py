@@ -217,12 +217,16 @@ def _solve(
     input_errors: Array,
 ) -> inversion.ElasticResult:
     return inversion.invert_elastic(
-        power, base.range, molecular_backscatter=base.molecular_backscatter,
-        molecular_extinction=base.molecular_extinction, lidar_ratio=elastic_cases.LIDAR_RATIO,
-        reference=edges, variance=noise, background_standard_error=input_errors[0],
-        lidar_ratio_standard_error=_RATIO_ERROR * elastic_cases.LIDAR_RATIO,
-        reference_relative_error=input_errors[1], molecular_relative_error=_AIR_ERROR,
-    )  # fmt: skip
+        power,
+        base.range,
+        air=inversion.Air(base.molecular_backscatter, base.molecular_extinction, _AIR_ERROR),
+        lidar_ratio=inversion.LidarRatio(
+            elastic_cases.LIDAR_RATIO, _RATIO_ERROR * elastic_cases.LIDAR_RATIO
+        ),
+        reference=inversion.Reference(edges, relative_error=input_errors[1]),
+        variance=noise,
+        background_standard_error=input_errors[0],
+    )
 
 
 def visible_misfit_of_sky(

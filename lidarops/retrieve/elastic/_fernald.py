@@ -11,7 +11,7 @@ denominator are linear in the power, so the first-order errors are exact sums.
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,8 @@ GAIN, RATIO, AIR, SHAPE = 0, 1, 2, 3
 DEPTH, DEPTH_RATIO, DEPTH_AIR = 4, 5, 6
 GAIN_RATIO, SOURCE_RATIO = 7, 8
 GAIN_AIR, SOURCE_AIR, OWN_AIR = 9, 10, 11
-COLUMN, COLUMN_AIR, RATIO_ERROR, AIR_ERROR = 12, 13, 14, 15
-PATH_ROWS: Final = 16
+COLUMN, COLUMN_AIR, RATIO_ERROR, AIR_ERROR, DISTANCE = 12, 13, 14, 15, 16
+PATH_ROWS: Final = 17
 
 # Values that `invert_fernald` writes for each bin, and for each profile.
 BACKSCATTER, ATTENUATED, ATTENUATED_ERROR = 0, 1, 2
@@ -42,6 +42,25 @@ WORK_ROWS: Final = 9
 
 # The state of a bin.
 MISSING, VALID, UNSTABLE = 0, 1, 2
+
+
+class Given(NamedTuple):
+    """What is given beside the power, (profile or 1, bin), read-only."""
+
+    variance: Array
+    window: Booleans
+    """Bins of the reference window."""
+    range: Array
+    """(bin,), m, ascending."""
+    air: tuple[Array, Array, Array]
+    """Backscatter and extinction of the air, lidar ratio of the particles."""
+    scattering_ratio: Array
+    """(profile or 1,); in the reference window."""
+    errors: tuple[Array, Array]
+    """Of the lidar ratio in sr, and of the air, relative."""
+    causes: Array
+    """(profile or 1, 3): standard error of the background, relative one of the scattering ratio,
+    and the integral correlation length of the noise in bins."""
 
 
 @compiled
@@ -95,6 +114,7 @@ def _trace_path(
         path[OWN_AIR, i] = backscatter[i] * air_error[i]
         path[COLUMN, i], path[COLUMN_AIR, i] = column, column_air
         path[RATIO_ERROR, i], path[AIR_ERROR, i] = ratio_error[i], air_error[i]
+        path[DISTANCE, i] = range_[i]
 
 
 @compiled
@@ -144,7 +164,6 @@ def _integrate(
     power: Array,
     variance: Array,
     window: Booleans,
-    range_: Array,
     path: Array,
     start: int,
     direction: int,
@@ -157,22 +176,18 @@ def _integrate(
 
     Bins that are reached become `VALID`.
     """
-    d_start, weight, window_variance, count = (
-        calibration[0],
-        calibration[1],
-        calibration[2],
-        calibration[3],
-    )
+    d_start, weight = calibration[0], calibration[1]
+    window_variance, count = calibration[2], calibration[3]
     passed_variance = integral = gain_integral = ratio_integral = air_integral = half = 0.0
     twice, last = 2.0 * direction, -1
     last_power = last_gain = last_ratio = last_air = 0.0
     last_distance = last_variance = last_slope = 0.0
-    for steps in range(range_.size - start if direction > 0 else start + 1):
+    for steps in range(power.size - start if direction > 0 else start + 1):
         i = start + direction * steps
         p, v = power[i], variance[i]
         if not usable(p, v):
             continue
-        g, s, distance = path[GAIN, i], path[RATIO, i], range_[i]
+        g, s, distance = path[GAIN, i], path[RATIO, i], path[DISTANCE, i]
         q = g * p
         gain_term, power_term = s * g, s * q
         ratio_term, air_term = q * path[SOURCE_RATIO, i], q * path[SOURCE_AIR, i]
@@ -198,12 +213,8 @@ def _integrate(
         work[BY_AIR, i] = -d_start * calibration[6] - twice * air_integral
         state[i] = VALID
         last, last_distance, last_variance, last_slope = i, distance, v, slope
-        last_power, last_gain, last_ratio, last_air = (
-            power_term,
-            gain_term,
-            ratio_term,
-            air_term,
-        )
+        last_power, last_gain = power_term, gain_term
+        last_ratio, last_air = ratio_term, air_term
 
 
 @compiled
@@ -404,18 +415,7 @@ def _withhold(
 
 @compiled
 def invert_fernald(
-    power: Array,
-    variance: Array,
-    window: Booleans,
-    range_: Array,
-    air: tuple[Array, Array, Array],
-    scattering_ratio: Array,
-    errors: tuple[Array, Array],
-    causes: Array,
-    limits: Array,
-    out: Array,
-    scalars: Array,
-    state: Codes,
+    power: Array, given: Given, limits: Array, out: Array, scalars: Array, state: Codes
 ) -> None:
     """Invert profiles one by one.
 
@@ -423,20 +423,7 @@ def invert_fernald(
     ----------
     power : (profile, bin) float64
         Background subtracted.
-    variance : (profile or 1, bin) float64
-    window : (profile or 1, bin) bool
-        Bins of the reference window.
-    range_ : (bin,) float64
-        m, ascending.
-    air : three of (profile or 1, bin) float64
-        Backscatter and extinction of the air, lidar ratio of the particles.
-    scattering_ratio : (profile or 1,) float64
-        In the reference window.
-    errors : two of (profile or 1, bin) float64
-        Of the lidar ratio in sr, and of the air, relative.
-    causes : (profile or 1, 3) float64
-        Standard error of the background, relative one of the scattering ratio, and the integral
-        correlation length of the noise in bins.
+    given : Given
     limits : (4,) float64
         Longest gap that is integrated over, m; least share of the denominator at the reference;
         least square of the denominator over its variance; that over the variance by noise below
@@ -448,6 +435,7 @@ def invert_fernald(
     state : (profile, bin) uint8
         Output: the state of each bin.
     """
+    variance, window, range_, air, scattering_ratio, errors, causes = given
     varied = max(
         air[0].shape[0], air[1].shape[0], air[2].shape[0], scattering_ratio.size,
         errors[0].shape[0], errors[1].shape[0],
@@ -474,8 +462,8 @@ def invert_fernald(
         if start >= 0:
             for direction in (1, -1):
                 _integrate(
-                    power[k], noise, in_window, range_, path, start, direction, calibration,
-                    limits[0], work, state[k],
+                    power[k], noise, in_window, path, start, direction, calibration, limits[0],
+                    work, state[k],
                 )  # fmt: skip
             # Means and integrals over many bins.
             work[OTHERS] *= cause[2]
@@ -486,14 +474,9 @@ def invert_fernald(
         if nearest >= 0:
             scale = _scale(nearest, noise, range_, path, by_reference, cause[0], work, out[:, k])
             _attenuate(
-                power[k],
-                noise,
-                cause[0],
-                range_,
-                scale,
-                out[ATTENUATED, k],
+                power[k], noise, cause[0], range_, scale, out[ATTENUATED, k],
                 out[ATTENUATED_ERROR, k],
-            )
+            )  # fmt: skip
             scalars[k, CONSTANT] = scale[0]
             relative = scale[1] ** 2 + scale[2] ** 2 + scale[3] ** 2
             scalars[k, CONSTANT_ERROR] = scale[0] * math.sqrt(relative)

@@ -16,10 +16,8 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, frozen, root_sum_square
+from lidarops.retrieve.common.arrays import Array, Booleans, Codes, frozen, root_sum_square
 from lidarops.retrieve.elastic import _fernald
-
-Reference = tuple[npt.ArrayLike, npt.ArrayLike]
 
 CAUSES: Final = (
     "noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline"
@@ -61,6 +59,40 @@ _LIMITS: Final = np.array(
     ]
 )
 """Limits of the kernel."""
+
+
+class Air(NamedTuple):
+    """Clean air along the beam, broadcast against the power."""
+
+    backscatter: npt.ArrayLike
+    """(..., range), m-1 sr-1."""
+    extinction: npt.ArrayLike
+    """(..., range), m-1."""
+    relative_error: npt.ArrayLike = 0.0
+    """Number or (..., range): relative standard error of the density; one error of this shape,
+    common to all bins."""
+
+
+class LidarRatio(NamedTuple):
+    """Lidar ratio of the particles, a number or (..., range)."""
+
+    value: npt.ArrayLike
+    """sr."""
+    standard_error: npt.ArrayLike = 0.0
+    """sr; one error of this shape, common to all bins."""
+
+
+class Reference(NamedTuple):
+    """The reference window, and the air in it."""
+
+    edges: tuple[npt.ArrayLike, npt.ArrayLike]
+    """Bottom and top in m, one pair or one for each profile (NaN: none for that profile)."""
+    scattering_ratio: npt.ArrayLike = 1.0
+    """Number or (...); 1 is air free of particles."""
+    relative_error: npt.ArrayLike = 0.0
+    """Number or (...): relative standard error of the scattering ratio. It alone covers particles
+    whose backscatter falls with height nearly as that of air, which no test of the signal
+    reveals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,16 +173,11 @@ def invert_elastic(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     *,
-    molecular_backscatter: npt.ArrayLike,
-    molecular_extinction: npt.ArrayLike,
-    lidar_ratio: npt.ArrayLike,
+    air: Air,
+    lidar_ratio: LidarRatio,
     reference: Reference,
-    reference_scattering_ratio: npt.ArrayLike = 1.0,
     variance: npt.ArrayLike | None = None,
     background_standard_error: npt.ArrayLike = 0.0,
-    lidar_ratio_standard_error: npt.ArrayLike = 0.0,
-    reference_relative_error: npt.ArrayLike = 0.0,
-    molecular_relative_error: npt.ArrayLike = 0.0,
     dead_time_error: npt.ArrayLike = 0.0,
     baseline_error: npt.ArrayLike = 0.0,
     noise_correlation_length: npt.ArrayLike = 1.0,
@@ -179,29 +206,14 @@ def invert_elastic(
         overlap is incomplete. Negative values are used as they are.
     range : (range,) float
         m, bin centres.
-    molecular_backscatter : (..., range) float
-        m-1 sr-1, broadcast against `power`.
-    molecular_extinction : (..., range) float
-        m-1, broadcast against `power`.
-    lidar_ratio : float or (..., range) float
-        Of particles, sr.
-    reference : (bottom, top)
-        Edges in m, one pair or one for each profile (NaN: none for that profile).
-    reference_scattering_ratio : float or (...) float
-        In the reference window; 1 is air free of particles.
+    air : Air
+    lidar_ratio : LidarRatio
+    reference : Reference
     variance : (..., range) float, optional
         Noise variance of a bin, in the square of the power's unit, broadcast against `power`.
         Without it, the noise error and the total errors are NaN.
     background_standard_error : float or (...) float
         In the unit of `power`; one error common to all bins of a profile.
-    lidar_ratio_standard_error : float or (..., range) float
-        sr; one error of this shape, common to all bins.
-    reference_relative_error : float or (...) float
-        Relative standard error of the scattering ratio in the reference window. It alone covers
-        particles whose backscatter falls with height nearly as that of air, which no test of the
-        signal reveals.
-    molecular_relative_error : float or (..., range) float
-        Relative standard error of the air density; one error of this shape, common to all bins.
     dead_time_error : float or (..., range) float
         In the unit of `power`: its change with one standard error of the dead time, common to all
         bins; broadcast against `power`. The inversion is repeated with it.
@@ -235,119 +247,118 @@ def invert_elastic(
     """
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    air = _air(molecular_backscatter, molecular_extinction, lidar_ratio, grid, leading)
-    ratio = _profile_values(reference_scattering_ratio, "reference_scattering_ratio", leading)
-    _require(
-        ratio > 0.0, ratio, "reference_scattering_ratio", "give 1 where air is free of particles"
-    )
     noise = np.zeros((1, grid.size))
     if variance is not None:
         noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
-    ratio_error = _errors(lidar_ratio_standard_error, "lidar_ratio_standard_error", grid, leading)
-    air_error = _errors(molecular_relative_error, "molecular_relative_error", grid, leading)
-    window = _window(reference, grid, leading)
-    causes = _causes(
-        {
-            "background_standard_error": background_standard_error,
-            "reference_relative_error": reference_relative_error,
-            "noise_correlation_length": noise_correlation_length,
-        },
-        leading,
+    ratio_error = _errors(lidar_ratio.standard_error, "lidar_ratio_standard_error", grid, leading)
+    air_error = _errors(air.relative_error, "molecular_relative_error", grid, leading)
+    causes = {
+        "background_standard_error": background_standard_error,
+        "reference_relative_error": reference.relative_error,
+        "noise_correlation_length": noise_correlation_length,
+    }
+    window = _window(reference.edges, grid, leading)
+    given = _fernald.Given(
+        frozen(noise),
+        frozen(window),
+        frozen(grid),
+        _air(air, lidar_ratio.value, grid, leading),
+        frozen(_scattering_ratio(reference, leading)),
+        (frozen(ratio_error), frozen(air_error)),
+        frozen(_causes(causes, leading)),
     )
-
-    def solved(power_rows: Array) -> tuple[Array, Array, npt.NDArray[np.uint8]]:
-        out = np.empty((_fernald.FIELDS, *rows.shape))
-        scalars = np.empty((len(rows), _fernald.SCALARS))
-        state = np.empty(rows.shape, dtype=np.uint8)
-        _fernald.invert_fernald(
-            frozen(power_rows),
-            frozen(noise),
-            frozen(window),
-            frozen(grid),
-            (frozen(air[0]), frozen(air[1]), frozen(air[2])),
-            frozen(ratio),
-            (frozen(ratio_error), frozen(air_error)),
-            frozen(causes),
-            _LIMITS,
-            out,
-            scalars,
-            state,
-        )
-        return out, scalars, state
-
-    rows = rows.astype(np.float64, copy=False)
-    out, scalars, state = solved(rows)
-    both = [_fernald.BACKSCATTER, _fernald.ATTENUATED]
-
-    def shifted(*changes: Array) -> Array:
-        """Return the largest change of the backscatter, and add those of others to their errors."""
-        if not changes[0].any():
-            return np.zeros_like(rows)
-
-        def largest(former: Array, moved: Sequence[Array]) -> Array:
-            # Where the changed signal has no solution, the value itself is uncertain.
-            shifts = [np.where(np.isfinite(new), new - former, former) for new in moved]
-            first, last = shifts[0], shifts[-1]
-            return np.where(np.abs(first) >= np.abs(last), first, last)
-
-        moved, moved_scalars, _ = zip(*(solved(rows + change) for change in changes), strict=True)
-        shift = largest(out[both], [new[both] for new in moved])
-        of_constant = largest(
-            scalars[:, _fernald.CONSTANT], [new[:, _fernald.CONSTANT] for new in moved_scalars]
-        )
-        for errors, change in (
-            (out[_fernald.ATTENUATED_ERROR], shift[1]),
-            (scalars[:, _fernald.CONSTANT_ERROR], of_constant),
-        ):
-            errors[:] = np.hypot(errors, change)
-        return np.asarray(shift[0])
-
-    dead_time = shifted(inputs.noise_rows(dead_time_error, "dead_time_error", grid, leading))
+    solution = _Solution(rows.astype(np.float64, copy=False), given)
+    dead_time = solution.shifted(
+        inputs.noise_rows(dead_time_error, "dead_time_error", grid, leading)
+    )
     change = inputs.noise_rows(baseline_error, "baseline_error", grid, leading)
     # Its shape is not known: that of the window and that of the other bins would cancel. The
     # inversion is not linear where it exceeds the signal of the window, so both signs are tried.
     parts = [np.where(inside, change, 0.0) for inside in (window, ~window)]
-    baseline = np.hypot(*(shifted(part, -part) for part in parts))
+    baseline = np.hypot(*(solution.shifted(part, -part) for part in parts))
     if variance is None:
-        out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
-        scalars[:, _fernald.CONSTANT_ERROR] = np.nan
+        solution.out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
+        solution.scalars[:, _fernald.CONSTANT_ERROR] = np.nan
+    return solution.result(leading, dead_time, baseline)
 
-    def profiles(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        shape = (*leading, grid.size)
-        return rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
 
-    values = [profiles(rows) for rows in out]
-    errors = (
-        *values[_fernald.NOISE : _fernald.MOLECULAR + 1],
-        *map(profiles, (dead_time, baseline)),
-    )
-    return ElasticResult(
-        backscatter=values[_fernald.BACKSCATTER],
-        budget=dict(zip(CAUSES, errors, strict=True)),
-        attenuated_backscatter=values[_fernald.ATTENUATED],
-        attenuated_backscatter_standard_error=values[_fernald.ATTENUATED_ERROR],
-        lidar_constant=scalars[:, _fernald.CONSTANT].reshape(leading),
-        lidar_constant_standard_error=scalars[:, _fernald.CONSTANT_ERROR].reshape(leading),
-        molecular_backscatter=profiles(air[0]),
-        lidar_ratio=profiles(air[2]),
-        lidar_ratio_standard_error=profiles(ratio_error),
-        molecular_relative_error=profiles(air_error),
-        valid=profiles(state == _fernald.VALID),
-        unstable=profiles(state == _fernald.UNSTABLE),
-        calibrated=np.any(state != _fernald.MISSING, axis=-1).reshape(leading),
-    )
+class _Solution:
+    """The solution of profiles, (profile, bin), and its changes with their power."""
+
+    def __init__(self, rows: Array, given: _fernald.Given) -> None:
+        self._rows, self._given = rows, given
+        self.out, self.scalars, self._state = self._solved(rows)
+
+    def _solved(self, rows: Array) -> tuple[Array, Array, Codes]:
+        """Return the values of bins and of profiles, and the states of bins."""
+        out = np.empty((_fernald.FIELDS, *self._rows.shape))
+        scalars = np.empty((len(self._rows), _fernald.SCALARS))
+        state = np.empty(self._rows.shape, dtype=np.uint8)
+        _fernald.invert_fernald(frozen(rows), self._given, _LIMITS, out, scalars, state)
+        return out, scalars, state
+
+    def shifted(self, *changes: Array) -> Array:
+        """Return the largest change of the backscatter, and add those of others to their errors."""
+        if not changes[0].any():
+            return np.zeros_like(self._rows)
+        others = [self._solved(self._rows + change) for change in changes]
+        both, constant = [_fernald.BACKSCATTER, _fernald.ATTENUATED], _fernald.CONSTANT
+        shift = _largest(self.out[both], [out[both] for out, _, _ in others])
+        of_constant = _largest(
+            self.scalars[:, constant], [scalars[:, constant] for _, scalars, _ in others]
+        )
+        for errors, change in (
+            (self.out[_fernald.ATTENUATED_ERROR], shift[1]),
+            (self.scalars[:, _fernald.CONSTANT_ERROR], of_constant),
+        ):
+            errors[:] = np.hypot(errors, change)
+        return np.asarray(shift[0])
+
+    def result(self, leading: tuple[int, ...], dead_time: Array, baseline: Array) -> ElasticResult:
+        """Return the result with the leading axes of the power."""
+
+        def profiles(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            shape = (*leading, rows.shape[-1])
+            return rows.reshape(shape) if rows.shape[0] != 1 else np.broadcast_to(rows[0], shape)
+
+        values = [profiles(rows) for rows in self.out]
+        errors = (
+            *values[_fernald.NOISE : _fernald.MOLECULAR + 1],
+            *map(profiles, (dead_time, baseline)),
+        )
+        molecular_backscatter, _, lidar_ratio = self._given.air
+        ratio_error, air_error = self._given.errors
+        return ElasticResult(
+            backscatter=values[_fernald.BACKSCATTER],
+            budget=dict(zip(CAUSES, errors, strict=True)),
+            attenuated_backscatter=values[_fernald.ATTENUATED],
+            attenuated_backscatter_standard_error=values[_fernald.ATTENUATED_ERROR],
+            lidar_constant=self.scalars[:, _fernald.CONSTANT].reshape(leading),
+            lidar_constant_standard_error=self.scalars[:, _fernald.CONSTANT_ERROR].reshape(leading),
+            molecular_backscatter=profiles(molecular_backscatter),
+            lidar_ratio=profiles(lidar_ratio),
+            lidar_ratio_standard_error=profiles(ratio_error),
+            molecular_relative_error=profiles(air_error),
+            valid=profiles(self._state == _fernald.VALID),
+            unstable=profiles(self._state == _fernald.UNSTABLE),
+            calibrated=np.any(self._state != _fernald.MISSING, axis=-1).reshape(leading),
+        )
+
+
+def _largest(former: Array, moved: Sequence[Array]) -> Array:
+    """Return the larger of one or two changes, by size."""
+    # Where the changed signal has no solution, the value itself is uncertain.
+    shifts = [np.where(np.isfinite(new), new - former, former) for new in moved]
+    first, last = shifts[0], shifts[-1]
+    return np.where(np.abs(first) >= np.abs(last), first, last)
 
 
 def _air(
-    molecular_backscatter: npt.ArrayLike,
-    molecular_extinction: npt.ArrayLike,
-    lidar_ratio: npt.ArrayLike,
-    grid: Array,
-    leading: tuple[int, ...],
+    air: Air, lidar_ratio: npt.ArrayLike, grid: Array, leading: tuple[int, ...]
 ) -> tuple[Array, Array, Array]:
     """Return backscatter and extinction of the air, and the lidar ratio, (profile or 1, bin)."""
-    backscatter = inputs.noise_rows(molecular_backscatter, "molecular_backscatter", grid, leading)
-    extinction = inputs.noise_rows(molecular_extinction, "molecular_extinction", grid, leading)
+    backscatter = inputs.noise_rows(air.backscatter, "molecular_backscatter", grid, leading)
+    extinction = inputs.noise_rows(air.extinction, "molecular_extinction", grid, leading)
     ratio = inputs.noise_rows(lidar_ratio, "lidar_ratio", grid, leading)
     largest = THRESHOLDS.largest_backscatter
     # The lidar ratio of air is below 10 sr.
@@ -358,7 +369,14 @@ def _air(
         _require(rows >= 0.0, rows, name, "give a molecular value of 0 or more for every bin")
         _require(rows < most, rows, name, "give m-1, not km-1")
     _require(ratio > 0.0, ratio, "lidar_ratio", "give positive sr")
-    return backscatter, extinction, ratio
+    return frozen(backscatter), frozen(extinction), frozen(ratio)
+
+
+def _scattering_ratio(reference: Reference, leading: tuple[int, ...]) -> Array:
+    name = "reference_scattering_ratio"
+    ratio = _profile_values(reference.scattering_ratio, name, leading)
+    _require(ratio > 0.0, ratio, name, "give 1 where air is free of particles")
+    return ratio
 
 
 def _causes(causes: dict[str, npt.ArrayLike], leading: tuple[int, ...]) -> Array:
@@ -391,13 +409,15 @@ def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) 
     return cast("Array", inputs.profile_values(values, name, leading, finite=False))
 
 
-def _window(reference: Reference, grid: Array, leading: tuple[int, ...]) -> Booleans:
+def _window(
+    edges: tuple[npt.ArrayLike, npt.ArrayLike], grid: Array, leading: tuple[int, ...]
+) -> Booleans:
     """Return the bins of the reference window as (profile or 1, bin)."""
-    if not isinstance(reference, tuple) or len(reference) != 2:
+    if not isinstance(edges, tuple) or len(edges) != 2:
         raise RetrievalInputError(
             "is not a pair of ranges", field="reference", remedy="give (bottom, top) in m"
         )
-    bottom, top = (_profile_values(edge, "reference", leading) for edge in reference)
+    bottom, top = (_profile_values(edge, "reference", leading) for edge in edges)
     if np.any(bottom >= top):
         raise RetrievalInputError(
             "ends before it begins", field="reference", remedy="give (bottom, top) in m"

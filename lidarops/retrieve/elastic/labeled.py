@@ -16,6 +16,7 @@ from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air import reference_window as _reference
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.clouds.labeled import (
+    Clouds,
     MeanProfiles,
     MeanSignal,
     Reference,
@@ -109,7 +110,7 @@ def invert_elastic(
     averages, distance = averages.isel(range=inside), distance[inside]
     overlap = None if overlap is None else overlap[inside]
     air = air_along(molecules, station_altitude + climb * distance, distance, wavelength)
-    ratio, ratio_error = lidar_ratio(station_altitude + climb * distance)
+    ratio = _elastic.LidarRatio(*lidar_ratio(station_altitude + climb * distance))
     means = MeanProfiles(averages, distance, air, overlap, cloud_contrast(wavelength))
     signal, clouds = signal_and_clouds(
         means, averages, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
@@ -118,30 +119,20 @@ def invert_elastic(
     solution = _elastic.invert_elastic(
         signal.power,
         distance,
-        molecular_backscatter=air.backscatter,
-        molecular_extinction=air.extinction,
+        air=_elastic.Air(air.backscatter, air.extinction, molecular_relative_error),
         lidar_ratio=ratio,
-        reference=window.edges,
-        reference_scattering_ratio=reference.scattering_ratio,
+        reference=_elastic.Reference(
+            window.edges,
+            reference.scattering_ratio,
+            window.relative_error(reference.relative_error),
+        ),
         variance=means.variance,
         background_standard_error=signal.background_standard_error,
-        lidar_ratio_standard_error=ratio_error,
-        reference_relative_error=window.relative_error(reference.relative_error),
-        molecular_relative_error=molecular_relative_error,
         **_systematic_errors(averages, means, signal),
         noise_correlation_length=means.correlation_length,
     )
-    quality = means.quality
-    quality |= _solution_flags(solution, window, signal, quality)
-    cloudy = _with_beyond(with_margin(clouds.mask, distance), distance, window)
-    partly = _with_beyond(with_margin(clouds.partly, distance), distance, window)
-    for mask, bit in (
-        (cloudy, ElasticQuality.CLOUD),
-        (partly & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
-        (_with_beyond(_negative(solution), distance, window), ElasticQuality.NEGATIVE_BACKSCATTER),
-        (means.unknown_overlap, ElasticQuality.UNKNOWN_OVERLAP),
-    ):
-        quality |= mask.astype(np.int32) * np.int32(bit)
+    quality = means.quality | _solution_flags(solution, window, signal, means.quality)
+    quality |= _sky_flags(solution, means, clouds, window)
     profiles = {
         name: np.where(solution.valid, values, np.nan)
         for name, values in _profile_variables(solution).items()
@@ -151,8 +142,8 @@ def invert_elastic(
             **{name: (("time", "range"), values) for name, values in profiles.items()},
             "molecular_backscatter": ("range", air.backscatter),
             "molecular_extinction": ("range", air.extinction),
-            "lidar_ratio": ("range", ratio),
-            "lidar_ratio_standard_error": ("range", ratio_error),
+            "lidar_ratio": ("range", ratio.value),
+            "lidar_ratio_standard_error": ("range", ratio.standard_error),
             "vertical_resolution": float(np.median(np.diff(distance))),
             **window_variables(window, reference, station_altitude, climb),
             "cloud_mask": (("time", "range"), clouds.state),
@@ -195,6 +186,30 @@ def _solution_flags(
     bits[signal.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     unsolved = window.chosen[:, np.newaxis] & ~solution.valid & ((quality & WITHHELD) == 0)
     bits[unsolved] |= np.int32(ElasticQuality.UNSTABLE_INVERSION)
+    return bits
+
+
+def _sky_flags(
+    solution: _elastic.ElasticResult,
+    means: MeanProfiles,
+    clouds: Clouds,
+    window: _reference.ReferenceWindow,
+) -> Flags:
+    """Return the bits of clouds, of backscatter below zero and of an unknown overlap."""
+
+    def with_beyond(mask: Booleans) -> Booleans:
+        return _with_beyond(mask, means.distance, window)
+
+    cloudy = with_beyond(with_margin(clouds.mask, means.distance))
+    partly = with_beyond(with_margin(clouds.partly, means.distance))
+    bits = np.zeros(solution.valid.shape, dtype=np.int32)
+    for mask, bit in (
+        (cloudy, ElasticQuality.CLOUD),
+        (partly & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
+        (with_beyond(_negative(solution)), ElasticQuality.NEGATIVE_BACKSCATTER),
+        (means.unknown_overlap, ElasticQuality.UNKNOWN_OVERLAP),
+    ):
+        bits[mask] |= np.int32(bit)
     return bits
 
 

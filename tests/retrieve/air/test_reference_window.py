@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.cases import each
+from support.inversions import invert_elastic
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -15,7 +16,6 @@ from lidarops.retrieve.air.reference_window import (
     candidate_windows,
     choose_reference,
 )
-from lidarops.retrieve.elastic.inversion import invert_elastic
 
 AIR = MolecularProfile.us_standard()
 RANGE = 15.0 * (np.arange(900) + 0.5)[20:]

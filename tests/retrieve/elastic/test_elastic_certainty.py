@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.inversions import invert_elastic
 
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.elastic.inversion import invert_elastic
 
 AIR = MolecularProfile.us_standard()
 RANGE = 7.5 * (np.arange(1400) + 0.5)[20:]

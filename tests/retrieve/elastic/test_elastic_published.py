@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from support.inversions import invert_elastic
 
 from lidarops.flags import Quality
 from lidarops.products.elastic import ReferenceSettings
 from lidarops.raw import licel
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.elastic import labeled
-from lidarops.retrieve.elastic.inversion import invert_elastic
 from lidarops.retrieve.signal.counts_to_signal import photon_signal
 
 GREEN = 532e-9

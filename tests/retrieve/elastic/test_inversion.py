@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
+from support.inversions import invert_elastic
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.clouds.outlying_bins import bridge_outliers
-from lidarops.retrieve.elastic.inversion import THRESHOLDS, invert_elastic
+from lidarops.retrieve.elastic.inversion import THRESHOLDS
 
 GREEN = 532e-9
 AIR = MolecularProfile.us_standard()

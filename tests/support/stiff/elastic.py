@@ -14,8 +14,8 @@ from benchmarks.accuracy import elastic_cases
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.clouds import layers
-from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
+from support.inversions import invert_elastic
 from support.stiff.cases import (
     Accepted,
     Answer,
@@ -71,7 +71,7 @@ def truth() -> Array:
 
 def solve_elastic(compared: tuple[float, float] = (500.0, 6000.0), **arguments: Any) -> Answer:
     """Return the inverted backscatter of particles between two ranges."""
-    result = inversion.invert_elastic(**arguments)
+    result = invert_elastic(**arguments)
     r = np.asarray(arguments["range"])
     inside = (r >= compared[0]) & (r <= compared[1])
     bits = np.where(result.valid, np.int32(0), np.int32(ElasticQuality.UNSTABLE_INVERSION))
