@@ -16,7 +16,7 @@ from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
-from lidarops.simulate.signal import relative_signal
+from lidarops.simulate.signal import optical_depth
 
 BINS: Final = 225
 BACKGROUND: Final = 370.0
@@ -38,6 +38,27 @@ _AMPLITUDES: Final = (15.0, 1e2, 1e3, 1e4, 1e5)
 _SOLVABLE: Final = 0.1
 _QUICK: Final = 8
 _SEED: Final = 20240915
+
+
+def relative_signal(distance: Array, extinction: Array, backscatter: Array) -> Array:
+    r"""Return the signal of backscatter beyond full overlap, over that of the first bin, 1.
+
+    Parameters
+    ----------
+    distance : ndarray, m, shape (bins,)
+        Range of the bin centres, positive and ascending.
+    extinction, backscatter : ndarray, shape (..., bins)
+        m-1, and in any unit.
+
+    Notes
+    -----
+    :math:`(\beta_i / \beta_0) (R_0 / R_i)^2 \exp(-2 (\tau_i - \tau_0))` is defined also where
+    nothing of the signal itself is left in the first bin.
+    """
+    depth = optical_depth(distance, extinction)
+    shape = backscatter / backscatter[..., :1] * (distance[0] / distance) ** 2
+    signal: Array = shape * np.exp(-2.0 * (depth - depth[..., :1]))
+    return signal
 
 
 @dataclass(frozen=True, slots=True)

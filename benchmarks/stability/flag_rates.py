@@ -47,7 +47,9 @@ def few_counts(cluster: int, *, counts: float) -> Iterator[Part]:
     mean = counts * (1.0 + signal * fall)
     drawn = rng.poisson(mean, (_COUNTED, mean.size)).astype(float)
     for limits, exposure in (("normal limits", None), ("Poisson limits, as in products", 1.0)):
-        fit = path_fit.fit_homogeneous_path(drawn, distance, variance=mean, exposure=exposure)
+        fit = path_fit.fit_homogeneous_path(
+            drawn, distance, variance=mean, noise=path_fit.Noise(exposure=exposure)
+        )
         for bit in (Quality.OUTLIER, HomogeneousQuality.POOR_FIT):
             flagged = float(np.count_nonzero(fit.quality & np.int32(bit)))
             yield Part(f"{bit.name}, {limits}", f"{counts:g} counts a bin", flagged, _COUNTED)

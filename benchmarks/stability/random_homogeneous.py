@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from scipy import stats
 
+from benchmarks.accuracy.homogeneous_cases import relative_signal
 from benchmarks.accuracy.multiangle_cases import correlated
 from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import COVERED, Failure, ScoredValues
@@ -16,7 +17,6 @@ from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
-from lidarops.simulate.signal import relative_signal
 
 Random = np.random.Generator
 
@@ -316,8 +316,8 @@ def score_correlated_noise(cluster: int, profiles: int) -> Iterator[ScoredValues
         length = (1.0 + correlation) / (1.0 - correlation)
         for words, options in (
             ("not stated", {}),
-            ("stated", {"noise_correlation_length": length}),
-            ("estimated, as in products", {"noise_correlation_length": estimated}),
+            ("stated", {"noise": path_fit.Noise(correlation_length=length)}),
+            ("estimated, as in products", {"noise": path_fit.Noise(correlation_length=estimated)}),
         ):
             failure = Failure(
                 f"AR(1) {correlation:g}, correlation {words}", satisfied=bool(options),

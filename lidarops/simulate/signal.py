@@ -76,27 +76,6 @@ def optical_depth(distance: Array, extinction: Array) -> Array:
     return depth
 
 
-def relative_signal(distance: Array, extinction: Array, backscatter: Array) -> Array:
-    r"""Return the signal of backscatter beyond full overlap, over that of the first bin, 1.
-
-    Parameters
-    ----------
-    distance : ndarray, m, shape (bins,)
-        Range of the bin centres, positive and ascending.
-    extinction, backscatter : ndarray, shape (..., bins)
-        m-1, and in any unit.
-
-    Notes
-    -----
-    :math:`(\beta_i / \beta_0) (R_0 / R_i)^2 \exp(-2 (\tau_i - \tau_0))` is defined also where
-    nothing of the signal itself is left in the first bin.
-    """
-    depth = optical_depth(distance, extinction)
-    shape = backscatter / backscatter[..., :1] * (distance[0] / distance) ** 2
-    signal: Array = shape * np.exp(-2.0 * (depth - depth[..., :1]))
-    return signal
-
-
 def backscatter_signal(
     distance: Array,
     *,

@@ -18,6 +18,7 @@ from lidarops.products.homogeneous.variables import LAYOUT
 from lidarops.records import DetectionMode, is_glued
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.homogeneous import labeled
+from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import (
     CORRELATION_LENGTH,
@@ -295,9 +296,11 @@ class _Sections(ProductStream):
             quality=quality,
             method=settings.method,
             extinction=settings.extinction,
-            relative_variance=estimated,
-            noise_correlation_length=conditioned[CORRELATION_LENGTH],
-            exposure=None if counts is None else xr.DataArray(counts, dims="time"),
+            noise=Noise(
+                relative=estimated,
+                correlation_length=conditioned[CORRELATION_LENGTH],
+                exposure=None if counts is None else xr.DataArray(counts, dims="time"),
+            ),
         )
         fitted = fit(conditioned["power"])
         error = baseline_error(conditioned, decaying=True)

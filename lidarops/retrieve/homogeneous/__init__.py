@@ -15,7 +15,8 @@ the numerics stay free of xarray.
 from lidarops.retrieve.homogeneous.path_fit import (
     HomogeneousMethod,
     HomogeneousResult,
+    Noise,
     fit_homogeneous_path,
 )
 
-__all__ = ["HomogeneousMethod", "HomogeneousResult", "fit_homogeneous_path"]
+__all__ = ["HomogeneousMethod", "HomogeneousResult", "Noise", "fit_homogeneous_path"]

@@ -14,6 +14,7 @@ from lidarops.retrieve.background.estimate import Background, from_bounded_tail
 from lidarops.retrieve.common.arrays import Array, Block, Flags
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
@@ -36,6 +37,7 @@ _UNITS: Final = {
 _VARIABLES: Final = (*_UNITS, "valid_bins", "quality_flag")
 _OF_BINS: Final = ("power", "variance", "quality")
 """Values of bins; all others are of whole profiles."""
+_INDEPENDENT: Final = Noise()
 
 
 def fit_homogeneous_path(
@@ -45,11 +47,9 @@ def fit_homogeneous_path(
     variance: xr.DataArray | float | None = None,
     quality: xr.DataArray | None = None,
     method: str = "direct",
-    relative_variance: bool = False,
-    noise_correlation_length: xr.DataArray | None = None,
+    noise: Noise = _INDEPENDENT,
     background_range: tuple[float, float] | None = None,
     extinction: xr.DataArray | float | None = None,
-    exposure: xr.DataArray | None = None,
     background: tuple[float, float] | None = None,
     lag: int | None = None,
 ) -> xr.Dataset:
@@ -61,16 +61,15 @@ def fit_homogeneous_path(
         Any unit; the coordinate of ``range`` ascending, in m.
     sections : sequence of (float, float)
         m; a section holds the bins with near <= range < far.
-    variance, noise_correlation_length, extinction, exposure : xr.DataArray or float, optional
+    variance, extinction : xr.DataArray or float, optional
         As for `lidarops.retrieve.homogeneous.path_fit.fit_homogeneous_path`, as are `method` and
         `lag`; their dimensions are among those of `power`.
+    noise : Noise, optional
+        Of values whose dimensions are among those of `power`.
     quality : xr.DataArray, optional
         Bits of `lidarops.flags.Quality` of each bin. Missing, saturated and incompletely
         overlapping bins are excluded; a section takes over SATURATED, PILE_UP and
         INCOMPLETE_OVERLAP from its bins.
-    relative_variance : bool
-        Whether `variance` is known up to a factor only, which each section estimates: for a
-        variance estimated from the same data.
     background_range : (float, float), optional
         m; far range whose mean is the background of "known_background", which needs `variance`. Its
         error holds the signal that may be left there. Where that cannot be estimated,
@@ -98,9 +97,9 @@ def fit_homogeneous_path(
         "power": power,
         "variance": variance,
         "quality": quality,
-        "noise_correlation_length": noise_correlation_length,
+        "noise_correlation_length": noise.correlation_length,
         "extinction": extinction,
-        "exposure": exposure,
+        "exposure": noise.exposure,
     }
     arrays = {
         name: _along(xr.DataArray(values), power, name)
@@ -108,8 +107,14 @@ def fit_homogeneous_path(
         if values is not None
     }
     bins: dict[str, Block] = {name: arrays.pop(name) for name in _OF_BINS if name in arrays}
-    known: dict[str, Any] = {name: values[..., 0] for name, values in arrays.items()}
-    known |= {"method": method, "lag": lag}
+    length = arrays.get("noise_correlation_length", 1.0)
+    of_profiles = {name: values[..., 0] for name, values in arrays.items()}
+    noise = Noise(
+        noise.relative,
+        of_profiles.pop("noise_correlation_length", None),
+        of_profiles.pop("exposure", None),
+    )
+    known: dict[str, Any] = {**of_profiles, "noise": noise, "method": method, "lag": lag}
     doubt: Any = np.int32(0)
     if background is not None:
         if background_range is not None:
@@ -120,15 +125,18 @@ def fit_homogeneous_path(
             )
         known["background"], known["background_standard_error"] = background
     elif background_range is not None:
-        length = arrays.get("noise_correlation_length", 1.0)
         sky = _far_background(bins, length, distance, background_range)
         known["background"] = sky.background
         known["background_standard_error"] = np.hypot(sky.standard_error, sky.left)
         doubt = sky.quality & np.int32(Quality.BACKGROUND_UNCERTAIN)
-    solutions = [
-        _solve(bins, distance, _bins(distance, *edge), known, doubt, relative=relative_variance)
-        for edge in edges
-    ]
+    solutions = [_solve(bins, distance, _bins(distance, *edge), known, doubt) for edge in edges]
+    return _joined(solutions, power, edges)
+
+
+def _joined(
+    solutions: Sequence[tuple[Block, ...]], power: xr.DataArray, edges: Array
+) -> xr.Dataset:
+    """Return `_VARIABLES` of all sections, with their units and coordinates."""
     dims = (*power.dims[:-1], "section")
     stacked = (np.stack(values, axis=-1) for values in zip(*solutions, strict=True))
     result = xr.Dataset(
@@ -229,19 +237,15 @@ def _solve(
     bins: slice,
     known: Mapping[str, Any],
     doubt: Flags | np.int32,
-    *,
-    relative: bool,
 ) -> tuple[Block, ...]:
     """Return `_VARIABLES` of a section, over the leading dimensions of the power.
 
     `known` are the other arguments of the fit, and `doubt` the bits of the background.
     """
     inside = {n: a[..., bins] if a.shape[-1] > 1 else a for n, a in arrays.items()}
-    noise: dict[str, Any] = {"variance": inside.get("variance")}
-    if relative and "variance" in inside:
-        with np.errstate(divide="ignore"):
-            noise = {"weights": 1.0 / inside["variance"]}
-    fit = _homogeneous.fit_homogeneous_path(_usable(inside), distance[bins], **noise, **known)
+    fit = _homogeneous.fit_homogeneous_path(
+        _usable(inside), distance[bins], variance=inside.get("variance"), **known
+    )
     bits = fit.quality | doubt
     if "quality" in inside:
         bits = bits | np.bitwise_or.reduce(inside["quality"] & CARRIED, axis=-1).astype(np.int32)

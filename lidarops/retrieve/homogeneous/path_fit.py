@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.homogeneous import _methods
 from lidarops.retrieve.homogeneous._problem import HomogeneousResult, PathProblem
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
-__all__ = ["HomogeneousMethod", "HomogeneousResult", "fit_homogeneous_path"]
+__all__ = ["HomogeneousMethod", "HomogeneousResult", "Noise", "fit_homogeneous_path"]
 
 
 class HomogeneousMethod(StrEnum):
@@ -48,18 +49,34 @@ _TAKES: Final = {
 """Arguments that only these methods accept."""
 
 
+class Noise(NamedTuple):
+    """What is known of the noise beside its variance."""
+
+    relative: bool = False
+    """Whether the variance is known up to a common factor only, which the residuals of each profile
+    give: for a variance that is estimated from the same data."""
+    correlation_length: npt.ArrayLike | None = None
+    """(...) float, bins, at least 1; the integral correlation length
+    (`lidarops.retrieve.signal.noise_correlation`). Bins are independent where not given."""
+    exposure: npt.ArrayLike | None = None
+    """(...) float, of Poisson counts: counts per unit of power, as for
+    `lidarops.retrieve.background.known_shape.fit_known_shape`. With few counts, the limits of
+    OUTLIER and POOR_FIT are those of Poisson noise of the given variance, which is required."""
+
+
+_INDEPENDENT: Final = Noise()
+
+
 def fit_homogeneous_path(
     power: npt.ArrayLike,
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     *,
     variance: npt.ArrayLike | None = None,
-    weights: npt.ArrayLike | None = None,
+    noise: Noise = _INDEPENDENT,
     method: str = "direct",
     extinction: npt.ArrayLike | None = None,
     background: npt.ArrayLike | None = None,
     background_standard_error: npt.ArrayLike | None = None,
-    noise_correlation_length: npt.ArrayLike | None = None,
-    exposure: npt.ArrayLike | None = None,
     lag: int | None = None,
 ) -> HomogeneousResult:
     r"""Return background, amplitude and extinction of a homogeneous path.
@@ -76,9 +93,7 @@ def fit_homogeneous_path(
         Noise variance in the square of the power's unit, broadcast against `power`; a scalar
         holds for every bin. Bins whose variance is zero or not finite are excluded. For counts,
         give that of a mean profile: variances from the counts of the profile itself bias the fit.
-    weights : (..., range) float, optional
-        Inverse variances up to a common factor, in place of `variance`. Bins whose weight is
-        not positive and finite are excluded.
+    noise : Noise, optional
     method : str
         One of the methods of the notes below.
     extinction : (...) float, optional
@@ -87,13 +102,6 @@ def fit_homogeneous_path(
         For "known_background", in the unit of the power.
     background_standard_error : (...) float, optional
         Of the given background, which must not come from the same bins; 0 where not given.
-    noise_correlation_length : (...) float, optional
-        Bins, at least 1; the integral correlation length of the noise
-        (`lidarops.retrieve.signal.noise_correlation`). Bins are independent where not given.
-    exposure : (...) float, optional
-        For Poisson counts: counts per unit of power, as for
-        `lidarops.retrieve.background.known_shape.fit_known_shape`. With few counts, the limits of
-        OUTLIER and POOR_FIT are those of Poisson noise of the given variance, which is required.
     lag : int, optional
         Of "cubic": bins between those of a triple, by default that of
         `lidarops.retrieve.background.cubic`.
@@ -101,12 +109,12 @@ def fit_homogeneous_path(
     Returns
     -------
     HomogeneousResult
-        Without `variance`, the noise is estimated from second differences of the residuals
-        along range and scales the standard errors; with n bins they have 0.51 (n - 2) degrees
-        of freedom. They are widened by Student's distribution, so that 1.96 of them hold 95
-        percent: by 1 percent at 225 bins, 5 at 50, 15 at 20, and 60 at 8. No factor can also hold
-        the normal share of values within 4 of them: beyond are 0.03 percent at 50 bins, 0.12 at 20
-        and 0.7 at 8. NOISE_UNCERTAIN marks values from fewer than 32 bins.
+        Without a `variance`, or with a relative one, the noise is estimated from second
+        differences of the residuals along range and scales the standard errors; with n bins they
+        have 0.51 (n - 2) degrees of freedom. They are widened by Student's distribution, so that
+        1.96 of them hold 95 percent: by 1 percent at 225 bins, 5 at 50, 15 at 20, and 60 at 8. No
+        factor can also hold the normal share of values within 4 of them: beyond are 0.03 percent at
+        50 bins, 0.12 at 20 and 0.7 at 8. NOISE_UNCERTAIN marks values from fewer than 32 bins.
 
         With a correlation length s, standard errors are sqrt(s) times those of independent bins,
         and where s exceeds 1, noise is estimated from second differences of bins a twentieth of
@@ -178,34 +186,65 @@ def fit_homogeneous_path(
     )
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    known_variance = variance is not None
-    if known_variance and weights is not None:
-        raise RetrievalInputError(
-            "is given together with variance", field="weights", remedy="give one of the two"
-        )
-    noise = inputs.noise_rows(
-        variance if known_variance else weights,
-        "variance" if known_variance else "weights",
-        grid,
-        leading,
-        negative=not known_variance,
-    )
     error = inputs.profile_values(background_standard_error, "background_standard_error", leading)
     if error is not None and np.any(error < 0):
         raise RetrievalInputError("is negative", field="background_standard_error")
+    length = float(grid[-1] - grid[0]) if grid.size > 1 else 1.0
+    known_variance = variance is not None and not noise.relative
+    correlation_length, exposure = _noise_of_profiles(noise, leading, known_variance=known_variance)
+    problem = PathProblem(
+        power=rows,
+        range=grid,
+        noise=_variances_or_weights(variance, grid, leading, relative=noise.relative),
+        known_variance=known_variance,
+        bounds=(
+            THRESHOLDS.lowest_extinction / float(grid[-1]),
+            THRESHOLDS.highest_optical_depth / length,
+        ),
+        correlation_length=correlation_length,
+        extinction=_known_extinction(extinction, length, leading),
+        background=inputs.profile_values(background, "background", leading),
+        background_variance=None if error is None else error**2,
+        exposure=exposure,
+        lag=lag,
+    )
+    return inputs.with_leading_axes(_SOLVERS[chosen_method](problem), leading)
+
+
+def _variances_or_weights(
+    variance: npt.ArrayLike | None, grid: Array, leading: tuple[int, ...], *, relative: bool
+) -> Array:
+    """Return variances, or weights of relative ones, as (profile or 1, bin); ones for None."""
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
+    if not relative:
+        return noise
+    with np.errstate(divide="ignore"):
+        return 1.0 / noise
+
+
+def _noise_of_profiles(
+    noise: Noise, leading: tuple[int, ...], *, known_variance: bool
+) -> tuple[Array, Array | None]:
+    """Return correlation length and exposure, (profile or 1,)."""
     correlated = inputs.profile_values(
-        noise_correlation_length, "noise_correlation_length", leading
+        noise.correlation_length, "noise_correlation_length", leading
     )
     if correlated is not None and np.any(correlated < 1):
         raise RetrievalInputError("is less than 1 bin", field="noise_correlation_length")
-    counted = inputs.profile_values(exposure, "exposure", leading)
+    counted = inputs.profile_values(noise.exposure, "exposure", leading)
     if counted is not None and not (known_variance and np.all(counted > 0)):
         raise RetrievalInputError(
             "is not positive, or given without variance",
             field="exposure",
             remedy="give counts per unit of power with the variance of the counts",
         )
-    length = float(grid[-1] - grid[0]) if grid.size > 1 else 1.0
+    return np.ones(1) if correlated is None else correlated, counted
+
+
+def _known_extinction(
+    extinction: npt.ArrayLike | None, length: float, leading: tuple[int, ...]
+) -> Array | None:
+    """Return the prior or known extinction in m-1, (profile or 1,)."""
     prior = inputs.profile_values(extinction, "extinction", leading)
     limit = THRESHOLDS.largest_optical_depth / length
     if prior is not None and np.any(np.abs(prior) > limit):
@@ -215,23 +254,7 @@ def fit_homogeneous_path(
             remedy=f"stay within +-{limit:g} m-1"
             f" ({THRESHOLDS.largest_optical_depth:g} over the length)",
         )
-    problem = PathProblem(
-        power=rows,
-        range=grid,
-        noise=noise,
-        known_variance=known_variance,
-        bounds=(
-            THRESHOLDS.lowest_extinction / float(grid[-1]),
-            THRESHOLDS.highest_optical_depth / length,
-        ),
-        correlation_length=np.ones(1) if correlated is None else correlated,
-        extinction=prior,
-        background=inputs.profile_values(background, "background", leading),
-        background_variance=None if error is None else error**2,
-        exposure=counted,
-        lag=lag,
-    )
-    return inputs.with_leading_axes(_SOLVERS[chosen_method](problem), leading)
+    return prior
 
 
 def _check_arguments(method: HomogeneousMethod, given: Mapping[str, object]) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.cases import each
 from support.oracles.homogeneous import GEOMETRIES, iterated_fit, lowest_errors, section, signal
+from support.weights import by_weights
 
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -55,7 +56,7 @@ def test_result_is_the_least_squares_minimum_with_the_errors_of_its_information(
     r, power, variance = measured(case, kind, 10)
     weights = np.where(np.isfinite(power), 1.0 / variance, 0.0)
     fit = fit_homogeneous_path(power, r, variance=variance)
-    unscaled = fit_homogeneous_path(power, r, weights=3.0 * weights)
+    unscaled = fit_homogeneous_path(power, r, **by_weights(3.0 * weights))
     np.testing.assert_allclose(unscaled.extinction, fit.extinction, rtol=1e-9)
     relative_error = fit.amplitude_standard_error / fit.amplitude
     stated = fit.background_standard_error, relative_error, fit.extinction_standard_error
@@ -112,7 +113,7 @@ def test_noise_free_extinction_is_exact(start, length, level, kind):
     truth = np.geomspace(1e-5, 20.0 / length, 120)[:, np.newaxis]
     power = level + np.exp(-2.0 * truth * (r - start)) * (start / r) ** 2
     weights = weights_of(kind, truth.size)
-    fit = fit_homogeneous_path(power, r, weights=weights)
+    fit = fit_homogeneous_path(power, r, **by_weights(weights))
     if kind in ("near", "all"):
         # A signal that has decayed before the first valid bin holds no information.
         valid = truth[:, 0] * (r[20] - start) < 3.0

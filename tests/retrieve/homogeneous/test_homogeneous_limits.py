@@ -12,7 +12,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
-from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
+from lidarops.retrieve.homogeneous.path_fit import Noise, fit_homogeneous_path
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 
@@ -126,13 +126,13 @@ def test_few_counts_are_neither_outlying_nor_a_poor_fit(counts):
     flagged = {
         name: np.mean(fit_homogeneous_path(power, r, variance=mean / exposure, **given).quality
                       & tests != 0)
-        for name, given in (("normal", {}), ("counts", {"exposure": exposure}))
+        for name, given in (("normal", {}), ("counts", {"noise": Noise(exposure=exposure)}))
     }  # fmt: skip
     assert flagged["normal"] > 0.02
     assert flagged["counts"] < 2e-3
     # An outlier is still found.
     power[:, 150] += 30.0 / exposure
-    fit = fit_homogeneous_path(power, r, variance=mean / exposure, exposure=exposure)
+    fit = fit_homogeneous_path(power, r, variance=mean / exposure, noise=Noise(exposure=exposure))
     assert np.all(fit.quality & int(Quality.OUTLIER))
 
 
@@ -141,11 +141,14 @@ def test_many_counts_have_the_limits_of_normal_noise():
     r = np.linspace(500.0, 3500.0, 200)
     mean = 1e5 + 1e6 * (r[0] / r) ** 2
     power = rng.poisson(mean, (200, r.size)).astype(float)
-    fits = [fit_homogeneous_path(power, r, variance=mean, **g) for g in ({}, {"exposure": 1.0})]
+    fits = [
+        fit_homogeneous_path(power, r, variance=mean, **g)
+        for g in ({}, {"noise": Noise(exposure=1.0)})
+    ]
     assert np.array_equal(fits[0].extinction, fits[1].extinction)
     assert np.array_equal(fits[0].quality, fits[1].quality)
     with pytest.raises(RetrievalInputError, match="exposure"):
-        fit_homogeneous_path(power, r, exposure=1.0)
+        fit_homogeneous_path(power, r, noise=Noise(exposure=1.0))
 
 
 def test_labeled_profiles_take_their_exposures():
@@ -155,7 +158,7 @@ def test_labeled_profiles_take_their_exposures():
     mean = 0.2 + 40.0 * (r[0] / r) ** 2
     power = rng.poisson(mean * exposure[:, np.newaxis]) / exposure[:, np.newaxis]
     variance = mean / exposure[:, np.newaxis]
-    fit = fit_homogeneous_path(power, r, variance=variance, exposure=exposure)
+    fit = fit_homogeneous_path(power, r, variance=variance, noise=Noise(exposure=exposure))
     result = labeled.fit_homogeneous_path(
         xr.DataArray(
             power,
@@ -165,7 +168,7 @@ def test_labeled_profiles_take_their_exposures():
         ),
         sections=[(0.0, 4000.0)],
         variance=xr.DataArray(variance, dims=("time", "range")),
-        exposure=xr.DataArray(exposure, dims="time"),
+        noise=Noise(exposure=xr.DataArray(exposure, dims="time")),
     )
     assert np.array_equal(result["quality_flag"][:, 0], fit.quality)
     assert np.array_equal(result["total_extinction"][:, 0], fit.extinction, equal_nan=True)

@@ -18,6 +18,7 @@ from support.oracles.homogeneous import (
     signal,
     table_profiles,
 )
+from support.weights import by_weights
 
 from lidarops.errors import RetrievalInputError
 from lidarops.kinds import flags_of
@@ -68,7 +69,9 @@ def test_linear_step_solves_the_normal_equations(weighted):
     weights = rng.uniform(0.2, 5.0, 225) if weighted else np.ones(225)
     weights[:30] = 0.0 if weighted else 1.0
     prior = 0.03 * KM * rng.uniform(0.5, 1.5, 30)
-    fit = fit_homogeneous_path(power, LONG, weights=weights, method="linearized", extinction=prior)
+    fit = fit_homogeneous_path(
+        power, LONG, **by_weights(weights), method="linearized", extinction=prior
+    )
     for k in range(30):
         expected = linear_step(LONG, power[k], weights, prior[k])
         assert fit.background[k] == pytest.approx(expected[0], rel=1e-9)
@@ -205,7 +208,7 @@ def test_errors_at_known_extinction_are_honest(height, extinction, known):
     variance = np.linspace(0.5, 1.5, 225)
     power = 370.0 + signal(LONG, height, extinction * KM)
     power = power + np.sqrt(variance) * noise(3000, seed=8)
-    arguments = {"variance": variance} if known else {"weights": 3.0 / variance}
+    arguments = {"variance": variance} if known else by_weights(3.0 / variance)
     fit = fit_homogeneous_path(
         power, LONG, method="known_extinction", extinction=extinction * KM, **arguments
     )

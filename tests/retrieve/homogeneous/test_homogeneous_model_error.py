@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.cases import each
 from support.oracles.homogeneous import iterated_fit, section, signal
+from support.weights import by_weights
 
 from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -38,7 +39,7 @@ def test_model_error_is_the_effect_of_a_bent_signal(kind, extinction, length):
     share /= np.abs(extinction) + 1.0 / r.mean()
     refit = iterated_fit(r, bent(r, extinction, share), weights, bounds)
     straight = bent(r, extinction, 0.0)[np.newaxis]
-    fit = fit_homogeneous_path(straight, r, weights=weights[np.newaxis])
+    fit = fit_homogeneous_path(straight, r, **by_weights(weights[np.newaxis]))
     moved = abs(refit[0] - 370.0)
     assert moved > 1e-4
     scale = THRESHOLDS.model_error / 1e-3

@@ -15,6 +15,7 @@ from support.oracles.homogeneous import (
     section,
     signal,
 )
+from support.weights import by_weights
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -77,7 +78,7 @@ def gaps(kind):
 def test_extinction_is_exact_without_noise(start, length, ratio, kind):
     r = section(start, length)
     extinction = np.geomspace(0.01 * KM, 50.0 / length, 300)
-    fit = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r, weights=gaps(kind))
+    fit = fit_homogeneous_path(ratio + signal(r, 1.0, extinction), r, **by_weights(gaps(kind)))
     assert np.max(np.abs(fit.extinction / extinction - 1.0)) < 1e-9
     if kind == "none":
         assert np.max(np.abs(fit.background - ratio)) < 1e-10
@@ -140,8 +141,8 @@ def test_result_follows_scale_of_power_scale_of_range_and_shift(power_2, range_2
 def test_common_factor_of_weights_does_not_matter():
     power, weights = clean(20), np.random.default_rng(2).uniform(0.2, 5.0, 225)
     same(
-        fit_homogeneous_path(power, LONG, weights=weights),
-        fit_homogeneous_path(power, LONG, weights=weights * 2.0**50),
+        fit_homogeneous_path(power, LONG, **by_weights(weights)),
+        fit_homogeneous_path(power, LONG, **by_weights(weights * 2.0**50)),
     )
 
 
@@ -382,7 +383,7 @@ def test_nothing_valid_is_missing():
     assert np.all(fit.valid_bins == 0)
     assert fit_homogeneous_path(clean(1), LONG, variance=np.inf).quality == Quality.INPUT_MISSING
     assert fit_homogeneous_path(clean(1), LONG, variance=0.0).quality == Quality.INPUT_MISSING
-    assert fit_homogeneous_path(clean(1), LONG, weights=0.0).quality == Quality.INPUT_MISSING
+    assert fit_homogeneous_path(clean(1), LONG, **by_weights(0.0)).quality == Quality.INPUT_MISSING
 
 
 @each("bins", [1, 2, 3, 4, 7, 8])
@@ -514,8 +515,7 @@ def test_masked_bins_are_excluded():
         ({"variance": np.ones(7)}, "variance", "broadcast"),
         ({"variance": np.ones((3, 225))}, "variance", "broadcast"),
         ({"variance": "1"}, "variance", "real numbers"),
-        ({"weights": np.ones(7)}, "weights", "broadcast"),
-        ({"variance": 1.0, "weights": 1.0}, "weights", "one of the two"),
+        (by_weights(np.ones(7)), "variance", "broadcast"),
         ({"method": "klett"}, "method", "direct, cubic"),
     ],
 )
@@ -538,7 +538,7 @@ def test_cubic_method_is_unbiased_and_its_errors_honest(start, length, height, e
     r, extinction, count = section(start, length), extinction * KM, 3000
     variance = np.linspace(0.5, 1.5, r.size)
     power = 370.0 + signal(r, height, extinction) + noise(count, seed=16) * np.sqrt(variance)
-    arguments = {"variance": variance} if known else {"weights": 3.0 / variance}
+    arguments = {"variance": variance} if known else by_weights(3.0 / variance)
     fit = fit_homogeneous_path(power, r, method="cubic", **arguments)
     truth = {
         "background": 370.0,

@@ -230,7 +230,7 @@ def test_estimated_noise_serves_a_retrieval_as_well_as_known_noise(
     inside = (distance >= section[0]) & (distance < section[1])
     variance = counts_to_signal.difference_variance(profiles, distance)[:, inside]
     result = path_fit.fit_homogeneous_path(
-        profiles[:, inside], distance[inside], weights=1.0 / variance
+        profiles[:, inside], distance[inside], variance=variance, noise=path_fit.Noise(True)
     )
     accepted = result.quality == 0
     score = (result.extinction - 2e-4) / result.extinction_standard_error

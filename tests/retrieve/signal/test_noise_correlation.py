@@ -9,7 +9,7 @@ from scipy import signal
 
 import lidarops
 from lidarops.retrieve.background.estimate import from_tail
-from lidarops.retrieve.homogeneous.path_fit import fit_homogeneous_path
+from lidarops.retrieve.homogeneous.path_fit import Noise, fit_homogeneous_path
 from lidarops.retrieve.signal import labeled
 from lidarops.retrieve.signal.counts_to_signal import difference_variance
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
@@ -129,8 +129,8 @@ def test_fits_of_correlated_noise_hold_their_errors(kind):
     fit = fit_homogeneous_path(
         (true + deviations)[:, section],
         r[section],
-        weights=1.0 / stated[:, section],
-        noise_correlation_length=found.length,
+        variance=stated[:, section],
+        noise=Noise(True, found.length),
     )
     score = (fit.extinction - extinction) / fit.extinction_standard_error
     assert 0.85 < rms(score) < 1.1
@@ -148,8 +148,7 @@ def test_two_layers_are_not_homogeneous_whatever_the_correlation_of_noise(bins, 
     fit = fit_homogeneous_path(
         power,
         r,
-        weights=np.ones(bins),
-        noise_correlation_length=np.full(200, length),
+        noise=Noise(True, np.full(200, length)),
         method="direct",
     )
     assert (fit.quality != 0).all()
