@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.harness.figure import Array
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
+    OpticalDepthSettings,
     retrieve_optical_depth,
 )
 
@@ -258,14 +259,13 @@ def scan_methods() -> Mapping[str, ScanSolver]:
 
 
 def retrieve(scan: Scan, method: str, **options: Any) -> MultiAngleResult:
-    """Solve all profiles of a scan as one block, with options of `retrieve_optical_depth`."""
+    """Solve all profiles of a scan as one block, with further settings."""
     return retrieve_optical_depth(
         scan.signal,
         scan.scene.zenith_angle,
         scan.scene.altitude,
         variance=scan.variance,
-        method=method,
-        **options,
+        settings=OpticalDepthSettings(method=method, **options),
     )
 
 

@@ -101,7 +101,7 @@ def copied_thresholds() -> list[str]:
 
 
 def longest_parameters() -> tuple[int, str]:
-    """Return the largest number of parameters of a function, and its place."""
+    """Return the largest number of parameters of a function that is no command, and its place."""
     return max(
         (len(node.args.args) + len(node.args.kwonlyargs) + len(node.args.posonlyargs), place)
         for place, node in functions()
@@ -109,11 +109,21 @@ def longest_parameters() -> tuple[int, str]:
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
-    """Yield the functions of the library and their places."""
+    """Yield the functions of the library and their places, but for commands.
+
+    The parameters of commands, of typer and of Prefect, are the options of the user.
+    """
     for path in sources():
         for node in ast.walk(tree(path)):
-            if isinstance(node, ast.FunctionDef):
+            if isinstance(node, ast.FunctionDef) and not _is_command(node, path):
                 yield f"{path.relative_to(ROOT)}:{node.lineno} {node.name}", node
+
+
+def _is_command(node: ast.FunctionDef, path: Path) -> bool:
+    """Return whether typer or Prefect calls a function, by its decorators or the source."""
+    names = {ast.unparse(one).partition("(")[0] for one in node.decorator_list}
+    decorated = any(name.rpartition(".")[2] in {"command", "callback", "flow"} for name in names)
+    return decorated or f"typer.run({node.name})" in text(path)
 
 
 def packages() -> dict[str, int]:

@@ -33,7 +33,8 @@ from lidarops.records import Granule
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
-from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles
+from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles, BeamAir
+from lidarops.retrieve.multiangle.optical_depth import OpticalDepthSettings
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettings
 from lidarops.scene.choices import BackgroundSettings, background, no_scan, with_low_signal_to_noise
@@ -389,20 +390,18 @@ class _Scans(ProductStream):
     def _empty_cycles(self, baseline: AnalogBaseline | None = None) -> AltitudeCycles:
         signal, settings = self._signal, self._settings
         geometry, distance = signal.source.geometry, signal.profiles.range
+        air = None
+        if self._known_shape:
+            air = BeamAir(signal.molecules, signal.wavelength, signal.source.shared)
         return AltitudeCycles(
             distance,
-            zenith_angle=geometry["zenith_angle"].to_numpy(),
-            azimuth=geometry["azimuth"].to_numpy() if "azimuth" in geometry else None,
-            time_bnds=geometry["time_bnds"].to_numpy(),
-            shots=signal.shots.to_numpy(),
+            scan=geometry.assign(shots=signal.shots),
             altitude_grid=self._station + altitude_steps(settings.step, settings.highest),
             station_altitude=self._station,
             background_range=self._background.range,
-            molecules=signal.molecules if self._known_shape else None,
-            wavelength=signal.wavelength,
+            air=air,
             overlap=signal.overlap_at(distance),
             baseline=baseline,
-            shapes=signal.source.shared,
         )
 
     def ends(self) -> Indices:
@@ -430,11 +429,13 @@ class _Scans(ProductStream):
         cycles = self._cycles if baseline is None else self._without_baseline(baseline)
         optical_depth = labeled.retrieve_optical_depth(
             cycles.result(self._blocked.obstructions()),
-            station_altitude=self._station,
-            method=settings.method,
-            regularisation=settings.regularisation,
-            largest_gradient=settings.largest_gradient,
-            layers=[(low + self._station, high + self._station) for low, high in settings.layers],
+            OpticalDepthSettings(
+                method=settings.method,
+                station_altitude=self._station,
+                largest_gradient=settings.largest_gradient,
+                layers=[(low + self._station, top + self._station) for low, top in settings.layers],
+                regularisation=settings.regularisation,
+            ),
         )
         self.notes += blocked_in_words(optical_depth)
         optical_depth = optical_depth.assign(

@@ -21,7 +21,14 @@ from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleMethod,
     MultiAngleResult,
+    OpticalDepthSettings,
     retrieve_optical_depth,
 )
 
-__all__ = ["MultiAngleMethod", "MultiAngleQuality", "MultiAngleResult", "retrieve_optical_depth"]
+__all__ = [
+    "MultiAngleMethod",
+    "MultiAngleQuality",
+    "MultiAngleResult",
+    "OpticalDepthSettings",
+    "retrieve_optical_depth",
+]

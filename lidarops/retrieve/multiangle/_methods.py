@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import partial
@@ -49,6 +49,10 @@ REGULARISED: Final = frozenset({MultiAngleMethod.MLD, MultiAngleMethod.MLD_PRIOR
 """Methods with a penalty, which accept `regularisation`."""
 WITHOUT_GRADIENT: Final = REGULARISED | {MultiAngleMethod.TWO_ANGLE}
 """Methods that do not use the horizontal gradient that the regression fits."""
+
+
+LARGEST_GRADIENT: Final = 5e-5
+"""m-1, default horizontal gradient of ln backscatter covered by the gradient errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,24 +138,38 @@ class MultiAngleResult:
         self.quality[:] |= np.where(where, np.int32(bit), np.int32(0))
 
 
-@dataclass(frozen=True, slots=True)
-class BlockSettings:
-    """Settings common to all blocks of a retrieval."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpticalDepthSettings:
+    """How optical depths are retrieved from a scan."""
 
-    method: str
+    method: str = "auto"
+    """One of `MultiAngleMethod`."""
+    station_altitude: float = 0.0
+    """m, altitude of the lidar, where the optical depth is zero."""
+    inhomogeneity: float | None = None
+    """Standard deviation of the logarithms on top of the noise; estimated if not given."""
+    largest_gradient: float = LARGEST_GRADIENT
+    """m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
+    `extinction_gradient_error`, unless the residuals show a larger one."""
+    robust: bool = True
+    """Whether to test for outliers."""
+    layers: Sequence[tuple[float, float]] = ()
+    """m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
+    altitudes and the station, by at most half the distance to the next one."""
+    regularisation: float | None = None
+    """Strength of the penalty of "mld" and "mld_prior", dimensionless, for slant paths scaled to a
+    span of 1; by default the largest with residuals not larger than the noise, at each altitude."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockSettings(OpticalDepthSettings):
+    """The same with the geometry that all blocks of a retrieval share."""
+
     height: Array
     """(altitude,) m above the lidar."""
     scan: Scan
-    station_altitude: float
-    """m."""
-    inhomogeneity: float | None
-    largest_gradient: float
-    """m-1."""
-    robust: bool
-    layers: Indices
+    levels: Indices
     """(layer, 2) levels at bottom and top of layers: 0 for the lidar, k + 1 for altitude k."""
-    regularisation: float | None = None
-    """Strength of the penalty of "mld" and "mld_prior"; chosen from the noise where None."""
 
 
 def solve_cycles(
@@ -384,7 +402,7 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     for slope, single in zip(slopes, of_single, strict=True):
         slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
     _fill_gradient_errors(profiles, slopes, settings)
-    for number, (bottom, top) in enumerate(settings.layers):
+    for number, (bottom, top) in enumerate(settings.levels):
         depth, error = smooth.layer(bottom - 1, top - 1)
         profiles.layer_optical_depth[rows, number] = depth
         profiles.layer_optical_depth_standard_error[rows, number] = error
@@ -414,7 +432,7 @@ def _withhold_extinction(profiles: MultiAngleResult, where: Booleans) -> None:
 def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Return profiles with the values common to all methods; optical depths within the reach."""
     count, angles, altitudes = beams.noise.shape
-    profiles = MultiAngleResult.missing(count, angles, altitudes, len(settings.layers))
+    profiles = MultiAngleResult.missing(count, angles, altitudes, len(settings.levels))
     tau = fit.column(kh.TAU)
     within = (beams.alive >= beams.needed) & np.isfinite(tau)
     profiles.optical_depth[:] = np.where(within, tau, np.nan)
@@ -484,7 +502,7 @@ def _layer_means(optical_depth: Array, height: Array) -> Array:
 
 def _at_layers(values: Array, settings: BlockSettings) -> Array:
     """Return values at bottom and top of the layers, (profile, layer, 2); 0 at the lidar."""
-    return np.pad(values, ((0, 0), (1, 0)))[:, settings.layers]
+    return np.pad(values, ((0, 0), (1, 0)))[:, settings.levels]
 
 
 def _below(values: Array) -> Array:

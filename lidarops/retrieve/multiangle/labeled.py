@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -14,7 +13,7 @@ from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._horizontal_variation import gradient_scale
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
 from lidarops.retrieve.multiangle.flags import CARE, REJECTING, MultiAngleQuality
-from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult, OpticalDepthSettings
 from lidarops.retrieve.multiangle.smooth_profile import nearest_rising
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -47,33 +46,15 @@ _LINEARISATIONS: Final = 3
 (`test_unflagged_optical_depths_lie_within_three_standard_errors`, bright beams)."""
 
 
-def retrieve_optical_depth(
-    beams: xr.Dataset,
-    *,
-    station_altitude: float,
-    method: str = "auto",
-    largest_gradient: float = optical_depth.LARGEST_GRADIENT,
-    layers: Sequence[tuple[float, float]] = (),
-    regularisation: float | None = None,
-) -> xr.Dataset:
+def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) -> xr.Dataset:
     """Retrieve optical depth and extinction from the cycles of a scan.
 
     Parameters
     ----------
     beams : xr.Dataset
         From `lidarops.retrieve.multiangle.labeled_altitudes.AltitudeCycles`.
-    station_altitude : float
-        m above mean sea level.
-    method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
-        See `MultiAngleMethod`.
-    largest_gradient : float
-        m-1, horizontal gradient of ln backscatter covered by the gradient errors.
-    layers : sequence of (float, float)
-        m above mean sea level: bottom and top of the layers whose optical depth is requested;
-        moved to the nearest of the altitudes and the station.
-    regularisation : float, optional
-        Strength of the penalty of "mld" and "mld_prior"; see
-        `lidarops.retrieve.multiangle.optical_depth.retrieve_optical_depth`.
+    settings : OpticalDepthSettings
+        Altitudes in m above mean sea level.
 
     Returns
     -------
@@ -88,23 +69,18 @@ def retrieve_optical_depth(
     RetrievalInputError
         For invalid arguments.
     """
-    altitude, zenith_angle = (beams[n].to_numpy() for n in ("altitude", "beam_zenith_angle"))
-    levels, bounds = optical_depth.layer_levels(layers, altitude, station_altitude=station_altitude)
-    settings: dict[str, Any] = {
-        "azimuth": beams["beam_azimuth"].to_numpy() if "beam_azimuth" in beams.coords else None,
-        "method": method,
-        "station_altitude": station_altitude,
-        "largest_gradient": largest_gradient,
-        "regularisation": regularisation,
-        "signal_quality": beams["quality"].to_numpy(),
-    }
-    signals = _agreed_signals(beams, zenith_angle, altitude, settings)
-    retrieval = _solve_all(signals, zenith_angle, altitude, levels, layers=layers, **settings)
+    scan = _Scan.of(beams, settings)
+    levels, bounds = optical_depth.layer_levels(
+        settings.layers, scan.altitude, station_altitude=settings.station_altitude
+    )
+    signals = _agreed_signals(beams, scan)
+    retrieval = scan.solve_with_errors(signals, levels)
     signal = signals.signal
     sampled = np.isfinite(signal).any(axis=-1)
+    penalised = settings.method in optical_depth.REGULARISED
     values = {
         _variable(name): (("time", "altitude"), getattr(retrieval, name))
-        for name in (*_PER_ALTITUDE, *(_OF_PENALTY if method in optical_depth.REGULARISED else ()))
+        for name in (*_PER_ALTITUDE, *(_OF_PENALTY if penalised else ()))
     }
     depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
@@ -123,11 +99,62 @@ def retrieve_optical_depth(
         coords={name: beams[name] for name in beams.coords},
         attrs={"steps": _step_texts(retrieval), "method": _method_of(retrieval)},
     )
-    product = product.assign(_plane_variables(signals, beams, settings))
-    product = product.assign(_systematic_variables(retrieval, signals, beams, station_altitude))
-    if not layers:
+    product = product.assign(_plane_variables(signals, scan))
+    product = product.assign(
+        _systematic_variables(retrieval, signals, beams, settings.station_altitude)
+    )
+    if not settings.layers:
         return product
     return product.assign(_layer_variables(retrieval, quality, levels, bounds))
+
+
+class _Scan(NamedTuple):
+    """What the signals of the beams are solved with."""
+
+    zenith_angle: Array
+    """(beam,), degree."""
+    azimuth: Array | None
+    """(beam,), degree."""
+    altitude: Array
+    """m."""
+    quality: Flags
+    """(time, altitude)."""
+    settings: OpticalDepthSettings
+
+    @classmethod
+    def of(cls, beams: xr.Dataset, settings: OpticalDepthSettings) -> Self:
+        """Return the scan of the cycles."""
+        return cls(
+            beams["beam_zenith_angle"].to_numpy(),
+            beams["beam_azimuth"].to_numpy() if "beam_azimuth" in beams.coords else None,
+            beams["altitude"].to_numpy(),
+            beams["quality"].to_numpy(),
+            settings,
+        )
+
+    @property
+    def height(self) -> Array:
+        """Altitudes above the station, m."""
+        return self.altitude - self.settings.station_altitude
+
+    def solve(self, signals: ScanSignals) -> MultiAngleResult:
+        """Return the result of the method."""
+        return optical_depth.retrieve_optical_depth(
+            signals.signal,
+            self.zenith_angle,
+            self.altitude,
+            variance=signals.variance,
+            azimuth=self.azimuth,
+            settings=self.settings,
+            dead_time_change=signals.dead_time_change,
+            signal_quality=self.quality,
+        )
+
+    def solve_with_errors(self, signals: ScanSignals, levels: Indices) -> MultiAngleResult:
+        """Return the result of the method, with errors by what the backgrounds may hold."""
+        retrieval = self.solve(signals)
+        thickness = np.diff(self.altitude, prepend=self.settings.station_altitude)
+        return _with_background_errors(retrieval, signals, thickness, levels)
 
 
 def _variable(field: str) -> str:
@@ -139,59 +166,55 @@ def _variable(field: str) -> str:
     )
 
 
-def _agreed_signals(
-    beams: xr.Dataset, zenith_angle: Array, altitude: Array, settings: dict[str, Any]
-) -> ScanSignals:
+def _agreed_signals(beams: xr.Dataset, scan: _Scan) -> ScanSignals:
     """Return the signals with the backgrounds with which the beams agree best."""
     left = beams["left"].to_numpy()
-    height = altitude - settings["station_altitude"]
     prior = signals = ScanSignals.of(
         beams["signal"].to_numpy(),
         beams["variance"].to_numpy(),
         left,
-        slant_paths.slant_path(zenith_angle, height),
+        slant_paths.slant_path(scan.zenith_angle, scan.height),
         beams["response"].to_numpy(),
         beams["dead_time_error"].to_numpy() if "dead_time_error" in beams else None,
     )
     for _ in range(_LINEARISATIONS if (left > 0.0).any() else 0):
-        signals = prior.agreed(_solve(signals, zenith_angle, altitude, **settings))
+        signals = prior.agreed(scan.solve(signals))
     return signals
 
 
-def _plane_variables(
-    signals: ScanSignals, beams: xr.Dataset, settings: dict[str, Any]
-) -> dict[str, xr.Variable]:
+def _plane_variables(signals: ScanSignals, scan: _Scan) -> dict[str, xr.Variable]:
     """Return the variables of the vertical planes of a volume; none where it has one plane only.
 
     The inhomogeneity of a plane is its own. Values that a flag rejects are NaN. Where the planes
     surround the zenith, their scatter tells the gradient error.
     """
-    if settings["azimuth"] is None:
+    if scan.azimuth is None:
         return {}
-    altitude, zenith_angle = (beams[n].to_numpy() for n in ("altitude", "beam_zenith_angle"))
-    planes = _planes_with_leverage(signals, zenith_angle, settings["azimuth"])
+    zenith_angle, azimuth = scan.zenith_angle, scan.azimuth
+    planes = _planes_with_leverage(signals, zenith_angle, azimuth)
     if len(planes) < _SEVERAL:
         return {}
     pieces: dict[str, list[Array]] = {name: [] for name in _PER_PLANE}
+    without_layers = replace(scan.settings, layers=())
     for members in planes:
-        part = signals.of_beams(members)
-        own = settings | {"azimuth": settings["azimuth"][members]}
+        plane = scan._replace(
+            zenith_angle=zenith_angle[members], azimuth=azimuth[members], settings=without_layers
+        )
         nothing = np.empty((0, 2), dtype=np.intp)
-        retrieval = _solve_all(part, zenith_angle[members], altitude, nothing, layers=(), **own)
+        retrieval = plane.solve_with_errors(signals.of_beams(members), nothing)
         rejected = retrieval.raised(REJECTING)
         for name, values in pieces.items():
             values.append(np.where(rejected, np.nan, getattr(retrieval, name)))
     stacked = {name: np.stack(values) for name, values in pieces.items()}
     every = np.concatenate(planes)
-    height = altitude - settings["station_altitude"]
-    scan = slant_paths.make_scan(zenith_angle[every], height, settings["azimuth"][every])
-    if slant_paths.surrounds_zenith(scan.tilted_azimuths):
+    geometry = slant_paths.make_scan(zenith_angle[every], scan.height, azimuth[every])
+    if slant_paths.surrounds_zenith(geometry.tilted_azimuths):
         names = (f"optical_depth{error}" for error in ("", "_standard_error", "_gradient_error"))
         scale = gradient_scale(*(stacked[name] for name in names))
         for quantity in ("optical_depth", "extinction"):
             stacked[f"{quantity}_gradient_error"] *= scale
     cube = ("time", "plane", "altitude")
-    azimuths = [_azimuth_of_plane(settings["azimuth"], zenith_angle, own) for own in planes]
+    azimuths = [_azimuth_of_plane(azimuth, zenith_angle, own) for own in planes]
     return {
         "plane": xr.Variable("plane", np.arange(len(planes), dtype=np.int32)),
         "plane_azimuth": xr.Variable("plane", np.array(azimuths)),
@@ -258,33 +281,6 @@ def _layer_variables(
     middle = xr.Variable("layer", bounds.mean(axis=1))
     limits = xr.Variable(("layer", "nv"), bounds)
     return {**variables, "layer_altitude": middle, "layer_bnds": limits}
-
-
-def _solve_all(
-    beams: ScanSignals,
-    zenith_angle: Array,
-    altitude: Array,
-    levels: Indices,
-    **settings: Any,
-) -> MultiAngleResult:
-    """Return the result of the method, with errors by what the backgrounds may hold."""
-    retrieval = _solve(beams, zenith_angle, altitude, **settings)
-    thickness = np.diff(altitude, prepend=settings["station_altitude"])
-    return _with_background_errors(retrieval, beams, thickness, levels)
-
-
-def _solve(
-    beams: ScanSignals, zenith_angle: Array, altitude: Array, **settings: Any
-) -> MultiAngleResult:
-    """Return the result of the method."""
-    return optical_depth.retrieve_optical_depth(
-        beams.signal,
-        zenith_angle,
-        altitude,
-        variance=beams.variance,
-        dead_time_change=beams.dead_time_change,
-        **settings,
-    )
 
 
 def _method_of(retrieval: MultiAngleResult) -> str:

@@ -48,6 +48,40 @@ _BESIDE: Final = 4
 """Bins beyond the highest cell, of which its mean needs one."""
 
 
+class BeamAir(NamedTuple):
+    """Clean air along the beams of a scan, at the wavelength of a channel."""
+
+    molecules: MolecularProfile
+    wavelength: float
+    """m."""
+    kept: dict[Any, Any]
+    """Keeps the signals along the beams, for other channels of the scan; only the last ones."""
+
+    def shapes(self, zenith_angle: Array, distance: Array, station_altitude: float) -> Array:
+        """Return the shape of the signal of clean air along each beam; 0 behind the lidar."""
+        if not self.wavelength > 0:
+            raise RetrievalInputError(
+                f"is {self.wavelength}", field="wavelength", remedy="give m, or leave the air out"
+            )
+        arrays = (zenith_angle, distance, *(getattr(self.molecules, name) for name in _LEVELS))
+        key = (self.wavelength, station_altitude, *(array.tobytes() for array in arrays))
+        if key not in self.kept:
+            in_front = distance > 0
+            # The vertical planes of a volume have the same zenith angles.
+            angles, place = np.unique(zenith_angle, return_inverse=True)
+            climb = np.cos(np.radians(angles))[:, np.newaxis]
+            altitude = station_altitude + climb * distance[in_front]
+            shapes = np.zeros((angles.size, distance.size))
+            extinction = self.molecules.extinction(altitude, self.wavelength)
+            backscatter = extinction / molecular_lidar_ratio(self.wavelength)
+            shapes[:, in_front] = known_shape.molecular_shape(
+                backscatter, extinction, distance[in_front]
+            )
+            self.kept.clear()
+            self.kept[key] = shapes[place]
+        return np.asarray(self.kept[key])
+
+
 class AltitudeCycles:
     """Profiles of a scan in altitude cells, sorted by cycle and beam, from chunks of profiles.
 
@@ -60,12 +94,10 @@ class AltitudeCycles:
     ----------
     distance : (range,) float
         m along the beam.
-    zenith_angle, azimuth : (time,) float
-        degree, as for `lidarops.retrieve.multiangle.scan_cycles.directions`.
-    time_bnds : (time, 2) datetime64
-        Start and end of each profile; starts rising.
-    shots : (time,) int
-        Number of laser shots of each profile.
+    scan : xr.Dataset
+        Over time: ``zenith_angle`` and, where it is known, ``azimuth``, degree, as for
+        `lidarops.retrieve.multiangle.scan_cycles.directions`; ``time_bnds``, start and end of each
+        profile, starts rising; and ``shots``, the number of laser shots.
     altitude_grid : (altitude,) float
         m above mean sea level, ascending, above the station, at least two; uniform for the method
         "joint". The edges of cells are midway between altitudes.
@@ -73,17 +105,13 @@ class AltitudeCycles:
         m above mean sea level.
     background_range : (float, float)
         m along the beam: the tail, whose mean is the background.
-    molecules : MolecularProfile, optional
+    air : BeamAir, optional
         If given, the background is that of `estimate.from_far_range`, else that of
         `estimate.from_bounded_tail` (`lidarops.retrieve.background`).
-    wavelength : float
-        m, for the scattering of the molecules.
     overlap : (range,) float, optional
         The signal is divided by it; NaN where it is not known.
     baseline : AnalogBaseline, optional
         Subtracted from the power of all profiles, whose baseline error is then that of it.
-    shapes : dict, optional
-        Keeps the signals of clean air along the beams, for other channels of the scan.
 
     Raises
     ------
@@ -95,21 +123,20 @@ class AltitudeCycles:
         self,
         distance: Array,
         *,
-        zenith_angle: npt.ArrayLike,
-        azimuth: npt.ArrayLike | None,
-        time_bnds: npt.ArrayLike,
-        shots: npt.ArrayLike,
+        scan: xr.Dataset,
         altitude_grid: npt.ArrayLike,
         station_altitude: float,
         background_range: tuple[float, float],
-        molecules: MolecularProfile | None = None,
-        wavelength: float = np.nan,
+        air: BeamAir | None = None,
         overlap: Array | None = None,
         baseline: AnalogBaseline | None = None,
-        shapes: dict[Any, Any] | None = None,
     ) -> None:
+        zenith_angle = scan["zenith_angle"].to_numpy()
+        azimuth = scan["azimuth"].to_numpy() if "azimuth" in scan else None
+        self._bounds = scan["time_bnds"].to_numpy()
+        self._shots = scan["shots"].to_numpy().astype(np.float64)
         directions = scan_cycles.directions(zenith_angle, azimuth)
-        numbers = scan_cycles.cycles(zenith_angle, azimuth, time_bnds)
+        numbers = scan_cycles.cycles(zenith_angle, azimuth, self._bounds)
         self._altitude = np.asarray(altitude_grid, dtype=np.float64)
         height = slant_paths.altitude_grid(self._altitude, station_altitude)
         if height.size < 2:
@@ -129,14 +156,10 @@ class AltitudeCycles:
             self._azimuth = directions.azimuth[usable]
         self._profile, self._cycle, self._beam = _sorted_profiles(directions, usable, numbers)
         self._slant_edges = _slant_edges(self._zenith_angle, height)
-        self._bounds, self._shots = np.asarray(time_bnds), np.asarray(shots, dtype=np.float64)
         self._tail, self._baseline = background_range, baseline
         self._set_bins(distance, overlap)
-        self._shapes = None
-        if molecules is not None:
-            kept = {} if shapes is None else shapes
-            place = self._zenith_angle, distance, station_altitude
-            self._shapes = _shapes(kept, molecules, wavelength, *place)
+        place = self._zenith_angle, distance, station_altitude
+        self._shapes = None if air is None else air.shapes(*place)
         self._batches = list(_batches(self._cycle))
         self._pieces: list[dict[str, Block]] = []
 
@@ -434,41 +457,6 @@ def _few_visits(first: Integers, profiles: int) -> Iterator[tuple[slice, Integer
         high = max(int(np.searchsorted(ends, first[low] + _FEW, side="right")), low + 1)
         yield slice(int(first[low]), int(ends[high - 1])), first[low:high]
         low = high
-
-
-def _shapes(
-    kept: dict[Any, Any],
-    molecules: MolecularProfile,
-    wavelength: float,
-    zenith_angle: Array,
-    distance: Array,
-    station_altitude: float,
-) -> Array:
-    """Return the shape of the signal of clean air along each beam; 0 behind the lidar.
-
-    It is kept for the same arguments; only the last one is.
-    """
-    if not wavelength > 0:
-        raise RetrievalInputError(
-            f"is {wavelength}", field="wavelength", remedy="give m, or leave the molecules out"
-        )
-    arrays = (zenith_angle, distance, *(getattr(molecules, name) for name in _LEVELS))
-    key = (wavelength, station_altitude, *(array.tobytes() for array in arrays))
-    if key not in kept:
-        in_front = distance > 0
-        # The vertical planes of a volume have the same zenith angles.
-        angles, place = np.unique(zenith_angle, return_inverse=True)
-        climb = np.cos(np.radians(angles))[:, np.newaxis]
-        altitude = station_altitude + climb * distance[in_front]
-        shapes = np.zeros((angles.size, distance.size))
-        extinction = molecules.extinction(altitude, wavelength)
-        backscatter = extinction / molecular_lidar_ratio(wavelength)
-        shapes[:, in_front] = known_shape.molecular_shape(
-            backscatter, extinction, distance[in_front]
-        )
-        kept.clear()
-        kept[key] = shapes[place]
-    return np.asarray(kept[key])
 
 
 def _visit_means(bins: _Bins, shots: Array, first: Indices) -> _Bins:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Final
 
 import numpy as np
@@ -14,26 +15,28 @@ from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Flags, Indices
 from lidarops.retrieve.multiangle import _methods, slant_paths
 from lidarops.retrieve.multiangle._methods import (
+    LARGEST_GRADIENT,
     REGULARISED,
     BlockSettings,
     MultiAngleMethod,
     MultiAngleResult,
+    OpticalDepthSettings,
     StepRecord,
 )
 from lidarops.retrieve.multiangle.flags import CARE, MultiAngleQuality
-
-LARGEST_GRADIENT: Final = 5e-5
-"""m-1, default horizontal gradient of ln backscatter covered by the gradient errors."""
 
 __all__ = [
     "LARGEST_GRADIENT",
     "REGULARISED",
     "MultiAngleMethod",
     "MultiAngleResult",
+    "OpticalDepthSettings",
     "StepRecord",
     "layer_levels",
     "retrieve_optical_depth",
 ]
+
+_DEFAULT: Final = OpticalDepthSettings()
 
 
 def retrieve_optical_depth(
@@ -43,13 +46,7 @@ def retrieve_optical_depth(
     *,
     variance: npt.ArrayLike,
     azimuth: npt.ArrayLike | None = None,
-    method: str = "auto",
-    station_altitude: float = 0.0,
-    inhomogeneity: float | None = None,
-    largest_gradient: float = LARGEST_GRADIENT,
-    robust: bool = True,
-    layers: Sequence[tuple[float, float]] = (),
-    regularisation: float | None = None,
+    settings: OpticalDepthSettings = _DEFAULT,
     dead_time_change: npt.ArrayLike | None = None,
     signal_quality: Flags | None = None,
 ) -> MultiAngleResult:
@@ -66,31 +63,14 @@ def retrieve_optical_depth(
     zenith_angle : (angle,) float
         degree, -90 to 90; a beam with a negative angle points opposite to its azimuth.
     altitude : (altitude,) float
-        m, ascending, above `station_altitude`; uniform for "joint".
+        m, ascending, above the station; uniform for "joint".
     variance : (profile, angle, altitude) float
         Variance of the noise alone, in the square of the unit of the signal, broadcast against it.
         For counts, give that of a smoothed rate (`lidarops.retrieve.signal.counts_to_signal`):
         variances from single counts make intervals too narrow.
     azimuth : (angle,) float, optional
         degree; the same for all angles if not given.
-    method : {"auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior"}
-        See `MultiAngleMethod`.
-    station_altitude : float
-        m, altitude of the lidar, where the optical depth is zero.
-    inhomogeneity : float, optional
-        Standard deviation of the logarithms on top of the noise; estimated if not given.
-    largest_gradient : float
-        m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
-        `extinction_gradient_error`, unless the residuals show a larger one.
-    robust : bool
-        Whether to test for outliers.
-    layers : sequence of (float, float)
-        m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
-        altitudes and the station, by at most half the distance to the next one.
-    regularisation : float, optional
-        Strength of the penalty of "mld" and "mld_prior", dimensionless, for slant paths scaled to a
-        span of 1; by default the largest with residuals not larger than the noise, at each
-        altitude.
+    settings : OpticalDepthSettings
     dead_time_change : (profile, angle, altitude) float, optional
         Change of the signal with one standard error of the dead time, in all beams together, which
         looks like a horizontal gradient near the lidar; NaN where there is no signal.
@@ -111,8 +91,9 @@ def retrieve_optical_depth(
     ----------
     kano1968, hamilton1969, gobrusenko1989, dersimonian1986, siegel1982.
     """
-    chosen = inputs.choice(method, MultiAngleMethod, "method")
-    height = slant_paths.altitude_grid(altitude, station_altitude)
+    method = inputs.choice(settings.method, MultiAngleMethod, "method")
+    station = settings.station_altitude
+    height = slant_paths.altitude_grid(altitude, station)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
     rows = _cube(signal, "signal", scan.path.shape)
     noise = inputs.real_array(variance, "variance")
@@ -121,21 +102,17 @@ def retrieve_optical_depth(
             "is negative", field="variance", remedy="give squares of the signal's unit"
         )
     noise = _cube(inputs.broadcast(noise, rows.shape, "variance"), "variance", rows.shape)
-    settings = BlockSettings(
-        chosen,
-        height,
-        scan,
-        float(station_altitude),
-        _positive(inhomogeneity, "inhomogeneity"),
-        _positive(largest_gradient, "largest_gradient") or 0.0,
-        robust,
-        layer_levels(layers, altitude, station_altitude=station_altitude)[0],
-        _regularisation(regularisation, chosen),
+    _check(settings, method)
+    block = BlockSettings(
+        **{item.name: getattr(settings, item.name) for item in fields(settings)},
+        height=height,
+        scan=scan,
+        levels=layer_levels(settings.layers, altitude, station_altitude=station)[0],
     )
     change = None
     if dead_time_change is not None:
         change = np.nan_to_num(_cube(dead_time_change, "dead_time_change", rows.shape))
-    result = _methods.solve_cycles(rows, noise, change, settings)
+    result = _methods.solve_cycles(rows, noise, change, block)
     _with_reasons(result, rows, noise, signal_quality)
     return result
 
@@ -205,20 +182,18 @@ def _cube(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
     return np.require(array, np.float64, ["C", "W"])
 
 
-def _positive(value: float | None, name: str) -> float | None:
-    if value is not None and not (np.isfinite(value) and value >= 0):
-        raise RetrievalInputError(f"is {value}", field=name, remedy="give zero or more")
-    return value
-
-
-def _regularisation(strength: float | None, method: MultiAngleMethod) -> float | None:
-    if strength is not None and method not in REGULARISED:
+def _check(settings: OpticalDepthSettings, method: MultiAngleMethod) -> None:
+    """Refuse numbers below zero, and a strength of the penalty for a method that has none."""
+    if settings.regularisation is not None and method not in REGULARISED:
         raise RetrievalInputError(
             f"is not accepted by the method {str(method)!r}",
             field="regularisation",
             remedy=f"leave it out, or choose {' or '.join(sorted(REGULARISED))}",
         )
-    return _positive(strength, "regularisation")
+    for name in ("inhomogeneity", "largest_gradient", "regularisation"):
+        value = getattr(settings, name)
+        if value is not None and not (np.isfinite(value) and value >= 0):
+            raise RetrievalInputError(f"is {value}", field=name, remedy="give zero or more")
 
 
 def _with_reasons(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
+from support.scan_arguments import retrieve_optical_depth
 
 from benchmarks.accuracy import multiangle, multiangle_cases, multiangle_peers
 from benchmarks.accuracy.multiangle import StudySize
@@ -17,7 +18,6 @@ from benchmarks.harness.results import Effort
 from benchmarks.harness.timing import CPU_TIME, READ
 from benchmarks.throughput import retrievals
 from lidarops.retrieve.multiangle import mld
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 pytestmark = pytest.mark.slow
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.retrieve.multiangle import slant_paths
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 HEIGHT = 60.0 * np.arange(5, 61)
 ZENITH = np.array([0.0, 20.0, 35.0, 45.0, 55.0, 62.0, 68.0, 72.0, 75.0])

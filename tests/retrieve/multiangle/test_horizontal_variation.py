@@ -15,11 +15,11 @@ from support.oracles.multiangle import (
     cloud_scene,
     random_scene,
 )
+from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.retrieve.multiangle import _block
 from lidarops.retrieve.multiangle._horizontal_variation import path_variation_from
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 

@@ -17,11 +17,11 @@ from support.oracles.multiangle import (
     rms,
     signals,
 )
+from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 SIDES = np.array([-70.0, -55.0, -40.0, -20.0, 0.0, 15.0, 35.0, 50.0, 65.0, 75.0])
 HEIGHT = np.arange(300.0, 2100.0, 30.0)

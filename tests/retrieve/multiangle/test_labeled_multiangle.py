@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 from support.cases import each
 from support.oracles.angle_scenes import on_altitudes, retrieve_scan
+from support.scan_arguments import altitude_cycles
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -17,8 +18,7 @@ from lidarops.kinds import flags_of
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.multiangle import labeled, labeled_altitudes
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.labeled_altitudes import AltitudeCycles
-from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleMethod, OpticalDepthSettings
 
 STATION = 120.0
 RANGE = 15.0 * (np.arange(1200) + 0.5)
@@ -291,7 +291,7 @@ def test_extinction_stays_withheld_if_single_altitudes_replace_joint():
         },
         coords={"altitude": height, "beam_zenith_angle": ("beam", zenith)},
     )
-    product = labeled.retrieve_optical_depth(beams, station_altitude=0.0)
+    product = labeled.retrieve_optical_depth(beams, OpticalDepthSettings())
     assert "left out joint" in product.attrs["steps"]
     assert has(product, MultiAngleQuality.POOR_STRATIFICATION).all()
     assert np.isfinite(product["vertical_optical_depth"]).any()
@@ -537,7 +537,7 @@ def test_an_overlap_divides_the_signal():
 def test_any_chunks_of_cycles_give_the_same_bits(step):
     conditioned, pointing = scan(40)
     whole = on_altitudes(conditioned, **(pointing | SETTINGS))
-    cycles = AltitudeCycles(RANGE, **(pointing | SETTINGS))
+    cycles = altitude_cycles(RANGE, **(pointing | SETTINGS))
     ends = cycles.ends()
     assert ends.size > 3
     edges = [0, *ends[::step], conditioned.sizes["time"]]

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles.multiangle import PER_KM, rms
+from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.multiangle import mld
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 LAYERS = np.array([5.0, 10.0, 15.0, 20.0, 15.0, 10.0, 8.0, 5.0]) * PER_KM
 HEIGHT = 25.0 + 50.0 * np.arange(8)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.scan_arguments import retrieve_optical_depth
 
-from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 from lidarops.retrieve.multiangle.slant_paths import slant_path
@@ -28,7 +28,7 @@ def level_sky(gradient: float) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_a_gradient_cancels_or_is_within_the_stated_error(method, cancels):
     signal, variance = level_sky(5e-5)
-    result = optical_depth.retrieve_optical_depth(
+    result = retrieve_optical_depth(
         signal, ZENITH, ALTITUDE, variance=variance, method=method, largest_gradient=5e-5
     )
     known = np.isfinite(result.optical_depth)
@@ -60,7 +60,7 @@ def one_sided(
     drawn = np.random.default_rng(seed).normal(size=(10, *signal.shape))
     measured = signal * (1.0 + dead_time * near) + noise * drawn
     measured[:, path * CELLS < 700.0] = np.nan
-    return optical_depth.retrieve_optical_depth(
+    return retrieve_optical_depth(
         measured,
         LOW,
         CELLS,

@@ -17,13 +17,11 @@ from support.oracles.multiangle import (
     rms,
     signals,
 )
+from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.optical_depth import (
-    retrieve_optical_depth,
-)
 
 METHODS = ("auto", "two_angle", "kano_hamilton", "joint", "mld", "mld_prior")
 STEEP = np.linspace(0.0, 30.0, 6)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.oracles.multiangle import ANGLES, clear, cloud, rms, signals
+from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.retrieve.multiangle import _block
 from lidarops.retrieve.multiangle import altitude_correlation as correlation_of_air
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
 
 STEEP = np.linspace(0.0, 30.0, 6)
 

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-from lidarops.retrieve.multiangle import labeled, labeled_altitudes
+from lidarops.retrieve.multiangle import labeled
 from lidarops.retrieve.multiangle.altitude_correlation import ResidualMoments, residual_moments
+from lidarops.retrieve.multiangle.optical_depth import OpticalDepthSettings
+from support.scan_arguments import altitude_cycles
 
 WINDOW = 15
 FEWEST_BEAMS = 3
@@ -162,12 +164,13 @@ def retrieve_scan(conditioned, *, station_altitude, **arguments):
         if name in arguments
     }
     beams = on_altitudes(conditioned, station_altitude=station_altitude, **arguments)
-    return labeled.retrieve_optical_depth(beams, station_altitude=station_altitude, **method)
+    settings = OpticalDepthSettings(station_altitude=station_altitude, **method)
+    return labeled.retrieve_optical_depth(beams, settings)
 
 
 def on_altitudes(conditioned, **arguments):
     """Return the cycles of all profiles of a scan on common altitudes."""
-    cycles = labeled_altitudes.AltitudeCycles(conditioned["range"].to_numpy(), **arguments)
+    cycles = altitude_cycles(conditioned["range"].to_numpy(), **arguments)
     cycles.add(conditioned, 0)
     return cycles.result()
 

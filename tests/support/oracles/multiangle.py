@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarops.retrieve.multiangle import _block, slant_paths
-from lidarops.retrieve.multiangle.optical_depth import retrieve_optical_depth
+from support.scan_arguments import retrieve_optical_depth
 
 PER_KM = 1e-3
 PATHS = np.linspace(1.0, 1 / np.cos(np.radians(75.0)), 12)

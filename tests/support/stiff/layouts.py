@@ -11,11 +11,11 @@ import xarray as xr
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.homogeneous import labeled, path_fit
-from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.signal import counts_to_signal
+from support.inversions import invert_elastic
+from support.scan_arguments import retrieve_optical_depth
 from support.stiff import elastic, networks, scans
 from support.stiff.cases import Answer, Near, Refused, Retrieval, StiffCase
 from support.stiff.homogeneous import CLEAR
@@ -71,16 +71,14 @@ def _signal(array: Any, layout: Layout) -> Mapping[str, Any]:
 def _elastic(array: Any, layout: Layout) -> Mapping[str, Any]:
     arguments = elastic.elastic_arguments(array.shape[0])
     changed = {n: layout(np.asarray(arguments[n])) for n in ("range", "molecular_backscatter")}
-    solution = inversion.invert_elastic(**arguments | changed | {"power": layout(array)})
+    solution = invert_elastic(**arguments | changed | {"power": layout(array)})
     return {n: getattr(solution, n) for n in ("backscatter", "backscatter_standard_error", "valid")}
 
 
 def _scans(array: Any, layout: Layout) -> Mapping[str, Any]:
     arguments = scans.scan_arguments(profiles=array.shape[0])
     changed = {n: layout(np.asarray(arguments[n])) for n in ("zenith_angle", "altitude")}
-    solution = optical_depth.retrieve_optical_depth(
-        **arguments | changed | {"signal": layout(array)}
-    )
+    solution = retrieve_optical_depth(**arguments | changed | {"signal": layout(array)})
     return {n: getattr(solution, n) for n in ("optical_depth", "extinction", "quality")}
 
 

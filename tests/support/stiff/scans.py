@@ -12,8 +12,8 @@ from benchmarks.accuracy import multiangle_cases
 from benchmarks.accuracy.multiangle_cases import Scene
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
-from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
+from support.scan_arguments import retrieve_optical_depth
 from support.stiff.cases import (
     Accepted,
     Answer,
@@ -34,7 +34,7 @@ _case = partial(StiffCase, retrieval=Retrieval.MULTIANGLE)
 
 def _solve_scan(altitudes: slice = slice(None), **arguments: Any) -> Answer:
     """Return some altitudes of the solution; its standard errors include the gradient error."""
-    result = optical_depth.retrieve_optical_depth(**arguments)
+    result = retrieve_optical_depth(**arguments)
     values = {
         "optical_depth": result.optical_depth,
         "optical_depth_standard_error": np.hypot(
@@ -123,9 +123,7 @@ def _close_beams() -> Scene:
 
 def _blocks_of_constant() -> Answer:
     results = [
-        optical_depth.retrieve_optical_depth(
-            **scan_arguments(_null_space, 16, seed, largest_gradient=0.0)
-        )
+        retrieve_optical_depth(**scan_arguments(_null_space, 16, seed, largest_gradient=0.0))
         for seed in range(20)
     ]
     return Answer({
@@ -241,7 +239,7 @@ def _solve_without_noise(span: float, scale: float) -> Answer:
     height = np.array([1000.0, 2000.0, 3000.0])
     depth = np.array([0.1, 0.2, 0.3])
     signal = scale * np.exp(-2.0 * path[np.newaxis, :, np.newaxis] * depth)
-    result = optical_depth.retrieve_optical_depth(
+    result = retrieve_optical_depth(
         signal, np.degrees(np.arccos(1.0 / path)), height, variance=1e-12 * signal**2,
         method="kano_hamilton",
     )  # fmt: skip
