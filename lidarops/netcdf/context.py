@@ -20,15 +20,7 @@ from lidarops.errors import ProductError
 from lidarops.netcdf.provenance import product_id, writing_time
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
 from lidarops.raw.header import POLARISATIONS, label_of
-from lidarops.records import (
-    GLUED,
-    DetectionMode,
-    Provenance,
-    Role,
-    Stamp,
-    UnusedFile,
-    is_glued,
-)
+from lidarops.records import DetectionMode, Provenance, Role, Stamp, UnusedFile, is_glued
 
 RECORDERS: Final = "lidarops_recorder"
 UNUSED_INPUTS: Final = "lidarops_unused_inputs"
@@ -83,7 +75,7 @@ class Context:
     @property
     def detection(self) -> str:
         """``analog``, ``photon``, or ``glued`` of both."""
-        return GLUED.rstrip("_") if is_glued(self.channel) else self.mode.value
+        return "glued" if is_glued(self.channel) else self.mode.value
 
 
 def product_path(context: Context) -> str:
