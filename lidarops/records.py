@@ -243,6 +243,7 @@ class _Entry:
     __slots__ = ()
     name: str
     product: str
+    """Kind of product to which the step belongs; empty where all kinds share it."""
 
     @property
     def is_product(self) -> bool:
@@ -265,7 +266,6 @@ class PlannedStep(_Entry):
     number: float | None = None
     """Number on which the rule decided, where there is one."""
     product: str = ""
-    """Kind of product to which the step belongs; empty where all kinds share it."""
     needs: tuple[str, ...] = ()
     """Steps whose outputs it takes, run or left out: ``name``, or ``channel/name`` of another
     channel; for a product, also those of the same kind with which it is compared."""
@@ -287,7 +287,6 @@ class LeftOut(_Entry):
     number: float | None = None
     """Number on which the rule decided, where there is one."""
     product: str = ""
-    """Kind of product to which the step belongs; empty where all kinds share it."""
 
 
 _ALWAYS: Final = frozenset({"name", "channel", "settings", "reason"})
