@@ -11,6 +11,7 @@ from lidarops.kinds import CommonQuantity, Kind
 from lidarops.settings import (
     ChannelProduct,
     Metres,
+    SettingsModel,
     background_method,
     located_error,
     quantity,
@@ -23,10 +24,9 @@ if TYPE_CHECKING:
 Method = Literal["auto", "joint", "kano_hamilton", "two_angle", "mld", "mld_prior"]
 
 
-class MultiAngleSettings(ChannelProduct):
-    """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
+class ScanSettings(SettingsModel):
+    """What the retrieval assumes, as the campaign states it."""
 
-    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
     highest: Metres = quantity(6000.0, unit="m", description="highest altitude above the station")
     step: float = quantity(60.0, unit="m", ge=5, le=1000, description="distance of altitudes")
     method: Method = Field(
@@ -45,7 +45,6 @@ class MultiAngleSettings(ChannelProduct):
         description="strength of the penalty of mld and mld_prior; by default the largest with"
         " residuals not larger than the noise, at each altitude",
     )
-    background: Literal["known_shape", "tail_mean"] = background_method()
     layers: list[tuple[float, float]] = quantity(
         [],
         unit="m",
@@ -71,6 +70,13 @@ class MultiAngleSettings(ChannelProduct):
             if not 0 <= low <= high - self.step or high > self.highest:
                 raise ValueError("layers must be at least one step deep, between 0 and highest")
         return self
+
+
+class MultiAngleSettings(ChannelProduct, ScanSettings):
+    """The ``multiangle`` product: optical depth and extinction from scans over zenith angle."""
+
+    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
+    background: Literal["known_shape", "tail_mean"] = background_method()
 
 
 def _section(headers: InstrumentHeaders) -> tuple[str, ...]:

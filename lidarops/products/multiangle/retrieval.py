@@ -20,7 +20,7 @@ import xarray as xr
 from lidarops.constants import KNOWN_SHAPE_PAPERS, MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
 from lidarops.netcdf.variables import BACKGROUND_METHOD
-from lidarops.products.multiangle import Method, MultiAngleSettings
+from lidarops.products.multiangle import MultiAngleSettings, ScanSettings
 from lidarops.products.multiangle.baseline import (
     add_low_beams,
     blocked_in_words,
@@ -40,7 +40,7 @@ from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettin
 from lidarops.scene.choices import BackgroundSettings, background, no_scan, with_low_signal_to_noise
 from lidarops.scene.profiles import ChannelSignal, Chunk, Indices, ProductStream, in_one_batch
 from lidarops.scene.retrieval import Retrieval, Workload
-from lidarops.settings import SettingsModel, quantity
+from lidarops.settings import SettingsModel
 
 Array = npt.NDArray[np.float64]
 Case = ChannelCase[MultiAngleSettings]
@@ -280,20 +280,6 @@ def _layers(case: Case) -> Entry:
         reason = "the campaign requests the optical depth of layers"
         return case.run("layers", reason, number=number)
     return case.leave("layers", "the campaign requests no layers", number=number)
-
-
-class ScanSettings(SettingsModel):
-    """Settings of the entry ``multiangle``."""
-
-    highest: float = quantity(unit="m", description="above the station")
-    step: float = quantity(unit="m")
-    method: Method
-    regularisation: float | None = quantity(
-        None, unit="1", description="of `mld` and `mld_prior`; chosen from the noise if none"
-    )
-    largest_gradient: float = quantity(unit="m-1")
-    layers: tuple[tuple[float, float], ...] = quantity(unit="m", description="above the station")
-    least_signal_to_noise: float
 
 
 class MultiAnglePlan(SettingsModel):
