@@ -11,15 +11,14 @@ import numpy as np
 from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
-from lidarops.products.raman import RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
+from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
 from lidarops.retrieve.raman.signals import (
     AirColumn,
     Cells,
     ChannelSignal,
-    RamanSettings,
     make_cells,
 )
 
@@ -31,7 +30,6 @@ _STEP: Final = 30.0
 _RANGE: Final = _STEP * (np.arange(400, dtype=np.float64) + 0.5)
 _CELL: Final = 60.0
 _FULL_OVERLAP: Final = 300.0
-_WINDOW: Final = RamanReferenceSettings()
 """That of products."""
 _COMPARED: Final = 6000.0
 """m; values below are compared with the truth."""
@@ -98,6 +96,8 @@ def _air() -> tuple[AirColumn, Cells]:
         raman_depth=_along(molecules.extinction(_RANGE, _RAMAN)),
         density=molecules.number_density(_RANGE),
         overlap=np.where(_RANGE >= _FULL_OVERLAP, 1.0, np.nan),
+        wavelength=_LASER,
+        raman_wavelength=_RAMAN,
     )
     return air, make_cells(_RANGE, _RANGE[-1] + _STEP, _CELL)
 
@@ -140,16 +140,11 @@ def score_raman(cluster: int, profiles: int) -> Iterator[ScoredValues]:
             for mean in (raman, elastic)
         ]
         settings = RamanSettings(
-            _LASER,
-            _RAMAN,
-            _EXPONENT,
-            sky.assumed_error,
-            _WINDOW.lowest,
-            _WINDOW.highest,
-            _WINDOW.width,
-            1.0,
-            sky.reference_error,
-            0.0,
+            reference=RamanReference(relative_error=sky.reference_error),
+            angstrom_exponent=_EXPONENT,
+            angstrom_standard_error=sky.assumed_error,
+            molecular_relative_error=0.0,
+            overlap_relative_error=0.0,
         )
         bits = np.repeat(quality[np.newaxis], profiles, axis=0)
         result = retrieve_raman(signals[0], signals[1], air, cells, settings, quality=bits)

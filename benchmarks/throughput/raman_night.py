@@ -15,7 +15,7 @@ from benchmarks.harness.verdicts import Scores
 from lidarops.records import DetectionMode
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.signals import RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import condition
 from lidarops.retrieve.signal.labeled_averaging import (
@@ -143,23 +143,12 @@ def retrieved(means: dict[str, xr.Dataset]) -> list[xr.Dataset]:
 def _pair(
     means: dict[str, xr.Dataset], laser: str, raman: str, water: labeled.WaterVapour | None
 ) -> xr.Dataset:
-    settings = RamanSettings(
-        wavelength=CHANNELS[laser],
-        raman_wavelength=CHANNELS[raman],
-        angstrom_exponent=1.2,
-        angstrom_standard_error=0.5,
-        lowest=6000.0,
-        highest=_HIGHEST,
-        width=2000.0,
-        scattering_ratio=1.0,
-        reference_relative_error=0.02,
-        molecular_relative_error=0.01,
-    )
     return labeled.retrieve(
         means[laser].assign_coords(zenith_angle=0.0),
         means[raman],
         molecules=MolecularProfile.us_standard(),
         station_altitude=100.0,
-        settings=settings,
+        wavelengths=(CHANNELS[laser], CHANNELS[raman]),
+        settings=RamanSettings(),
         water=water,
     )

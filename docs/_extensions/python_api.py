@@ -31,6 +31,7 @@ MODULES: Final = (
     "lidarops.retrieve.elastic",
     "lidarops.retrieve.elastic.labeled",
     "lidarops.retrieve.raman.retrieval",
+    "lidarops.retrieve.raman.settings",
     "lidarops.retrieve.raman.signals",
     "lidarops.retrieve.raman.scattering",
     "lidarops.retrieve.raman.depth_fit",

@@ -4,8 +4,3 @@
 other. They share `signal` (raw counts to signals), `background`, `clouds`, `air` (molecules,
 visibility) and `common` (input checks). The modules `labeled*` do the same on `xarray` data.
 """
-
-from lidarops.retrieve.common.compiled_code import keep_apart
-
-# Before any function is compiled.
-keep_apart()

@@ -14,4 +14,4 @@ signal.
 """
 
 # Sets the cache of compiled code, whichever module is imported first.
-import lidarops.retrieve  # noqa: F401
+import lidarops.retrieve.common  # noqa: F401

@@ -8,13 +8,12 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import lidar_ratio_profile
 from lidarops.flags import Quality, rejecting
-from lidarops.products.raman import RamanReferenceSettings
 from lidarops.products.raman.variables import FLAGS
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic.labeled import invert_elastic
 from lidarops.retrieve.raman.labeled import retrieve
-from lidarops.retrieve.raman.signals import RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.counts_to_signal import photon_signal
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 from lidarops.settings import ReferenceSettings
@@ -63,17 +62,13 @@ def test_elastic_values_with_measured_lidar_ratios_are_right_within_their_errors
         )
     levels = np.loadtxt(folder / "pressure_temperature.txt", skiprows=1)
     air = MolecularProfile.from_profile(levels[:, 1], levels[:, 2], levels[:, 3] + 273.15)
-    window = RamanReferenceSettings()
-    settings = RamanSettings(
-        laser, wavelength, 1.2, 0.5, window.lowest, window.highest, window.width,
-        window.scattering_ratio, window.relative_error, 0.01, 0.1, 2e-6,
-    )  # fmt: skip
     product = retrieve(
         elastic,
         nitrogen,
         molecules=air,
         station_altitude=0.0,
-        settings=settings,
+        wavelengths=(laser, wavelength),
+        settings=RamanSettings(),
         overlap=np.where(r < 345.0, np.nan, 1.0),
     )
     rejected = (product["quality_flag"] & np.int32(rejecting(FLAGS))) != 0

@@ -18,10 +18,10 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.flags import Quality, rejecting
 from lidarops.kinds import flags_of
-from lidarops.products.raman.retrieval import STANDARD_SLOPE_ERROR
 from lidarops.records import RunRecord
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
 from lidarops.run.archive import Options, reprocess
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.signal import sine_overlap
@@ -403,7 +403,7 @@ def test_the_slope_of_the_standard_atmosphere_is_off_by_its_stated_error(data_ro
     densities = (air.number_density(z) for air in (sounding, MolecularProfile.us_standard()))
     slopes = [np.gradient(np.log(density), z) for density in densities]
     away = np.sqrt(np.mean((slopes[0] - slopes[1]) ** 2))
-    assert away == pytest.approx(STANDARD_SLOPE_ERROR, rel=0.02)
+    assert away == pytest.approx(THRESHOLDS.standard_slope_error, rel=0.02)
     edges = np.array([100.0, 1000.0, 2000.0, 4000.0, 8000.0, 12_000.0])
     parts = [(z > low) & (z < high) for low, high in itertools.pairwise(edges)]
     of_parts = [np.sqrt(np.mean((slopes[0] - slopes[1])[part] ** 2)) for part in parts]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
 
 import pytest
 
@@ -11,9 +10,9 @@ from benchmarks.throughput.raman_night import night, night_signals, screened_ave
 from lidarops.products.raman.retrieval import bytes_held
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman import labeled
-from lidarops.retrieve.raman.signals import RamanSettings
+from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
 
-SETTINGS = RamanSettings(355e-9, 387e-9, 1.0, 0.5, 3000.0, 6500.0, 2000.0, 1.0, 0.02, 0.01)
+WINDOW = RamanReference(lowest=3000.0, highest=6500.0)
 NAMES = ("355", "387")
 
 
@@ -30,7 +29,8 @@ def peak(means: int, bins: int, cell: float) -> tuple[float, int]:
         raman,
         molecules=MolecularProfile.us_standard(),
         station_altitude=100.0,
-        settings=replace(SETTINGS, cell=cell, farthest=float(counts["range"][-1])),
+        wavelengths=(355e-9, 387e-9),
+        settings=RamanSettings(cell=cell, highest=float(counts["range"][-1]), reference=WINDOW),
     )
     highest = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
 from lidarops.retrieve.raman.signals import (
     AirColumn,
     Cells,
     ChannelSignal,
-    RamanSettings,
     make_cells,
 )
 
@@ -40,6 +40,11 @@ class Sky:
     air: AirColumn
     cells: Cells
     settings: RamanSettings
+
+    @property
+    def ratio(self) -> float:
+        """Particle extinction at the Raman wavelength over that at the laser's."""
+        return self.air.particle_ratio(self.settings.angstrom_exponent)
 
     @property
     def quality(self) -> npt.NDArray[np.int32]:
@@ -96,9 +101,16 @@ def make_sky(
         extinction / lidar_ratio,
         light * raman / raman[at],
         brightness * light * elastic / elastic[at],
-        AirColumn(r, backscatter, depth, raman_depth, density, known),
+        AirColumn(r, backscatter, depth, raman_depth, density, known, LASER, RAMAN),
         make_cells(r, r[-1] + step, cell),
-        RamanSettings(LASER, RAMAN, exponent, 0.0, low, high, width, 1.0, 0.0, 0.0),
+        RamanSettings(
+            highest=high,
+            reference=RamanReference(lowest=low, highest=high, width=width, relative_error=0.0),
+            angstrom_exponent=exponent,
+            angstrom_standard_error=0.0,
+            molecular_relative_error=0.0,
+            overlap_relative_error=0.0,
+        ),
     )
 
 

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from pydantic import Field, model_validator
 
 from lidarops.constants import FIXED, STEEPEST
 from lidarops.kinds import Kind
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.settings import (
     ChannelProduct,
-    Metres,
     PartOfDay,
-    ReferenceSettings,
     average_interval,
-    background_method,
     located_error,
-    quantity,
     signal_to_noise_limit,
 )
 
@@ -24,17 +21,12 @@ if TYPE_CHECKING:
     from lidarops.catalog.folder import InstrumentHeaders
 
 
-class RamanReferenceSettings(ReferenceSettings):
-    """Limits of the reference window of Raman signals, which are weak: higher up and wider."""
+class RamanProduct(ChannelProduct, RamanSettings):
+    """The ``raman`` product: extinction, backscatter and lidar ratio without an assumed one.
 
-    lowest: Metres = quantity(
-        6000.0, unit="m", description="least height of the window above the station"
-    )
-    width: float = quantity(2000.0, unit="m", ge=100, le=20_000, description="of the window")
-
-
-class RamanProductSettings(ChannelProduct):
-    """The ``raman`` product: extinction, backscatter and lidar ratio without an assumed one."""
+    Beside what the retrieval assumes, the channels that it is made of, and what is done to signals
+    before and to values after it.
+    """
 
     channels: list[str] = Field(
         min_length=1, description="elastic channels, each with its Raman channel under nitrogen"
@@ -49,44 +41,6 @@ class RamanProductSettings(ChannelProduct):
         " give water_vapour_calibration",
     )
     average: PartOfDay = average_interval()
-    cell: float = quantity(
-        60.0, unit="m", ge=3, le=1000, description="length of the bins of values"
-    )
-    highest: Metres = quantity(15_000.0, unit="m", description="farthest range")
-    background: Literal["known_shape", "tail_mean"] = background_method()
-    reference: RamanReferenceSettings = RamanReferenceSettings()
-    angstrom_exponent: float = quantity(
-        1.2,
-        unit="1",
-        ge=-1,
-        le=4,
-        description="of particle extinction, elastic to Raman wavelength",
-    )
-    angstrom_standard_error: float = quantity(
-        0.5, unit="1", ge=0, le=3, description="of angstrom_exponent"
-    )
-    molecular_relative_error: float = quantity(
-        0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
-    )
-    molecular_slope_error: float | None = quantity(
-        None,
-        unit="m-1",
-        ge=0,
-        le=1e-3,
-        description="standard error of the derivative of the logarithm of the density of the air"
-        " over height; by default 1.6e-5 of the standard atmosphere, 2e-6 of a molecular_profile",
-    )
-    overlap_relative_error: float = quantity(
-        0.1, unit="1", ge=0, le=1, description="standard error of 1 - overlap, relative"
-    )
-    filter_width: float | None = quantity(
-        None,
-        unit="m",
-        gt=1e-11,
-        lt=1e-7,
-        description="full width at half maximum of the filters of nitrogen; by default, all lines"
-        " pass at all temperatures",
-    )
     least_signal_to_noise: float = signal_to_noise_limit()
 
     @model_validator(mode="after")
@@ -130,7 +84,7 @@ KIND: Final = Kind(
     name="raman",
     title="Extinction and lidar ratio of Raman signals",
     package=__name__,
-    settings=RamanProductSettings,
+    settings=RamanProduct,
     rank=45,
     expects_usable=False,
     draft=_section,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields
 from typing import Final, cast
 
 import xarray as xr
@@ -12,7 +11,7 @@ import xarray as xr
 from lidarops.campaign.model import channel_facts
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.errors import SceneError
-from lidarops.products.raman import RamanProductSettings
+from lidarops.products.raman import RamanProduct
 from lidarops.products.raman.variables import LAYOUT
 from lidarops.records import file_channels
 from lidarops.retrieve.raman import labeled
@@ -22,7 +21,7 @@ from lidarops.retrieve.raman.scattering import (
     is_raman_line,
     raman_wavelength,
 )
-from lidarops.retrieve.raman.signals import RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, member_channel
@@ -37,38 +36,18 @@ from lidarops.scene.profiles import Averages, ChannelSignal, Chunk, ProductStrea
 from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
-Case = ChannelCase[RamanProductSettings]
-
-STANDARD_SLOPE_ERROR: Final = 1.6e-5
-"""m-1, of the derivative of the logarithm of the density of the standard atmosphere: root mean
-square from 0.1 to 12 km of its deviation from the sounding of Manaus
-(`tests/end_to_end/test_raman.py`), 16 K warmer."""
-SOUNDING_SLOPE_ERROR: Final = 2e-6
-"""m-1, the same of a sounding or model: 0.5 K over 1 km. Assumed."""
+Case = ChannelCase[RamanProduct]
 
 
-class RetrievalSettings(SettingsModel):
-    """Settings of the entry ``raman``; lengths are along the beam."""
+class RetrievalEntry(SettingsModel, RamanSettings):
+    """Settings of the entry ``raman``: those of the campaign, and what the scene gives."""
 
     nitrogen: str
     water_vapour: str | None = None
     calibration: float | None = None
     """kg kg-1 per ratio of the signals of water vapour and nitrogen."""
     calibration_standard_error: float | None = None
-    lowest: float = quantity(unit="m", description="of the reference window")
-    highest: float = quantity(unit="m", description="of the reference window")
-    width: float = quantity(unit="m", description="of the reference window")
-    scattering_ratio: float
-    reference_relative_error: float
-    cell: float = quantity(unit="m")
-    farthest: float = quantity(unit="m")
-    known_shape: bool
-    angstrom_exponent: float
-    angstrom_standard_error: float
-    molecular_relative_error: float
-    molecular_slope_error: float = quantity(unit="m-1", description="along the beam")
-    overlap_relative_error: float
-    filter_width: float | None = quantity(None, unit="m")
+    zenith_angle: float = quantity(unit="degree")
     least_signal_to_noise: float
 
     @property
@@ -77,37 +56,30 @@ class RetrievalSettings(SettingsModel):
         water = self.water_vapour
         return (self.nitrogen,) if water is None else (self.nitrogen, water)
 
+    @property
+    def stretch(self) -> float:
+        """Length along the beam per height, m m-1."""
+        return 1.0 / math.cos(math.radians(self.zenith_angle))
+
 
 class RamanPlan(SettingsModel):
     """What a plan states of a product."""
 
     average: AverageSettings
-    raman: RetrievalSettings
+    raman: RetrievalEntry
 
 
-def _limits(case: Case) -> tuple[float, float, str]:
-    """Return stretch and reach of ranges along the beam, m, and why there are none."""
+def _beam(case: Case) -> tuple[float, str]:
+    """Return the zenith angle of the beam, degree, and why it has no reference window."""
     zenith, reason = fixed_zenith(case)
-    stretch = 1.0 / math.cos(math.radians(zenith)) if not reason else math.nan
+    stretch, window = 1.0 / math.cos(math.radians(zenith)), case.request.reference
     reach = case.last - 0.5 * case.channel.bin_width
-    window = case.request.reference
-    if (
-        not reason
-        and min(window.highest * stretch, reach) < (window.lowest + window.width) * stretch
-    ):
+    if min(window.highest * stretch, reach) < (window.lowest + window.width) * stretch:
         reason = (
             f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
             f" above {window.lowest:g} m"
         )
-    return stretch, reach, reason
-
-
-def _slope_error(case: Case) -> float:
-    """Return the error of the derivative of the logarithm of the density of air, m-1 of height."""
-    stated = case.request.molecular_slope_error
-    if stated is not None:
-        return stated
-    return SOUNDING_SLOPE_ERROR if case.facts.molecular_profile else STANDARD_SLOPE_ERROR
+    return zenith, reason
 
 
 def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
@@ -138,7 +110,7 @@ def _needs(case: Case) -> Entries:
     Where a fixed beam reaches the reference window, and the files hold the channels.
     """
     request, name = case.request, case.channel.name
-    stretch, reach, reason = _limits(case)
+    zenith, reason = _beam(case)
     nitrogen, water = request.nitrogen[name], request.water_vapour.get(name)
     reason = reason or _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
     if reason:
@@ -155,21 +127,13 @@ def _needs(case: Case) -> Entries:
     )
     if absent:
         yield case.leave("raman", f"no water vapour: {absent}")
-    window = request.reference
-    settings = RetrievalSettings.taken_from(
+    settings = RetrievalEntry.taken_from(
         request,
         nitrogen=nitrogen,
         water_vapour=water,
         calibration=facts.water_vapour_calibration if facts else None,
         calibration_standard_error=facts.water_vapour_calibration_error if facts else None,
-        lowest=window.lowest * stretch,
-        highest=min(window.highest * stretch, reach),
-        width=window.width * stretch,
-        scattering_ratio=window.scattering_ratio,
-        reference_relative_error=window.relative_error,
-        farthest=min(request.highest * stretch, reach),
-        known_shape=request.background == "known_shape",
-        molecular_slope_error=_slope_error(case) / stretch,
+        zenith_angle=zenith,
     )
     taken = ["read", "overlap", "noise", "glue", "molecular", "average"]
     taken += [f"{raman}/{stage}" for raman in settings.channels for stage in _FROM_COMPANIONS]
@@ -184,8 +148,9 @@ def _held(settings: RamanPlan, work: Workload) -> float:
     names = (work.channel, *settings.raman.channels)
     records = sum(len(file_channels(name)) for name in names)
     together = min(work.intervals(settings.average.seconds), MEANS_TOGETHER)
-    cells = settings.raman.farthest / settings.raman.cell
-    return bytes_held(records, together, work.bins, cells)
+    width = member_channel(work.scene.layout, work.channel).bin_width
+    highest = min(settings.raman.highest * settings.raman.stretch, work.bins * width)
+    return bytes_held(records, together, work.bins, highest / settings.raman.cell)
 
 
 def bytes_held(records: int, means: int, bins: int, cells: float) -> float:
@@ -205,16 +170,6 @@ _BYTES_OF_A_SOLUTION: Final = 80.0
 """Bytes per pair of cells of the profile that is being solved."""
 
 
-def _assumed(settings: RetrievalSettings, signal: ChannelSignal) -> RamanSettings:
-    """Return what the retrieval assumes: the wavelengths, and what the plan states."""
-    _, _, *stated = fields(RamanSettings)
-    return RamanSettings(
-        signal.wavelength,
-        signal.channels[settings.nitrogen].wavelength,
-        **{field.name: getattr(settings, field.name) for field in stated},
-    )
-
-
 class _Retrieval(ProductStream):
     """Averages of the profiles of all channels, and their retrieval."""
 
@@ -222,12 +177,13 @@ class _Retrieval(ProductStream):
         self._settings, self._signal = settings.raman, signal
         self._begun = False
         names = [signal.channel, *settings.raman.channels]
+        highest = settings.raman.reference.highest * settings.raman.stretch
         self._averages = Averages(
             [signal.channels[name].profiles for name in names],
             signal.source.geometry,
             signal.shots,
             settings.average.seconds,
-            Screening(cloud_contrast(signal.wavelength), settings.raman.highest),
+            Screening(cloud_contrast(signal.wavelength), highest),
         )
 
     def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
@@ -249,7 +205,8 @@ class _Retrieval(ProductStream):
             nitrogen,
             molecules=signal.molecules,
             station_altitude=signal.source.station_altitude,
-            settings=_assumed(settings, signal),
+            wavelengths=(signal.wavelength, signal.channels[settings.nitrogen].wavelength),
+            settings=settings,
             water=None if water is None else self._water(water),
             overlap=signal.overlap_at(elastic["range"].to_numpy()),
             overlap_is_stated=signal.full_overlap_range is not None,

@@ -5,7 +5,3 @@ optical depth of the Raman signal (`depth_fit`); its slope (`depth_fit`); the ra
 signals, calibrated in a reference window (`backscatter`); the lidar ratio, with the covariance
 of both. No lidar ratio is assumed.
 """
-
-from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
-
-__all__ = ["RamanResult", "retrieve_raman"]

@@ -20,7 +20,8 @@ import numpy as np
 from scipy.special import erfcx
 
 from lidarops.retrieve.common.arrays import Array, Booleans
-from lidarops.retrieve.raman.depth_fit import SignalNoise
+from lidarops.retrieve.raman.depth_fit import DepthFit, SignalNoise
+from lidarops.retrieve.raman.signals import CellSignal
 
 
 def inverse_mean(signal: Array, relative_variance: Array) -> Array:
@@ -109,55 +110,34 @@ class Ratio:
     """By which the elastic signal was multiplied."""
 
 
-def smooth_ratio(
-    elastic: Array, variance: Array, depth: Array, depth_error: Array, ratio: float
+def signal_ratio(
+    elastic: CellSignal, raman: CellSignal, fit: DepthFit, partial: Booleans, ratio: float
 ) -> Ratio:
-    """Return the ratio of an elastic signal to a smooth Raman signal.
+    """Return the ratio of an elastic to a Raman signal: the smooth one, but in partial overlap.
+
+    There the fit does not hold. The ratio to the Raman signal of the same cell cancels the overlap
+    that both signals have in common.
 
     Parameters
     ----------
-    elastic, variance : (cell,) float
-        Elastic signal over the transmission of clean air, and its variance.
-    depth, depth_error : (cell,) float
-        Of the Raman signal, with its standard error by noise.
+    elastic, raman : CellSignal
+    fit : DepthFit
+        Of the Raman signal, continued into cells of partial overlap.
+    partial : (cell,) bool
     ratio : float
         Particle extinction at the Raman wavelength over that at the laser's.
     """
-    sensitivity = np.full(depth.size, 2.0 / (1.0 + ratio))
-    factor = inverse_mean(np.exp(-depth), depth_error**2) * np.exp((sensitivity - 1.0) * depth)
-    return Ratio(elastic * factor, variance * factor**2, sensitivity, factor)
+    of_both = 2.0 / (1.0 + ratio)
+    of_cell = np.where(raman.value > 0.0, raman.value, np.nan)
+    signal = np.where(partial, of_cell, np.exp(-fit.depth))
+    square = np.where(partial, raman.variance / of_cell**2, fit.standard_error**2)
+    factor = inverse_mean(signal, square) * np.exp((of_both - 1.0) * fit.depth)
+    variance = elastic.variance + np.where(partial, elastic.value**2 * square, 0.0)
+    sensitivity = np.where(partial, of_both - 1.0, of_both)
+    return Ratio(elastic.value * factor, variance * factor**2, sensitivity, factor)
 
 
-def cell_ratio(
-    elastic: Array,
-    variance: Array,
-    raman: Array,
-    raman_variance: Array,
-    depth: Array,
-    ratio: float,
-) -> Ratio:
-    """Return the ratio of an elastic to a Raman signal of the same cells.
-
-    Overlap that both have in common cancels, where the fit of the depth does not hold.
-
-    Parameters
-    ----------
-    elastic, variance, raman, raman_variance : (cell,) float
-        Signals over those of clean air, and their variances.
-    depth : (cell,) float
-        Of particles alone, continued into cells of partial overlap.
-    ratio : float
-        Particle extinction at the Raman wavelength over that at the laser's.
-    """
-    sensitivity = np.full(depth.size, 2.0 / (1.0 + ratio) - 1.0)
-    signal = np.where(raman > 0.0, raman, np.nan)
-    square = raman_variance / signal**2
-    factor = inverse_mean(signal, square) * np.exp(sensitivity * depth)
-    own = (variance + elastic**2 * square) * factor**2
-    return Ratio(elastic * factor, own, sensitivity, factor)
-
-
-def calibrated(
+def calibrated_backscatter(
     ratio: Ratio,
     noise: SignalNoise,
     depth_noise: Array,

@@ -22,7 +22,7 @@ library of linear algebra.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
@@ -81,15 +81,6 @@ class DepthFit:
     What is decided by it is not decided by the noise of the cell: by its own standard error, cells
     that noise makes bright would be kept, and the depth there biased."""
 
-    @classmethod
-    def of(cls, depth: Array, information: Array, inverse: Array, walk: float) -> Self:
-        """Return a fit with its errors."""
-        noise = inverse * np.sqrt(information)
-        error = root_of_squares(noise)
-        nearer = depth[int(np.argmin(error))]
-        expected = error * np.exp(-0.5 * (depth - nearer))
-        return cls(depth, information, inverse, walk, noise, error, expected)
-
     def respond(self, relative: Array) -> Array:
         """Return the change of the depth when the signal changes by shares of it.
 
@@ -144,7 +135,10 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
     information = _working(values, noise, used)[0]
     mean = float(information.mean())
     inverse = solve(information, weight * mean, np.eye(signal.size))
-    return DepthFit.of(used, information, inverse, walk * mean)
+    of_noise = inverse * np.sqrt(information)
+    error = root_of_squares(of_noise)
+    expected = error * np.exp(-0.5 * (used - used[int(np.argmin(error))]))
+    return DepthFit(used, information, inverse, walk * mean, of_noise, error, expected)
 
 
 def _level(signal: Array, noise: SignalNoise, known: Booleans) -> float:

@@ -11,7 +11,8 @@ import numpy as np
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import Backscatter
 from lidarops.retrieve.raman.depth_fit import DepthFit, Extinction, slope
-from lidarops.retrieve.raman.signals import AirColumn, CellSignal, RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import AirColumn, CellSignal
 
 EXTINCTION_CAUSES: Final = (
     "noise", "resolution", "background", "dead_time", "baseline", "angstrom", "molecular",
@@ -83,6 +84,8 @@ class Effects:
     step: float
     """m, length of a cell."""
     settings: RamanSettings
+    reference_error: float
+    """Relative standard error of the scattering ratio in the reference window."""
     partial: Booleans
 
     def causes(self) -> Iterator[Cause]:
@@ -94,11 +97,15 @@ class Effects:
         )
         partial = self.partial[:, np.newaxis]
         depth = self.profile.fit.respond(np.where(partial, 0.0, raman))
-        alpha = slope(depth, self.step) / (1.0 + self.settings.ratio)
+        alpha = slope(depth, self.step) / (1.0 + self._ratio)
         beta = self._respond(elastic - np.where(partial, raman, 0.0), depth) + beside
         for change, *effects in zip(changes, alpha.T, beta.T, depth.T, strict=True):
             yield Cause(change.name, *effects)
         yield from self._assumed()
+
+    @property
+    def _ratio(self) -> float:
+        return self.air.particle_ratio(self.settings.angstrom_exponent)
 
     @property
     def _none(self) -> Array:
@@ -133,7 +140,7 @@ class Effects:
             2.0 * error * depth,
             error * (self._total - self.air.backscatter),
         )
-        error = self.settings.molecular_slope_error
+        error = self.air.slope_error
         shares = self._none if self.calibrated is None else self.calibrated.shares
         away = self.air.range - shares @ self.air.range
         beside = -error * away * self.air.backscatter
@@ -146,10 +153,11 @@ class Effects:
 
     def _assumed(self) -> Iterator[Cause]:
         """Yield the effects of the scattering ratio and the Angstrom exponent."""
-        none, settings = self._none, self.settings
-        yield Cause("reference", none, settings.reference_relative_error * self._total, none)
-        change = settings.ratio_error / (1.0 + settings.ratio)
-        relative = -2.0 * self.profile.fit.depth * change / (1.0 + settings.ratio)
+        none, ratio = self._none, self._ratio
+        yield Cause("reference", none, self.reference_error * self._total, none)
+        colour = abs(float(np.log(self.air.wavelength / self.air.raman_wavelength)))
+        change = ratio * colour * self.settings.angstrom_standard_error / (1.0 + ratio)
+        relative = -2.0 * self.profile.fit.depth * change / (1.0 + ratio)
         alpha = -change * self.profile.extinction.value
         yield Cause("angstrom", alpha, self._respond(relative, none), none)
 

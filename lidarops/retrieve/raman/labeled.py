@@ -7,7 +7,6 @@ lidar ratio, clouds of the elastic signal, water vapour, overlap.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -23,17 +22,18 @@ from lidarops.retrieve.raman.backscatter import overlap_of
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.scattering import nitrogen_line_share
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import (
     AirColumn,
     Cells,
     ChannelSignal,
-    RamanSettings,
     cell_signals,
     largest_of_cells,
     make_cells,
     state_of_cells,
     touched,
 )
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import (
@@ -50,6 +50,7 @@ _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 _BITS_OF_ANY_BIN: Final = (
     _DOUBTED | int(Quality.INCOMPLETE_OVERLAP | Quality.SINGLE_RECORD)
 ) & ~int(_MISSING)
+_PLANE: Final = ("time", "range")
 _DIGITS_OF_A_BIN: Final = 6
 """Digits of the difference of ranges in bins, which are no more certain: 1e-6 bins are 10 um."""
 
@@ -146,12 +147,37 @@ class _Channel:
         return (1.0 - self._share) * values[..., :-1] + self._share * values[..., 1:]
 
 
+@dataclass(frozen=True, slots=True)
+class _Beam:
+    """What is known along the beam, at the ranges that all channels have."""
+
+    molecules: MolecularProfile
+    station_altitude: float
+    """m above mean sea level."""
+    climb: float
+    """m of height per m along the beam."""
+    air: AirColumn
+    cells: Cells
+    settings: RamanSettings
+
+    @property
+    def altitude(self) -> Array:
+        """Altitudes of the ranges, m."""
+        return np.asarray(self.station_altitude + self.climb * self.air.range)
+
+    @property
+    def reference(self) -> _clouds.Reference:
+        """Limits of the reference window along the beam."""
+        return _clouds.Reference(**dict(self.settings.reference.along(self.air.stretch)))
+
+
 def retrieve(
     elastic: xr.Dataset,
     raman: xr.Dataset,
     *,
     molecules: MolecularProfile,
     station_altitude: float,
+    wavelengths: tuple[float, float],
     settings: RamanSettings,
     water: WaterVapour | None = None,
     overlap: Array | None = None,
@@ -169,6 +195,8 @@ def retrieve(
     molecules : MolecularProfile
     station_altitude : float
         m above mean sea level.
+    wavelengths : (float, float)
+        m, of the laser and of the Raman line of nitrogen.
     settings : RamanSettings
     water : WaterVapour, optional
     overlap : (range,) float, optional
@@ -200,32 +228,24 @@ def retrieve(
         for averages, part in zip((elastic, *others), bins, strict=True)
     ]
     seen = np.ones(distance.size) if overlap is None else overlap[bins[0][0]]
-    heights = station_altitude + climb * distance
-    air = _air(molecules, heights, distance, settings, settings.filter_width, seen)
-    cells = make_cells(distance, min(settings.farthest, float(distance[-1])), settings.cell)
-    of_elastic, elastic_uncertain = channels[0].signal(
-        air.backscatter * air.elastic_shape, known_shape=settings.known_shape
-    )
-    of_raman, raman_uncertain = channels[1].signal(
-        air.raman_shape, known_shape=settings.known_shape
+    air = _air(molecules, station_altitude, climb, distance, wavelengths, settings, seen)
+    highest = min(settings.highest * air.stretch, float(distance[-1]))
+    cells = make_cells(distance, highest, settings.cell)
+    beam = _Beam(molecules, station_altitude, climb, air, cells, settings)
+    shapes = (air.backscatter * air.elastic_shape, air.raman_shape)
+    (of_elastic, elastic_uncertain), (of_raman, raman_uncertain) = (
+        channel.signal(shape, known_shape=settings.known_shape)
+        for channel, shape in zip(channels[:2], shapes, strict=True)
     )
     quality = _quality(cells, channels[:2], seen)
-    uncertain = elastic_uncertain | raman_uncertain
-    quality[uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
+    quality[elastic_uncertain | raman_uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
     stated = seen if overlap_is_stated or overlap is not None else np.full_like(seen, np.nan)
-    sky = _Sky(molecules, station_altitude, climb, seen, overlap_is_stated)
-    reference = _clouds.Reference(
-        settings.lowest,
-        settings.highest,
-        settings.width,
-        settings.scattering_ratio,
-        settings.reference_relative_error,
-    )
     variables = {
-        **_variables(result, cells, air, of_raman, settings, stated),
-        **_clouds.window_variables(result.reference, reference, station_altitude, climb),
-        **_cloud_variables(channels[0], settings, reference, cells, result, sky),
+        **_variables(result, beam),
+        **_overlap(result, beam, of_raman, stated),
+        **_clouds.window_variables(result.reference, beam.reference, station_altitude, climb),
+        **_cloud_variables(channels[0], result, beam, overlap_is_stated=overlap_is_stated),
         "background": ("time", of_elastic.background),
         "background_standard_error": ("time", of_elastic.background_standard_error),
         "profiles": elastic["profiles"],
@@ -233,7 +253,7 @@ def retrieve(
         "shots": elastic["shots"],
     }
     if water is not None:
-        of_water, doubtful = _water(water, channels[2], of_raman, air, cells, result, sky, settings)
+        of_water, doubtful = _water(water, channels[2], of_raman, result, beam)
         dims, bits = variables["quality_flag"]
         doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
         variables |= {**of_water, "quality_flag": (dims, bits | doubt)}
@@ -278,17 +298,23 @@ def _depth(
 
 def _air(
     molecules: MolecularProfile,
-    altitude: Array,
+    station_altitude: float,
+    climb: float,
     distance: Array,
+    wavelengths: tuple[float, float],
     settings: RamanSettings,
-    filter_width: float | None,
     overlap: Array,
 ) -> AirColumn:
-    laser, raman = settings.wavelength, settings.raman_wavelength
+    laser, raman = wavelengths
+    altitude, stretch = station_altitude + climb * distance, 1.0 / climb
     density = molecules.number_density(altitude)
-    if filter_width is not None:
+    if settings.filter_width is not None:
         temperature = molecules.at(altitude)[1]
-        density = density * nitrogen_line_share(temperature, laser, raman, filter_width)
+        density = density * nitrogen_line_share(temperature, laser, raman, settings.filter_width)
+    slope_error = settings.molecular_slope_error
+    if slope_error is None:
+        of_source = THRESHOLDS.standard_slope_error, THRESHOLDS.sounding_slope_error
+        slope_error = of_source[0] if molecules.standard else of_source[1]
     return AirColumn(
         distance,
         molecules.backscatter(altitude, laser),
@@ -296,6 +322,10 @@ def _air(
         _depth(molecules, altitude, distance, raman),
         density,
         overlap,
+        laser,
+        raman,
+        stretch,
+        slope_error / stretch,
     )
 
 
@@ -312,77 +342,49 @@ def _quality(cells: Cells, channels: list[_Channel], overlap: Array) -> Flags:
     return bits
 
 
-def _variables(
-    result: RamanResult,
-    cells: Cells,
-    air: AirColumn,
-    raman: ChannelSignal,
-    settings: RamanSettings,
-    overlap: Array,
-) -> dict[str, Any]:
-    both = ("time", "range")
-    profiles: dict[str, Array] = {
+def _variables(result: RamanResult, beam: _Beam) -> dict[str, Any]:
+    profiles = {
         "aerosol_extinction": result.extinction,
         "aerosol_extinction_standard_error": result.extinction_standard_error,
-        **_budget("aerosol_extinction", result.extinction_budget),
         "aerosol_extinction_smoothing_error": result.extinction_smoothing_error,
         "aerosol_backscatter": result.backscatter,
         "aerosol_backscatter_standard_error": result.backscatter_standard_error,
-        **_budget("aerosol_backscatter", result.backscatter_budget),
         "lidar_ratio": result.lidar_ratio,
         "lidar_ratio_standard_error": result.lidar_ratio_standard_error,
         "lidar_ratio_error_random": result.lidar_ratio_random,
         "lidar_ratio_error_systematic": result.lidar_ratio_systematic,
         "vertical_resolution": result.vertical_resolution,
-        **_overlap(result, cells, air, raman, settings, overlap),
     }
+    for cause, error in result.extinction_budget.items():
+        profiles[f"aerosol_extinction_error_{cause}"] = error
+    for cause, error in result.backscatter_budget.items():
+        profiles[f"aerosol_backscatter_error_{cause}"] = error
     return {
-        **{name: (both, values) for name, values in profiles.items()},
-        "quality_flag": (both, result.quality),
-        "molecular_backscatter": ("range", cells.mean(air.backscatter)),
+        **{name: (_PLANE, values) for name, values in profiles.items()},
+        "molecular_backscatter": ("range", beam.cells.mean(beam.air.backscatter)),
     }
-
-
-def _budget(name: str, budget: Mapping[str, Array]) -> dict[str, Array]:
-    return {f"{name}_error_{cause}": error for cause, error in budget.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class _Sky:
-    """What is known of the air and of the overlap along the beam."""
-
-    molecules: MolecularProfile
-    station_altitude: float
-    climb: float
-    overlap: Array
-    overlap_is_stated: bool
-
-    def altitude(self, distance: Array) -> Array:
-        """Return altitudes of ranges, m."""
-        return np.asarray(self.station_altitude + self.climb * distance)
 
 
 def _cloud_variables(
-    elastic: _Channel,
-    settings: RamanSettings,
-    reference: _clouds.Reference,
-    cells: Cells,
-    result: RamanResult,
-    sky: _Sky,
+    elastic: _Channel, result: RamanResult, beam: _Beam, *, overlap_is_stated: bool
 ) -> dict[str, Any]:
     """Return the clouds of the elastic signal, and the quality with their bits."""
-    both = ("time", "range")
-    averages = elastic.averages
-    distance = averages["range"].to_numpy()
-    air = _clouds.air_along(sky.molecules, sky.altitude(distance), distance, settings.wavelength)
-    contrast = cloud_contrast(settings.wavelength)
-    means = _clouds.MeanProfiles(averages, distance, air, sky.overlap, contrast, elastic.noise)
+    cells, distance = beam.cells, beam.air.range
+    laser = beam.air.wavelength
+    means = _clouds.MeanProfiles(
+        elastic.averages,
+        distance,
+        _clouds.air_along(beam.molecules, beam.altitude, distance, laser),
+        beam.air.overlap,
+        cloud_contrast(laser),
+        elastic.noise,
+    )
     _, clouds = _clouds.signal_and_clouds(
         means,
-        averages,
-        reference,
-        known_shape=settings.known_shape,
-        overlap_is_stated=sky.overlap_is_stated,
+        elastic.averages,
+        beam.reference,
+        known_shape=beam.settings.known_shape,
+        overlap_is_stated=overlap_is_stated,
     )
     state = state_of_cells(clouds.state, cells, _clouds.UNKNOWN)
     fraction = largest_of_cells(clouds.fraction, cells)
@@ -396,37 +398,27 @@ def _cloud_variables(
         near = touched(mask, result.vertical_resolution, cells.step)
         near |= _clouds.with_margin(mask, cells.range)
         quality = quality | np.where(near, np.int32(bit), np.int32(0))
+    # Up to the last cell, beyond which no value has their bit.
+    n = cells.stop
+    in_cells = _clouds.Clouds(clouds.mask[:, :n], clouds.fraction[:, :n], clouds.unknown[:, :n])
     return {
-        "quality_flag": (both, quality),
-        "cloud_mask": (both, state),
-        "cloud_fraction": (both, fraction),
-        **_heights_in(cells, clouds, distance, sky),
+        "quality_flag": (_PLANE, quality),
+        "cloud_mask": (_PLANE, state),
+        "cloud_fraction": (_PLANE, fraction),
+        **_clouds.cloud_heights(in_cells, distance[:n], beam.station_altitude, beam.climb),
     }
 
 
-def _heights_in(
-    cells: Cells, clouds: _clouds.Clouds, distance: Array, sky: _Sky
-) -> dict[str, tuple[str, Array]]:
-    """Return base and top of clouds up to the last cell, beyond which no value has their bit."""
-    n = cells.stop
-    of_cells = _clouds.Clouds(clouds.mask[:, :n], clouds.fraction[:, :n], clouds.unknown[:, :n])
-    return _clouds.cloud_heights(of_cells, distance[:n], sky.station_altitude, sky.climb)
-
-
 def _overlap(
-    result: RamanResult,
-    cells: Cells,
-    air: AirColumn,
-    raman: ChannelSignal,
-    settings: RamanSettings,
-    overlap: Array,
-) -> dict[str, Array]:
-    """Return the overlap of each profile: that of the campaign, `overlap`, where it is stated.
+    result: RamanResult, beam: _Beam, raman: ChannelSignal, stated: Array
+) -> dict[str, Any]:
+    """Return the overlap of each profile: that of the campaign where it is stated.
 
     Below, it is measured by a signal that is not corrected for overlap.
     """
-    stated = cells.mean(overlap)
-    stated_error = settings.overlap_relative_error * (1.0 - stated)
+    air, cells, settings = beam.air, beam.cells, beam.settings
+    of_cells = cells.mean(stated)
+    error_of_cells = settings.overlap_relative_error * (1.0 - of_cells)
     unity = replace(air, overlap=np.ones(air.overlap.size))
     value, error = np.full((2, *result.quality.shape), np.nan)
     signals = cell_signals(raman, unity.raman_shape, cells)
@@ -440,27 +432,24 @@ def _overlap(
             (result.lidar_ratio[row], result.lidar_ratio_standard_error[row]),
             partial,
             cells.step,
-            settings.ratio,
+            air.particle_ratio(settings.angstrom_exponent),
         )
-        value[row] = np.where(partial, measured, stated)
-        error[row] = np.where(partial, spread, stated_error)
-    return {"overlap": value, "overlap_standard_error": error}
+        value[row] = np.where(partial, measured, of_cells)
+        error[row] = np.where(partial, spread, error_of_cells)
+    return {"overlap": (_PLANE, value), "overlap_standard_error": (_PLANE, error)}
 
 
 def _water(
     water: WaterVapour,
     channel: _Channel,
     nitrogen: ChannelSignal,
-    air: AirColumn,
-    cells: Cells,
     result: RamanResult,
-    sky: _Sky,
-    settings: RamanSettings,
+    beam: _Beam,
 ) -> tuple[dict[str, Any], Booleans]:
     """Return the mixing ratio of water vapour with its errors, and the cells that are doubtful."""
-    heights = sky.altitude(air.range)
-    density = sky.molecules.number_density(heights)
-    depth = _depth(sky.molecules, heights, air.range, water.wavelength)
+    air, cells, settings = beam.air, beam.cells, beam.settings
+    density = beam.molecules.number_density(beam.altitude)
+    depth = _depth(beam.molecules, beam.altitude, air.range, water.wavelength)
     # The share of the lines of nitrogen that the filter passes is not that of water vapour.
     shape = replace(air, raman_depth=depth, density=density)
     vapour, uncertain = channel.signal(shape.raman_shape, known_shape=settings.known_shape)
@@ -472,7 +461,8 @@ def _water(
         cells.mean(share / share[0] - 1.0),
     )
     partial = (result.quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
-    particles = particle_transmission(settings, water.wavelength)
+    lines = air.wavelength, air.raman_wavelength, water.wavelength
+    particles = particle_transmission(settings, *lines)
     value, random, systematic = np.full((3, *result.quality.shape), np.nan)
     signals = (
         cell_signals(nitrogen, air.raman_shape, cells),
@@ -494,6 +484,6 @@ def _water(
     doubted = cells.split((channel.quality & np.int32(_DOUBTED)) != 0).any(axis=-1)
     doubtful = np.isnan(value) | doubted | uncertain[:, np.newaxis]
     return {
-        f"water_vapour_mixing_ratio{name}": (("time", "range"), array)
+        f"water_vapour_mixing_ratio{name}": (_PLANE, array)
         for name, array in zip(names, arrays, strict=True)
     }, doubtful

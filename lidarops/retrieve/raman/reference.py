@@ -20,76 +20,75 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.common.arrays import Array, Booleans
-from lidarops.retrieve.raman.depth_fit import DepthFit
-from lidarops.retrieve.raman.signals import (
-    AirColumn,
-    Cells,
-    CellSignal,
-    ChannelSignal,
-    RamanSettings,
-)
+from lidarops.retrieve.raman.errors import Profile
+from lidarops.retrieve.raman.settings import RamanReference
+from lidarops.retrieve.raman.signals import AirColumn, Cells, ChannelSignal
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 
 def choose_window(
     elastic: ChannelSignal,
-    raman: Sequence[tuple[CellSignal, DepthFit] | None],
+    profiles: Sequence[Profile | None],
     air: AirColumn,
     cells: Cells,
-    settings: RamanSettings,
+    limits: RamanReference,
+    ratio: float,
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows of all profiles: of clean air, by the ratio of both signals.
 
     Parameters
     ----------
     elastic : ChannelSignal
-    raman : sequence of (CellSignal, DepthFit) or None
-        Raman signal of each profile with its fit; None where there is none, and no window then.
+    profiles : sequence of Profile or None
+        None where there is no Raman signal, and no window then.
     air : AirColumn
     cells : Cells
-    settings : RamanSettings
+    limits : RamanReference
+        Along the beam.
+    ratio : float
+        Particle extinction at the Raman wavelength over that at the laser's.
 
     Raises
     ------
     RetrievalInputError
         Where all cells lie below the least range of the window.
     """
-    candidates = _candidates(cells, settings)
+    candidates = _candidates(cells, limits)
     # Of cells: the tests take noise as normal, which it is not in bins of few counts.
     of_air = cells.mean(air.backscatter * air.elastic_shape)
     power, bins = cells.mean(elastic.power), np.maximum(cells.known(elastic.power), 1.0)
     variance = cells.mean(elastic.variance) / bins
-    shape = np.tile(of_air, (len(raman), 1))
+    shape = np.tile(of_air, (len(profiles), 1))
     background = np.nan_to_num(elastic.background_standard_error)
     baseline = cells.mean(np.broadcast_to(elastic.baseline_error, elastic.power.shape))
     baseline = np.nan_to_num(baseline)
     inside = (cells.range >= candidates[:, :1]) & (cells.range <= candidates[:, 1:])
-    for number, signal in enumerate(raman):
-        if signal is None:
+    for number, profile in enumerate(profiles):
+        if profile is None:
             power[number] = np.nan
             continue
-        of_raman, fit = signal
+        raman, fit = profile.raman, profile.fit
         power[number, fit.expected_error > THRESHOLDS.most_uncertain] = np.nan
         # Of the fit, only the small difference of both transmissions is used.
         mean = np.exp(-fit.depth)
-        per_raman = of_air * np.exp((1.0 - 2.0 / (1.0 + settings.ratio)) * fit.depth)
+        per_raman = of_air * np.exp((1.0 - 2.0 / (1.0 + ratio)) * fit.depth)
         # For the smooth signal: by the observed one, low counts would weigh more.
-        noise = of_raman.noise.of(mean)
+        noise = raman.noise.of(mean)
         level = _level(
             inside,
             power[number],
             variance[number],
-            per_raman * of_raman.value,
+            per_raman * raman.value,
             per_raman**2 * noise,
         )
-        away = level * per_raman * (of_raman.value - mean)
+        away = level * per_raman * (raman.value - mean)
         shape[number] = per_raman * mean
         power[number] -= away
         variance[number] += (level * per_raman) ** 2 * noise
         # Over air, both signals have nearly the same shape, so that backgrounds are alike too.
-        shift = level * (per_raman * of_raman.background)[inside.any(axis=0)].mean()
+        shift = level * (per_raman * raman.background)[inside.any(axis=0)].mean()
         background[number] = np.hypot(background[number], shift)
-        shift = np.nan_to_num(level * per_raman * of_raman.baseline)
+        shift = np.nan_to_num(level * per_raman * raman.baseline)
         baseline[number] = np.hypot(baseline[number], shift)
     return reference_window.choose_reference(
         power,
@@ -102,18 +101,18 @@ def choose_window(
     )
 
 
-def _candidates(cells: Cells, settings: RamanSettings) -> Array:
-    highest = min(settings.highest, float(cells.range[-1]))
-    if not highest > settings.lowest:
+def _candidates(cells: Cells, limits: RamanReference) -> Array:
+    highest = min(limits.highest, float(cells.range[-1]))
+    if not highest > limits.lowest:
         raise RetrievalInputError(
             f"the last cell at {highest:g} m is nearer than the reference window, which begins at"
-            f" {settings.lowest:g} m or beyond",
+            f" {limits.lowest:g} m or beyond",
             field="highest",
             remedy="give a farther range, smaller cells or a nearer window",
         )
-    width = min(settings.width, highest - settings.lowest)
-    step = settings.width / WINDOW_THRESHOLDS.steps_per_window
-    return reference_window.candidate_windows(settings.lowest, highest, width, step)
+    width = min(limits.width, highest - limits.lowest)
+    step = limits.width / WINDOW_THRESHOLDS.steps_per_window
+    return reference_window.candidate_windows(limits.lowest, highest, width, step)
 
 
 def _level(

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Self
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Integers, root_sum_square
-from lidarops.retrieve.common.compiled_code import compiled
-from lidarops.retrieve.raman import backscatter as _backscatter
-from lidarops.retrieve.raman.backscatter import Backscatter, inverse_of_weak
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags, root_sum_square
+from lidarops.retrieve.raman.backscatter import (
+    Backscatter,
+    calibrated_backscatter,
+    inverse_of_weak,
+    signal_ratio,
+)
 from lidarops.retrieve.raman.depth_fit import (
     DepthFit,
     Extinction,
@@ -34,12 +37,12 @@ from lidarops.retrieve.raman.errors import (
 )
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.reference import choose_window
+from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import (
     AirColumn,
     Cells,
     CellSignal,
     ChannelSignal,
-    RamanSettings,
     cell_signals,
 )
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
@@ -123,45 +126,41 @@ def retrieve_raman(
     `ansmann1990`, `ansmann1992`, `pappalardo2004`, `russo2006`.
     """
     partial = (quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
-    pairs = zip(
-        cell_signals(raman, air.raman_shape, cells),
-        cell_signals(elastic, air.elastic_shape, cells),
-        strict=True,
-    )
-    rows = [
-        _profile(of_raman, of_elastic, cells, settings, near)
-        for (of_raman, of_elastic), near in zip(pairs, partial, strict=True)
+    ratio = air.particle_ratio(settings.angstrom_exponent)
+    profiles = [
+        _profile(of_raman, of_elastic, cells.step, ratio, near)
+        for of_raman, of_elastic, near in zip(
+            cell_signals(raman, air.raman_shape, cells),
+            cell_signals(elastic, air.elastic_shape, cells),
+            partial,
+            strict=True,
+        )
     ]
-    fitted = [None if row is None else (row.raman, row.fit) for row in rows]
-    window = choose_window(elastic, fitted, air, cells, settings)
-    edges = np.stack(window.edges, axis=-1)
-    errors = window.relative_error(settings.reference_relative_error)
-    assumed = [replace(settings, reference_relative_error=float(error)) for error in errors]
+    limits = settings.reference.along(air.stretch)
+    window = choose_window(elastic, profiles, air, cells, limits, ratio)
+    errors = window.relative_error(settings.reference.relative_error)
     in_cells = air.in_cells(cells)
+    inside = (cells.range >= window.bottom[:, None]) & (cells.range <= window.top[:, None])
     solved = [
-        _Solution.of(row, in_cells, cells, assumed[number], partial[number], edges[number], number)
-        for number, row in enumerate(rows)
-        if row is not None
+        None if profile is None else _solved(profile, in_cells, cells, settings, *of_profile)
+        for profile, *of_profile in zip(profiles, errors, partial, inside, strict=True)
     ]
     return _joined(solved, quality, window)
 
 
 def _profile(
-    raman: CellSignal, elastic: CellSignal, cells: Cells, settings: RamanSettings, partial: Booleans
+    raman: CellSignal, elastic: CellSignal, step: float, ratio: float, partial: Booleans
 ) -> Profile | None:
     """Return the fitted profile; None where there is no Raman signal."""
     noise = SignalNoise(raman.noise.per_signal, np.where(partial, np.inf, raman.noise.fixed))
     fit = fit_depth(raman.value, noise)
-    if fit is None:
-        return None
-    return Profile(raman, elastic, fit, extinction_of(fit, cells.step, settings.ratio))
+    return None if fit is None else Profile(raman, elastic, fit, extinction_of(fit, step, ratio))
 
 
 @dataclass(frozen=True, slots=True)
 class _Solution:
     """Values and errors of one profile, (cell,)."""
 
-    number: int
     profile: Profile
     extinction_budget: dict[str, Array]
     backscatter: Array
@@ -170,66 +169,42 @@ class _Solution:
     negative: Booleans
     """Cells beyond which the Raman signal falls by less than in clean air."""
 
-    @classmethod
-    def of(
-        cls,
-        profile: Profile,
-        air: AirColumn,
-        cells: Cells,
-        settings: RamanSettings,
-        partial: Booleans,
-        window: Array,
-        number: int,
-    ) -> Self:
-        """Calibrate a profile and state its errors."""
-        molecular = air.backscatter
-        bottom, top = window
-        inside = (cells.range >= bottom) & (cells.range <= top)
-        ratio = _ratio(profile, partial, settings.ratio)
-        assumed = settings.scattering_ratio * molecular
-        calibrated = _backscatter.calibrated(
-            ratio, profile.elastic.noise, profile.fit.noise, assumed, inside
-        )
-        effects = Effects(profile, calibrated, air, cells.step, settings, partial)
-        causes = list(effects.causes())
-        extinction = profile.extinction
-        budget = summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
-        budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
-        empty = np.full(molecular.size, np.nan)
-        usable = ~partial & (profile.fit.expected_error <= THRESHOLDS.most_uncertain)
-        negative = _negative(profile.fit, [cause.depth for cause in causes], usable)
-        if calibrated is None:
-            absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)
-            return cls(
-                number, profile, budget, empty, absent, Quotient(empty, empty, empty), negative
-            )
-        noise = calibrated.respond(np.zeros((molecular.size, 1)), profile.fit.noise)
-        of_backscatter = summed(BACKSCATTER_CAUSES, [(c.name, c.backscatter) for c in causes])
-        of_backscatter["noise"] = np.sqrt(
-            calibrated.own**2
-            + root_of_squares(noise) ** 2
-            + (calibrated.total * calibrated.reference) ** 2
-        )
-        value = calibrated.total - molecular
-        ratios = lidar_ratio_of(profile.extinction, calibrated, value, noise, causes, usable)
-        return cls(number, profile, budget, value, of_backscatter, ratios, negative)
 
-
-def _ratio(profile: Profile, partial: Booleans, ratio: float) -> _backscatter.Ratio:
-    """Return the ratio of the signals: to the smooth Raman signal, but in partial overlap."""
-    fit, elastic, raman = profile.fit, profile.elastic, profile.raman
-    smooth = _backscatter.smooth_ratio(
-        elastic.value, elastic.variance, fit.depth, fit.standard_error, ratio
+def _solved(
+    profile: Profile,
+    air: AirColumn,
+    cells: Cells,
+    settings: RamanSettings,
+    reference_error: float,
+    partial: Booleans,
+    window: Booleans,
+) -> _Solution:
+    """Return the values of a profile with their errors, calibrated in the cells of the window."""
+    fit, extinction = profile.fit, profile.extinction
+    colour = air.particle_ratio(settings.angstrom_exponent)
+    ratio = signal_ratio(profile.elastic, profile.raman, fit, partial, colour)
+    assumed = settings.reference.scattering_ratio * air.backscatter
+    calibrated = calibrated_backscatter(ratio, profile.elastic.noise, fit.noise, assumed, window)
+    effects = Effects(profile, calibrated, air, cells.step, settings, reference_error, partial)
+    causes = list(effects.causes())
+    budget = summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
+    budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
+    usable = ~partial & (fit.expected_error <= THRESHOLDS.most_uncertain)
+    negative = _negative(fit, [cause.depth for cause in causes], usable)
+    if calibrated is None:
+        empty = np.full(partial.size, np.nan)
+        absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)
+        return _Solution(profile, budget, empty, absent, Quotient(empty, empty, empty), negative)
+    noise = calibrated.respond(np.zeros((partial.size, 1)), fit.noise)
+    of_backscatter = summed(BACKSCATTER_CAUSES, [(c.name, c.backscatter) for c in causes])
+    of_backscatter["noise"] = np.sqrt(
+        calibrated.own**2
+        + root_of_squares(noise) ** 2
+        + (calibrated.total * calibrated.reference) ** 2
     )
-    near = _backscatter.cell_ratio(
-        elastic.value, elastic.variance, raman.value, raman.variance, fit.depth, ratio
-    )
-    return _backscatter.Ratio(
-        np.where(partial, near.value, smooth.value),
-        np.where(partial, near.variance, smooth.variance),
-        np.where(partial, near.sensitivity, smooth.sensitivity),
-        np.where(partial, near.factor, smooth.factor),
-    )
+    value = calibrated.total - air.backscatter
+    ratios = lidar_ratio_of(extinction, calibrated, value, noise, causes, usable)
+    return _Solution(profile, budget, value, of_backscatter, ratios, negative)
 
 
 def _negative(fit: DepthFit, effects: Sequence[Array], usable: Booleans) -> Booleans:
@@ -238,61 +213,68 @@ def _negative(fit: DepthFit, effects: Sequence[Array], usable: Booleans) -> Bool
     The total is from a cell to any other beyond. Air without particles has none, so that overlap
     is not complete there, or the background is wrong.
     """
-    compared = np.flatnonzero(usable)
-    return falling(fit.depth, fit.inverse, np.stack(effects), compared, THRESHOLDS.negative)
+    cells = np.flatnonzero(usable)
+    depth, covariance = fit.depth[cells], fit.inverse[np.ix_(cells, cells)]
+    own = np.diagonal(covariance)
+    variance = own[:, np.newaxis] + own - 2.0 * covariance
+    for effect in effects:
+        variance += np.subtract.outer(effect[cells], effect[cells]) ** 2
+    fall = np.subtract.outer(depth, depth)
+    certain = (fall > 0.0) & (fall**2 > THRESHOLDS.negative**2 * variance)
+    negative = np.zeros(usable.size, dtype=np.bool_)
+    negative[cells] = np.triu(certain, 1).any(axis=1)
+    return negative
 
 
 def _joined(
-    solved: Sequence[_Solution],
+    solved: Sequence[_Solution | None],
     quality: Flags,
     window: reference_window.ReferenceWindow,
 ) -> RamanResult:
     """Return the profiles together, NaN where a bit rejects them."""
-    numbers = [one.number for one in solved]
+    missing = np.full(quality.shape[-1], np.nan)
 
-    def stacked(rows: Iterable[Array], hidden: Booleans) -> Array:
-        values = np.full(quality.shape, np.nan)
-        for number, row in zip(numbers, rows, strict=True):
-            values[number] = row
-        return np.where(hidden, np.nan, values)
+    def stacked(row: Callable[[_Solution], Array], hidden: Booleans) -> Array:
+        rows = [missing if one is None else row(one) for one in solved]
+        return np.where(hidden, np.nan, np.reshape(rows, quality.shape))
 
     nothing = np.zeros(quality.shape, dtype=np.bool_)
-    expected = stacked((one.profile.fit.expected_error for one in solved), nothing)
+    expected = stacked(lambda one: one.profile.fit.expected_error, nothing)
     weak = ~(expected <= THRESHOLDS.most_uncertain)
     no_slope = weak | ((quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0)
 
-    def values(rows: Iterable[Array]) -> Array:
-        return stacked(rows, weak)
+    def budget(
+        causes: Sequence[str], row: Callable[[_Solution], dict[str, Array]], hidden: Booleans
+    ) -> dict[str, Array]:
+        def of(cause: str) -> Array:
+            return stacked(lambda one: row(one)[cause], hidden)
 
-    def slopes(rows: Iterable[Array]) -> Array:
-        return stacked(rows, no_slope)
+        return {cause: of(cause) for cause in causes}
 
-    lidar_ratio = slopes(one.lidar_ratio.value for one in solved)
+    lidar_ratio = stacked(lambda one: one.lidar_ratio.value, no_slope)
     return RamanResult(
-        extinction=slopes(one.profile.extinction.value for one in solved),
-        extinction_budget={
-            cause: slopes(one.extinction_budget[cause] for one in solved)
-            for cause in EXTINCTION_CAUSES
-        },
-        extinction_smoothing_error=slopes(one.profile.extinction.smoothing_error for one in solved),
-        vertical_resolution=slopes(one.profile.extinction.vertical_resolution for one in solved),
-        backscatter=values(one.backscatter for one in solved),
-        backscatter_budget={
-            cause: values(one.backscatter_budget[cause] for one in solved)
-            for cause in BACKSCATTER_CAUSES
-        },
+        extinction=stacked(lambda one: one.profile.extinction.value, no_slope),
+        extinction_budget=budget(EXTINCTION_CAUSES, lambda one: one.extinction_budget, no_slope),
+        extinction_smoothing_error=stacked(
+            lambda one: one.profile.extinction.smoothing_error, no_slope
+        ),
+        vertical_resolution=stacked(
+            lambda one: one.profile.extinction.vertical_resolution, no_slope
+        ),
+        backscatter=stacked(lambda one: one.backscatter, weak),
+        backscatter_budget=budget(BACKSCATTER_CAUSES, lambda one: one.backscatter_budget, weak),
         lidar_ratio=lidar_ratio,
-        lidar_ratio_random=slopes(one.lidar_ratio.random for one in solved),
-        lidar_ratio_systematic=slopes(one.lidar_ratio.systematic for one in solved),
-        raman_depth=values(one.profile.fit.depth for one in solved),
-        raman_depth_error=values(one.profile.fit.standard_error for one in solved),
+        lidar_ratio_random=stacked(lambda one: one.lidar_ratio.random, no_slope),
+        lidar_ratio_systematic=stacked(lambda one: one.lidar_ratio.systematic, no_slope),
+        raman_depth=stacked(lambda one: one.profile.fit.depth, weak),
+        raman_depth_error=stacked(lambda one: one.profile.fit.standard_error, weak),
         reference=window,
         quality=_flags(solved, quality, weak, np.isnan(lidar_ratio), window.chosen),
     )
 
 
 def _flags(
-    solved: Sequence[_Solution],
+    solved: Sequence[_Solution | None],
     quality: Flags,
     weak: Booleans,
     no_ratio: Booleans,
@@ -303,51 +285,10 @@ def _flags(
     flags[weak] |= np.int32(RamanQuality.WEAK_SIGNAL)
     flags[no_ratio] |= np.int32(RamanQuality.NO_LIDAR_RATIO)
     flags[~chosen] |= np.int32(RamanQuality.NO_REFERENCE)
-    for one in solved:
-        flags[one.number, one.negative] |= np.int32(RamanQuality.NEGATIVE_EXTINCTION)
+    for row, one in enumerate(solved):
+        if one is not None:
+            flags[row, one.negative] |= np.int32(RamanQuality.NEGATIVE_EXTINCTION)
     return flags
-
-
-@compiled
-def falling(
-    depth: Array,
-    covariance: Array,
-    effects: Array,
-    usable: Integers,
-    least: float,
-) -> Booleans:
-    """Return the cells from which the depth falls to any other beyond, by more than its error.
-
-    Parameters
-    ----------
-    depth : (cell,) float
-    covariance : (cell, cell) float
-        Of the depth, by noise and smoothness.
-    effects : (cause, cell) float
-        Change of the depth with one standard error of each other cause.
-    usable : (usable cell,) int
-        Cells that are compared, ascending.
-    least : float
-        Standard errors.
-    """
-    negative = np.zeros(depth.size, dtype=np.bool_)
-    for number in range(usable.size):
-        i = usable[number]
-        for beyond in range(number + 1, usable.size):
-            j = usable[beyond]
-            if depth[i] <= depth[j]:
-                continue
-            square = (depth[i] - depth[j]) ** 2
-            variance = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
-            # Most differ by less than their noise.
-            if square <= least**2 * variance:
-                continue
-            for effect in effects:
-                variance += (effect[i] - effect[j]) ** 2
-            if square > least**2 * variance:
-                negative[i] = True
-                break
-    return negative
 
 
 _MOST_UNKNOWN: Final = 0.05

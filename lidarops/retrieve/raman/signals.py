@@ -1,8 +1,8 @@
-"""What a retrieval assumes; signals and air along the beam, and in cells of several bins."""
+"""Signals and air along the beam, and in cells of several bins."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -56,6 +56,18 @@ class AirColumn:
     unit."""
     overlap: Array
     """Common to both signals; NaN where it is not known."""
+    wavelength: float
+    """m, of the laser."""
+    raman_wavelength: float
+    """m."""
+    stretch: float = 1.0
+    """m along the beam per m of height."""
+    slope_error: float = 0.0
+    """m-1, standard error of the derivative of the logarithm of the density along the beam."""
+
+    def particle_ratio(self, exponent: float) -> float:
+        """Return particle extinction at the Raman wavelength over that at the laser's."""
+        return particle_ratio(exponent, self.wavelength, self.raman_wavelength)
 
     @property
     def elastic_shape(self) -> Array:
@@ -76,8 +88,15 @@ class AirColumn:
 
     def in_cells(self, cells: Cells) -> AirColumn:
         """Return the means of cells, with the known overlap."""
-        profiles = (self.range, self.backscatter, self.depth, self.raman_depth, self.density)
-        return AirColumn(*(cells.mean(values) for values in (*profiles, self.known_overlap)))
+        return replace(
+            self,
+            range=cells.mean(self.range),
+            backscatter=cells.mean(self.backscatter),
+            depth=cells.mean(self.depth),
+            raman_depth=cells.mean(self.raman_depth),
+            density=cells.mean(self.density),
+            overlap=cells.mean(self.known_overlap),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,50 +265,3 @@ def touched(mask: Booleans, resolution: Array, step: float) -> Booleans:
     np.cumsum(mask, axis=-1, out=sums[:, 1:])
     inside = np.take_along_axis(sums, stop, axis=-1) - np.take_along_axis(sums, first, axis=-1)
     return np.asarray(inside > 0)
-
-
-@dataclass(frozen=True, slots=True)
-class RamanSettings:
-    """What is assumed, with standard errors; lengths are along the beam."""
-
-    wavelength: float
-    """m, of the laser."""
-    raman_wavelength: float
-    """m."""
-    angstrom_exponent: float
-    """Of particle extinction between both wavelengths."""
-    angstrom_standard_error: float
-    lowest: float
-    """m, least range of the reference window."""
-    highest: float
-    """m, largest range of the reference window."""
-    width: float
-    """m, of the reference window."""
-    scattering_ratio: float
-    """Total over molecular backscatter in the reference window."""
-    reference_relative_error: float
-    molecular_relative_error: float
-    """Of the density of air."""
-    overlap_relative_error: float = 0.0
-    """Of one minus the overlap."""
-    molecular_slope_error: float = 0.0
-    """m-1, of the derivative of the logarithm of the density of air."""
-    cell: float = 60.0
-    """m, length of a cell."""
-    farthest: float = 15_000.0
-    """m, of cells."""
-    known_shape: bool = True
-    """Whether the background is fitted with the shape of clean air."""
-    filter_width: float | None = None
-    """m, full width at half maximum of the filter of nitrogen; None where all lines pass."""
-
-    @property
-    def ratio(self) -> float:
-        """Particle extinction at the Raman wavelength over that at the laser's."""
-        return particle_ratio(self.angstrom_exponent, self.wavelength, self.raman_wavelength)
-
-    @property
-    def ratio_error(self) -> float:
-        """Standard error of `ratio`."""
-        colour = abs(float(np.log(self.wavelength / self.raman_wavelength)))
-        return self.ratio * colour * self.angstrom_standard_error

@@ -45,6 +45,12 @@ class Thresholds(NamedTuple):
     full where it was stated to be, all values up to 6 km (`tests/end_to_end/test_raman.py`)."""
     fewest_cells: int = 8
     """Cells with data of a profile that is fitted. Assumed."""
+    standard_slope_error: float = 1.6e-5
+    """m-1, of the derivative of the logarithm of the density of the standard atmosphere: root mean
+    square from 0.1 to 12 km of its deviation from the sounding of Manaus
+    (`tests/end_to_end/test_raman.py`), 16 K warmer."""
+    sounding_slope_error: float = 2e-6
+    """m-1, the same of a sounding or model: 0.5 K over 1 km. Assumed."""
     many_counts: float = 1000.0
     """Counts of a cell from which on the stated variance tells more than that of counts: it then
     shows the effect of the dead time beyond its own scatter of 3 %."""

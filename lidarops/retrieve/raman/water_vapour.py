@@ -10,10 +10,13 @@ from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.raman.backscatter import inverse_mean
 from lidarops.retrieve.raman.errors import Quotient
 from lidarops.retrieve.raman.scattering import particle_ratio
-from lidarops.retrieve.raman.signals import CellSignal, RamanSettings
+from lidarops.retrieve.raman.settings import RamanSettings
+from lidarops.retrieve.raman.signals import CellSignal
 
 
-def particle_transmission(settings: RamanSettings, wavelength: float) -> tuple[float, float]:
+def particle_transmission(
+    settings: RamanSettings, laser: float, raman: float, wavelength: float
+) -> tuple[float, float]:
     r"""Return the transmission of particles at the nitrogen line over that of water vapour.
 
     That is the exponent of its logarithm per fitted optical depth,
@@ -22,14 +25,13 @@ def particle_transmission(settings: RamanSettings, wavelength: float) -> tuple[f
     Parameters
     ----------
     settings : RamanSettings
-    wavelength : float
-        m, of the channel of water vapour.
+    laser, raman, wavelength : float
+        m, of the laser, and of the channels of nitrogen and of water vapour.
     """
-    laser = settings.wavelength
-    nitrogen = settings.ratio
+    nitrogen = particle_ratio(settings.angstrom_exponent, laser, raman)
     water = particle_ratio(settings.angstrom_exponent, laser, wavelength)
     exponent = (water - nitrogen) / (1.0 + nitrogen)
-    of_nitrogen = nitrogen * np.log(laser / settings.raman_wavelength)
+    of_nitrogen = nitrogen * np.log(laser / raman)
     of_water = water * np.log(laser / wavelength)
     slope = (of_water - of_nitrogen - exponent * of_nitrogen) / (1.0 + nitrogen)
     return exponent, float(abs(slope)) * settings.angstrom_standard_error

@@ -21,7 +21,8 @@ from lidarops.retrieve.raman.scattering import (
     nitrogen_line_share,
     raman_wavelength,
 )
-from lidarops.retrieve.raman.signals import CellSignal, RamanSettings
+from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
+from lidarops.retrieve.raman.signals import CellSignal
 from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 
 STEP = 15.0
@@ -72,7 +73,12 @@ def raman_power(wavelength, r=R, share=1.0):
     return 1e13 * density * share / r**2 * transmission(LASER, r) * transmission(wavelength, r)
 
 
-SETTINGS = RamanSettings(LASER, RAMAN, EXPONENT, 0.5, 7000.0, 12_000.0, 3000.0, 1.0, 0.0, 0.01, 0.1)
+SETTINGS = RamanSettings(
+    highest=12_000.0,
+    reference=RamanReference(lowest=7000.0, highest=12_000.0, width=3000.0, relative_error=0.0),
+    angstrom_exponent=EXPONENT,
+    molecular_slope_error=0.0,
+)
 
 
 def retrieved(nitrogen=None, water=None, filter_width=None, seen=1.0, **arguments: Any):
@@ -84,7 +90,8 @@ def retrieved(nitrogen=None, water=None, filter_width=None, seen=1.0, **argument
         nitrogen,
         molecules=AIR,
         station_altitude=0.0,
-        settings=replace(SETTINGS, farthest=12_000.0, filter_width=filter_width),
+        wavelengths=(LASER, RAMAN),
+        settings=replace(SETTINGS, filter_width=filter_width),
         water=None if water is None else WaterVapour(water, WATER, 1.0, 0.03),
         **arguments,
     )
@@ -212,7 +219,7 @@ def mixing(nitrogen, water, depth=DEPTH, settings=SETTINGS, relative=0.0):
         (depth, np.zeros(CELLS.size)),
         PARTIAL,
         constant=0.2,
-        particles=particle_transmission(settings, WATER),
+        particles=particle_transmission(settings, LASER, RAMAN, WATER),
         relative_errors=(relative,),
     )
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from support.raman_signals import LASER, make_sky, mean_over
+from support.raman_signals import LASER, RAMAN, make_sky, mean_over
 
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.flags import RamanQuality
@@ -88,7 +88,8 @@ def product_of(cloudy, cirrus=CIRRUS):
         raman,
         molecules=MolecularProfile.us_standard(),
         station_altitude=0.0,
-        settings=replace(clear.settings, farthest=10_000.0),
+        wavelengths=(LASER, RAMAN),
+        settings=replace(clear.settings, highest=10_000.0, molecular_slope_error=0.0),
         overlap=clear.air.overlap,
     )
 

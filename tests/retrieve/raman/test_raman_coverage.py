@@ -7,17 +7,16 @@ import pytest
 from support.raman_signals import make_sky, mean_over
 
 from lidarops.flags import Quality, rejecting
-from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.backscatter import (
     Backscatter,
     Ratio,
-    calibrated,
+    calibrated_backscatter,
     inverse_mean,
     inverse_of_weak,
 )
 from lidarops.retrieve.raman.depth_fit import Extinction, SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
-from lidarops.retrieve.raman.retrieval import lidar_ratio_of
+from lidarops.retrieve.raman.retrieval import lidar_ratio_of, retrieve_raman
 
 STEP = 30.0
 R = STEP * (np.arange(400) + 0.5)
@@ -118,7 +117,9 @@ def test_backscatter_from_a_reference_of_few_counts_has_no_bias():
         factor = np.where(window, inverse_mean(level, 1.0 / 60.0), 1.0)
         signal = counts / light
         ratio = Ratio(signal * factor, factor**2 * truth / light, np.ones(30), factor)
-        total.append(calibrated(ratio, noise, response, truth, window).total[:10].mean())
+        total.append(
+            calibrated_backscatter(ratio, noise, response, truth, window).total[:10].mean()
+        )
     assert abs(np.mean(total) / 2.0 - 1.0) < 3.0 * np.std(total) / 2.0 / np.sqrt(len(total))
 
 

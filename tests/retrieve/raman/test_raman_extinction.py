@@ -22,7 +22,7 @@ def solved(extinction, light, counts=None):
     full = sky.quality[0] == 0
     noise = SignalNoise(cells.noise.per_signal, np.where(full, cells.noise.fixed, np.inf))
     fit = fit_depth(cells.value, noise)
-    return extinction_of(fit, STEP, sky.settings.ratio), full, sky
+    return extinction_of(fit, STEP, sky.ratio), full, sky
 
 
 @pytest.mark.parametrize("light", [1e4, 1e10])
@@ -62,7 +62,7 @@ def test_noise_error_is_the_scatter_of_profiles():
 def test_lines_agree_with_the_smooth_solution_where_there_is_much_light():
     sky = make_sky(HAZE, STEP, 1e8, cell=STEP)
     (cells,) = cell_signals(sky.signal(sky.raman[np.newaxis]), sky.air.raman_shape, sky.cells)
-    value, error = sliding_line(cells.value, cells.variance, STEP, sky.settings.ratio, 5)
+    value, error = sliding_line(cells.value, cells.variance, STEP, sky.ratio, 5)
     inside = slice(12, 250)
     np.testing.assert_allclose(value[inside], HAZE[inside], rtol=0.02)
     assert np.all(error[inside] > 0.0)

@@ -17,13 +17,12 @@ import xarray as xr
 from support.raman_signals import along, mean_over, sliding_line
 
 from lidarops.flags import Quality
-from lidarops.products.raman import RamanProductSettings, RamanReferenceSettings
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman import retrieve_raman
+from lidarops.retrieve.raman.retrieval import retrieve_raman
+from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
 from lidarops.retrieve.raman.signals import (
     AirColumn,
     ChannelSignal,
-    RamanSettings,
     cell_signals,
     make_cells,
 )
@@ -84,7 +83,8 @@ def column_of(air, r, laser, raman, *, simple):
     else:
         backscatter, extinction = air.backscatter, air.extinction
     depths = (along(extinction(r, x), STEP) for x in (laser, raman))
-    return AirColumn(r, backscatter(r, laser), *depths, air.number_density(r), np.ones(r.size))
+    density, overlap = air.number_density(r), np.ones(r.size)
+    return AirColumn(r, backscatter(r, laser), *depths, density, overlap, laser, raman)
 
 
 @pytest.fixture(scope="module", params=["355", "532"])
@@ -114,8 +114,12 @@ def case(request, data_root):
     air = MolecularProfile.from_profile(levels[:, 1], levels[:, 2], levels[:, 3] + 273.15)
     laser = float(name) * 1e-9
     settings = RamanSettings(
-        laser, wavelength, 1.0, 0.3, 7250.0, 15_000.0, 7000.0, 1.0, 0.0, 0.0
-    )  # fmt: skip
+        reference=RamanReference(lowest=7250.0, highest=15_000.0, width=7000.0, relative_error=0.0),
+        angstrom_exponent=1.0,
+        angstrom_standard_error=0.3,
+        molecular_relative_error=0.0,
+        overlap_relative_error=0.0,
+    )
     return SimpleNamespace(
         name=name,
         raman=of_raman,
@@ -131,7 +135,7 @@ def case(request, data_root):
 
 def expected(case, air):
     """Return mean counts of both channels, in proportion to all counts from 400 m to 20 km."""
-    ratio = (case.settings.wavelength / case.settings.raman_wavelength) ** case.exponent
+    ratio = (air.wavelength / air.raman_wavelength) ** case.exponent
     depth, of_raman = along(case.extinction, STEP), along(case.extinction * ratio, STEP)
     raman = air.raman_shape * np.exp(-depth - of_raman)
     elastic = air.elastic_shape * (air.backscatter + case.backscatter) * np.exp(-2.0 * depth)
@@ -154,13 +158,7 @@ def retrieved(case, raman=None, elastic=None, air=None, settings=None):
 
 def by_default(case, *signals):
     """Return values with the reference and air that products have without settings of their own."""
-    window, of_product = RamanReferenceSettings(), RamanProductSettings.model_fields
-    settings = RamanSettings(
-        case.settings.wavelength, case.settings.raman_wavelength,
-        of_product["angstrom_exponent"].default, of_product["angstrom_standard_error"].default,
-        window.lowest, window.highest, window.width, window.scattering_ratio,
-        window.relative_error, of_product["molecular_relative_error"].default,
-    )  # fmt: skip
+    settings = RamanSettings(overlap_relative_error=0.0)
     return retrieved(case, *signals, air=case.own_air, settings=settings)
 
 
@@ -221,9 +219,10 @@ def normalised(case, found):
 
 def lines(case):
     """Return extinction by lines through 11 cells, 660 m."""
+    ratio = case.air.particle_ratio(case.settings.angstrom_exponent)
     return np.array(
         [
-            sliding_line(signal.value, signal.variance, case.cells.step, case.settings.ratio, 11)[0]
+            sliding_line(signal.value, signal.variance, case.cells.step, ratio, 11)[0]
             for signal in cell_signals(channel(case.raman), case.air.raman_shape, case.cells)
         ]
     )

@@ -7,7 +7,7 @@ import pytest
 from support.raman_signals import make_sky
 
 from lidarops.errors import RetrievalInputError
-from lidarops.retrieve.raman import retrieve_raman
+from lidarops.retrieve.raman.retrieval import retrieve_raman
 
 STEP = 30.0
 R = STEP * (np.arange(450) + 0.5)

@@ -9,15 +9,15 @@ import pytest
 from support.raman_signals import make_sky
 
 from lidarops.flags import Quality
-from lidarops.products.raman.retrieval import STANDARD_SLOPE_ERROR
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman import retrieve_raman
 from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.retrieval import retrieve_raman
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
     nitrogen_line_share,
     raman_wavelength,
 )
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 STEP = 30.0
 R = STEP * (np.arange(400) + 0.5)
@@ -35,8 +35,10 @@ def retrieved(sky, **settings):
     raman, elastic = (sky.signal(mean[np.newaxis]) for mean in (sky.raman, sky.elastic))
     raman = replace(raman, **settings.pop("raman", {}))
     elastic = replace(elastic, **settings.pop("elastic", {}))
-    changed = replace(sky.settings, **settings)
-    return retrieve_raman(raman, elastic, sky.air, sky.cells, changed, quality=quality)
+    limits = sky.settings.reference.model_copy(update=settings.pop("reference", {}))
+    air = replace(sky.air, **settings.pop("air", {}))
+    changed = replace(sky.settings, reference=limits, **settings)
+    return retrieve_raman(raman, elastic, air, sky.cells, changed, quality=quality)
 
 
 def test_values_without_noise_are_exact():
@@ -64,7 +66,7 @@ def test_particles_everywhere_leave_no_reference():
     sky = make_sky(np.full(R.size, 1e-4), STEP, 1e7, cell=STEP, window=WINDOW)
     assumed = 1.0 + 1e-4 / 50.0 / sky.air.backscatter
     middle = (R > 9000.0) & (R < 11_000.0)
-    found = retrieved(sky, scattering_ratio=float(assumed[middle].mean()))
+    found = retrieved(sky, reference={"scattering_ratio": float(assumed[middle].mean())})
     assert np.isnan(found.reference.bottom).all()  # no shape of air anywhere
     assert np.all(found.quality & RamanQuality.NO_REFERENCE)
     np.testing.assert_allclose(found.extinction[0, 20:300], 1e-4, rtol=1e-6)
@@ -81,7 +83,11 @@ def test_partial_overlap_cancels_in_backscatter(sky):
 @pytest.mark.parametrize(
     ("cause", "settings", "changed"),
     [
-        ("reference", {"reference_relative_error": 1e-3}, {"scattering_ratio": 1.001}),
+        (
+            "reference",
+            {"reference": {"relative_error": 1e-3}},
+            {"reference": {"scattering_ratio": 1.001}},
+        ),
         ("angstrom", {"angstrom_standard_error": 0.01}, {"angstrom_exponent": 1.21}),
     ],
 )
@@ -118,7 +124,7 @@ def test_errors_of_the_overlap_are_the_change_by_it(sky):
 
 
 def test_errors_of_the_slope_of_air_are_the_change_by_it(sky):
-    before = retrieved(sky, molecular_slope_error=1e-6)
+    before = retrieved(sky, air={"slope_error": 1e-6})
     steeper, molecular = np.exp(1e-6 * R), sky.air.backscatter
     window = (before.reference.bottom < R) & (before.reference.top > R)
     # The density in the reference window stays.
@@ -144,7 +150,7 @@ def test_errors_cover_the_standard_atmosphere_in_the_tropics(sky):
     shape = density / sky.air.density
     # The signal is that of tropical air, and the retrieval takes the standard.
     truth = replace(sky, raman=sky.raman * shape)
-    found = retrieved(truth, molecular_slope_error=STANDARD_SLOPE_ERROR)
+    found = retrieved(truth, air={"slope_error": THRESHOLDS.standard_slope_error})
     away = found.extinction - retrieved(sky).extinction
     for low, high in ((600.0, 5000.0), (5000.0, 11_000.0)):
         heights = (low < R) & (high > R)
