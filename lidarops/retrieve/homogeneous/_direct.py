@@ -186,7 +186,7 @@ def find_extinction(g: Grid, s: Scratch, sums: Sums) -> Point:
     """Return the linear fit of a loaded profile from where one linear step leads to the best."""
     tau = _start(g, s, sums)
     for _ in range(_MOST_STEPS):
-        p = evaluate(tau, g, s, sums)
+        p: Point = evaluate(tau, g, s, sums)
         tau = _newton(p, g)
         if _is_last(tau - p.tau, p, g, sums):
             break

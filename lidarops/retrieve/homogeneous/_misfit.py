@@ -199,4 +199,5 @@ def judge_residuals(
     row.second_differences, row.difference_count = 0.0, 0.0
     if noise_spacing > 0:
         row.second_differences, row.difference_count = _second_differences(s, noise_spacing)
-    return _left(residuals, p, free)
+    left: Left = _left(residuals, p, free)
+    return left
