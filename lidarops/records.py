@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from datetime import UTC, date, datetime
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, Final, NamedTuple, Self
 
 from lidarops.kinds import kinds
@@ -303,7 +304,7 @@ def entry_as_dict(entry: PlannedStep | LeftOut) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Plan:
     """The steps that run for one scene, and those that are left out, with the reasons."""
 
@@ -335,7 +336,7 @@ class Plan:
             for name, owner, words in (*steps, *omitted)
         ]
 
-    @property
+    @cached_property
     def hash(self) -> str:
         """sha256 of the canonical JSON form."""
         return digest(self.as_dict())
@@ -451,10 +452,20 @@ class Verdicts(NamedTuple):
         """Return the numbers of so many values, some without any bit and some not rejected."""
         return cls(unflagged, usable - unflagged, values - usable)
 
+    @classmethod
+    def total(cls, several: Iterable[Verdicts]) -> Verdicts:
+        """Return the sums of several numbers of values."""
+        return cls(*(sum(counts) for counts in zip((0, 0, 0), *several, strict=True)))
+
     @property
     def values(self) -> int:
         """Number of all values."""
         return sum(self)
+
+    @property
+    def usable(self) -> int:
+        """Number of values that no bit rejects."""
+        return self.good + self.care
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import RECORDERS
 from lidarops.netcdf.read import changed, opened_product
-from lidarops.netcdf.stored_flags import count_bits, rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
@@ -245,9 +245,8 @@ def read_header(product: xr.Dataset, path: str, selection: ProductSelection) -> 
 
 
 def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
-    flags = product[QUALITY_FLAG].values
-    bits = stored_bits(product[QUALITY_FLAG].attrs, header.kind)
-    rejecting = np.int32(rejecting_mask(bits))
+    counts = FlagCounter(stored_bits(product[QUALITY_FLAG].attrs, header.kind))
+    counts.add(product[QUALITY_FLAG].values)
     height = "station_altitude" if "station_altitude" in product else "altitude"
     return Facts(
         **{stated.name: getattr(header, stated.name) for stated in fields(header)},
@@ -258,11 +257,11 @@ def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
         altitude=_middle(product, height),
         sha256=sha256_of(file),
         size=file.stat().st_size,
-        values=flags.size,
-        usable=flags.size - int(np.count_nonzero(flags & rejecting)),
-        unflagged=flags.size - int(np.count_nonzero(flags)),
+        values=counts.verdicts.values,
+        usable=counts.verdicts.usable,
+        unflagged=counts.verdicts.good,
         code_version=product.attrs["lidarops_code_version"],
-        flagged={bit.word.upper(): n for bit, n in count_bits(flags, bits).items()},
+        flagged={bit.word.upper(): n for bit, n in counts.carried.items()},
     )
 
 

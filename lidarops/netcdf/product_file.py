@@ -6,9 +6,9 @@ Data that do not match the layout of the kind are refused.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
@@ -16,14 +16,13 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.flags import FlagBit
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import Context, global_attributes, product_path
 from lidarops.netcdf.coordinates import auxiliary_names, locate_product
 from lidarops.netcdf.encoding import CheckedInput, Values, as_text, stored, whole_numbers
 from lidarops.netcdf.provenance import prov_json
-from lidarops.netcdf.stored_flags import places
+from lidarops.netcdf.stored_flags import FlagCounter, places, stored_bits
 from lidarops.netcdf.variables import Row, attributes, layout_of
 from lidarops.netcdf.write import RowFile, Skeleton, Written, create_file
 from lidarops.records import Change, Grade, ProductRecord
@@ -109,9 +108,7 @@ class ProductWriter:
         for name, values in self._fixed.items():
             self._sizes |= dict(zip(layout.row(name).dims, values.shape, strict=True))
         self._flags = layout.flags
-        self._flagged: Counter[FlagBit] = Counter()
-        self._verdicts = np.zeros(3, np.int64)
-        """Numbers of good values, of those to be used with care, and of rejected ones."""
+        self._counts = FlagCounter(stored_bits({}, context.kind))
         self.file: RowFile | None = None
         """None until the first profiles, which decide on optional variables."""
 
@@ -138,7 +135,7 @@ class ProductWriter:
                 create_file(self.skeleton(encoded), self._path, replaces=self._replaces)
             )
         self.file.add(encoded)
-        self._count(encoded[rows.QUALITY_FLAG], encoded[rows.USABLE])
+        self._counts.add(encoded[rows.QUALITY_FLAG])
 
     def encode(self, profiles: xr.Dataset) -> dict[str, Values]:
         """Return the next profiles as they are stored, with their coordinates; see `add`."""
@@ -266,12 +263,6 @@ class ProductWriter:
         self._change = compare_products(self._path, new)
         return self._change.grade is not Grade.NONE
 
-    def _count(self, flags: Values, usable: Values) -> None:
-        self._verdicts += np.bincount(usable.reshape(-1), minlength=3)
-        # Few bits occur in a product: count only these.
-        for bit in self._flags.raised(int(np.bitwise_or.reduce(flags, axis=None))):
-            self._flagged[bit] += int(np.count_nonzero(flags & np.int32(bit)))
-
     @property
     def record(self) -> ProductRecord:
         """What was written, after the ``with`` block, with counts of ``quality_flag``.
@@ -288,17 +279,19 @@ class ProductWriter:
             file = Written(self._former, self._path.stat().st_size)
         else:
             file = self.file.written
-        good, care, reject = self._verdicts.tolist()
+        carried, verdicts = self._counts.carried, self._counts.verdicts
         return ProductRecord(
             product_path(context),
             context.kind,
             context.channel,
             file.sha256,
             file.size,
-            values=good + care + reject,
-            flagged={str(bit.name): self._flagged[bit] for bit in sorted(self._flagged)},
-            unflagged=good,
-            usable=good + care,
+            values=verdicts.values,
+            flagged={
+                bit.word.upper(): carried[bit] for bit in sorted(carried, key=attrgetter("mask"))
+            },
+            unflagged=verdicts.good,
+            usable=verdicts.usable,
             stamp=context.stamp,
             change=change,
         )

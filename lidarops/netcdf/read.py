@@ -126,10 +126,9 @@ def read_provenance(path: str | Path) -> dict[str, Any]:
 
 def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read the PROV-JSON document of a product and its global attributes; see `read_provenance`."""
-    if not _is_netcdf(Path(path)):
-        problem = "is no NetCDF file" if Path(path).is_file() else "is no file"
+    if not is_netcdf(path):
         remedy = "give the path of a product of lidarops"
-        raise ProductError(problem, file=path, remedy=remedy, wrong_use=True)
+        raise ProductError("is no NetCDF file", file=path, remedy=remedy, wrong_use=True)
     with opened_product(path, in_parts=True, decode_times=False) as product:
         if "provenance" not in product:
             problem = "has no such variable"
@@ -142,15 +141,20 @@ def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return document, attributes
 
 
-def _is_netcdf(path: Path) -> bool:
-    """Return whether a file is NetCDF by its first bytes, or exists but cannot be read."""
+def is_netcdf(path: str | Path) -> bool:
+    """Return whether a file is NetCDF by its first bytes.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be read.
+    """
     try:
-        with path.open("rb") as file:
+        with Path(path).open("rb") as file:
             return file.read(4) in NETCDF_MAGIC
-    except NO_FILE:
-        return False
-    except OSError:
-        return True
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror}"
+        raise ProductError(problem, file=path, wrong_use=isinstance(error, NO_FILE)) from error
 
 
 @contextmanager

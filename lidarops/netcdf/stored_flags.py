@@ -6,6 +6,7 @@ alone has no meaning. Results are either those of the file, or given the places 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +20,7 @@ from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Flags, Quality, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.records import Verdicts
 
 Values = NDArray[Any]
 Recoding = Callable[[Values], Values]
@@ -51,7 +53,7 @@ def stored_bits(attributes: Mapping[str, Any], kind: str | None) -> tuple[Stored
     kind : str or None
         Kind of product. Without a known kind, severity is known of shared bits only.
     """
-    flags = _known(kind)
+    flags = _flags_of_known_kind(kind)
     meanings = _meanings(attributes)
     if meanings is None:
         meanings = {bit.word: int(bit) for bit in flags or Quality}
@@ -66,11 +68,34 @@ def rejecting_mask(bits: Iterable[StoredBit]) -> int:
     return sum(bit.mask for bit in bits if bit.rejects)
 
 
-def count_bits(values: Values, bits: Iterable[StoredBit]) -> dict[StoredBit, int]:
-    """Return how many values carry each bit, of the bits that occur."""
-    # Few bits occur in a product: count only these.
-    union = int(np.bitwise_or.reduce(values, axis=None))
-    return {bit: int(np.count_nonzero(values & bit.mask)) for bit in bits if union & bit.mask}
+class FlagCounter:
+    """Counts values of ``quality_flag`` by bit, and by what their bits say of them.
+
+    Parameters
+    ----------
+    bits : iterable of StoredBit
+        All that the values may carry.
+    """
+
+    def __init__(self, bits: Iterable[StoredBit]) -> None:
+        self._bits = tuple(bits)
+        self._rejecting = rejecting_mask(self._bits)
+        self.carried: Counter[StoredBit] = Counter()
+        """Numbers of values that carry each of the bits that occur."""
+        self.verdicts = Verdicts(0, 0, 0)
+
+    def add(self, values: Values) -> None:
+        """Count more values, integers of any shape."""
+        unflagged, usable = (
+            values.size - int(np.count_nonzero(bits)) for bits in (values, values & self._rejecting)
+        )
+        more = Verdicts.of(values.size, unflagged=unflagged, usable=usable)
+        self.verdicts = Verdicts.total([self.verdicts, more])
+        # Few bits occur in a product: count only these.
+        union = int(np.bitwise_or.reduce(values, axis=None))
+        for bit in self._bits:
+            if union & bit.mask:
+                self.carried[bit] += int(np.count_nonzero(values & bit.mask))
 
 
 def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:
@@ -89,7 +114,7 @@ def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:
         Raises `ProductError` where a value carries a bit that the file does not name, or that the
         kind no longer has. None where no bit has moved, or the kind is not known.
     """
-    flags = _known(kind)
+    flags = _flags_of_known_kind(kind)
     meanings = None if flags is None else _meanings(attributes)
     if flags is None or meanings is None or meanings == {bit.word: int(bit) for bit in flags}:
         return None
@@ -135,7 +160,7 @@ def places(bits: int) -> str:
     return ", ".join(str(place) for place in range(PLACES + 1) if bits >> place & 1)
 
 
-def _known(kind: object) -> Flags | None:
+def _flags_of_known_kind(kind: object) -> Flags | None:
     return flags_of(str(kind)) if kind in set(kinds()) else None
 
 

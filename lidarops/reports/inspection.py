@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -20,11 +19,11 @@ from rich.table import Table
 from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
-from lidarops.errors import NO_FILE, LidarOpsError, RawFormatError
+from lidarops.errors import RawFormatError
 from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
-from lidarops.netcdf.read import NETCDF_MAGIC, opened_product, read_provenance
-from lidarops.netcdf.stored_flags import StoredBit, count_bits, stored_bits
+from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
+from lidarops.netcdf.stored_flags import FlagCounter, stored_bits
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
 
@@ -72,14 +71,7 @@ def describe(file: Path) -> dict[str, Any]:
     """
     if file.is_dir():
         return _folder(file)
-    try:
-        with file.open("rb") as stream:
-            magic = stream.read(4)
-    except OSError as error:
-        raise LidarOpsError(
-            f"cannot be read: {error.strerror}", file=file, wrong_use=isinstance(error, NO_FILE)
-        ) from error
-    return _product(file) if magic in NETCDF_MAGIC else _raw(file)
+    return _product(file) if is_netcdf(file) else _raw(file)
 
 
 def tables(file: Path) -> list[Table]:
@@ -88,31 +80,31 @@ def tables(file: Path) -> list[Table]:
     about = _table(file.name, "field", "value")
     for key, value in description.items():
         if key != _HEADER and (isinstance(value, str | int | float) or value is None):
-            _row(about, key.replace("_", " "), _with_unit(key, value))
+            _add_row(about, key.replace("_", " "), _with_unit(key, value))
     if description["type"] == "folder":
-        refused = _listed("Damaged files", description["refused"], ("file", "reason"))
+        refused = _table_of_rows("Damaged files", description["refused"], ("file", "reason"))
         others = [{"file": path} for path in description["other"][:_OTHERS]]
-        other = _listed("Files of no raw format", others, ("file",))
+        other = _table_of_rows("Files of no raw format", others, ("file",))
         return [
             about,
-            _listed("Groups of like files", description["groups"], _GROUP),
+            _table_of_rows("Groups of like files", description["groups"], _GROUP),
             refused,
             other,
         ]
     if description["type"] == "raw":
         for note in description["notes"] or ["none"]:
-            _row(about, "notes", note)
+            _add_row(about, "notes", note)
         header = _table("Header as written", "line")
         for line in description.get(_HEADER, "").splitlines():
-            _row(header, line)
-        return [about, _listed("Channels", description["channels"], _CHANNEL), header]
+            _add_row(header, line)
+        return [about, _table_of_rows("Channels", description["channels"], _CHANNEL), header]
     for key, value in description["attributes"].items():
         if key not in _LONG:
-            _row(about, key, value)
+            _add_row(about, key, value)
     columns = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
-    shown = [about, _listed("Variables", description["variables"], columns)]
+    shown = [about, _table_of_rows("Variables", description["variables"], columns)]
     flags = ("name", "severity", "values", "share", "description")
-    return [*shown, _listed("Quality", description["quality"], flags)]
+    return [*shown, _table_of_rows("Quality", description["quality"], flags)]
 
 
 def _with_unit(key: str, value: object) -> str:
@@ -217,24 +209,19 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     """Count values by verdict and by quality bit; empty for files without quality flags."""
     if "quality_flag" not in dataset.variables:
         return []
-    size = dataset["quality_flag"].size
-    bits = stored_bits(dataset["quality_flag"].attrs, dataset.attrs.get("lidarops_kind"))
-    rows = []
-    if "usable" in dataset.variables and dataset["usable"].size:
-        verdicts: Counter[int] = Counter()
-        for block in blocks(dataset["usable"], _READ_VALUES):
-            usable = block.to_numpy()
-            verdicts.update({v: int(np.count_nonzero(usable == v)) for v in range(len(_VERDICTS))})
-        rows = [
-            _counted(name, "verdict", verdicts[value], size, "")
-            for value, name in enumerate(_VERDICTS)
-        ]
-    counts: Counter[StoredBit] = Counter()
-    for flags in blocks(dataset["quality_flag"], _READ_VALUES) if size else ():
-        counts.update(count_bits(quality_bits(flags), bits))
-    for bit in (bit for bit in bits if counts[bit]):
+    flags = dataset["quality_flag"]
+    bits = stored_bits(flags.attrs, dataset.attrs.get("lidarops_kind"))
+    counts = FlagCounter(bits)
+    for block in blocks(flags, _READ_VALUES) if flags.size else ():
+        counts.add(quality_bits(block))
+    rows = [
+        _counted(name, "verdict", count, flags.size, "")
+        for name, count in zip(_VERDICTS, counts.verdicts, strict=True)
+        if flags.size
+    ]
+    for bit in (bit for bit in bits if counts.carried[bit]):
         severity = "unknown" if bit.severity is None else bit.severity.name.lower()
-        rows.append(_counted(bit.word, severity, counts[bit], size, bit.description))
+        rows.append(_counted(bit.word, severity, counts.carried[bit], flags.size, bit.description))
     return rows
 
 
@@ -275,10 +262,10 @@ def _plain_scalar(value: Any) -> Any:
     return str(value)
 
 
-def _listed(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
+def _table_of_rows(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
     table = _table(title, *(_title(column) for column in columns))
     for item in items:
-        _row(table, *(_cell(item.get(column)) for column in columns))
+        _add_row(table, *(_cell(item.get(column)) for column in columns))
     return table
 
 
@@ -300,6 +287,6 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _row(table: Table, *cells: Any) -> None:
+def _add_row(table: Table, *cells: Any) -> None:
     # As Text, because rich would interpret brackets in a header as markup.
     table.add_row(*(Text(visible(str(cell))) for cell in cells))

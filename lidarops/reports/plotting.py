@@ -16,7 +16,7 @@ from lidarops.figures.any_kind import view_of, views_of
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import ProductSource, View, image_view
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
-from lidarops.netcdf.read import NETCDF_MAGIC, open_product, opened_product, reading
+from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
 
@@ -98,14 +98,7 @@ def draw_file(path: Path, chosen: Selection = ALL) -> tuple[Figure, ...]:
     LidarOpsError
         If the file cannot be read, or there is nothing to draw.
     """
-    try:
-        with path.open("rb") as stream:
-            magic = stream.read(4)
-    except OSError as error:
-        raise LidarOpsError(
-            f"cannot be read: {error.strerror}", file=path, wrong_use=True
-        ) from error
-    figures = tuple(_of_product(path, chosen) if magic in NETCDF_MAGIC else _of_raw(path, chosen))
+    figures = tuple(_of_product(path, chosen) if is_netcdf(path) else _of_raw(path, chosen))
     if not figures:
         raise LidarOpsError("holds nothing that can be drawn", file=path)
     return figures

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -16,7 +15,7 @@ from lidarops.figures.product_names import attribute, scalar
 from lidarops.figures.quality_panel import READ_VALUES
 from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import named_shares, percent
-from lidarops.netcdf.stored_flags import StoredBit, count_bits, rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, StoredBit, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.site.paths import CALENDAR_HEIGHT
 
@@ -125,22 +124,22 @@ def count_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Qualit
     if QUALITY_FLAG not in product:
         return QualityCounts(0, 0, 0, 0, 0, ())
     bits = stored_bits(product[QUALITY_FLAG].attrs, product.attrs.get("lidarops_kind"))
-    counts: Counter[StoredBit] = Counter()
-    values = usable = unflagged = profiles = available = 0
+    counts = FlagCounter(bits)
+    profiles = available = 0
     rejecting = np.int64(rejecting_mask(bits))
     low = _low(product, below)
     for block in blocks(product[QUALITY_FLAG], READ_VALUES):
         flags = np.atleast_1d(quality_bits(block))
         accepted = (flags & rejecting) == 0
-        values += flags.size
-        usable += int(np.count_nonzero(accepted))
-        unflagged += flags.size - int(np.count_nonzero(flags))
         profiles += len(flags)
         seen = accepted[:, low].reshape(len(flags), -1) if accepted.ndim > 1 else accepted[:, None]
         available += int(np.count_nonzero(seen.any(axis=1)))
-        counts.update(count_bits(flags, bits))
-    rows = [_flag_row(bit, counts[bit], values) for bit in bits if counts[bit]]
-    return QualityCounts(values, usable, unflagged, profiles, available, tuple(rows))
+        counts.add(flags)
+    verdicts, carried = counts.verdicts, counts.carried
+    rows = [_flag_row(bit, carried[bit], verdicts.values) for bit in bits if carried[bit]]
+    return QualityCounts(
+        verdicts.values, verdicts.usable, verdicts.good, profiles, available, tuple(rows)
+    )
 
 
 def _low(product: xr.Dataset, below: float) -> NDArray[np.bool_] | slice:
