@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -50,7 +49,7 @@ from flows.start import (
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.product_files import publish_products
-from lidarops.catalog.store import RunStatus, Store
+from lidarops.catalog.store import RunStatus
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
@@ -62,10 +61,17 @@ from lidarops.run.archive import (
     Result,
     Selection,
     bring_up_to_date,
+    refused_files,
     report_earlier_runs,
     report_run,
 )
-from lidarops.run.options import check_selection, missing_report, selects_no_scene
+from lidarops.run.options import (
+    NO_USABLE_VALUE,
+    check_selection,
+    missing_report,
+    selected,
+    selects_no_scene,
+)
 from lidarops.settings import Instant
 
 _T = TypeVar("_T")
@@ -275,7 +281,7 @@ def reprocess(
         workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
     )
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
-    selection = _selection(instruments, stations, products, since, until)
+    selection = selected(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
     # First, because copy and report may fail.
     message = _log_problems(settings, result) if result.has_failures else ""
@@ -304,31 +310,17 @@ def reprocess(
     return cast("tuple[Result, Path | None]", ended)
 
 
-def _selection(
-    instruments: list[str] | None,
-    stations: list[str] | None,
-    products: list[str] | None,
-    since: datetime | None,
-    until: datetime | None,
-) -> Selection:
-    return Selection(
-        stations=tuple(stations or ()),
-        instruments=tuple(instruments or ()),
-        kinds=tuple(products or ()),
-        since=since,
-        until=until,
-    )
-
-
 def _log_problems(campaign: Campaign, result: Result) -> str:
     """Log refused and failed files and scenes, some by name; return their numbers as text."""
     problems = {
         "scenes ended with an internal error": result.internal_errors,
         "scenes failed": result.failed_scenes,
-        "scenes without a usable value": dict.fromkeys(
-            result.unusable_scenes, "its retrievals gave no usable value"
-        ),
-        "files refused": _refused(campaign, result),
+        "scenes without a usable value": dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE),
+        "files refused": {
+            granule.path: granule.reason
+            for granule in refused_files(campaign, result)
+            if granule.path not in result.set_aside
+        },
         "scenes without product": result.empty_scenes,
         "good files in no scene": result.set_aside,
         "requested channels in no file": {
@@ -341,7 +333,7 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
             for row in finding_rows(result.findings)
             if row.fails
         },
-        "requested products that no scene gives": {
+        "requested products made in no scene": {
             f"{unmade.kind} {unmade.channel} of {unmade.instrument}": unmade.reason
             for unmade in result.findings.unmade
         },
@@ -359,14 +351,6 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
     summary = ", ".join(f"{number} {kind}" for kind, number in numbers.items() if number)
     logger.warning("campaign %s: %s", campaign.name, summary)
     return summary
-
-
-def _refused(campaign: Campaign, result: Result) -> Mapping[str, str]:
-    """Return file -> reason of the files refused by the catalog or by a scene of the run."""
-    with Store(campaign.catalog_url, campaign.name) as store:
-        early = store.refused()
-    late = [granule for scene in result.scenes for granule in scene.refused]
-    return {granule.path: granule.reason for granule in (*early, *late)}
 
 
 def main(
@@ -421,7 +405,7 @@ def main(
         valid = reprocess.validate_parameters(parameters)
         settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
         selection_names = ("instruments", "stations", "products", "since", "until")
-        check_selection(settings, _selection(*(valid[name] for name in selection_names)))
+        check_selection(settings, selected(*(valid[name] for name in selection_names)))
         clusters.choose_cluster(
             workers=workers, scheduler=scheduler, cluster=cluster, memory=memory_limit
         )

@@ -523,13 +523,13 @@ class Store(Granules):
 
     def failures(self) -> dict[str, str]:
         """Return scene -> error of the scenes whose last try failed."""
-        return self._said_of_scenes(SCENE.c.error)
+        return self._errors_of_scenes(SCENE.c.error)
 
     def internal_errors(self) -> dict[str, str]:
         """Return scene -> traceback of the scenes whose last try ended with an internal error."""
-        return self._said_of_scenes(SCENE.c.internal)
+        return self._errors_of_scenes(SCENE.c.internal)
 
-    def _said_of_scenes(self, column: sa.Column[str]) -> dict[str, str]:
+    def _errors_of_scenes(self, column: sa.Column[str]) -> dict[str, str]:
         query = sa.select(SCENE.c.scene, column)
         own = SCENE.c.campaign == self.campaign
         return dict(self.read(query.where(own, column != ""), tuple))

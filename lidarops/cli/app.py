@@ -380,20 +380,14 @@ def selection_of(
     until: datetime | None,
 ) -> Selection:
     """Return the selection that options describe; refuse an unknown kind of product."""
-    from lidarops.run.options import Selection
+    from lidarops.run.options import selected
 
     for name in products or ():
         if name not in kinds():
             raise typer.BadParameter(
                 f"{name!r} is not a kind of product; the kinds are {', '.join(kinds())}"
             )
-    return Selection(
-        stations=tuple(stations or ()),
-        instruments=tuple(instruments or ()),
-        kinds=tuple(products or ()),
-        since=utc(since),
-        until=utc(until),
-    )
+    return selected(instruments, stations, products, utc(since), utc(until))
 
 
 class JsonLines(logging.Formatter):

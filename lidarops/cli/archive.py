@@ -315,7 +315,10 @@ def _show_refused(refused: list[Granule]) -> None:
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
+    from lidarops.run.archive import refused_files
+
     record, scenes = result.record, result.scenes
+    refused = refused_files(campaign, result)
     return {
         "run": None if record is None else record.id,
         "status": result.status.value,
@@ -327,7 +330,7 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             for scene, error in result.internal_errors.items()
         },
         "unusable_scenes": list(result.unusable_scenes),
-        "refused_files": {granule.path: granule.reason for granule in _refused(campaign, result)},
+        "refused_files": {granule.path: granule.reason for granule in refused},
         "products": [product.path for scene in scenes for product in scene.products],
         "quality": {
             product.path: product.verdicts._asdict()
@@ -380,19 +383,9 @@ def _print_places(result: Result, page: Path | None) -> None:
         )
 
 
-def _refused(campaign: Campaign, result: Result) -> list[Granule]:
-    if result.record is not None:
-        late = [granule for scene in result.record.scenes for granule in scene.refused]
-        early = {granule.path: granule for granule in (*result.record.refused, *late)}
-        return list(early.values())
-    from lidarops.catalog.store import Store
-
-    with Store(campaign.catalog_url, campaign.name) as store:
-        return store.refused()
-
-
 def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removing: bool) -> None:
     from lidarops.reports.findings import disagreement_rows, scene_note_rows
+    from lidarops.run.archive import refused_files
 
     scenes = result.scenes
     columns: tuple[str, ...] = (
@@ -407,7 +400,7 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     )
     show_rows("Products", columns, (row for scene in scenes for row in _product_rows(scene)))
     _show_changes(result)
-    refused = _refused(campaign, result)
+    refused = refused_files(campaign, result)
     _show_refused(refused)
     _show_unused(result, {granule.path for granule in refused})
     show_findings(result.findings)

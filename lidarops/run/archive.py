@@ -16,7 +16,7 @@ from lidarops.catalog.lock import Lock, OvertakenError
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import RunStatus, Store, Verdict
 from lidarops.errors import LidarOpsError
-from lidarops.records import Findings, RunRecord
+from lidarops.records import Findings, Granule, RunRecord
 from lidarops.reports import run_record
 from lidarops.run.day_states import DayStates, Signature
 from lidarops.run.findings import find
@@ -43,6 +43,7 @@ __all__ = [
     "Selection",
     "assess",
     "bring_up_to_date",
+    "refused_files",
     "remove_orphans",
     "report_earlier_runs",
     "report_run",
@@ -255,8 +256,8 @@ def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None
     if days or _is_something_left(states, signatures):
         from lidarops.run.processing import Pass  # noqa: PLC0415 - loads the numerics
 
-        work = Pass(states, lock, options, summary, days, signatures, verdicts)
-        return work.carry_out(client)
+        work = Pass(states, lock, options, client, summary, days, signatures, verdicts)
+        return work.carry_out()
     empty_scenes, set_aside = unused(verdicts, signatures)
     return Result(
         record=None,
@@ -280,6 +281,15 @@ def _is_something_left(states: DayStates, signatures: Mapping[int, Signature]) -
         or store.has_dead_run()
         or product_files.is_littered(Path(campaign.output), store)
     )
+
+
+def refused_files(campaign: Campaign, result: Result) -> list[Granule]:
+    """Return the files refused by the catalog or by a scene, and of a run those in no scene."""
+    if result.record is None:
+        with Store(campaign.catalog_url, campaign.name) as store:
+            return store.refused()
+    late = (granule for scene in result.scenes for granule in scene.refused)
+    return list({granule.path: granule for granule in (*result.record.refused, *late)}.values())
 
 
 def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> int:
@@ -319,7 +329,7 @@ def remove_orphans(campaign: Campaign, result: Result, *, wait: float = 0.0) -> 
         lock.acquire()
         with store.all_products() as made:
             runs = {product.path: product.run for product in made}
-        paths = [orphan.path for orphan in removable if runs.get(orphan.path) == orphan.run]
+        paths = [orphan.path for orphan in removable if runs.get(orphan.path) == orphan.product.run]
         for name in paths:
             path = campaign.products_root / name
             removed += path.exists()

@@ -7,7 +7,7 @@ is a typing error, one that some files lack is a changed lidar.
 from __future__ import annotations
 
 import itertools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -26,6 +26,7 @@ from lidarops.records import (
     glued_parts,
     is_glued,
 )
+from lidarops.run.options import Selection
 from lidarops.scene.case import ABSENT, LAG_STEP, UNMATCHED, missing_channels, named_channels
 
 _ROUNDING_OF_WAVELENGTHS: Final = 1e-9
@@ -77,11 +78,8 @@ def validity_edges(campaign: Campaign) -> list[datetime]:
 def unavailable_channels(
     campaign: Campaign,
     holdings: Iterable[Holding],
-    *,
-    instruments: Collection[str] | None = None,
-    kinds: Collection[str] = (),
-    since: datetime | None = None,
-    until: datetime | None = None,
+    instruments: Collection[str],
+    selection: Selection,
 ) -> tuple[Unmet, ...]:
     """Return the channels that are requested or have facts, and that files of an instrument lack.
 
@@ -93,43 +91,28 @@ def unavailable_channels(
     campaign : Campaign
     holdings : iterable of Holding
         Of all files, cut at `validity_edges`.
-    instruments : collection of str, optional
-        Restricts the result to these instruments.
-    kinds : collection of str
-        Restricts requested channels to these kinds of product; all where empty.
-    since, until : datetime, optional
-        Restricts facts to periods that touch [since, until).
+    instruments : collection of str
+        Restricts the result to these instruments of the campaign.
+    selection : Selection
+        Restricts requested channels to its kinds, and facts to periods that touch its times.
 
     Returns
     -------
     tuple of Unmet
         Channels that no file holds come first.
     """
-    all_files: dict[tuple[str, str], int] = defaultdict(int)
+    all_files, held = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     lacking: dict[tuple[str, str, str], list[tuple[int, str]]] = defaultdict(list)
-    held: dict[tuple[str, str], int] = defaultdict(int)
     for holding in holdings:
-        name = holding.instrument
-        instrument = campaign.instruments.get(name)
-        if instrument is None or not (instruments is None or name in instruments):
+        name, files = holding.instrument, holding.files
+        if name not in instruments:
             continue
-        for channel_layout in holding.layout:
-            held[name, channel_layout.name] += holding.files
+        instrument = campaign.instruments[name]
         facts = instrument.facts_at(holding.since)
-        period = period_of(facts)
-        for requester in {"", period}:
-            all_files[name, requester] += holding.files
-        touched = (since is None or facts.valid_to > since) and (
-            until is None or facts.valid_from < until
-        )
-        reasons = {}
-        for omission in missing_channels(holding.layout, instrument.products.requested, facts):
-            if omission.rule == ABSENT and (not kinds or omission.name in kinds):
-                reasons[omission.name, omission.channel] = omission.reason
-            elif omission.rule == UNMATCHED and touched and omission.name != LAG_STEP:
-                reasons[period, omission.channel] = omission.reason
-        for (requester, channel), reason in reasons.items():
-            lacking[name, requester, channel].append((holding.files, reason))
+        held.update({(name, channel.name): files for channel in holding.layout})
+        all_files.update({(name, requester): files for requester in ("", period_of(facts))})
+        for requester, channel, reason in _lacking(holding, instrument, facts, selection):
+            lacking[name, requester, channel].append((files, reason))
     unmet = []
     for (name, requester, channel), counts in lacking.items():
         of_facts = requester.startswith(FACTS)
@@ -138,6 +121,24 @@ def unavailable_channels(
         having = held[name, channel] if of_facts else whole - files
         unmet.append(Unmet(name, channel, requester, max(counts)[1], files, whole, having))
     return tuple(sorted(unmet, key=lambda request: (not request.nowhere, request.instrument)))
+
+
+def _lacking(
+    holding: Holding, instrument: Instrument, facts: InstrumentFacts, selection: Selection
+) -> Iterator[tuple[str, str, str]]:
+    """Yield what requests a channel that some files lack, the channel, and why."""
+    since, until = selection.since, selection.until
+    touched = (since is None or facts.valid_to > since) and (
+        until is None or facts.valid_from < until
+    )
+    reasons = {}
+    for left in missing_channels(holding.layout, instrument.products.requested, facts):
+        if left.rule == ABSENT and (not selection.kinds or left.name in selection.kinds):
+            reasons[left.name, left.channel] = left.reason
+        elif left.rule == UNMATCHED and touched and left.name != LAG_STEP:
+            reasons[period_of(facts), left.channel] = left.reason
+    for (requester, channel), reason in reasons.items():
+        yield requester, channel, reason
 
 
 def exchanged_recorders(holdings: Iterable[Holding]) -> Iterator[FactsNote]:

@@ -61,12 +61,7 @@ def find(
     incomplete, idle = _facts_notes(states, sorted(instruments))
     return Findings(
         unmet=channels.unavailable_channels(
-            campaign,
-            states.names.holdings,
-            instruments=instruments,
-            kinds=selection.kinds,
-            since=selection.since,
-            until=selection.until,
+            campaign, states.names.holdings, instruments, selection
         ),
         file_notes=(*store.file_notes(instruments), *states.names.notes(instruments)),
         idle_patterns=tuple(one for one in idle_patterns if one.instrument in instruments),

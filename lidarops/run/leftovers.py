@@ -47,14 +47,17 @@ Planned = tuple[Scene, Plan]
 class Orphan:
     """A product that would not be made again."""
 
-    path: str
+    product: RecordedProduct
     reason: str
-    run: str
-    """Id of the run that made it."""
     requested: bool = False
     """Whether the campaign still requests it but the present files do not allow it."""
     lost: bool = False
     """Whether the campaign still requests it, but no raw file of its scene is left."""
+
+    @property
+    def path(self) -> str:
+        """Path of the product."""
+        return self.product.path
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +152,7 @@ class Leftovers:
     """Returns the SHA-256 of a granule."""
     lost: Lost
 
-    def orphans(self, made: Iterable[RecordedProduct]) -> list[tuple[RecordedProduct, Orphan]]:
+    def orphans(self, made: Iterable[RecordedProduct]) -> list[Orphan]:
         """Return those of the products of these days that no scene would give.
 
         Without those whose raw files the campaign acknowledges as lost. Products whose raw files
@@ -167,8 +170,7 @@ class Leftovers:
             reason, kept, lost = self._fate(product)
             stays = product.path in self.lost.protected
             if stays or not (lost and product.path in self.lost.excused):
-                one = Orphan(product.path, reason, product.run, kept or stays, lost and not stays)
-                orphans.append((product, one))
+                orphans.append(Orphan(product, reason, kept or stays, lost and not stays))
         return orphans
 
     def _fate(self, product: RecordedProduct) -> tuple[str, bool, bool]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lidarops.run.leftovers import Orphan
 
 Progress = Callable[[SceneOutcome], None]
-NO_USABLE_VALUE: Final = "its retrievals gave no usable value"
+NO_USABLE_VALUE: Final = "no retrieval gave a usable value"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +74,18 @@ class Selection:
         return (not self.instruments or name in self.instruments) and (
             not self.stations or station in self.stations
         )
+
+
+def selected(
+    instruments: Iterable[str] | None,
+    stations: Iterable[str] | None,
+    products: Iterable[str] | None,
+    since: datetime | None,
+    until: datetime | None,
+) -> Selection:
+    """Return the selection of some names and an interval of time; None selects all."""
+    stations, instruments, products = (tuple(n or ()) for n in (stations, instruments, products))
+    return Selection(stations, instruments, products, since, until)
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,7 +125,7 @@ def outlying_headers(
     return found
 
 
-def _lone(
+def _places_of_lone_values(
     around: Sequence[Granule], day: int, stated: Sequence[Hashable]
 ) -> Iterator[tuple[int, int]]:
     """Yield places of files of a day that alone state a value, with that of a usual file."""
@@ -143,8 +143,8 @@ def _setups(
     around: Sequence[Granule], day: int, read: ReadHeader
 ) -> Iterator[tuple[int, Outlying]]:
     """Yield places of files whose site or channels are recorded as in no other file."""
-    lone = dict(_lone(around, day, [granule.layout for granule in around]))
-    lone |= _lone(around, day, [granule.setup for granule in around])
+    lone = dict(_places_of_lone_values(around, day, [granule.layout for granule in around]))
+    lone |= _places_of_lone_values(around, day, [granule.setup for granule in around])
     for place, usual in lone.items():
         own, other = read(around[place]), read(around[usual])
         if own and other:
@@ -179,7 +179,7 @@ def _intervals(
     """
     ends = [(g.start.timestamp(), g.stop.timestamp()) for g in around if g.start and g.stop]
     lengths = [round(stop - start) for start, stop in ends]
-    for place, usual in _lone(around, day, lengths):
+    for place, usual in _places_of_lone_values(around, day, lengths):
         length, other = lengths[place], lengths[usual]
         if any(0 < abs(length - near) <= _JITTER for near in lengths):
             continue
@@ -210,7 +210,7 @@ def _pointings(around: Sequence[Granule], day: int) -> Iterator[tuple[int, Outly
     stated = [(granule.zenith_angle, granule.azimuth) for granule in around]
     others = sorted(Counter(stated).values())[1:]
     if others and others[0] >= FEWEST_ALIKE:
-        for place, _ in _lone(around, day, stated):
+        for place, _ in _places_of_lone_values(around, day, stated):
             named = zip(("zenith angle", "azimuth"), stated[place], strict=True)
             words = " and ".join(f"{name} {angle:g}" for name, angle in named if angle is not None)
             text = f"the pointing {words} alone of all files around it"

@@ -11,20 +11,18 @@ from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-import numpy as np
-
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Dependence, NewProduct, RunStatus, SceneEntry, Store
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.figures.series_data import blocks
-from lidarops.kinds import flags_of, kinds
+from lidarops.kinds import kinds
 from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
-from lidarops.netcdf.stored_flags import recoding
+from lidarops.netcdf.stored_flags import FlagCounter, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.records import ProductRecord, Role, SceneOutcome, day_of
-from lidarops.run.processing import new_run
+from lidarops.records import Findings, ProductRecord, Role, SceneOutcome, Verdicts, day_of
+from lidarops.run.ledger_run import JudgedDays, LedgerRun
 from lidarops.run.recipe import Recipe
 from lidarops.run.scenes import MONTH, parse_scene_id
 from lidarops.run.staleness import Judge, settings_digest
@@ -94,21 +92,16 @@ def rebuild_ledger(
         read = partial(_read_products, campaign, rebuilt, progress)
         # Says which name each of them should have.
         read(unnamed)
-        judge, run = Judge(campaign, store), None
+        judge, run = Judge(campaign, store), LedgerRun(campaign, store, lock, journal=False)
         for days, batch in [(part, batch) for part in parts for batch in judge.batches(part)]:
             present = {judged.scene.id for judged in judge.days(batch).judgements}
             scenes = ((day, *group) for day in batch for group in groupby(read(days[day]), _scene))
             for day, scene, products in scenes:
-                if run is None:
-                    run = new_run(campaign)
-                    store.begin_run(run, lock.token)
                 entry = _entry(day, tuple(products))
-                store.record(entry, run.id, lock.token)
+                store.record(entry, run.begin().id, lock.token)
                 rebuilt.entered += len(entry.products)
                 rebuilt.without_scene += 0 if scene in present else len(entry.products)
-        if run is not None:
-            refused = len(store.refused())
-            store.end_run(run.id, RunStatus.FINISHED, refused=refused, token=lock.token)
+        run.conclude(RunStatus.FINISHED, Findings(), JudgedDays())
     return rebuilt
 
 
@@ -158,10 +151,10 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
         if path != name:
             raise ProductError(f"should have the name {name}", file=file)
         status = file.stat()
-        values, unflagged, usable = _counts(file, kind)
+        verdicts = _verdicts(file, kind)
         record = ProductRecord(
-            path, kind, channel, sha256_of(file), status.st_size, values, {}, unflagged, usable,
-            stamp=recipe.stamp,
+            path, kind, channel, sha256_of(file), status.st_size, verdicts.values, {},
+            verdicts.good, verdicts.usable, stamp=recipe.stamp,
         )  # fmt: skip
         depends_on = Dependence(
             plan_hash=recipe.plan.hash,
@@ -173,21 +166,14 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
         return recipe, NewProduct(record, status.st_mtime_ns, depends_on, inputs)
 
 
-def _counts(file: Path, kind: str) -> tuple[int, int, int]:
-    """Return the numbers of all values of a product, of those without any bit, and of usable ones.
-
-    The file may be larger than memory.
-    """
-    rejecting = np.int32(flags_of(kind).rejecting)
-    unflagged = usable = 0
+def _verdicts(file: Path, kind: str) -> Verdicts:
+    """Return the numbers of values of a product, which may be larger than memory."""
     with opened_product(file, in_parts=True, decode_cf=False) as product:
         flags = product[QUALITY_FLAG]
-        recode = recoding(flags.attrs, kind)
+        counts = FlagCounter(stored_bits(flags.attrs, kind))
         for block in blocks(flags, _BLOCK):
-            values = recode(block.to_numpy()) if recode else block.to_numpy()
-            unflagged += int(np.count_nonzero(values == 0))
-            usable += int(np.count_nonzero(values & rejecting == 0))
-    return flags.size, unflagged, usable
+            counts.add(block.to_numpy())
+    return counts.verdicts
 
 
 def _entry(day: int, products: tuple[_Product, ...]) -> SceneEntry:

@@ -177,12 +177,18 @@ def _bring(source: Path | RemoteStore, staged: Path, names: Mapping[str, str]) -
 def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
     """Return recorded name -> present name of files that a catalog knows under another name."""
     digests = {record.sha256 for record in lost}
-    present = _asked(recipe, catalog, lambda store: store.paths_by_digest(digests)) if lost else {}
+    present = (
+        _answer_of_catalog(recipe, catalog, lambda store: store.paths_by_digest(digests))
+        if lost
+        else {}
+    )
     names = {record.path: (present or {}).get(record.sha256, record.path) for record in lost}
     return {old: new for old, new in names.items() if old != new and stays_inside(new)}
 
 
-def _asked(recipe: Recipe, catalog: str | None, question: Callable[[Store], _T]) -> _T | None:
+def _answer_of_catalog(
+    recipe: Recipe, catalog: str | None, question: Callable[[Store], _T]
+) -> _T | None:
     """Return what the catalog of a product answers; None where no catalog is found."""
     near = (parent / "catalog.sqlite" for parent in recipe.file.resolve().parents)
     found = next((f"sqlite:///{file}" for file in near if file.is_file()), "")
@@ -213,14 +219,14 @@ def _folder(
     """
     digests = {record.path: record.sha256 for record in records}
     moved = {name: digests[old] for old, name in _moved(recipe, records, catalog).items()}
-    last = _asked(recipe, catalog, lambda store: next(iter(store.runs(limit=1)), None))
+    last = _answer_of_catalog(recipe, catalog, lambda store: next(iter(store.runs(limit=1)), None))
     known = "" if last is None else last.archive if option == "--archive" else last.folder
     last_read = [Path(known)] if known and not is_url(known) else []
     local = [*_folders_above(recipe.file), *last_read]
     own = [folder for folder in local if folder.parent != folder.parent.parent] + last_read
     for content, folders in ((True, local), (False, own)):
         for folder in folders:
-            if any(_holds(folder, names, content=content) for names in (digests, moved)):
+            if any(_has_any(folder, names, content=content) for names in (digests, moved)):
                 return str(folder)
         if is_url(known):
             return known
@@ -232,7 +238,7 @@ def _folder(
     )
 
 
-def _holds(folder: Path, digests: Mapping[str, str], *, content: bool) -> bool:
+def _has_any(folder: Path, digests: Mapping[str, str], *, content: bool) -> bool:
     """Return whether there is any named file, on request with the digest of its name."""
     return any(
         (folder / name).is_file() and (not content or sha256_of(folder / name) == digest)

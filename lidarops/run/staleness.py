@@ -236,38 +236,12 @@ class Judge(DayStates):
         planned = [(judged.scene, judged.plan) for judged in judgements]
         reasons = scenes_without_product(planned, self.campaign)
         judgements = [
-            replace(judged, empty_reason=reasons.get(judged.scene.id, ""))
-            if judged.planned
-            else judged
+            replace(judged, empty_reason=reasons.get(judged.scene.id, "") if judged.planned else "")
             for judged in judgements
         ]
-        unplanned = {judged.scene.id for judged in judgements if not judged.planned}
-        plans = {scene.id: (scene, plan) for scene, plan in planned}
-        leftovers = Leftovers(self.campaign, self.store, plans, cut, self._content, self.lost)
-        orphans = [
-            (product, orphan)
-            for product, orphan in leftovers.orphans(made.values())
-            if product.scene not in unplanned
-        ]
-        # What is not replaced and files that cannot be used are reported by every run; a signature
-        # does not hold all that may end an internal error.
-        unsettled = {product.day for product, _ in orphans} | {
-            judged.day
-            for judged in judgements
-            if judged.frozen
-            or judged.kept
-            or any(self.file_problem(used.path, used.role) for used in judged.ancillaries)
-            or not judged.planned
-            or (judged.failure and judged.failure.internal)
-        }
-        settled = within - unsettled if self.selection.everything else set()
-        orphans += [
-            (known, Orphan(known.path, stale.reason, known.run, requested=True))
-            for judged in judgements
-            for stale in judged.kept
-            for known in [stale.before]
-            if known
-        ]
+        orphans = self._orphans(judgements, made.values(), cut)
+        settled = within if self.selection.everything else set()
+        settled = settled - self._unsettled(judgements, orphans)
         own = [one for one in judgements if self.selection.scene(one.scene.id, self.campaign)]
         unmade = {
             day: unmade_products(
@@ -281,9 +255,7 @@ class Judge(DayStates):
         return DaysJudged(
             judgements=tuple(own),
             orphans=tuple(
-                orphan
-                for product, orphan in orphans
-                if self.selection.product(product, self.campaign)
+                one for one in orphans if self.selection.product(one.product, self.campaign)
             ),
             set_aside=cut.set_aside,
             file_notes=tuple(note for note in cut.file_notes if note.instrument in instruments),
@@ -293,6 +265,35 @@ class Judge(DayStates):
             touched=self._touched,
             digests=self._digests,
         )
+
+    def _orphans(
+        self, judgements: Sequence[Judgement], made: Iterable[RecordedProduct], cut: Cut
+    ) -> list[Orphan]:
+        """Return the products of some days that would not be made again, or are kept as they are.
+
+        Without those of scenes that cannot be planned.
+        """
+        plans = {judged.scene.id: (judged.scene, judged.plan) for judged in judgements}
+        unplanned = {judged.scene.id for judged in judgements if not judged.planned}
+        leftovers = Leftovers(self.campaign, self.store, plans, cut, self._content, self.lost)
+        left = [one for one in leftovers.orphans(made) if one.product.scene not in unplanned]
+        kept = (stale for judged in judgements for stale in judged.kept)
+        return left + [Orphan(s.before, s.reason, requested=True) for s in kept if s.before]
+
+    def _unsettled(self, judgements: Iterable[Judgement], orphans: Iterable[Orphan]) -> set[int]:
+        """Return the days of which every run reports something, or that it tries again.
+
+        These are what is not replaced, and files that cannot be used; a signature does not hold
+        all that may end an internal error.
+        """
+        return {orphan.product.day for orphan in orphans} | {
+            judged.day
+            for judged in judgements
+            if judged.frozen
+            or any(self.file_problem(used.path, used.role) for used in judged.ancillaries)
+            or not judged.planned
+            or (judged.failure and judged.failure.internal)
+        }
 
     def _gone(
         self, judgements: Iterable[Judgement], tried: Mapping[str, LastTry], days: Collection[int]
@@ -364,10 +365,10 @@ class Judge(DayStates):
             held = self.store.products_of_days(first, first_of_month(first + 31) - 1)
             made = {product.path: product for product in held}
             scenes = {path: product.scene for path, product in made.items()} | self._to_be_made
-            records = {self._read(path, made): scene for path, scene in scenes.items()}
+            records = {self._product_to_read(path, made): scene for path, scene in scenes.items()}
             yield from months_of_products(self.campaign, {first}, records)
 
-    def _read(self, path: str, made: Mapping[str, RecordedProduct]) -> InputRecord:
+    def _product_to_read(self, path: str, made: Mapping[str, RecordedProduct]) -> InputRecord:
         """Return a product of which another is made, with its content if that is known."""
         known = None if path in self._to_be_made else made.get(path)
         return InputRecord(path, Role.PRODUCT, known.sha256 if known else f"to be made: {path}")
@@ -459,7 +460,7 @@ class Judge(DayStates):
         scene = judged.scene
         closure, _ = self.plan_and_settings(scene, judged.plan, product)
         keys = [key for step in closure.steps for key in dependence.read_products(step)]
-        of_scene = (self._read(product_file(scene, key), made) for key in keys)
+        of_scene = (self._product_to_read(product_file(scene, key), made) for key in keys)
         return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)
 
     def _with_remedy(self, frozen: Stale) -> Stale:

@@ -114,7 +114,9 @@ class _Series:
     def of(cls, campaign: Campaign, files: Sequence[DatedFile]) -> Self:
         windows = list(_windows(campaign, files))
         pairs = itertools.pairwise(zip(files, windows, strict=True))
-        lengths = [_alike(a.path, b.path) for (a, first), (b, then) in pairs if first != then]
+        lengths = [
+            _common_begin(a.path, b.path) for (a, first), (b, then) in pairs if first != then
+        ]
         return cls(files, windows, max(lengths, default=-1))
 
     def times_beside(self, path: str) -> list[datetime]:
@@ -125,7 +127,7 @@ class _Series:
         return [
             self.files[index].start
             for index in near
-            if between or _alike(self.files[index].path, path) > self.in_common
+            if between or _common_begin(self.files[index].path, path) > self.in_common
         ]
 
     def times_around(self, path: str) -> tuple[datetime, datetime]:
@@ -148,7 +150,7 @@ def _windows(campaign: Campaign, files: Iterable[DatedFile]) -> Iterator[datetim
         yield opens
 
 
-def _alike(one: str, other: str) -> int:
+def _common_begin(one: str, other: str) -> int:
     """Return how many characters two texts begin with that are the same."""
     pairs = enumerate(zip(one, other, strict=False))
     return next((n for n, (a, b) in pairs if a != b), min(len(one), len(other)))

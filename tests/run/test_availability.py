@@ -13,10 +13,8 @@ from support import factories
 from lidarops.catalog.headers import row_of
 from lidarops.catalog.store import Store
 from lidarops.records import Granule, Role, Unmet
-from lidarops.run.channels import (
-    unavailable_channels,
-    validity_edges,
-)
+from lidarops.run.channels import unavailable_channels, validity_edges
+from lidarops.run.options import Selection
 
 DAY = 1440
 OLD = factories.PHOTON
@@ -36,7 +34,8 @@ def unavailable(
     with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
         store.replace([row_of(granule, campaign.name, "key") for granule in granules])
         holdings = store.holdings(validity_edges(campaign))
-        return list(unavailable_channels(campaign, holdings, **selection))
+        chosen = Selection(**selection)
+        return list(unavailable_channels(campaign, holdings, campaign.instruments, chosen))
 
 
 def file_of(day: int, *layout: Any, minutes: float = 0.0, role: Role = Role.SIGNAL) -> Granule:

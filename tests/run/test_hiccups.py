@@ -17,7 +17,7 @@ from lidarops.catalog.store import Store
 from lidarops.netcdf.comparison import compare_products
 from lidarops.records import Grade
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
-from lidarops.run.processing import Pass
+from lidarops.run.ledger_run import LedgerRun
 from lidarops.scene import processing
 
 
@@ -153,15 +153,17 @@ def test_products_that_are_gone_when_their_scene_ends_are_made_again(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For example because the folder of products was mounted over."""
-    end = Pass.end
+    end = LedgerRun.end
 
-    def without_products(work: Pass, judged: Any, outcome: Any, *, final: bool) -> Any:
+    def without_products(
+        run: LedgerRun, judge: Any, judged: Any, outcome: Any, *, final: bool
+    ) -> Any:
         for product in outcome.products:
             (campaign.products_root / product.path).unlink()
-        return end(work, judged, outcome, final=final)
+        return end(run, judge, judged, outcome, final=final)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Pass, "end", without_products)
+        patch.setattr(LedgerRun, "end", without_products)
         assert "vanished or changed" in str(bring_up_to_date(campaign).failures)
     later = bring_up_to_date(campaign)
     assert not later.has_failures

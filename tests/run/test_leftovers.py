@@ -21,9 +21,9 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Run, RunStatus, Store
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.reports import gallery, run_journal, run_record
+from lidarops.reports import gallery, run_record
 from lidarops.run import archive as pipeline
-from lidarops.run import processing, staleness
+from lidarops.run import ledger_run, staleness
 from lidarops.run.archive import (
     Options,
     Selection,
@@ -32,7 +32,7 @@ from lidarops.run.archive import (
     report_run,
     reprocess,
 )
-from lidarops.run.processing import Pass
+from lidarops.run.ledger_run import LedgerRun
 from lidarops.scene.dependence import plan_closure, planned_products
 from lidarops.system.files import only_one
 
@@ -108,7 +108,7 @@ def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
 
 
 def test_a_report_names_empty_scenes(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processing, "MOST_EMPTY_SCENES", 3)
+    monkeypatch.setattr(ledger_run, "MOST_EMPTY_SCENES", 3)
     archive.tree["instruments"]["poor"]["products"] = {
         "homogeneous": {"channels": ["photon_532o"], "sections": [[50_000, 60_000]]}
     }
@@ -522,7 +522,7 @@ def test_a_run_whose_record_could_not_be_saved_is_reported_without_making_it_aga
         record = run_record.load_run_record(folder)
         assert [scene.scene for scene in record.scenes] == ["poor_20260301T000000"]
         assert record.scenes[0].products
-        assert not (folder / run_journal.FILE_NAME).exists()
+        assert not (folder / run_record.JOURNAL).exists()
     assert "index.html" not in CliRunner().invoke(app, command).stdout
 
 
@@ -533,7 +533,7 @@ def test_a_journal_that_is_cut_gives_the_scenes_before(archive: Archive) -> None
         patch.setattr(run_record, "write_atomically", _full)
         CliRunner().invoke(app, ["reprocess", str(archive.file)])
     (folder,) = (archive.folder / "out/report").glob("*")
-    journal = folder / run_journal.FILE_NAME
+    journal = folder / run_record.JOURNAL
     os.truncate(journal, journal.stat().st_size - 10)
     assert len(run_record.load_run_record(folder).scenes) == 2
     journal.write_text("{}\n")
@@ -545,7 +545,12 @@ def test_a_full_disk_for_the_journal_does_not_stop_the_run(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive.raw("poor/h09", 630, seed=9)
-    monkeypatch.setattr(run_journal, "plain", _full)
+    opened = Path.open
+
+    def full_for_the_journal(path: Path, *how: str, **more: str) -> object:
+        return _full() if path.name == run_record.JOURNAL else opened(path, *how, **more)
+
+    monkeypatch.setattr(Path, "open", full_for_the_journal)
     options = Options(journal=True)
     assert not bring_up_to_date(archive.write(), options=options).has_failures
 
@@ -563,7 +568,7 @@ def _killed(archive: Archive) -> None:
 def test_a_killed_run_is_reported_by_the_next_one(archive: Archive) -> None:
     archive.raw("poor/h09", 630, seed=9)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Pass, "_conclude", _stopped)
+        patch.setattr(LedgerRun, "conclude", _stopped)
         with pytest.raises(KeyboardInterrupt):
             bring_up_to_date(archive.write(), options=Options(journal=True))
     assert not list((archive.folder / "out/report").glob("*/index.html"))
@@ -583,7 +588,7 @@ def test_a_record_that_cannot_be_read_keeps_no_other_page_from_being_made(
     old, empty, foreign = sorted((archive.folder / "out/report").glob("*"))
     for record in (empty / run_record.FILE_NAME, foreign / run_record.FILE_NAME):
         record.unlink()
-    (empty / run_journal.FILE_NAME).touch()
+    (empty / run_record.JOURNAL).touch()
     document = {"format": "lidarops run record", "version": 3}
     (foreign / run_record.FILE_NAME).write_text(json.dumps(document))
     shown = CliRunner().invoke(app, ["reprocess", str(archive.file), "--json"])

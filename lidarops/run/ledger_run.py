@@ -1,0 +1,328 @@
+"""Enter a run and its scenes as they end: in the ledger, and in the record for its report."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections import defaultdict
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from lidarops import __version__
+from lidarops.campaign.model import Campaign
+from lidarops.catalog import product_files
+from lidarops.catalog.lock import Lock
+from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Store, Verdict
+from lidarops.errors import CatalogError
+from lidarops.records import (
+    Findings,
+    Granule,
+    LeftOut,
+    ProductRecord,
+    RunRecord,
+    Scene,
+    SceneOutcome,
+)
+from lidarops.reports.run_record import Journal, save_run_record
+from lidarops.run.leftovers import Orphan
+from lidarops.run.staleness import DaysJudged, Judge, Judgement
+from lidarops.system.code_version import joint_code_version
+from lidarops.system.stores import without_keys
+
+MOST_INPUTS: Final = 100_000
+"""Granules that the record of a run names; the ledger names all."""
+MOST_EMPTY_SCENES: Final = 1000
+"""Scenes without product that the record of a run names; it counts the others."""
+
+_LOG = logging.getLogger(__name__)
+
+
+class JudgedDays:
+    """What the judging of some days told, as they were judged last."""
+
+    def __init__(self) -> None:
+        self.orphans: dict[str, Orphan] = {}
+        """By path."""
+        self.set_aside: dict[str, Granule] = {}
+        """By path."""
+        self.held: dict[str, Judgement] = {}
+        """By scene."""
+        self.frozen: dict[str, str] = {}
+        """Product of a frozen period that would be replaced -> why."""
+        self.empty_scenes: dict[str, str] = {}
+        """Scene -> why it can give no product."""
+        self.verdicts: dict[int, Verdict] = {}
+        """Of settled days, without signature; of those in `open` once all their scenes succeed."""
+        self.open: dict[int, set[str]] = defaultdict(set)
+        """Days with stale products -> scenes."""
+
+    def note(self, judged: DaysJudged) -> None:
+        """Note what was told of some days, in place of what was told before."""
+        self.orphans |= {orphan.path: orphan for orphan in judged.orphans}
+        self.set_aside |= {granule.path: granule for granule in judged.set_aside}
+        self.verdicts.update(judged.verdicts)
+        for one in judged.judgements:
+            scene = one.scene.id
+            self.held.pop(scene, None)
+            if one.held:
+                self.held[scene] = one
+            if one.empty_reason:
+                self.empty_scenes[scene] = one.empty_reason
+            if one.due:
+                self.open[one.day].add(scene)
+            self.frozen |= {stale.before.path: stale.reason for stale in one.frozen if stale.before}
+
+
+class LedgerRun:
+    """One run in the ledger, which begins before its first scene is processed.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    store : Store
+    lock : Lock
+    journal : bool
+        Whether to note each scene in the report folder as it ends.
+    """
+
+    def __init__(self, campaign: Campaign, store: Store, lock: Lock, *, journal: bool) -> None:
+        self._campaign, self._store, self._lock = campaign, store, lock
+        self._output = Path(campaign.output)
+        self._journals = journal
+        self._journal: Journal | None = None
+        self._run: Run | None = None
+        self._outcomes: dict[str, SceneOutcome] = {}
+        """By scene, for the record of the run."""
+        self._named = 0
+        """Granules that the record names."""
+        self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
+        self.fresh: set[str] = set()
+        """Scenes whose products are all fresh now."""
+
+    def begin(self) -> Run:
+        """Return the run; enter it first in the ledger, and remove what killed runs left."""
+        if self._run is None:
+            self._lock.acquire_unchanged()
+            started = datetime.now(UTC)
+            self._run = Run(
+                id=f"{started:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}",
+                started=started,
+                finished=None,
+                status=RunStatus.RUNNING,
+                holder=Lock.holder_name(),
+                version=__version__,
+                code_version=joint_code_version(),
+                archive=without_keys(self._campaign.archive),
+                folder=str(self._campaign.folder),
+            )
+            swept = product_files.sweep(self._output, self._store)
+            self._store.begin_run(self._run, self._lock.token, swept=swept)
+            if self._journals:
+                self._journal = Journal(self._campaign.report_root / self._run.id)
+                self._journal.write(self._record(self._run))
+        return self._run
+
+    def take(self, judged: Judgement, *, note: bool = False) -> None:
+        """Prepare for a scene that is about to start: keep replaced versions.
+
+        On request, note the start in the ledger, because the scene runs in this process: if the
+        process dies, the next run knows the suspect.
+        """
+        run, scene = self.begin(), judged.scene.id
+        for stale in judged.stale:
+            _LOG.info("%s %s of %s: %s", stale.kind, stale.channel, scene, stale.reason)
+            if stale.before is not None and self._campaign.superseded == "keep":
+                product_files.keep(self._output, stale.before.path, stale.before.sha256)
+        if note:
+            self._store.begin_scene(scene, judged.day, run.id, self._lock.token)
+
+    def end(
+        self, judge: Judge, judged: Judgement, outcome: SceneOutcome, *, final: bool
+    ) -> SceneOutcome:
+        """Enter the outcome of a scene in the ledger, and return it as entered.
+
+        It failed if its product files are missing or changed, which another try may mend.
+        """
+        run, reported = self.begin(), len(outcome.products)
+        new, outcome = self._new_products(judge, judged, outcome)
+        entry = SceneEntry(
+            outcome=outcome,
+            day=judged.day,
+            key=judge.key(judged, internal=bool(outcome.internal)),
+            final=final and len(new) == reported,
+            products=tuple(new),
+            digests=_unknown_digests(judged.scene, outcome),
+        )
+        outcome = replace(outcome, left_out=self._left_out_of_request(judged, outcome))
+        self._named += outcome.granules
+        # A million file names would fill memory, and the page shows few.
+        brief = outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
+        if outcome.scene in self._outcomes:
+            brief = _joined(self._outcomes[outcome.scene], brief)
+        # First, so that whatever the ledger knows is in the report, also of a run that is killed.
+        if self._journal:
+            self._journal.write(brief)
+        self._store.record(entry, run.id, self._lock.token)
+        if _went_as_planned(judged, outcome):
+            self.fresh.add(judged.scene.id)
+        self._drop_unreplaced(judged, outcome)
+        _log(outcome)
+        self._outcomes[outcome.scene] = brief
+        return outcome
+
+    def _left_out_of_request(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:
+        """Return the left-out steps of the request that are in no plan of a product."""
+        planned = set(() if outcome.plan is None else outcome.plan.left_out)
+        others = tuple(left for left in judged.requested.left_out if left not in planned)
+        # Share equal tuples: nearly all scenes of an instrument have the same.
+        return self._left_out.setdefault(others, others)
+
+    def _new_products(
+        self, judge: Judge, judged: Judgement, outcome: SceneOutcome
+    ) -> tuple[list[NewProduct], SceneOutcome]:
+        new = []
+        for record in outcome.products:
+            mtime_ns = self._written(record)
+            if mtime_ns is None:
+                error = f"{record.path}: vanished or changed after it was written"
+                return [], replace(outcome, products=(), error=error)
+            product = record.kind, record.channel
+            depends_on, used = judge.depends_on(judged.scene, judged.plan, product, outcome.inputs)
+            new.append(NewProduct(record, mtime_ns, depends_on, used))
+        return new, outcome
+
+    def _written(self, record: ProductRecord) -> int | None:
+        try:
+            status = (self._campaign.products_root / record.path).stat()
+        except OSError:
+            return None
+        return status.st_mtime_ns if status.st_size == record.size else None
+
+    def _drop_unreplaced(self, judged: Judgement, outcome: SceneOutcome) -> None:
+        """Drop kept versions that were not replaced."""
+        now = {record.path: record.sha256 for record in outcome.products}
+        kept = [stale.before for stale in judged.stale if self._campaign.superseded == "keep"]
+        for before in filter(None, kept):
+            if now.get(before.path, before.sha256) == before.sha256:
+                product_files.drop(self._output, before.path, before.sha256)
+
+    def clear_up(self, *, lost_worker: bool) -> None:
+        """Remove half files, of workers of this run, or of a killed one if this has not begun."""
+        if self._run is not None:
+            if lost_worker:
+                product_files.sweep(self._output, self._store)
+        # Another run may be at work.
+        elif self._store.has_dead_run() or product_files.is_littered(self._output, self._store):
+            self._lock.acquire_unchanged()
+            if product_files.sweep(self._output, self._store):
+                self._store.close_runs(self._lock.token)
+
+    def conclude(self, status: RunStatus, findings: Findings, told: JudgedDays) -> RunRecord | None:
+        """Close the run in the ledger and return its record; None if it has not begun."""
+        if self._run is None:
+            return None
+        for judged in told.held.values():
+            if judged.failure:
+                error = f"{judged.failure.error} (not tried again, because nothing has changed)"
+                outcome = judged.failure.outcome(judged.scene, judged.plan)
+                self._outcomes[judged.scene.id] = replace(outcome, error=error)
+        aside = (*self._store.refused(), *told.set_aside.values())
+        stated = {file.path for outcome in self._outcomes.values() for file in outcome.refused}
+        listed = dict(islice(told.empty_scenes.items(), MOST_EMPTY_SCENES))
+        record = replace(
+            self._record(self._run),
+            refused=tuple(granule for granule in aside if granule.path not in stated),
+            findings=findings,
+            scenes=tuple(self._outcomes[scene] for scene in sorted(self._outcomes)),
+            empty_scenes=listed,
+            more_empty_scenes=len(told.empty_scenes) - len(listed),
+            frozen=dict(told.frozen),
+        )
+        if self._journal:
+            # Before the run has ended: from then on, another process may report it.
+            try:
+                save_run_record(record, self._campaign.report_root / record.id)
+            except CatalogError as error:
+                _LOG.warning("the journal of the run stays: %s", error)
+        self._store.end_run(record.id, status, refused=len(aside), token=self._lock.token)
+        _LOG.info("run %s %s: %d scenes", record.id, status.value, len(self._outcomes))
+        return record
+
+    def _record(self, run: Run) -> RunRecord:
+        """Return the record of the run without its scenes."""
+        truth = self._campaign.truth_path
+        return RunRecord(
+            id=run.id,
+            campaign=self._campaign.name,
+            title=self._campaign.title,
+            started=run.started,
+            finished=datetime.now(UTC),
+            version=run.version,
+            archive=run.archive,
+            products=str(self._campaign.products_root),
+            scenes=(),
+            refused=(),
+            truth=str(truth) if self._campaign.simulation and truth.exists() else "",
+        )
+
+
+def _log(outcome: SceneOutcome) -> None:
+    made = [record.path for record in outcome.products]
+    fields = {
+        "scene": outcome.scene,
+        "granules": outcome.granules,
+        "products": made,
+        "seconds": dict(outcome.seconds),
+    }
+    if outcome.internal:
+        words = (outcome.scene, outcome.error, outcome.internal)
+        _LOG.error("scene %s: %s\n%s", *words, extra=fields)
+    elif outcome.error:
+        _LOG.error("scene %s failed: %s", outcome.scene, outcome.error, extra=fields)
+    else:
+        numbers = (outcome.scene, outcome.granules, len(made))
+        _LOG.info("scene %s: %d granules, %d products", *numbers, extra=fields)
+    for granule in outcome.refused:
+        facts = {"scene": outcome.scene, "granule": granule.path}
+        _LOG.warning("refused %s: %s", granule.path, granule.reason, extra=facts)
+
+
+def _joined(before: SceneOutcome, after: SceneOutcome) -> SceneOutcome:
+    """Return the outcome of a scene that was processed again without files that were refused."""
+    made = {product.path: product for product in (*before.products, *after.products)}
+    refused = {file.path: file for file in (*before.refused, *after.refused)}
+    return replace(
+        after,
+        granules=before.granules,
+        products=tuple(made.values()),
+        refused=tuple(refused.values()),
+    )
+
+
+def _known_digests(scene: Scene) -> dict[str, str | None]:
+    """Return path -> SHA-256 of the raw files of a scene, as the catalog knows it."""
+    return {granule.path: granule.sha256 for granule in (*scene.granules, *scene.dark)}
+
+
+def _went_as_planned(judged: Judgement, outcome: SceneOutcome) -> bool:
+    """Return whether every product that was stale was made from the files that were judged."""
+    # A refused file no longer belongs to the scene.
+    if outcome.error or outcome.refused:
+        return False
+    made = {(product.kind, product.channel) for product in outcome.products}
+    known = _known_digests(judged.scene) | {used.path: used.sha256 for used in judged.ancillaries}
+    same = all(known.get(used.path) in (None, "", used.sha256) for used in outcome.inputs)
+    return same and made.issuperset(stale.product for stale in judged.stale)
+
+
+def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:
+    """Return path -> SHA-256 of the files of a scene whose digest differs from the catalog's."""
+    known = _known_digests(scene)
+    return {
+        used.path: used.sha256
+        for used in outcome.inputs
+        if used.path in known and used.sha256 != known[used.path]
+    }
