@@ -16,14 +16,12 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.schema import METADATA, REMADE, SCHEMA, SCHEMA_VERSION
+from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
 from lidarops.catalog.sources import Source
 from lidarops.errors import CatalogError, LidarOpsError
 
 _T = TypeVar("_T")
 
-_UPGRADED: Final = 11
-"""Version of a schema that is brought to the present one."""
 _BATCH: Final = 1000
 """Largest number of values in the list of one statement."""
 _MOVE_AWAY: Final = "move it away; lidarops then makes a new one, and all products again"
@@ -228,30 +226,16 @@ class Database:
             METADATA.create_all(connection)
             connection.execute(self.upsert(SCHEMA, replacing=False), {"version": SCHEMA_VERSION})
             version = connection.scalar(newest)
-        if version == _UPGRADED:
-            for table in REMADE:
-                connection.execute(sa.text(f"DROP TABLE IF EXISTS {table}"))
-            if connection.dialect.name == "postgresql":
-                # It held 10 characters: no file of lidar ratios.
-                connection.execute(
-                    sa.text("ALTER TABLE product_input ALTER COLUMN role TYPE VARCHAR(16)")
-                )
-            METADATA.create_all(connection)
-            connection.execute(sa.update(SCHEMA).values(version=SCHEMA_VERSION))
-            return
         if version != SCHEMA_VERSION:
-            raise self._other_version(version)
+            raise CatalogError(
+                f"is a catalog of schema version {version}; this lidarops needs {SCHEMA_VERSION}",
+                file=self.place,
+                remedy=_MOVE_AWAY,
+            )
 
     def _absent(self) -> CatalogError:
         return CatalogError(
             "there is no catalog yet", file=self.place, remedy="run lidarops reprocess first"
-        )
-
-    def _other_version(self, version: int) -> CatalogError:
-        return CatalogError(
-            f"is a catalog of schema version {version}; this lidarops needs {SCHEMA_VERSION}",
-            file=self.place,
-            remedy=_MOVE_AWAY,
         )
 
     def _catalog_error(self, error: sa.exc.SQLAlchemyError) -> CatalogError:

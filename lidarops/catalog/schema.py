@@ -8,8 +8,6 @@ import sqlalchemy as sa
 
 SCHEMA_VERSION: Final = 12
 """Raised with every change of a table; a database of another version is refused."""
-REMADE: Final = ("superseded", "verdict")
-"""Tables of version 11 that a database of it loses: a folder tells of the first, a run of both."""
 
 METADATA: Final = sa.MetaData()
 

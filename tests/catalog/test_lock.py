@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ import sqlalchemy as sa
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.schema import LOCK, PRODUCT_INPUT, SCHEMA_VERSION
-from lidarops.catalog.store import Run, RunStatus, Store
+from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Role
 
@@ -96,7 +95,7 @@ def test_a_lock_is_waited_for_for_the_given_time(url: str, monkeypatch: pytest.M
         assert second.acquire() is True
 
 
-@pytest.mark.parametrize("version", [SCHEMA_VERSION - 2, SCHEMA_VERSION + 1])
+@pytest.mark.parametrize("version", [SCHEMA_VERSION - 1, SCHEMA_VERSION + 1])
 def test_a_catalog_of_another_schema_version_is_refused(
     url: str, tmp_path: Path, version: int
 ) -> None:
@@ -116,26 +115,6 @@ def test_a_catalog_whose_making_was_killed_is_made(url: str, tmp_path: Path) -> 
     with Store(url, "test") as store:
         assert store.verdicts() == {}
     Store(url, "test", create=False).close()
-
-
-def test_a_catalog_of_the_version_before_is_upgraded(url: str, tmp_path: Path) -> None:
-    started = datetime(2026, 3, 1, tzinfo=UTC)
-    run = Run("before", started, None, RunStatus.RUNNING, "me", "0", "0", "", "")
-    with Store(url, "test") as store, Lock(store) as lock:
-        lock.acquire()
-        store.begin_run(run, lock.token)
-    with sqlite3.connect(tmp_path / "catalog.sqlite") as connection:
-        connection.executescript(
-            "drop table verdict; create table superseded (path text, run text references run (id));"
-            " create table verdict (day integer, files text); insert into verdict values (1, '{}');"
-            f" insert into superseded values ('a.nc', '{run.id}');"
-            f" update schema_version set version = {SCHEMA_VERSION - 1}"
-        )
-    with Store(url, "test", create=False) as store:
-        assert store.verdicts() == {}
-        assert [known.id for known in store.runs()] == [run.id]
-    with Store(url, "test") as again:
-        assert again.verdicts() == {}
 
 
 def test_every_role_fits_into_its_column() -> None:
