@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import Database
-from lidarops.catalog.headers import NO_NOTES, GranuleRow, naive
+from lidarops.catalog.headers import NO_NOTES, GranuleRow, aware, naive
 from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
@@ -376,7 +376,6 @@ def _sentences(stored: str) -> tuple[str, ...]:
 
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
     stored = row._asdict()
-    start, stop = stored["start"], stored["stop"]
     return Granule(
         **stored
         | {
@@ -384,8 +383,8 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
             "status": _STATUSES[stored["status"]],
             "notes": _sentences(stored["notes"]),
             "contradictions": _sentences(stored["contradictions"]),
-            "start": None if start is None else start.replace(tzinfo=UTC),
-            "stop": None if stop is None else stop.replace(tzinfo=UTC),
+            "start": aware(stored["start"]),
+            "stop": aware(stored["stop"]),
             "layout": layouts[stored["layout"]],
         }
     )

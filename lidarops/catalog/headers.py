@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -25,6 +25,7 @@ from lidarops.records import (
     Granule,
     Role,
     Status,
+    day_of,
 )
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ NO_NOTES: Final = "[]"
 """Stored notes of a file that has none."""
 
 _FIELDS: Final = tuple(item.name for item in fields(Granule))
-_EPOCH: Final = date(1970, 1, 1)
 _HALF: Final = (1 << 31) - 1
 _TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
@@ -265,9 +265,7 @@ def row_of(granule: Granule, campaign: str, scan_key: str) -> GranuleRow:
         "start": naive(granule.start),
         "stop": naive(granule.stop),
         "layout": layout,
-        "day": None
-        if granule.start is None
-        else (granule.start.astimezone(UTC).date() - _EPOCH).days,
+        "day": None if granule.start is None else day_of(granule.start),
         "stamp_low": low,
         "stamp_high": high,
     }

@@ -242,13 +242,15 @@ def _machine() -> str:
         namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - the target is no path
     except OSError:
         namespace = ""
-    return ":".join((socket.gethostname(), _read("/proc/sys/kernel/random/boot_id"), namespace))
+    return ":".join(
+        (socket.gethostname(), _text_of_file("/proc/sys/kernel/random/boot_id"), namespace)
+    )
 
 
 def process_start(process: int) -> str:
     """Return the start time of a process in units of its system; empty if it does not run."""
     # The program name, in brackets, may hold blanks.
-    fields = _read(f"/proc/{process}/stat").rpartition(")")[2].split()
+    fields = _text_of_file(f"/proc/{process}/stat").rpartition(")")[2].split()
     if len(fields) > 19:
         return "" if fields[0] == "Z" else fields[19]
     if Path("/proc/self/stat").exists():
@@ -262,7 +264,7 @@ def process_start(process: int) -> str:
     return "alive"
 
 
-def _read(path: str) -> str:
+def _text_of_file(path: str) -> str:
     try:
         return Path(path).read_text(encoding="utf-8", errors="replace").strip()
     except OSError:

@@ -50,7 +50,7 @@ def _rank(entry: os.DirEntry[str]) -> str:
     return f"{name}/" if entry.is_dir(follow_symlinks=False) else name
 
 
-def _listed(entry: os.DirEntry[str], path: str) -> RawFile:
+def _raw_file(entry: os.DirEntry[str], path: str) -> RawFile:
     try:
         status = entry.stat()
     except OSError:
@@ -76,7 +76,7 @@ class Source:
     ) -> Iterator[RawFile]:
         """List files, sorted by path; those that are not used may have no size."""
         self.refuse_absent()
-        yield from self._below(str(self._root), "")
+        yield from self._files_below(str(self._root), "")
 
     def refuse_absent(self) -> None:
         """Raise an error if the folder does not exist.
@@ -92,7 +92,7 @@ class Source:
                 remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
             )
 
-    def _below(self, folder: str, prefix: str) -> Iterator[RawFile]:
+    def _files_below(self, folder: str, prefix: str) -> Iterator[RawFile]:
         try:
             with os.scandir(folder) as listing:
                 entries = sorted(listing, key=_rank)
@@ -103,9 +103,9 @@ class Source:
         for entry in entries:
             path = f"{prefix}{entry.name}"
             if entry.is_dir(follow_symlinks=False):
-                yield from self._below(entry.path, f"{path}/")
+                yield from self._files_below(entry.path, f"{path}/")
             else:
-                yield _listed(entry, path)
+                yield _raw_file(entry, path)
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""

@@ -72,7 +72,7 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Read all products and their inputs again; list files that are not as in the ledger.
+    """Read all products and their inputs again; list files that differ from the ledger.
 
     Example: lidarops verify catalogs/demo.yaml
     """

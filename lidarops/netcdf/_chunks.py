@@ -2,6 +2,12 @@
 
 The result is in the format of HDF5's filters `shuffle` and `deflate`, so any NetCDF reader can
 read it.
+
+The whole writing of a `signal` product of one real day, from values in memory to the digest of the
+file, is about 3.4 times faster than with HDF5's own filters at level 4 of zlib (files are 4 to 7 %
+larger), and about 2.4 times faster than at level 1 (files are 3 to 4 % smaller). Measured on one
+channel of Pilar (8.5 MB of values) and one of Manaus (8.1 MB), as medians of five paired repeats;
+CPU times have the same ratios.
 """
 
 from __future__ import annotations

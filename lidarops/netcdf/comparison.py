@@ -324,7 +324,7 @@ def planned_changes(file: Path, settings: Mapping[str, Any], plan: Plan) -> tupl
     making = _making(file)
     changes = [*_changes("setting", making["setting"], dict(_flat("", settings)))]
     changes = changes or [*_changes("step", making["step"], _steps(plan.as_dict()))]
-    return tuple(_first(changes, _MOST_REASONS))
+    return tuple(_first_causes(changes, _MOST_REASONS))
 
 
 def _causes(
@@ -332,10 +332,10 @@ def _causes(
 ) -> Iterator[str]:
     """Yield what differs in the making of two products."""
     causes = [cause for what in old for cause in _changes(what, old[what], new[what])]
-    yield from _first(causes, _MOST_CAUSES)
+    yield from _first_causes(causes, _MOST_CAUSES)
 
 
-def _first(causes: Sequence[str], most: int) -> Iterator[str]:
+def _first_causes(causes: Sequence[str], most: int) -> Iterator[str]:
     """Yield the first causes, and the number of the others."""
     yield from causes[:most]
     if len(causes) > most:

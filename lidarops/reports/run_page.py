@@ -20,7 +20,7 @@ from lidarops.errors import CatalogError
 from lidarops.figures import browser
 from lidarops.figures.panels import Figure
 from lidarops.figures.templates import environment, page_style
-from lidarops.figures.wording import duration, percent, size
+from lidarops.figures.wording import change_in_words, duration, percent, size
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
@@ -103,7 +103,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         verdict=run_tables.verdict(record),
         outcome=run_tables.outcome_class(record),
         difference=difference(record, folder),
-        changes=run_tables.changes(record),
+        changes=run_tables.changed_products(record),
         page_style=Markup(page_style()),  # noqa: S704 - it is a file of the package
         overview=_overview(pictures),
         findings=[
@@ -143,7 +143,8 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
 def _environment() -> Environment:
     own = environment("lidarops.reports")
     own.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
-    own.filters |= {"lacking": lacking, "source_hash": _source_hash, "drawn": browser.inline}
+    own.filters |= {"lacking": lacking, "source_hash": _source_hash}
+    own.filters |= {"drawn": browser.inline, "words": change_in_words}
     return own
 
 

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from typing import Any, Final, TypeVar
 
 from lidarops.figures.wording import (
-    change_in_words,
     counted,
     decided_on,
     duration,
@@ -21,10 +20,12 @@ from lidarops.flags import PLACES, FlagBit, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import (
+    Change,
     Grade,
     Granule,
     LeftOut,
     PlannedStep,
+    ProductRecord,
     Role,
     RunRecord,
     SceneOutcome,
@@ -43,24 +44,16 @@ Row = dict[str, Any]
 """Values of a row of a table, by column."""
 
 
-def changes(record: RunRecord) -> list[Row]:
-    """Return how products differ from those that they replace, the largest changes first."""
+def changed_products(record: RunRecord) -> list[tuple[str, ProductRecord, Change]]:
+    """Return scene, product, and how it differs from that it replaces; largest changes first."""
     rows = [
-        {
-            "scene": scene.scene,
-            "label": f"{product.kind} {product.channel}",
-            "version": product.stamp.version,
-            "grade": change.grade.value,
-            "difference": change_in_words(change),
-            "cause": "; ".join(change.causes),
-        }
+        (scene.scene, product, product.change)
         for scene in record.scenes
         for product in scene.products
-        for change in [product.change]
-        if change is not None
+        if product.change is not None
     ]
     order = list(Grade)
-    return sorted(rows, key=lambda row: -order.index(Grade(row["grade"])))
+    return sorted(rows, key=lambda row: -order.index(row[2].grade))
 
 
 def summary(record: RunRecord) -> list[tuple[str, str]]:
@@ -250,7 +243,7 @@ def flags(record: RunRecord) -> list[Row]:
             if count:
                 counts[name.lower()].append(count)
         for name in sorted(counts, key=lambda name: (bits.get(name, _LAST), name)):
-            severity, description = _about(bits.get(name))
+            severity, description = _severity_and_meaning(bits.get(name))
             rows.append(
                 {
                     "kind": kind,
@@ -284,15 +277,12 @@ def refused(record: RunRecord) -> list[Row]:
     ]
 
 
-def scenes_without_product(record: RunRecord) -> list[Row]:
-    """Group scenes without product by reason, the most frequent first."""
+def scenes_without_product(record: RunRecord) -> list[tuple[str, list[str]]]:
+    """Return each reason with the scenes that have no product for it, the most frequent first."""
     scenes: dict[str, list[str]] = defaultdict(list)
-    for scene, reason in record.empty_scenes.items():
+    for scene, reason in sorted(record.empty_scenes.items()):
         scenes[reason].append(scene)
-    return [
-        {"reason": reason, "scenes": sorted(names)}
-        for reason, names in _most_frequent_first(scenes)
-    ]
+    return _most_frequent_first(scenes)
 
 
 def _most_frequent_first(groups: Mapping[Any, list[_T]]) -> list[tuple[Any, list[_T]]]:
@@ -350,14 +340,10 @@ def quality_words(scene: SceneOutcome) -> Mapping[str, str]:
 def _verdicts_by_kind(record: RunRecord) -> list[tuple[str, Verdicts]]:
     products = [product for scene in record.scenes for product in scene.products]
     sums = {
-        kind: _sum(product.verdicts for product in products if product.kind == kind)
+        kind: Verdicts.total(product.verdicts for product in products if product.kind == kind)
         for kind in sorted({product.kind for product in products})
     }
     return [(kind, verdicts) for kind, verdicts in sums.items() if verdicts.values]
-
-
-def _sum(several: Iterable[Verdicts]) -> Verdicts:
-    return Verdicts(*(sum(counts) for counts in zip((0, 0, 0), *several, strict=True)))
 
 
 def _instrument_row(name: str, scenes: Sequence[SceneOutcome], refused_before: int) -> Row:
@@ -374,12 +360,12 @@ def _instrument_row(name: str, scenes: Sequence[SceneOutcome], refused_before: i
         "refused": refused_before + sum(len(scene.refused) for scene in scenes),
         "products": len(products),
         "retrieved values": sum(product.values for product in retrieved),
-        "quality": verdicts_in_words(_sum(product.verdicts for product in retrieved)),
+        "quality": verdicts_in_words(Verdicts.total(product.verdicts for product in retrieved)),
         "time": duration(sum(sum(scene.seconds.values()) for scene in scenes)),
     }
 
 
-def _about(bit: FlagBit | None) -> tuple[str, str]:
+def _severity_and_meaning(bit: FlagBit | None) -> tuple[str, str]:
     if bit is None:
         return "unknown", "bit unknown to this version of lidarops"
     word = "do not use" if bit.severity is Severity.REJECT else "use with care"
