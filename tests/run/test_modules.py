@@ -48,11 +48,8 @@ def _assert_light(modules: set[str]) -> None:
     """Each of them takes a tenth of a second and more; numpy is needed to read headers."""
     of_others = {"dask", "distributed", "h5py", "jinja2", "matplotlib", "netCDF4", "numba"}
     of_others |= {"pandas", "pyarrow", "scipy", "xarray"}
-<<<<<<< HEAD
-    own = {"figures.browser", "retrieve", "run.processing", "run.staleness", "scene.processing"}
-=======
-    own = {"figures.svg", "retrieve.common", "run.processing", "run.staleness", "scene.processing"}
->>>>>>> aabe559c (Let one dataclass of the retrieval be the settings of Raman products, from campaign to numerics)
+    own = {"figures.browser", "retrieve.common"}
+    own |= {"run.processing", "run.staleness", "scene.processing"}
     assert not (of_others | {f"lidarops.{name}" for name in own}) & modules
 
 
