@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from datetime import UTC, date, datetime
 from enum import StrEnum
 from functools import cached_property
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self, TypeVar
 
 from lidarops.kinds import kinds
 
@@ -246,10 +246,13 @@ class _Entry:
     product: str
     """Kind of product to which the step belongs; empty where all kinds share it."""
 
-    @property
-    def is_product(self) -> bool:
-        """Whether the entry is a product itself, and no step on the way to it."""
-        return self.name == self.product
+
+_AnyEntry = TypeVar("_AnyEntry", bound=_Entry)
+
+
+def products_of(entries: Iterable[_AnyEntry]) -> tuple[_AnyEntry, ...]:
+    """Return the entries that are products themselves, and no steps on the way to one."""
+    return tuple([entry for entry in entries if entry.name == entry.product])
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,10 +315,10 @@ class Plan:
     steps: tuple[PlannedStep, ...]
     left_out: tuple[LeftOut, ...]
 
-    @property
+    @cached_property
     def products(self) -> tuple[PlannedStep, ...]:
         """Steps that are products."""
-        return tuple(step for step in self.steps if step.is_product)
+        return products_of(self.steps)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the plan as plain JSON types."""

@@ -220,6 +220,7 @@ def _needs(plan: Plan) -> Iterator[str]:
 
     For a product, also the channels with which it is compared.
     """
+    from lidarops.records import products_of
     from lidarops.scene.dependence import needed_places
 
     for step, places in zip(plan.steps, needed_places(plan.steps), strict=True):
@@ -227,9 +228,9 @@ def _needs(plan: Plan) -> Iterator[str]:
         names = [
             other.name if other.channel in ("", step.channel) else f"{other.channel}/{other.name}"
             for other in others
-            if not other.is_product
+            if other not in plan.products
         ]
-        compared = [other.channel for other in others if other.is_product]
+        compared = [other.channel for other in products_of(others)]
         words = {"after": names, "compared with": compared}
         yield "; ".join(f"{word} {', '.join(those)}" for word, those in words.items() if those)
 

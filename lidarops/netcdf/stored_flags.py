@@ -176,8 +176,9 @@ def _meanings(attributes: Mapping[str, Any]) -> dict[str, int] | None:
 
 
 def _bit(word: str, mask: int, flags: Flags | None) -> StoredBit:
-    shared = {bit.word: bit for bit in Quality}
-    bit = shared.get(word) if flags is None else flags.named(word)
+    bit = next(
+        (bit for bit in (Quality if flags is None else flags.bits) if bit.word == word), None
+    )
     if bit is None:
         return StoredBit(mask, word, None, "bit unknown to this version of lidarops")
     return StoredBit(mask, word, bit.severity, bit.description)

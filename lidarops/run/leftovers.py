@@ -113,8 +113,7 @@ def unmade_products(campaign: Campaign, planned: Iterable[Planned]) -> dict[str,
         plans[scene.instrument].append(plan)
     unmade = {}
     for owner in (*campaign.instruments, *campaign.networks):
-        steps = [step for plan in plans[owner] for step in plan.steps]
-        made = {(step.product, step.channel) for step in steps if step.is_product}
+        made = {(step.name, step.channel) for plan in plans[owner] for step in plan.products}
         for kind, channel in requested_products(campaign, owner):
             if any(kind == name and channel in ("", other) for name, other in made):
                 continue

@@ -459,7 +459,7 @@ class Judge(DayStates):
         """Return the products that are there or to be made, and of which a product is made."""
         scene = judged.scene
         closure, _ = self.plan_and_settings(scene, judged.plan, product)
-        keys = [key for step in closure.steps for key in dependence.read_products(step)]
+        keys = [key for step in closure.products for key in dependence.read_products(step)]
         of_scene = (self._product_to_read(product_file(scene, key), made) for key in keys)
         return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)
 

@@ -23,6 +23,7 @@ from lidarops.records import (
     Role,
     Scene,
     UnusedFile,
+    products_of,
 )
 from lidarops.scene.case import NO_DARK, READ_STEP, sources
 
@@ -45,8 +46,8 @@ _FILES: Final = {
 
 
 def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
-    """Return kind and channel of the products that a step reads."""
-    reads = kinds()[step.product].reads if step.is_product else ()
+    """Return kind and channel of the products that a product reads."""
+    reads = kinds()[step.name].reads
     parts = (need.rpartition("/") for need in step.needs) if reads else ()
     return tuple((name, channel or step.channel) for channel, _, name in parts if name in reads)
 
@@ -71,11 +72,11 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
         The same for a product, whatever else the whole plan holds.
     """
     entries: Sequence[PlannedStep | LeftOut] = (*plan.steps, *plan.left_out)
-    needed = needed_places(entries)
+    needed, own = needed_places(entries), products_of(entries)
     waiting = [
         place
         for place, entry in enumerate(entries)
-        if entry.is_product and (entry.name, entry.channel) in products
+        if entry in own and (entry.name, entry.channel) in products
     ]
     reached: set[int] = set()
     while waiting:
@@ -88,7 +89,7 @@ def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     # A channel is read for the products and channels that are left.
     readers = defaultdict[str, set[tuple[bool, str]]](set)
     for step in steps:
-        if step.is_product:
+        if step in own:
             readers[step.channel].add((False, step.name))
         for channel in sources(step):
             readers[channel].add((True, step.channel))
@@ -122,7 +123,10 @@ def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
             f"{name}: {problems[name]}" for name in ancillary_files(steps) if name in problems
         ]
         reasons += [
-            without[read] for step in steps for read in read_products(step) if read in without
+            without[read]
+            for step in products_of(steps)
+            for read in read_products(step)
+            if read in without
         ]
         if reasons:
             reason = without[kind, channel] = "; ".join(dict.fromkeys(reasons))
@@ -258,7 +262,7 @@ def product_inputs(plan: Plan, files: Iterable[InputRecord]) -> tuple[InputRecor
     names = {step.name for step in plan.steps}
     raw = {Role.SIGNAL: READ_STEP in names, Role.DARK: "dark" in names}
     named = ancillary_files(plan.steps)
-    products = {product for step in plan.steps for product in read_products(step)}
+    products = {product for step in plan.products for product in read_products(step)}
     return tuple(
         file
         for file in files

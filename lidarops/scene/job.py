@@ -19,6 +19,7 @@ from lidarops.records import (
     Provenance,
     Scene,
     Stamp,
+    products_of,
 )
 from lidarops.scene import dependence
 from lidarops.scene.case import REQUEST
@@ -63,9 +64,10 @@ class Job:
 def nothing_to_do(plan: Plan) -> str:
     """Return why a plan makes no product: omissions of requested steps, those of products first."""
     requested = [omission for omission in plan.left_out if omission.rule != REQUEST]
-    omissions = sorted(requested or plan.left_out, key=lambda left: not left.is_product)
+    omissions = requested or plan.left_out
     reasons = dict.fromkeys(
-        f"{omission.name} of {omission.channel}: {omission.reason}" for omission in omissions
+        f"{omission.name} of {omission.channel}: {omission.reason}"
+        for omission in (*products_of(omissions), *omissions)
     )
     return "nothing to do: " + "; ".join(reasons)
 

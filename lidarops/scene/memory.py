@@ -79,7 +79,7 @@ def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
     members = {member.instrument: member for member in scene.members}
     for step in plan.steps:
         work = Workload(members.get(step.instrument, scene), step.channel)
-        if step.is_product:
+        if step in plan.products:
             known = making(step.product, Making)
             settings = product_settings(plan.steps, step.product, step.channel)
             held[step.channel] += known.held(settings, work)

@@ -19,7 +19,15 @@ from lidarops.campaign.model import (
 )
 from lidarops.kinds import Scope, kinds, kinds_of
 from lidarops.netcdf.context import product_of_path
-from lidarops.records import LeftOut, Plan, PlannedStep, Scene, file_channels, is_glued
+from lidarops.records import (
+    LeftOut,
+    Plan,
+    PlannedStep,
+    Scene,
+    file_channels,
+    is_glued,
+    products_of,
+)
 from lidarops.scene.case import (
     NO_PRODUCT,
     NOT_REQUESTED,
@@ -111,8 +119,8 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
 
 def _made(entries: Iterable[Entry]) -> dict[ProductKey, None]:
     """Return kind and channel of the products that run."""
-    steps = (entry for entry in entries if isinstance(entry, PlannedStep))
-    return {(step.name, step.channel): None for step in steps if step.is_product}
+    steps = [entry for entry in entries if isinstance(entry, PlannedStep)]
+    return {(step.name, step.channel): None for step in products_of(steps)}
 
 
 def _cases(
@@ -193,8 +201,10 @@ def _derived_entries(
         yield case.leave(kind.name, reason, rule=NO_PRODUCT, number=float(len(missing)))
         return
     needs = (name if channel == own else f"{channel}/{name}" for name, channel in read)
-    for entry in making(kind.name, Derivation).needs(case):
-        if isinstance(entry, PlannedStep) and entry.is_product:
+    entries = list(making(kind.name, Derivation).needs(case))
+    products = products_of(entries)
+    for entry in entries:
+        if isinstance(entry, PlannedStep) and entry in products:
             yield replace(entry, needs=(*entry.needs, *needs))
         else:
             yield entry
@@ -230,16 +240,17 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
     steps = [entry for entry in entries if isinstance(entry, PlannedStep)]
     wavelengths = {s.channel: s.settings["wavelength"] for s in steps if s.name == READ_STEP}
     alike: defaultdict[tuple[str, float], list[str]] = defaultdict(list)
-    for step in steps:
-        kind = kinds()[step.product] if step.is_product else None
-        if kind and kind.common and not kind.reads:
+    products = products_of(steps)
+    for step in products:
+        kind = kinds()[step.name]
+        if kind.common and not kind.reads:
             alike[kind.name, wavelengths[step.channel]].append(step.channel)
     linked: list[Entry] = []
     for entry in entries:
         if isinstance(entry, LeftOut):
             linked.append(entry)
             continue
-        read = kinds()[entry.product].reads if entry.is_product else ()
+        read = kinds()[entry.name].reads if entry in products else ()
         needs = []
         for need in entry.needs:
             channel, _, name = need.rpartition("/")

@@ -20,7 +20,7 @@ from lidarops.campaign.model import Campaign, Station
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import kinds
 from lidarops.netcdf.read import open_product
-from lidarops.records import PlannedStep, Scene, file_channels
+from lidarops.records import PlannedStep, Scene, file_channels, products_of
 from lidarops.scene.case import Entries
 from lidarops.scene.pipe import Stages
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream
@@ -205,8 +205,8 @@ def streams_of(steps: Sequence[PlannedStep], signal: ChannelSignal) -> dict[str,
         step.product: making(step.product, Retrieval).stream(
             product_settings(steps, step.product, channel), signal
         )
-        for step in steps
-        if step.channel == channel and step.is_product and not kinds()[step.product].reads
+        for step in products_of(steps)
+        if step.channel == channel and not kinds()[step.product].reads
     }
 
 
