@@ -21,7 +21,7 @@ from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import RECORDERS
 from lidarops.netcdf.read import changed, opened_product
-from lidarops.netcdf.stored_flags import FlagCounter, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
@@ -245,7 +245,8 @@ def read_header(product: xr.Dataset, path: str, selection: ProductSelection) -> 
 
 
 def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
-    counts = FlagCounter(stored_bits(product[QUALITY_FLAG].attrs, header.kind))
+    bits = stored_bits(product[QUALITY_FLAG].attrs, header.kind)
+    counts = FlagCounter(rejecting_mask(bits))
     counts.add(product[QUALITY_FLAG].values)
     height = "station_altitude" if "station_altitude" in product else "altitude"
     return Facts(
@@ -261,7 +262,9 @@ def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
         usable=counts.verdicts.usable,
         unflagged=counts.verdicts.good,
         code_version=product.attrs["lidarops_code_version"],
-        flagged={bit.word.upper(): n for bit, n in counts.carried.items()},
+        flagged={
+            bit.word.upper(): counts.carried[bit.mask] for bit in bits if bit.mask in counts.carried
+        },
     )
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +21,7 @@ from lidarops.netcdf.context import Context, global_attributes, product_path
 from lidarops.netcdf.coordinates import auxiliary_names, locate_product
 from lidarops.netcdf.encoding import CheckedInput, Values, as_text, stored, whole_numbers
 from lidarops.netcdf.provenance import prov_json
-from lidarops.netcdf.stored_flags import FlagCounter, places, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, places
 from lidarops.netcdf.variables import Row, attributes, layout_of
 from lidarops.netcdf.write import RowFile, Skeleton, Written, create_file
 from lidarops.records import Change, Grade, ProductRecord
@@ -108,7 +107,7 @@ class ProductWriter:
         for name, values in self._fixed.items():
             self._sizes |= dict(zip(layout.row(name).dims, values.shape, strict=True))
         self._flags = layout.flags
-        self._counts = FlagCounter(stored_bits({}, context.kind))
+        self._counts = FlagCounter(layout.flags.rejecting)
         self.file: RowFile | None = None
         """None until the first profiles, which decide on optional variables."""
 
@@ -288,7 +287,9 @@ class ProductWriter:
             file.size,
             values=verdicts.values,
             flagged={
-                bit.word.upper(): carried[bit] for bit in sorted(carried, key=attrgetter("mask"))
+                bit.word.upper(): carried[int(bit)]
+                for bit in sorted(self._flags.bits)
+                if int(bit) in carried
             },
             unflagged=verdicts.good,
             usable=verdicts.usable,

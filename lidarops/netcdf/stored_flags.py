@@ -73,15 +73,14 @@ class FlagCounter:
 
     Parameters
     ----------
-    bits : iterable of StoredBit
-        All that the values may carry.
+    rejecting : int
+        Union of the bits that reject a value.
     """
 
-    def __init__(self, bits: Iterable[StoredBit]) -> None:
-        self._bits = tuple(bits)
-        self._rejecting = rejecting_mask(self._bits)
-        self.carried: Counter[StoredBit] = Counter()
-        """Numbers of values that carry each of the bits that occur."""
+    def __init__(self, rejecting: int) -> None:
+        self._rejecting = rejecting
+        self.carried: Counter[int] = Counter()
+        """Numbers of values that carry each of the bits that occur, by the mask of the bit."""
         self.verdicts = Verdicts(0, 0, 0)
 
     def add(self, values: Values) -> None:
@@ -93,9 +92,9 @@ class FlagCounter:
         self.verdicts = Verdicts.total([self.verdicts, more])
         # Few bits occur in a product: count only these.
         union = int(np.bitwise_or.reduce(values, axis=None))
-        for bit in self._bits:
-            if union & bit.mask:
-                self.carried[bit] += int(np.count_nonzero(values & bit.mask))
+        for mask in (1 << place for place in range(PLACES)):
+            if union & mask:
+                self.carried[mask] += int(np.count_nonzero(values & mask))
 
 
 def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:

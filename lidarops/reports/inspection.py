@@ -23,7 +23,7 @@ from lidarops.errors import RawFormatError
 from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
-from lidarops.netcdf.stored_flags import FlagCounter, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, rejecting_mask, stored_bits
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
 
@@ -211,7 +211,7 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
         return []
     flags = dataset["quality_flag"]
     bits = stored_bits(flags.attrs, dataset.attrs.get("lidarops_kind"))
-    counts = FlagCounter(bits)
+    counts = FlagCounter(rejecting_mask(bits))
     for block in blocks(flags, _READ_VALUES) if flags.size else ():
         counts.add(quality_bits(block))
     rows = [
@@ -219,9 +219,10 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
         for name, count in zip(_VERDICTS, counts.verdicts, strict=True)
         if flags.size
     ]
-    for bit in (bit for bit in bits if counts.carried[bit]):
+    for bit in (bit for bit in bits if bit.mask in counts.carried):
         severity = "unknown" if bit.severity is None else bit.severity.name.lower()
-        rows.append(_counted(bit.word, severity, counts.carried[bit], flags.size, bit.description))
+        count = counts.carried[bit.mask]
+        rows.append(_counted(bit.word, severity, count, flags.size, bit.description))
     return rows
 
 

@@ -19,7 +19,7 @@ from lidarops.figures.series_data import blocks
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
-from lidarops.netcdf.stored_flags import FlagCounter, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.records import Findings, ProductRecord, Role, SceneOutcome, Verdicts, day_of
 from lidarops.run.ledger_run import JudgedDays, LedgerRun
@@ -170,7 +170,7 @@ def _verdicts(file: Path, kind: str) -> Verdicts:
     """Return the numbers of values of a product, which may be larger than memory."""
     with opened_product(file, in_parts=True, decode_cf=False) as product:
         flags = product[QUALITY_FLAG]
-        counts = FlagCounter(stored_bits(flags.attrs, kind))
+        counts = FlagCounter(rejecting_mask(stored_bits(flags.attrs, kind)))
         for block in blocks(flags, _BLOCK):
             counts.add(block.to_numpy())
     return counts.verdicts

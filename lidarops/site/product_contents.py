@@ -124,19 +124,21 @@ def count_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Qualit
     if QUALITY_FLAG not in product:
         return QualityCounts(0, 0, 0, 0, 0, ())
     bits = stored_bits(product[QUALITY_FLAG].attrs, product.attrs.get("lidarops_kind"))
-    counts = FlagCounter(bits)
+    rejecting = rejecting_mask(bits)
+    counts = FlagCounter(rejecting)
     profiles = available = 0
-    rejecting = np.int64(rejecting_mask(bits))
     low = _low(product, below)
     for block in blocks(product[QUALITY_FLAG], READ_VALUES):
         flags = np.atleast_1d(quality_bits(block))
-        accepted = (flags & rejecting) == 0
+        accepted = (flags & np.int64(rejecting)) == 0
         profiles += len(flags)
         seen = accepted[:, low].reshape(len(flags), -1) if accepted.ndim > 1 else accepted[:, None]
         available += int(np.count_nonzero(seen.any(axis=1)))
         counts.add(flags)
     verdicts, carried = counts.verdicts, counts.carried
-    rows = [_flag_row(bit, carried[bit], verdicts.values) for bit in bits if carried[bit]]
+    rows = [
+        _flag_row(bit, carried[bit.mask], verdicts.values) for bit in bits if bit.mask in carried
+    ]
     return QualityCounts(
         verdicts.values, verdicts.usable, verdicts.good, profiles, available, tuple(rows)
     )
