@@ -78,12 +78,12 @@ def plot(
     from lidarops.reports import plotting
     from lidarops.system.files import write_atomically
 
-    out = out or Path(f"{file.name.removesuffix('.nc')}.png")
-    if out.suffix not in plotting.TYPES:
+    if out is not None and out.suffix not in plotting.TYPES:
         raise LidarOpsError(f"is none of {', '.join(plotting.TYPES)}", file=out, wrong_use=True)
     figures = plotting.draw_file(file, plotting.selection(variable, time, range_, altitude))
     from lidarops.figures.stills import still
 
+    out = out or Path(f"{file.name.removesuffix('.nc')}.png")
     out.parent.mkdir(parents=True, exist_ok=True)
     for number, figure in enumerate(figures, 1):
         target = out if len(figures) == 1 else out.with_stem(f"{out.stem}_{number}")

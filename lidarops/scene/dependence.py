@@ -25,7 +25,7 @@ from lidarops.records import (
     UnusedFile,
     products_of,
 )
-from lidarops.scene.case import NO_DARK, READ_STEP, sources
+from lidarops.scene.case import DARK_FILES, READ_STEP, sources
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
@@ -191,7 +191,7 @@ def product_unused(scene: Scene, plan: Plan) -> tuple[UnusedFile, ...]:
     if not reads_files(plan):
         return ()
     dark = any(step.name == "dark" for step in plan.steps) or any(
-        omission.rule == NO_DARK for omission in plan.left_out
+        omission.rule == DARK_FILES for omission in plan.left_out
     )
     return tuple(file for file in scene.unused if dark or file.role is Role.SIGNAL)
 

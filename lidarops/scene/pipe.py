@@ -33,7 +33,7 @@ from lidarops.retrieve.signal.lag import enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.scene import gluing
 from lidarops.scene.case import (
-    NO_DARK,
+    DARK_FILES,
     READ_STEP,
     REQUEST,
     ChannelCase,
@@ -136,7 +136,7 @@ def plan_dark(case: ChannelCase[Any]) -> Entry:
     if not count:
         refused = any(file.role is Role.DARK for file in case.scene.unused)
         which = "dark files that can be used" if refused else "dark files"
-        return case.leave("dark", f"no {which} {_NEAR_THE_SCENE}", number=0.0, rule=NO_DARK)
+        return case.leave("dark", f"no {which} {_NEAR_THE_SCENE}", number=0.0, rule=DARK_FILES)
     times = sorted(granule.start for granule in case.scene.dark if granule.start)
     profiles = [granule.start for granule in case.scene.granules if granule.start]
     enclosed = times[0] < max(profiles) and min(profiles) < times[-1]
@@ -153,7 +153,8 @@ def plan_dark(case: ChannelCase[Any]) -> Entry:
     files = "1 dark file" if count == 1 else f"{count} dark files"
     reason = f"{files} {_NEAR_THE_SCENE}, {order}: {use}"
     settings = DarkSettings(files=count, method=method)
-    return case.run("dark", reason, settings, needs=("read",), number=float(count))
+    number = float(count)
+    return case.run("dark", reason, settings, needs=("read",), number=number, rule=DARK_FILES)
 
 
 def _sessions(dark: Iterable[Granule]) -> int:

@@ -69,7 +69,7 @@ def test_commands_state_a_damaged_product_in_one_line(
             file.write_bytes(damaged)
             for command in (
                 ("inspect", file),
-                ("plot", file, "--out", tmp_path),
+                ("plot", file, "--out", tmp_path / "figure.png"),
                 ("compare", product, file),
                 ("compare", file, product),
             ):
@@ -134,7 +134,7 @@ def test_whatever_the_library_raises_is_stated(
     monkeypatch.setattr(read.xr, "open_dataset", _foreign(error))
     for command in (
         ("inspect", product),
-        ("plot", product, "--out", tmp_path),
+        ("plot", product, "--out", tmp_path / "figure.png"),
         ("compare", product, product),
         ("reproduce", product),
     ):

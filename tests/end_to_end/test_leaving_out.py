@@ -97,7 +97,7 @@ BEYOND = with_products(homogeneous={"channels": ["photon_532o"], "sections": [[1
         ("range_window", ([LEVEL], {}), ([LEVEL], OF_ANALOG)),
         ("overlap", ([LEVEL], {}), ([LEVEL], with_facts())),
         ("range_offset", ([LEVEL], OFFSET), ([LEVEL], {})),
-        ("dark", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
+        ("dark_files", ([LEVEL, DARK], ANALOG), ([LEVEL], ANALOG)),
         ("dead_time", ([LEVEL], {}), ([LEVEL], with_facts())),
         ("lag", ([UP], GLUED), ([UP], LATE)),
         ("signal", ([LEVEL], ANALOG), ([LEVEL], FEW)),

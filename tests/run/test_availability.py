@@ -34,8 +34,9 @@ def unavailable(
     with Store(f"sqlite:///{folder}/catalog.sqlite", campaign.name) as store:
         store.replace([row_of(granule, campaign.name, "key") for granule in granules])
         holdings = store.holdings(validity_edges(campaign))
+        instruments = selection.pop("instruments", campaign.instruments)
         chosen = Selection(**selection)
-        return list(unavailable_channels(campaign, holdings, campaign.instruments, chosen))
+        return list(unavailable_channels(campaign, holdings, instruments, chosen))
 
 
 def file_of(day: int, *layout: Any, minutes: float = 0.0, role: Role = Role.SIGNAL) -> Granule:

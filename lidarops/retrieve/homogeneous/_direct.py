@@ -48,9 +48,7 @@ _SMALL: Final = 1e-7
 _NEGLIGIBLE: Final = 1e-5
 """Standard errors of the extinction that the last step may leave, and step over extinction by which
 stated errors, which are those before it, may be off."""
-_UNSEEN: Final = 1e-2
-"""Standard errors of a step that no test of the residuals sees: they are those before it."""
-_ROUNDING: Final = 2e-16
+_ROUNDING: Final = float(np.finfo(np.float64).eps)
 """Rounding of a sum of squares, over the sum."""
 _DETERMINED: Final = 0.3
 """Standard error of the extinction over its scale, above which only a step of `_SMALL` is the last:
@@ -169,7 +167,8 @@ def _is_last(step: float, p: Point, g: Grid, sums: Sums) -> bool:
     """
     size = abs(p.tau) + g.scale
     variance = max(p.energy, _ROUNDING * sums.square) / ((sums.bins - 3.0) * p.gauss)
-    if abs(step) > _NEGLIGIBLE * size or step * step > _UNSEEN * _UNSEEN * variance:
+    # The tests see the residuals before the last step.
+    if abs(step) > _NEGLIGIBLE * size or step * step > _NEGLIGIBLE * variance:
         return False
     if abs(step) <= _SMALL * size:
         return True
