@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 72_733,
-    "lines of code alone": 47_452,
+    "lines": 71_793,
+    "lines of code alone": 46_756,
     "modules": 288,
-    "dataclasses": 282,
-    "lines of dataclasses": 7_110,
-    "tuning numbers": 252,
+    "dataclasses": 273,
+    "lines of dataclasses": 6_947,
+    "tuning numbers": 254,
     "tuning numbers that are assumed": 86,
     "copied thresholds": 0,
-    "most parameters": 24,
-    "lines of the largest package": 6_210,
+    "most parameters": 14,
+    "lines of the largest package": 6_040,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 66, "functions": 617, "changes": 219},
-    "elastic": {"modules": 75, "functions": 761, "changes": 236},
+    "homogeneous": {"modules": 67, "functions": 634, "changes": 242},
+    "elastic": {"modules": 76, "functions": 780, "changes": 258},
 }
 
 

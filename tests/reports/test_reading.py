@@ -90,7 +90,7 @@ class TestFigures:
         assert replace(together, pictures=[]) == replace(alone, pictures=[])
         assert [problem.path for problem in alone.problems] == ["s3.nc", "s4.nc", "e2.nc"]
         assert alone.problems[2].reason == "the file is missing"
-        assert alone.problems[1].reason == "background: is missing from the product"
+        assert alone.problems[1].reason == "signal_standard_error: is missing from the product"
         assert alone.compared
 
     def test_no_product_is_read_twice(self, many, tmp_path, monkeypatch):
