@@ -63,9 +63,10 @@ function timeTicks(low, high, most) {
     for (let at = Math.ceil(from / (step * MINUTE)) * step * MINUTE; at <= to; at += step * MINUTE) found.push(at);
   } else {
     const months = [1, 2, 3, 6, 12, 24, 60, 120].find((count) => (to - from) / (30.4 * DAY * count) <= most) || 240;
-    const first = new Date(from), start = first.getUTCFullYear() * 12 + first.getUTCMonth() + 1;
-    for (let month = Math.ceil(start / months) * months; Date.UTC(0, month) <= to; month += months)
-      found.push(Date.UTC(0, month));
+    const first = new Date(from), start = first.getUTCFullYear() * 12 + first.getUTCMonth();
+    const begin = (month) => Date.UTC(Math.floor(month / 12), month % 12);
+    for (let month = Math.ceil(start / months) * months; begin(month) <= to; month += months)
+      if (begin(month) >= from) found.push(begin(month));
   }
   const clock = step < 1440 || !found.length;
   let before = "";
@@ -81,9 +82,10 @@ function timeTicks(low, high, most) {
 function named(axis, place) {
   if (axis.time) return new Date(place * DAY).toISOString().replace("T", " ").slice(0, 19) + " UTC";
   const [, name, unit] = axis.label.match(/^(.*?)(?: \(([^()]*)\))?$/);
-  if (axis.ticks?.length) {
-    const [, text] = axis.ticks.reduce((a, b) => (Math.abs(b[0] - place) < Math.abs(a[0] - place) ? b : a));
-    return `${name} ${text}`;
+  // Ticks that are no numbers of the axis are names, and some places have none.
+  if (axis.ticks?.some(([at, text]) => Number(text.replace("−", "-")) !== at)) {
+    const [at, text] = axis.ticks.reduce((a, b) => (Math.abs(b[0] - place) < Math.abs(a[0] - place) ? b : a));
+    return `${name} ${Math.abs(at - place) <= 0.5 ? "" : "near "}${text}`;
   }
   return `${name} ${format(value(axis, place), 3)}${unit ? ` ${unit}` : ""}`;
 }
@@ -491,7 +493,8 @@ class Picture {
     this.show();
   }
 
-  // Returns the value under a point: of an image, and of the nearest point of a curve.
+  // Returns the value under a point: of an image, and of the nearest point of a curve. The first and
+  // the last colour also stand for what lies beyond the scale.
   read(box, px, py) {
     const { panel } = box, x = box.fromX(px), y = box.fromY(py), found = [];
     for (const layer of panel.layers.filter((one) => one.is === "image")) {
@@ -503,23 +506,27 @@ class Picture {
     }
     let nearest = Infinity, words = "";
     panel.layers.forEach((layer, k) => {
-      if (layer.is !== "curve" || layer.x.length < 3) return;
+      if (layer.is !== "curve" || (layer.x.length < 3 && !layer.label)) return;
       for (let i = 0; i < layer.x.length; i++) {
-        const distance = (box.toX(layer.x[i]) - px) ** 2 + (box.toY(layer.y[i]) - py) ** 2;
-        if (!(distance < nearest)) continue;
+        const at = [box.toX(layer.x[i]), box.toY(layer.y[i])];
+        const distance = (at[0] - px) ** 2 + (at[1] - py) ** 2;
+        // What lies outside is drawn to the edge, and is not read.
+        if (!(distance < nearest) || !within(box, ...at)) continue;
         nearest = distance;
-        words = `${layer.label ? `${layer.label}: ` : ""}${named(panel.x, layer.x[i])}, ${named(panel.y, layer.y[i])}`;
-        const error = this.error(panel, k, i);
-        if (error) words += ` ± ${format(error, 2)}`;
+        const error = this.error(panel, k, i), upright = panel.layers[k - 1]?.upright;
+        const part = error ? ` ± ${format(error, 2)}` : "";
+        words = `${layer.label ? `${layer.label}: ` : ""}${named(panel.x, layer.x[i])}${upright ? part : ""}`;
+        words += `, ${named(panel.y, layer.y[i])}${upright ? "" : part}`;
       }
     });
     if (words && !(found.length && nearest > 100)) found.push(words);
-    return found.join("; ") || `${named(panel.x, x)}, ${named(panel.y, y)}`;
+    return found.join("; ") || this.hint;
   }
 
   coded(panel, code) {
     const low = along(panel.bar, panel.bar.low), high = along(panel.bar, panel.bar.high);
-    return named(panel.bar, low + ((code - FIRST) / (255 - FIRST)) * (high - low));
+    const words = named(panel.bar, low + ((code - FIRST) / (255 - FIRST)) * (high - low));
+    return words + (code === FIRST ? " or less" : code === 255 ? " or more" : "");
   }
 
   // Returns the error of a point: half of the band or bar below the curve.
@@ -585,7 +592,8 @@ class Picture {
           layer.codes.forEach((code, at) => {
             const column = Math.floor(at / layer.rows), row = at % layer.rows;
             const x = (layer.left[column] + layer.right[column]) / 2, y = (layer.edges[row] + layer.edges[row + 1]) / 2;
-            const number = code < FIRST ? "" : value(panel.bar, low + ((code - FIRST) / (255 - FIRST)) * (high - low)).toPrecision(3);
+            const beyond = code === FIRST ? "<=" : code === 255 ? ">=" : "";
+            const number = code < FIRST ? "" : beyond + value(panel.bar, low + ((code - FIRST) / (255 - FIRST)) * (high - low)).toPrecision(3);
             rows.push([cell(panel.x, x), cell(panel.y, y), number]);
           });
         }
@@ -598,13 +606,18 @@ class Picture {
   }
 }
 
+const within = ({ left, top, width, height }, x, y) =>
+  x >= left - 1 && x <= left + width + 1 && y >= top - 1 && y <= top + height + 1;
 const key = (axis) => `${axis.label} ${axis.low} ${axis.high}`;
 
 const watch = new IntersectionObserver((entries) => {
   for (const { target, isIntersecting } of entries) {
     if (!isIntersecting) continue;
     watch.unobserve(target);
-    new Picture(target).begin();
+    const picture = new Picture(target);
+    picture.begin().catch((error) => {
+      picture.words.textContent = `The figure cannot be drawn: ${error.message}`;
+    });
   }
 }, { rootMargin: "300px" });
 document.querySelectorAll("div.fig").forEach((place) => watch.observe(place));

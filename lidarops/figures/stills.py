@@ -29,7 +29,6 @@ from lidarops.figures.wording import visible
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SUFFIXES: Final = (".png", ".svg", ".pdf")
 _WIDTH: Final = 9.6
 """Width of a figure, inches."""
 _INCH: Final = 100.0
@@ -47,6 +46,8 @@ _UNDATED: Final = {
 _DASHES: Final = {"d1": (7, 3), "d2": (2, 3), "d3": (9, 3, 2, 3), "d4": (12, 4), "d5": (1, 4)}
 _STYLE: Final[dict[str, Any]] = {
     "svg.hashsalt": "lidarops",
+    # Dollar signs of names of files are no formulas.
+    "text.parse_math": False,
     "font.size": 9.0,
     "axes.grid": True,
     "axes.axisbelow": True,
@@ -58,7 +59,7 @@ _STYLE: Final[dict[str, Any]] = {
 
 
 def still(figure: Figure, suffix: str) -> bytes:
-    """Return a figure as a file of a type: one of `SUFFIXES`. Equal figures give equal bytes."""
+    """Return a figure as a file of a type: one of `_UNDATED`. Equal figures give equal bytes."""
     panels = figure.panels
     with rc_context(rc=cast("Any", _STYLE)):
         heights = [panel.height / _INCH for panel in panels]

@@ -50,7 +50,7 @@ def every_layer() -> Figure:
         Words(x[:1], y[:1], ("<words>",)),
     )
     right = Axis("right", 0.0, 3.0)
-    flat = Panel(Axis("a", 0, 1), Axis("b", 0, 1), (Curve(ONE, ONE),), note="$x^", to_scale=True)
+    flat = Panel(Axis("a", 0, 1), Axis("b", 0, 1), (Curve(ONE, ONE),), note="$x^$", to_scale=True)
     return Figure(
         "Caption", "words", (Panel(ACROSS, UP, layers, bar=SCALE), Panel(ACROSS, right, ()), flat)
     )
