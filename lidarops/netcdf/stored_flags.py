@@ -151,7 +151,13 @@ def with_current_flags(product: xr.Dataset) -> xr.Dataset:
     recode = recoding(stored.attrs, product.attrs.get("lidarops_kind"))
     if recode is None:
         return product
-    return product.assign({QUALITY_FLAG: stored.copy(data=recode(stored.values))})
+    moved = stored.copy(data=recode(stored.values))
+    flags = flags_of(product.attrs["lidarops_kind"])
+    moved.attrs |= {
+        "flag_masks": np.array(flags.bits, dtype=moved.dtype),
+        "flag_meanings": flags.words,
+    }
+    return product.assign({QUALITY_FLAG: moved})
 
 
 def places(bits: int) -> str:
