@@ -299,10 +299,10 @@ _UNKNOWN: Final = (
 )
 
 
-def _fitted(paths: Paths, noise: Array, **options: Any) -> Any:
+def _fitted(paths: Paths, deviations: Array, **options: Any) -> Any:
     """Return the fit of paths with unit noise."""
     with np.errstate(under="ignore"):
-        power = paths.background + paths.clean + noise
+        power = paths.background + paths.clean + deviations
         return path_fit.fit_homogeneous_path(power, paths.range, **{"variance": 1.0, **options})
 
 
