@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 71_793,
-    "lines of code alone": 46_756,
+    "lines": 71_800,
+    "lines of code alone": 46_762,
     "modules": 288,
     "dataclasses": 273,
     "lines of dataclasses": 6_947,
