@@ -227,15 +227,15 @@ def _noise_of_profiles(
 ) -> tuple[Array, Array | None]:
     """Return correlation length and exposure, (profile or 1,)."""
     correlated = inputs.profile_values(
-        noise.correlation_length, "noise_correlation_length", leading
+        noise.correlation_length, "noise.correlation_length", leading
     )
     if correlated is not None and np.any(correlated < 1):
-        raise RetrievalInputError("is less than 1 bin", field="noise_correlation_length")
-    counted = inputs.profile_values(noise.exposure, "exposure", leading)
+        raise RetrievalInputError("is less than 1 bin", field="noise.correlation_length")
+    counted = inputs.profile_values(noise.exposure, "noise.exposure", leading)
     if counted is not None and not (known_variance and np.all(counted > 0)):
         raise RetrievalInputError(
             "is not positive, or given without variance",
-            field="exposure",
+            field="noise.exposure",
             remedy="give counts per unit of power with the variance of the counts",
         )
     return np.ones(1) if correlated is None else correlated, counted
