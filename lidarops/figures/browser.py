@@ -9,7 +9,7 @@ import base64
 import io
 import json
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,13 +22,13 @@ from lidarops.figures.panels import (
     BLANK,
     COLOURS,
     FIRST,
+    PALETTE,
     Axis,
     Band,
     Curve,
     Figure,
     Image,
     Layer,
-    Palette,
     Panel,
 )
 from lidarops.figures.wording import visible
@@ -53,16 +53,15 @@ _PEN: Final = 110
 def script() -> bytes:
     """Return the script that draws, with the colours and codes of panels."""
     text = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
-    palettes = {palette: palette.anchors for palette in Palette}
-    constants = {"COLOURS": COLOURS, "PALETTES": palettes, "FIRST": FIRST}
+    constants = {"COLOURS": COLOURS, "PALETTE": PALETTE, "FIRST": FIRST}
     head = "".join(f"const {name} = {json.dumps(value)};\n" for name, value in constants.items())
     return f'"use strict";\n{head}{text}'.encode()
 
 
 def inline(figure: Figure) -> Markup:
     """Return a figure as markup for a page that loads `SCRIPT`."""
-    # Data that look like markup would end the element.
-    data = json.dumps(_described(figure), ensure_ascii=True).replace("<", "\\u003c")
+    # Data that look like markup would end the element; axes that are not finite are no JSON.
+    data = json.dumps(_described(figure), allow_nan=False).replace("<", "\\u003c")
     words = escape(visible(figure.text))
     return Markup(  # noqa: S704 - text is escaped
         f'<div class="fig" data-words="{words}"><script type="application/json">{data}</script>'
@@ -112,11 +111,8 @@ def _panel(panel: Panel, packed: _Packed) -> dict[str, Any]:
     return {
         "x": _axis(panel.x),
         "y": _axis(panel.y),
-        "right": _axis(panel.right),
         "bar": _axis(panel.bar),
         "height": panel.height,
-        "title": visible(panel.title),
-        "note": visible(panel.note),
         "toScale": panel.to_scale,
         "layers": [_layer(layer, panel, packed) for layer in panel.layers],
     }
@@ -125,8 +121,7 @@ def _panel(panel: Panel, packed: _Packed) -> dict[str, Any]:
 def _axis(axis: Axis | None) -> dict[str, Any] | None:
     if axis is None:
         return None
-    ends = {"label": visible(axis.label), "low": axis.low, "high": axis.high}
-    return ends | {"log": axis.log, "time": axis.time, "ticks": axis.ticks}
+    return asdict(axis) | {"label": visible(axis.label)}
 
 
 def _layer(layer: Layer, panel: Panel, packed: _Packed) -> dict[str, Any]:
@@ -135,7 +130,6 @@ def _layer(layer: Layer, panel: Panel, packed: _Packed) -> dict[str, Any]:
         case Image():
             return {
                 "is": "image",
-                "palette": layer.palette,
                 # Together, so that columns that touch still do.
                 "sides": pack(np.concatenate([layer.left, layer.right]), x),
                 "edges": pack(layer.edges, y),
@@ -214,23 +208,23 @@ def _pixels(values: NDArray[np.float64], axis: Axis, size: int) -> NDArray[np.fl
 def _fill(codes: NDArray[np.uint8], image: Image, panel: Panel) -> None:
     """Fill in an image, whose columns have at least a pixel each."""
     height, width = codes.shape
-    middles = height - 0.5 - np.arange(height)
-    edges = _pixels(image.edges, panel.y, height)
-    row = np.searchsorted(edges, middles, side="right") - 1
-    inside = (row >= 0) & (row < edges.size - 1)
+    up = _pixels(image.edges, panel.y, height)
+    row = np.searchsorted(up, height - 0.5 - np.arange(height), side="right") - 1
+    inside = (row >= 0) & (row < image.codes.shape[1])
     left, right = (
-        np.rint(_pixels(ends, panel.x, width)).astype(int) for ends in (image.left, image.right)
+        np.rint(_pixels(ends, panel.x, width)).astype(int).clip(0, width)
+        for ends in (image.left, image.right)
     )
-    left = np.clip(left, 0, width - 1)
-    for column, (start, stop) in enumerate(zip(left, np.maximum(right, left + 1), strict=True)):
-        codes[inside, start:stop] = image.codes[column, row[inside], np.newaxis]
+    for column, (start, stop) in enumerate(zip(left, right, strict=True)):
+        first = min(start, width - 1)
+        codes[inside, first : max(stop, first + 1)] = image.codes[column, row[inside], np.newaxis]
 
 
 @cache
 def _colours() -> bytes:
     """Return the colours of all codes."""
     greys = [_rgb(COLOURS[name][0]) for name in ("page", "reject", "negative")]
-    anchors = np.array([_rgb(colour) for colour in Palette.SIGNAL.anchors], dtype=np.float64)
+    anchors = np.array([_rgb(colour) for colour in PALETTE], dtype=np.float64)
     places = np.linspace(0.0, len(anchors) - 1.0, 256 - FIRST)
     scale = [np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T]
     return bytes(np.concatenate([greys, np.rint(np.stack(scale, -1))]).astype(np.uint8))

@@ -31,8 +31,6 @@ function format(number, digits = 4) {
 }
 
 function ticks(axis, [low, high], most) {
-  const inside = ([place]) => place >= Math.min(low, high) - 1e-9 && place <= Math.max(low, high) + 1e-9;
-  if (axis.ticks) return axis.ticks.map(([place, text]) => [along(axis, place), text]).filter(inside);
   if (axis.time) return timeTicks(low, high, most);
   if (axis.log) return decades(low, high).map((number) => [Math.log(number), format(number)]);
   const rough = Math.abs(high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
@@ -82,11 +80,6 @@ function timeTicks(low, high, most) {
 function named(axis, place) {
   if (axis.time) return new Date(place * DAY).toISOString().replace("T", " ").slice(0, 19) + " UTC";
   const [, name, unit] = axis.label.match(/^(.*?)(?: \(([^()]*)\))?$/);
-  // Ticks that are no numbers of the axis are names, and some places have none.
-  if (axis.ticks?.some(([at, text]) => Number(text.replace("−", "-")) !== at)) {
-    const [at, text] = axis.ticks.reduce((a, b) => (Math.abs(b[0] - place) < Math.abs(a[0] - place) ? b : a));
-    return `${name} ${Math.abs(at - place) <= 0.5 ? "" : "near "}${text}`;
-  }
   return `${name} ${format(value(axis, place), 3)}${unit ? ` ${unit}` : ""}`;
 }
 
@@ -113,19 +106,14 @@ async function unpack(spec) {
   return spec;
 }
 
-const scales = {};
-function scaleOf(palette) {
-  const key = palette + scheme.matches;
-  if (!scales[key]) {
-    const anchors = PALETTES[palette].map(rgb), last = anchors.length - 1;
-    const codes = [null, rgb(colour("reject")), rgb(colour("negative"))];
-    for (let code = FIRST; code < 256; code++) {
-      const place = ((code - FIRST) / (255 - FIRST)) * last, k = Math.min(Math.floor(place), last - 1);
-      codes.push(anchors[k].map((part, c) => part + (place - k) * (anchors[k + 1][c] - part)));
-    }
-    scales[key] = Uint32Array.from(codes, (c) => (c ? (255 << 24) | (c[2] << 16) | (c[1] << 8) | c[0] : 0));
+function codeColours() {
+  const anchors = PALETTE.map(rgb), last = anchors.length - 1;
+  const codes = [null, rgb(colour("reject")), rgb(colour("negative"))];
+  for (let code = FIRST; code < 256; code++) {
+    const place = ((code - FIRST) / (255 - FIRST)) * last, k = Math.min(Math.floor(place), last - 1);
+    codes.push(anchors[k].map((part, c) => part + (place - k) * (anchors[k + 1][c] - part)));
   }
-  return scales[key];
+  return Uint32Array.from(codes, (c) => (c ? (255 << 24) | (c[2] << 16) | (c[1] << 8) | c[0] : 0));
 }
 const rgb = (text) => [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16));
 
@@ -157,7 +145,6 @@ const MARKS = {
   D: (c, x, y) => outline(c, [[x, y - 4], [x + 4, y], [x, y + 4], [x - 4, y]]),
   v: (c, x, y) => outline(c, [[x - 5, y - 8], [x + 5, y - 8], [x, y]]),
   x: (c, x, y) => [[-3, 3], [3, -3]].forEach(([a, b]) => (c.moveTo(x + a, y - 3), c.lineTo(x + b, y + 3))),
-  _: (c, x, y) => (c.moveTo(x - 5, y), c.lineTo(x + 5, y)),
 };
 function outline(ctx, points) {
   points.forEach(([x, y], k) => (k ? ctx.lineTo(x, y) : ctx.moveTo(x, y)));
@@ -218,7 +205,7 @@ function drawBand(ctx, layer, place) {
 
 function drawImage(ctx, layer, box, ratio) {
   const width = Math.round(box.width * ratio), height = Math.round(box.height * ratio);
-  const columns = new Int32Array(width).fill(-1), colours = scaleOf(layer.palette);
+  const columns = new Int32Array(width).fill(-1), colours = codeColours();
   const pixels = new ImageData(width, height), colour32 = new Uint32Array(pixels.data.buffer);
   for (let c = 0; c < layer.left.length; c++) {
     const [a, b] = [layer.left[c], layer.right[c]].map((edge) => Math.round((box.toX(edge) - box.left) * ratio));
@@ -289,7 +276,7 @@ class Picture {
     const most = (panel) => Math.max(3, Math.round(panel.height / 45));
     const labels = panels.flatMap((panel) => ticks(panel.y, this.range(panel.y), most(panel)).map(([, text]) => text));
     const left = Math.max(40, ...labels.map(textWidth)) + 34;
-    const right = panels.some((panel) => panel.bar) * (narrow ? 84 : 96) + (!narrow && panels.some((p) => p.right)) * 66 || 16;
+    const right = panels.some((panel) => panel.bar) * (narrow ? 84 : 96) || 16;
     const across = beside ? (width - right) / panels.length - left : width - left - right;
     const seen = new Set();
     let bottom = 0;
@@ -297,7 +284,7 @@ class Picture {
       const box = { panel, width: across, left: left + (beside ? k * (across + left) : 0), most: most(panel) };
       box.legend = this.legend(panel, across, seen);
       box.labelled = beside || k + 1 === panels.length || key(panels[k + 1].x) !== key(panel.x);
-      box.top = (beside ? 0 : bottom) + 12 + LINE * (box.legend.length + Boolean(panel.title));
+      box.top = (beside ? 0 : bottom) + 12 + LINE * box.legend.length;
       const shape = Math.abs((panel.y.high - panel.y.low) / (panel.x.high - panel.x.low));
       box.height = panel.toScale ? clamp(across * shape, 120, 640) : panel.height * (narrow && this.spec.beside ? 0.7 : 1);
       const x = this.range(panel.x), y = this.range(panel.y);
@@ -379,9 +366,7 @@ class Picture {
     }
     text(panel.y.label, 13 + box.left - this.boxes[0].left, box.top + box.height / 2, "center", "soft", true);
     if (box.labelled) text(panel.x.label, box.left + box.width / 2, bottom + (panel.x.time ? 52 : 36), "center");
-    if (panel.note) text(panel.note, box.left + box.width / 2, box.top + box.height / 2, "center");
-    this.drawSides(box, line, text, ctx, whole);
-    text(panel.title, box.left, box.top - 8 - LINE * box.legend.length, "left", "ink");
+    if (panel.bar) this.drawBar(box, text, ctx, whole);
     box.legend.forEach((row, k) => {
       const y = box.top - 8 - LINE * (box.legend.length - 1 - k);
       for (const [x, layer] of row) {
@@ -391,25 +376,10 @@ class Picture {
     });
   }
 
-  drawSides(box, line, text, ctx, whole) {
-    const { panel } = box;
-    let x = box.left + box.width;
-    if (panel.right && whole >= NARROW) {
-      // The second axis is a linear function of the first.
-      const [low, high] = this.range(panel.y).map((place) =>
-        panel.right.low + ((place - panel.y.low) / (panel.y.high - panel.y.low)) * (panel.right.high - panel.right.low));
-      for (const [place, words] of ticks(panel.right, [low, high], box.most)) {
-        const y = box.top + box.height - ((place - low) / (high - low)) * box.height;
-        line("soft", [x, y], [x + 4, y]);
-        text(words, x + 7, y + 4, "left", "ink");
-      }
-      text(panel.right.label, x + 54, box.top + box.height / 2, "center", "soft", true);
-      x += 60;
-    }
-    if (!panel.bar) return;
-    const image = panel.layers.find((layer) => layer.is === "image");
-    const shown = ctx.createLinearGradient(0, box.top + box.height, 0, box.top), anchors = PALETTES[image.palette];
-    anchors.forEach((part, k) => shown.addColorStop(k / (anchors.length - 1), part));
+  drawBar(box, text, ctx, whole) {
+    const { panel } = box, x = box.left + box.width;
+    const shown = ctx.createLinearGradient(0, box.top + box.height, 0, box.top);
+    PALETTE.forEach((part, k) => shown.addColorStop(k / (PALETTE.length - 1), part));
     ctx.fillStyle = shown;
     ctx.fillRect(x + 12, box.top, 12, box.height);
     const [low, high] = [panel.bar.low, panel.bar.high].map((end) => along(panel.bar, end));
@@ -610,14 +580,10 @@ const within = ({ left, top, width, height }, x, y) =>
   x >= left - 1 && x <= left + width + 1 && y >= top - 1 && y <= top + height + 1;
 const key = (axis) => `${axis.label} ${axis.low} ${axis.high}`;
 
-const watch = new IntersectionObserver((entries) => {
-  for (const { target, isIntersecting } of entries) {
-    if (!isIntersecting) continue;
-    watch.unobserve(target);
-    const picture = new Picture(target);
-    picture.begin().catch((error) => {
-      picture.words.textContent = `The figure cannot be drawn: ${error.message}`;
-    });
-  }
-}, { rootMargin: "300px" });
-document.querySelectorAll("div.fig").forEach((place) => watch.observe(place));
+// All at once, so that printing a page shows the figures that nobody has scrolled to.
+for (const place of document.querySelectorAll("div.fig")) {
+  const picture = new Picture(place);
+  picture.begin().catch((error) => {
+    picture.words.textContent = `The figure cannot be drawn: ${error.message}`;
+  });
+}

@@ -79,16 +79,14 @@ def image_view(
     return View(
         kind if kind == variable else f"{kind}-{variable.replace('_', '-')}",
         raster_variables(variable, along),
-        partial(_read_raster, kind, variable, along),
+        partial(_read_raster, variable, along),
         lambda rasters: [image_figure(rasters, quantity, along)],
         shows=variable,
     )
 
 
-def _read_raster(
-    kind: str, variable: str, along: str, product: xr.Dataset, source: ProductSource
-) -> Raster:
-    return read_raster(product, quantity=variable, kind=kind, profiles=source.profiles, along=along)
+def _read_raster(variable: str, along: str, product: xr.Dataset, source: ProductSource) -> Raster:
+    return read_raster(product, quantity=variable, profiles=source.profiles, along=along)
 
 
 def figures_of(kind: str) -> KindFigures | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,38 +57,18 @@ class Mark(StrEnum):
     DIAMOND = "D"
     CROSS = "x"
     DOWN = "v"
-    DASH = "_"
 
 
 SERIES_MARKS: Final = (Mark.DISC, Mark.SQUARE, Mark.TRIANGLE, Mark.DIAMOND)
 """Marks of the series of a panel."""
 
 
-class Palette(StrEnum):
-    """Colours of an image, by their name in matplotlib. Both become lighter with the value."""
-
-    SIGNAL = "viridis"
-    SIGNED = "cividis"
-    """Grey in the middle; can be read with colour vision deficiency."""
-
-    @property
-    def anchors(self) -> list[str]:
-        """Colours at equal steps of the scale."""
-        return [f"#{colour}" for colour in _ANCHORS[self].split()]
-
-
-_ANCHORS: Final = {
-    Palette.SIGNAL: "440154 481567 482677 453781 404788 39568c 33638d 2d708e 287d8e 238a8d 1f968b"
-    " 20a387 29af7f 3cbb75 55c667 73d055 95d840 b8de29 dce319 fde725",
-    Palette.SIGNED: "00224e 123570 3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
-}
-
-
-class Tick(NamedTuple):
-    """A labelled position on an axis."""
-
-    x: float
-    label: str
+PALETTE: Final = [
+    *("#440154", "#481567", "#482677", "#453781", "#404788", "#39568c", "#33638d", "#2d708e"),
+    *("#287d8e", "#238a8d", "#1f968b", "#20a387", "#29af7f", "#3cbb75", "#55c667", "#73d055"),
+    *("#95d840", "#b8de29", "#dce319", "#fde725"),
+]
+"""Colours of images at equal steps of the scale, those of viridis in matplotlib."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +79,6 @@ class Axis:
     low: float
     high: float
     log: bool = False
-    ticks: tuple[Tick, ...] | None = None
-    """Round values where None."""
     time: bool = False
     """Whether values are days since 1970, UTC."""
 
@@ -143,7 +121,6 @@ class Image:
     """(column,)"""
     edges: Floats
     """(row + 1,) Rising edges of the rows along the vertical axis."""
-    palette: Palette = Palette.SIGNAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,13 +143,8 @@ class Panel:
     y: Axis
     layers: tuple[Layer, ...]
     height: float = 240.0
-    right: Axis | None = None
-    """Second vertical axis."""
     bar: Axis | None = None
     """Colour bar of the image."""
-    title: str = ""
-    note: str = ""
-    """Why the panel is empty."""
     to_scale: bool = False
     """Whether both axes have one scale."""
 

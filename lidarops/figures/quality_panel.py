@@ -10,19 +10,21 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import Axis, Band, Figure, Panel, time_axis
-from lidarops.figures.raster import column_edges, column_starts, profile_bounds
-from lidarops.figures.series_data import blocks, quality_bits
-from lidarops.figures.time_axis import Times, days
+from lidarops.figures.time_axis import Times, column_edges, column_starts, days, profile_bounds
 from lidarops.figures.wording import percent
-from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import (
+    READ_VALUES,
+    bits_of,
+    blocks,
+    quality_bits,
+    rejecting_mask,
+)
 from lidarops.netcdf.variables import QUALITY_FLAG
 
 Floats = NDArray[np.float64]
 
 _COLUMNS: Final = 240
 """Most columns."""
-READ_VALUES: Final = 2_000_000
-"""Most flags in memory."""
 _HEIGHT: Final = 110
 
 
@@ -60,7 +62,7 @@ def read_quality(product: xr.Dataset) -> QualityOverTime | None:
         return None
     order = np.argsort(product["time"].values, kind="stable")
     start, stop = (edge[order] for edge in profile_bounds(product))
-    rejecting = rejecting_mask(stored_bits(flags.attrs, product.attrs.get("lidarops_kind")))
+    rejecting = rejecting_mask(bits_of(product))
     shares = []
     for block in blocks(flags, READ_VALUES):
         bits = quality_bits(block).reshape(block.sizes["time"], -1)

@@ -6,10 +6,9 @@ Also checks and reads variables of any product.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
 from lidarops.figures.time_axis import Times, segments
-from lidarops.flags import Quality
 
 Floats = NDArray[np.float64]
 
@@ -57,67 +55,20 @@ class TimeSeries:
     estimates: Mapping[str, SeriesEstimate]
     """By name of the quantity."""
 
-    @property
-    def key(self) -> tuple[float, ...]:
-        """Identity and place among the series of a product."""
-        return ()
-
-    @property
-    def label(self) -> str:
-        """Name in legends."""
-        return ""
+    label: str = ""
+    """Name in legends."""
+    key: tuple[float, ...] = ()
+    """Identity and place among the series of a product: bounds in m, or a number."""
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
         """(time,) Whether a quality bit rejects the value."""
         return np.asarray((self.flag & self.rejecting) != 0)
 
-
-@dataclass(frozen=True, slots=True)
-class Section(TimeSeries):
-    """The quantities retrieved from one range section, over time."""
-
-    near: float
-    """m"""
-    far: float
-    """m"""
-
-    @property
-    def key(self) -> tuple[float, ...]:
-        """The bounds."""
-        return self.near, self.far
-
-    @property
-    def label(self) -> str:
-        """Range of the section in km."""
-        return section_label(self.near, self.far)
-
-
-def section_label(near: float, far: float) -> str:
-    """Return the range of a section (m) in km."""
-    return f"{near / 1e3:g}\N{EN DASH}{far / 1e3:g} km"
-
-
-@dataclass(frozen=True, slots=True)
-class NumberedSeries(TimeSeries):
-    """The quantities at one index of another dimension than time."""
-
-    noun: str
-    """What is numbered; may be empty."""
-    number: int
-
-    @property
-    def key(self) -> tuple[float, ...]:
-        """The number."""
-        return (self.number,)
-
-    @property
-    def label(self) -> str:
-        """Noun and number."""
-        return f"{self.noun} {self.number}".strip()
-
-
-AnySeries = TypeVar("AnySeries", bound=TimeSeries)
+    def at(self, index: NDArray[np.bool_] | NDArray[np.intp]) -> TimeSeries:
+        """Return the series at some times."""
+        estimates = {name: estimate.at(index) for name, estimate in self.estimates.items()}
+        return replace(self, time=self.time[index], flag=self.flag[index], estimates=estimates)
 
 
 class Verdict(StrEnum):
@@ -177,7 +128,7 @@ class Comparison:
         return Verdict.OVERSTATED if self.spread < 1.0 - chance else Verdict.AS_STATED
 
 
-def join(series: Iterable[AnySeries]) -> list[AnySeries]:
+def join(series: Iterable[TimeSeries]) -> list[TimeSeries]:
     """Join series of the same key in time.
 
     Parameters
@@ -190,7 +141,7 @@ def join(series: Iterable[AnySeries]) -> list[AnySeries]:
     list of TimeSeries
         One per key, sorted by key.
     """
-    groups: dict[tuple[float, ...], list[AnySeries]] = {}
+    groups: dict[tuple[float, ...], list[TimeSeries]] = {}
     for part in series:
         groups.setdefault(part.key, []).append(part)
     return [_joined(group) for _, group in sorted(groups.items())]
@@ -232,7 +183,7 @@ def normalised_error(section: TimeSeries, quantity: str) -> Floats:
     return np.asarray((estimate.value - estimate.truth) / error)
 
 
-def thin(section: AnySeries, points: int) -> AnySeries:
+def thin(section: TimeSeries, points: int) -> TimeSeries:
     """Reduce the unflagged profiles of a section to about `points` block means for drawing.
 
     A block has the mean of its unflagged profiles, the standard error of that mean (as if errors
@@ -250,7 +201,7 @@ def thin(section: AnySeries, points: int) -> AnySeries:
     TimeSeries
         Unflagged profiles only; block means if there are more than `points`.
     """
-    good = _where(section, section.flag == 0)
+    good = section.at(section.flag == 0)
     if good.time.size <= points:
         return good
     size = -(-good.time.size // points)
@@ -274,15 +225,6 @@ def thin(section: AnySeries, points: int) -> AnySeries:
     )
 
 
-def _where(section: AnySeries, keep: NDArray[np.bool_]) -> AnySeries:
-    return replace(
-        section,
-        time=section.time[keep],
-        flag=section.flag[keep],
-        estimates={name: estimate.at(keep) for name, estimate in section.estimates.items()},
-    )
-
-
 def _block_mean(values: Floats, starts: NDArray[np.intp]) -> Floats:
     use = np.isfinite(values)
     counts = np.add.reduceat(use.astype(np.int64), starts)
@@ -296,27 +238,23 @@ def _block_error(errors: Floats, starts: NDArray[np.intp]) -> Floats:
     return np.sqrt(_block_mean(errors**2, starts) / np.maximum(counts, 1))
 
 
-def _joined(group: list[AnySeries]) -> AnySeries:
-    if len(group) == 1:
-        return group[0]
-    time = np.concatenate([series.time for series in group])
-    order = np.argsort(time, kind="stable")
-
+def _joined(group: Sequence[TimeSeries]) -> TimeSeries:
     def joined(name: str) -> SeriesEstimate:
         parts = [series.estimates[name] for series in group]
         return SeriesEstimate(
-            value=np.concatenate([part.value for part in parts]),
-            standard_error=np.concatenate([part.standard_error for part in parts]),
-            truth=np.concatenate([part.truth for part in parts]),
-            units=parts[0].units,
-        ).at(order)
+            np.concatenate([part.value for part in parts]),
+            np.concatenate([part.standard_error for part in parts]),
+            np.concatenate([part.truth for part in parts]),
+            parts[0].units,
+        )
 
-    return replace(
+    whole = replace(
         group[0],
-        time=time[order],
-        flag=np.concatenate([series.flag for series in group])[order],
+        time=np.concatenate([series.time for series in group]),
+        flag=np.concatenate([series.flag for series in group]),
         estimates={name: joined(name) for name in group[0].estimates},
     )
+    return whole.at(np.argsort(whole.time, kind="stable"))
 
 
 def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
@@ -339,27 +277,3 @@ def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
 def float_values(product: xr.Dataset, name: str) -> Floats:
     """Return a variable in double precision."""
     return np.asarray(product[name].values, dtype=np.float64)
-
-
-def blocks(variable: xr.DataArray, most: int) -> Iterator[xr.DataArray]:
-    """Yield a variable some rows at a time, at most `most` values but at least a row."""
-    if not variable.dims or variable.size == 0:
-        yield variable
-        return
-    first, rows = next(iter(variable.sizes.items()))
-    step = max(1, most * rows // variable.size)
-    for start in range(0, rows, step):
-        yield variable.isel({first: slice(start, start + step)})
-
-
-def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
-    """Return quality flags as integers; missing flags become `Quality.INPUT_MISSING`."""
-    return as_bits(flags.values)
-
-
-def as_bits(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Return values of quality flags as integers, as `quality_bits` does."""
-    if values.dtype.kind == "f":
-        # Where there are fill values, xarray decodes integers as floats with NaN.
-        values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
-    return np.asarray(values, dtype=np.int64)

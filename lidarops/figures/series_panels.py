@@ -18,16 +18,14 @@ from lidarops.figures.panels import (
     Layer,
     Mark,
     Panel,
-    Tick,
     axis_of_times,
     finite,
-    number,
     percentile_axis,
     span_in_words,
 )
-from lidarops.figures.series_data import TimeSeries, compare, normalised_error, thin
+from lidarops.figures.series_data import TimeSeries, thin
 from lidarops.figures.time_axis import Times, days, segments
-from lidarops.figures.wording import counted, percent
+from lidarops.figures.wording import counted
 
 Floats = NDArray[np.float64]
 
@@ -39,10 +37,6 @@ _BARS: Final = 160
 """Most values with marks and error bars; more values get a band."""
 _FLAGGED: Final = 300
 """Most flagged values that are marked."""
-_SCORES: Final = 1500
-"""Most normalised errors of a series that are marked, but for those beyond 3."""
-_FAR_OFF: Final = 10.0
-"""Larger normalised errors are drawn at this value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +63,9 @@ def series_figures(
     series: Sequence[TimeSeries], quantities: Sequence[Quantity], caption: str
 ) -> Iterator[Figure]:
     """Yield figures of quantities against time, `SERIES` series in each, one panel per quantity."""
-    for few in _some(series):
-        x = axis_of_times(_times(few))
+    for first in range(0, len(series), SERIES):
+        few = series[first : first + SERIES]
+        x = axis_of_times(np.unique(np.concatenate([one.time for one in few])))
         panels = [series_panel(x, few, quantity) for quantity in quantities]
         words = [series_in_words(few, quantities[0])]
         for quantity, panel in zip(quantities, panels, strict=True):
@@ -114,87 +109,20 @@ def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> P
     return Panel(x, y, tuple(layers))
 
 
-def background_panel(x: Axis, line: Quantity, time: Times, value: Floats, error: Floats) -> Panel:
-    """Return a background against time with its standard error."""
-    layers = _line(time, value, error, "c0", Mark.DISC, "")
-    return Panel(x, percentile_axis(line.label, [value]), tuple(layers), height=110)
-
-
-def score_figures(series: Sequence[TimeSeries], quantities: Sequence[str]) -> Iterator[Figure]:
-    """Yield figures of (retrieved - truth) / standard error of unflagged values with a truth."""
-    for few in _some(series):
-        x = axis_of_times(_times(few))
-        words = []
-        panels = []
-        for quantity in quantities:
-            layers: list[Layer] = []
-            for place, one in enumerate(few):
-                comparison = compare(one, quantity)
-                if comparison is not None:
-                    share = f"{percent(comparison.within_3)} of {comparison.count:,} within 3"
-                    label = f"{one.label}: {share}"
-                    words.append(f"{quantity} {label} standard errors")
-                    layers.append(_scores(one, quantity, place, label))
-            if layers:
-                largest = float(np.abs(finite([_y(layer) for layer in layers])).max(initial=3.6))
-                panels.append(_score_panel(x, quantity, layers, 1.1 * largest))
-        if panels:
-            caption = "Unflagged values compared with the simulated truth"
-            yield Figure(caption, "; ".join(words), tuple(panels))
-
-
-def _y(layer: Layer) -> Floats:
-    return layer.y if isinstance(layer, Curve) else np.array([])
-
-
-def _scores(one: TimeSeries, quantity: str, place: int, label: str) -> Curve:
-    score = np.where(one.flag == 0, normalised_error(one, quantity), np.nan)
-    known = np.flatnonzero(np.isfinite(score))
-    # Values beyond 3 are always drawn, the others thinned.
-    shown = np.union1d(known[:: -(-known.size // _SCORES) or 1], known[np.abs(score[known]) > 3.0])
-    far = int((np.abs(score[known]) > _FAR_OFF).sum())
-    label += f", {far:,} beyond {_FAR_OFF:g} drawn there" if far else ""
-    values = np.clip(score[shown], -_FAR_OFF, _FAR_OFF)
-    x = days(one.time[shown])
-    return Curve(x, values, f"c{place}", SERIES_MARKS[place], joined=False, label=label)
-
-
-def _score_panel(x: Axis, quantity: str, layers: Sequence[Layer], limit: float) -> Panel:
-    ends = np.array([x.low, x.high])
-    levels = [Curve(ends, np.full(2, level), "ink thin d1") for level in (-3.0, 3.0)]
-    one = Band(ends, np.full(2, -1.0), np.full(2, 1.0), "soft wide")
-    ticks = tuple(
-        Tick(level, number(level)) for level in (-6.0, -3.0, 0.0, 3.0, 6.0) if abs(level) < limit
-    )
-    name = quantity.replace("_", " ")
-    y = Axis(f"{name}: error / \N{GREEK SMALL LETTER SIGMA}", -limit, limit, ticks=ticks)
-    zero = Curve(ends, np.zeros(2), "ink thin")
-    return Panel(x, y, (one, zero, *layers, *levels), height=150)
-
-
 def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
+    """Return values with bars and marks if they are few, else with a band."""
     drawn = thin(one, _POINTS)
     estimate = drawn.estimates[quantity.name]
     profiles = round(int((one.flag == 0).sum()) / max(drawn.time.size, 1))
     means = f", means of {profiles} profiles" if profiles > 1 else ""
-    return _line(
-        drawn.time,
-        quantity.factor * estimate.value,
-        quantity.factor * estimate.standard_error,
-        f"c{place} d{place}" if place else "c0",
-        SERIES_MARKS[place],
-        f"{one.label}{means}".removeprefix(", "),
+    few = drawn.time.size <= _BARS
+    x, y, wide = _with_gaps(
+        drawn.time, quantity.factor * estimate.value, quantity.factor * estimate.standard_error
     )
-
-
-def _line(
-    time: Times, value: Floats, error: Floats, style: str, mark: Mark, label: str
-) -> list[Layer]:
-    """Return values with bars and marks if they are few, else with a band."""
-    few = time.size <= _BARS
-    x, y, wide = _with_gaps(time, value, error)
+    style, mark = f"c{place} d{place}" if place else "c0", SERIES_MARKS[place] if few else None
+    label = f"{one.label}{means}".removeprefix(", ")
     band = Band(x, y - wide, y + wide, style, bars=few)
-    return [band, Curve(x, y, style, mark if few else None, label=label)]
+    return [band, Curve(x, y, style, mark, label=label)]
 
 
 def _truth(one: TimeSeries, quantity: Quantity) -> Curve:
@@ -213,15 +141,6 @@ def _with_gaps(time: Times, *values: Floats) -> tuple[Floats, ...]:
     cuts = [stretch.start for stretch in segments(time)][1:]
     x = days(time)
     return np.insert(x, cuts, x[cuts]), *(np.insert(value, cuts, np.nan) for value in values)
-
-
-def _some(series: Sequence[TimeSeries]) -> Iterator[Sequence[TimeSeries]]:
-    for first in range(0, len(series), SERIES):
-        yield series[first : first + SERIES]
-
-
-def _times(series: Sequence[TimeSeries]) -> Times:
-    return np.unique(np.concatenate([one.time for one in series]))
 
 
 def series_in_words(series: Sequence[TimeSeries], quantity: Quantity) -> str:

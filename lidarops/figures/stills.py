@@ -21,7 +21,6 @@ from lidarops.figures.panels import (
     Figure,
     Image,
     Layer,
-    Mark,
     Panel,
 )
 from lidarops.figures.wording import visible
@@ -43,6 +42,7 @@ _UNDATED: Final = {
     ".pdf": {"CreationDate": None},
 }
 """Metadata that would make equal figures differ."""
+_COLOURS: Final = colormaps["viridis"]
 _DASHES: Final = {"d1": (7, 3), "d2": (2, 3), "d3": (9, 3, 2, 3), "d4": (12, 4), "d5": (1, 4)}
 _STYLE: Final[dict[str, Any]] = {
     "svg.hashsalt": "lidarops",
@@ -88,9 +88,6 @@ def _draw(canvas: Canvas, axes: Axes, panel: Panel, seen: set[str], *, labelled:
         _layer(axes, layer)
     axes.set(xlim=(panel.x.low, panel.x.high), xscale="log" if panel.x.log else "linear")
     axes.set(ylim=(panel.y.low, panel.y.high), yscale="log" if panel.y.log else "linear")
-    for axis, set_ticks in ((panel.x, axes.set_xticks), (panel.y, axes.set_yticks)):
-        if axis.ticks is not None:
-            set_ticks([tick.x for tick in axis.ticks], [visible(t.label) for t in axis.ticks])
     if panel.x.time:
         locator = dates.AutoDateLocator()  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_locator(locator)
@@ -101,15 +98,9 @@ def _draw(canvas: Canvas, axes: Axes, panel: Panel, seen: set[str], *, labelled:
     axes.set_xlabel(visible(panel.x.label) if labelled else "")
     if panel.to_scale:
         axes.set_aspect("equal")
-    if panel.note:
-        axes.text(0.5, 0.5, visible(panel.note), ha="center", transform=axes.transAxes)
-    if panel.right is not None:
-        _second(axes, panel.y, panel.right)
     if panel.bar is not None:
-        _bar(canvas, axes, panel, panel.bar)
+        _bar(canvas, axes, panel.bar)
     _legend(axes, seen)
-    if panel.title:
-        axes.set_title(visible(panel.title), loc="right", fontsize=9)
 
 
 def _legend(axes: Axes, seen: set[str]) -> None:
@@ -130,17 +121,9 @@ def _legend(axes: Axes, seen: set[str]) -> None:
         )
 
 
-def _second(axes: Axes, y: Axis, right: Axis) -> None:
-    slope = (right.high - right.low) / (y.high - y.low)
-    there = lambda value: right.low + (value - y.low) * slope  # noqa: E731
-    back = lambda value: y.low + (value - right.low) / slope  # noqa: E731
-    axes.secondary_yaxis("right", functions=(there, back)).set_ylabel(visible(right.label))
-
-
-def _bar(canvas: Canvas, axes: Axes, panel: Panel, bar: Axis) -> None:
-    palette = next(layer.palette for layer in panel.layers if isinstance(layer, Image))
+def _bar(canvas: Canvas, axes: Axes, bar: Axis) -> None:
     norm = LogNorm(bar.low, bar.high) if bar.log else Normalize(bar.low, bar.high)
-    shown = ScalarMappable(norm, colormaps[palette])
+    shown = ScalarMappable(norm, _COLOURS)
     canvas.colorbar(shown, ax=axes, label=visible(bar.label), pad=0.02, aspect=25)
 
 
@@ -156,7 +139,7 @@ def _layer(axes: Axes, layer: Layer) -> None:
                 style["linestyle"] = "none"
             face = "none" if "hollow" in layer.style.split() else style["color"]
             style |= {"marker": layer.mark or "none", "label": visible(layer.label)}
-            style["markersize"] = 8 if layer.mark is Mark.DASH else 4
+            style["markersize"] = 4
             style["markerfacecolor"] = "white" if layer.style == "cloud" else face
             axes.plot(layer.x, layer.y, **style)
         case _:
@@ -187,7 +170,7 @@ def _band(axes: Axes, band: Band) -> None:
 
 def _image(axes: Axes, image: Image) -> None:
     """Draw an image: between its columns, those of gaps are blank."""
-    scale = colormaps[image.palette](np.linspace(0.0, 1.0, 256 - FIRST))
+    scale = _COLOURS(np.linspace(0.0, 1.0, 256 - FIRST))
     greys = [(0, 0, 0, 0), COLOURS["reject"][0], COLOURS["negative"][0]]
     codes = np.full((image.codes.shape[1], 2 * image.left.size - 1), BLANK, dtype=np.uint8)
     codes[:, ::2] = image.codes.T

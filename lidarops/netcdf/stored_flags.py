@@ -7,10 +7,10 @@ alone has no meaning. Results are either those of the file, or given the places 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Flags, Quality, Severity
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.records import Verdicts
 
 Values = NDArray[Any]
 Recoding = Callable[[Values], Values]
+READ_VALUES: Final = 2_000_000
+"""Most flags in memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,48 @@ def stored_bits(attributes: Mapping[str, Any], kind: str | None) -> tuple[Stored
     stated = sum({bit.mask for bit in named})
     unnamed = (1 << place for place in range(PLACES) if not stated >> place & 1)
     return (*named, *(_bit(f"bit_{places(mask)}", mask, None) for mask in unnamed))
+
+
+def bits_of(product: xr.Dataset) -> tuple[StoredBit, ...]:
+    """Return all bits of the ``quality_flag`` of a product, as `stored_bits`.
+
+    Of a kind that is not known, a bit that a value with another ``usable`` than the worst carries
+    does not reject.
+    """
+    kind = product.attrs.get("lidarops_kind")
+    bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
+    if kind in set(kinds()) or USABLE not in product:
+        return bits
+    kept = 0
+    for flags, usable in zip(
+        *(blocks(product[name], READ_VALUES) for name in (QUALITY_FLAG, USABLE)), strict=True
+    ):
+        accepted = quality_bits(flags)[usable.values < Severity.REJECT]
+        kept |= int(np.bitwise_or.reduce(accepted, axis=None))
+    return tuple(
+        replace(bit, severity=Severity.CARE) if bit.severity is None and bit.mask & kept else bit
+        for bit in bits
+    )
+
+
+def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
+    """Return quality flags as integers; missing flags become `Quality.INPUT_MISSING`."""
+    values = flags.values
+    if values.dtype.kind == "f":
+        # Where there are fill values, xarray decodes integers as floats with NaN.
+        values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
+    return np.asarray(values, dtype=np.int64)
+
+
+def blocks(variable: xr.DataArray, most: int) -> Iterator[xr.DataArray]:
+    """Yield a variable some rows at a time, at most `most` values but at least a row."""
+    if not variable.dims or variable.size == 0:
+        yield variable
+        return
+    first, rows = next(iter(variable.sizes.items()))
+    step = max(1, most * rows // variable.size)
+    for start in range(0, rows, step):
+        yield variable.isel({first: slice(start, start + step)})
 
 
 def rejecting_mask(bits: Iterable[StoredBit]) -> int:

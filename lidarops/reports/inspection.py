@@ -20,10 +20,9 @@ from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import RawFormatError
-from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import visible
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
-from lidarops.netcdf.stored_flags import FlagCounter, rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, bits_of, blocks, quality_bits, rejecting_mask
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
 
@@ -210,7 +209,7 @@ def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     if "quality_flag" not in dataset.variables:
         return []
     flags = dataset["quality_flag"]
-    bits = stored_bits(flags.attrs, dataset.attrs.get("lidarops_kind"))
+    bits = bits_of(dataset)
     counts = FlagCounter(rejecting_mask(bits))
     for block in blocks(flags, _READ_VALUES) if flags.size else ():
         counts.add(quality_bits(block))

@@ -113,7 +113,7 @@ def _of_product(path: Path, chosen: Selection) -> Iterator[Figure]:
             )
         views = [_view_of(opened, kind, chosen.variable)] if chosen.variable else views_of(kind)
     for view in views:
-        names = {*view.variables, "time", "range", "altitude"}
+        names = {*view.variables, "time", "range", "altitude", "usable"}
         with reading(path), open_product(path, names) as product:
             content = view.read(_part(product, chosen, path), ProductSource())
         if content is not None:
@@ -130,7 +130,7 @@ def _view_of(product: xr.Dataset, kind: str, name: str) -> View[Any]:
     across = product[name].dims[1:]
     if across in (("range",), ("altitude",)) and f"{name}_standard_error" in product:
         label = str(product[name].attrs.get("long_name", name))
-        return image_view(kind, name, ImageQuantity(label, background=False), str(across[0]))
+        return image_view(kind, name, ImageQuantity(label), str(across[0]))
     return view_of(kind, name)
 
 

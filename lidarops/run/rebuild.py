@@ -15,11 +15,10 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Dependence, NewProduct, RunStatus, SceneEntry, Store
 from lidarops.errors import LidarOpsError, ProductError
-from lidarops.figures.series_data import blocks
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import path_of_product
 from lidarops.netcdf.read import opened_product, reading
-from lidarops.netcdf.stored_flags import FlagCounter, rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import FlagCounter, blocks, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.records import Findings, ProductRecord, Role, SceneOutcome, Verdicts, day_of
 from lidarops.run.ledger_run import JudgedDays, LedgerRun

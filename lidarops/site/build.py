@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import xarray as xr
+from markupsafe import Markup
 
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError
@@ -83,6 +84,8 @@ class _Task:
     below: float
 
 
+_Drawn = tuple[Figure, Markup]
+"""A figure, and as a page holds it."""
 _Outcome = tuple[Entry | Problem, bool]
 """Entry or problem of a product, and whether its page was made now."""
 
@@ -242,15 +245,14 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         origin = product_contents.origin(opened)
         span = product_contents.span(opened)
         kind = attribute(opened, "lidarops_kind")
-        figures, problem = _draw(opened, kind)
+        over_time, no_quality = _guarded(
+            lambda: read_quality(opened), "its quality over time cannot be drawn"
+        )
+        figures, problem = _draw(opened, kind, over_time)
         page = product_page(task.path)
         values, no_values = _guarded(
             lambda: read_values(opened, kind), "its values cannot be shown"
         )
-        over_time, no_quality = _guarded(
-            lambda: read_quality(opened), "its quality over time cannot be drawn"
-        )
-        figures = _with_quality(figures, over_time)
         station = attribute(opened, "lidarops_station")
         instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
@@ -280,12 +282,12 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             profiles=quality.profiles,
             available=quality.available,
             lacking=quality.lacking,
-            alt=figures[0].text if figures else _EMPTY,
+            alt=figures[0][0].text if figures else _EMPTY,
             problem=_joined(problem, no_values, no_quality, origin.problem, _missing_flags(opened)),
         )
         contents = (
             pages.product(entry, opened, quality, origin, figures, values or ()),
-            browser.thumbnail(figures[0] if figures else None),
+            browser.thumbnail(figures[0][0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):
         _write(task.site, name, content)
@@ -313,29 +315,34 @@ def _with_quality(figures: list[Figure], quality: QualityOverTime | None) -> lis
     return [replace(first, panels=joined, words=words), *figures[1:]]
 
 
-def _draw(opened: xr.Dataset, kind: str) -> tuple[list[Figure], str]:
+def _draw(
+    opened: xr.Dataset, kind: str, quality: QualityOverTime | None
+) -> tuple[list[_Drawn], str]:
     """Draw a product; if it does not fit its kind, as a product of unknown kind."""
     figures = figures_of(kind)
     problem = ""
     try:
         if figures is not None:
-            return _figures(with_current_flags(opened), figures.views), ""
+            return _figures(with_current_flags(opened), figures.views, quality), ""
     except UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        return _figures(opened, [any_kind.view_of(kind)]), problem
+        return _figures(opened, [any_kind.view_of(kind)], quality), problem
     except UNREADABLE as error:
         return [], problem or f"it cannot be drawn: {error}"
 
 
-def _figures(opened: xr.Dataset, views: Sequence[View[Any]]) -> list[Figure]:
+def _figures(
+    opened: xr.Dataset, views: Sequence[View[Any]], quality: QualityOverTime | None
+) -> list[_Drawn]:
     contents = ((view, view.read(opened, ProductSource())) for view in views)
-    return [
+    figures = [
         figure
         for view, content in contents
         if content is not None
         for figure in view.draw([content])
     ]
+    return [(figure, browser.inline(figure)) for figure in _with_quality(figures, quality)]
 
 
 def _missing_flags(opened: xr.Dataset) -> str:

@@ -12,6 +12,7 @@ from itertools import groupby
 from typing import Any, Final
 
 import xarray as xr
+from markupsafe import Markup
 
 from lidarops import __version__
 from lidarops.figures import browser
@@ -63,7 +64,7 @@ def product(
     opened: xr.Dataset,
     quality: QualityCounts,
     origin: Origin,
-    figures: Sequence[Figure],
+    figures: Sequence[tuple[Figure, Markup]],
     values: Sequence[ValueRow],
 ) -> bytes:
     """Return the page of a product; it depends only on the product and its path."""
@@ -90,7 +91,7 @@ def product(
         problem=entry.problem,
         lacking=entry.lacking,
         summary=summary,
-        figures=[(browser.inline(figure), figure.text) for figure in figures],
+        figures=[(markup, figure.text) for figure, markup in figures],
         quality=quality,
         grade=entry.grade,
         quality_text=_quality(entry),

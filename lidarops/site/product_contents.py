@@ -12,10 +12,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.product_names import attribute, scalar
-from lidarops.figures.quality_panel import READ_VALUES
-from lidarops.figures.series_data import blocks, quality_bits
 from lidarops.figures.wording import named_shares, percent
-from lidarops.netcdf.stored_flags import FlagCounter, StoredBit, rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import (
+    READ_VALUES,
+    FlagCounter,
+    StoredBit,
+    bits_of,
+    blocks,
+    quality_bits,
+    rejecting_mask,
+)
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.site.paths import CALENDAR_HEIGHT
 
@@ -123,7 +129,7 @@ def count_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Qualit
     """
     if QUALITY_FLAG not in product:
         return QualityCounts(0, 0, 0, 0, 0, ())
-    bits = stored_bits(product[QUALITY_FLAG].attrs, product.attrs.get("lidarops_kind"))
+    bits = bits_of(product)
     rejecting = rejecting_mask(bits)
     counts = FlagCounter(rejecting)
     profiles = available = 0

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from lidarops.figures.any_kind import main_name
 from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import number, units
-from lidarops.figures.series_data import quality_bits
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import percent
-from lidarops.netcdf.stored_flags import rejecting_mask, stored_bits
+from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
 from lidarops.netcdf.variables import QUALITY_FLAG
 
 READ_BYTES: Final = 16_000_000
@@ -51,7 +50,7 @@ def read_values(product: xr.Dataset, kind: str) -> tuple[ValueRow, ...]:
     kind : str
         Kind of the product, which states its main quantities; may be unknown.
     """
-    return tuple(_row(product, quantity, kind) for quantity in _quantities(product, kind))
+    return tuple(_row(product, quantity) for quantity in _quantities(product, kind))
 
 
 def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
@@ -66,7 +65,7 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
     return tuple(q for q in known if product[q.name].dims[:1] == ("time",))
 
 
-def _row(product: xr.Dataset, quantity: Quantity, kind: str) -> ValueRow:
+def _row(product: xr.Dataset, quantity: Quantity) -> ValueRow:
     every = -(-product[quantity.name].nbytes // READ_BYTES)
 
     def read(name: str) -> NDArray[Any]:
@@ -75,8 +74,8 @@ def _row(product: xr.Dataset, quantity: Quantity, kind: str) -> ValueRow:
     values = quantity.factor * read(quantity.name).astype(np.float64)
     usable = np.isfinite(values)
     if QUALITY_FLAG in product and product[QUALITY_FLAG].dims == product[quantity.name].dims:
-        bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
-        usable &= (quality_bits(product[QUALITY_FLAG][::every]) & rejecting_mask(bits)) == 0
+        rejecting = rejecting_mask(bits_of(product))
+        usable &= (quality_bits(product[QUALITY_FLAG][::every]) & rejecting) == 0
     error = f"{quantity.name}_standard_error"
     errors = np.full(values.shape, np.nan)
     if error in product and product[error].dims == product[quantity.name].dims:

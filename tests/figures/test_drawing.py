@@ -49,10 +49,10 @@ def every_layer() -> Figure:
         *(Curve(x, y, "ink hollow d1", mark, label=mark.name) for mark in Mark),
         Words(x[:1], y[:1], ("<words>",)),
     )
-    right = Axis("right", 0.0, 3.0)
-    flat = Panel(Axis("a", 0, 1), Axis("b", 0, 1), (Curve(ONE, ONE),), note="$x^$", to_scale=True)
+    other = Axis("other $x^$", 0.0, 3.0)
+    flat = Panel(Axis("a", 0, 1), Axis("b", 0, 1), (Curve(ONE, ONE),), to_scale=True)
     return Figure(
-        "Caption", "words", (Panel(ACROSS, UP, layers, bar=SCALE), Panel(ACROSS, right, ()), flat)
+        "Caption", "words", (Panel(ACROSS, UP, layers, bar=SCALE), Panel(ACROSS, other, ()), flat)
     )
 
 
@@ -91,11 +91,17 @@ def test_codes_hold_a_share_to_half_a_step(share: float, count: int):
 
 def test_text_cannot_end_the_data():
     nasty = "</script><b>\x1b"
-    one = Panel(Axis(nasty, 0, 1), UP, (Curve(ONE, ONE, label=nasty),), title=nasty, note=nasty)
+    one = Panel(Axis(nasty, 0, 1), UP, (Curve(ONE, ONE, label=nasty),))
     markup = str(browser.inline(Figure(nasty, nasty, (one,))))
     assert markup.count("</script>") == 1
     assert "\x1b" not in markup
-    assert described(markup)["panels"][0]["title"] == "</script><b>\\x1b"
+    assert described(markup)["panels"][0]["x"]["label"] == "</script><b>\\x1b"
+
+
+def test_an_axis_that_is_not_finite_is_no_json():
+    panel = Panel(Axis("x", 0.0, np.nan), UP, (Curve(ONE, ONE),))
+    with pytest.raises(ValueError, match="JSON"):
+        browser.inline(Figure("c", "w", (panel,)))
 
 
 def test_thumbnails_are_small_and_show_every_column():

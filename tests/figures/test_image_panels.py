@@ -1,7 +1,8 @@
-"""Images show block means, flags, gaps, clouds and the background."""
+"""Images show block means, flags, gaps and clouds."""
 
 from __future__ import annotations
 
+import io
 from datetime import timedelta
 
 import numpy as np
@@ -9,16 +10,17 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image as Pictures
 from support.products.drawn import decoded, figures, images, labelled, pixels
 from support.products.encoded_products import build_product
 from support.products.fabricated import START, signal, times
 from support.products.made_products import MAKERS, context
 
+from lidarops.figures import browser
+from lidarops.figures.image_panels import colour_limits
 from lidarops.figures.panels import BLANK, NEGATIVE, REJECTED
-from lidarops.figures.raster import COLUMNS, ROWS, colour_limits
+from lidarops.figures.raster import COLUMNS, ROWS
 from lidarops.figures.time_axis import days
-from lidarops.figures.wording import percent
-from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
 
@@ -31,7 +33,7 @@ def drawn(*products):
 def test_codes_are_the_signal_and_its_flags():
     product = signal(times(START, 48, 1800.0), bins=150)
     figure = drawn(product)
-    panel, below = figure.panels
+    (panel,) = figure.panels
     (image,) = images(panel)
     rows = image.codes.shape[1]
     flag = product["quality_flag"].values[:, :rows]
@@ -45,8 +47,6 @@ def test_codes_are_the_signal_and_its_flags():
     assert shown.mean() > 0.5
     np.testing.assert_allclose(decoded(image.codes, panel.bar)[shown], value[shown], rtol=0.02)
     assert panel.bar.label == "range-corrected signal (MHz m²)"
-    (line,) = (layer for layer in below.layers if hasattr(layer, "mark"))
-    np.testing.assert_allclose(line.y, product["background"].values, rtol=1e-6)
     assert "light grey" in figure.words
 
 
@@ -85,39 +85,42 @@ def test_large_products_are_reduced():
 
 
 @pytest.mark.parametrize("value", [-1.0, np.nan, 0.0])
-def test_an_empty_panel_has_a_note(value):
+def test_an_empty_panel_says_so(value):
     product = signal(times(START, 5, 60.0), bins=40)
     product["signal"][:] = value
-    panel = drawn(product).panels[0]
-    assert panel.note == "no usable value above zero"
-    assert panel.bar is None
-
-
-def test_range_stands_beside_altitude():
-    panel = drawn(signal(times(START, 5, 60.0), bins=40)).panels[0]
-    assert (panel.y.label, panel.right.label) == ("altitude (km)", "range (km)")
-    ends = np.array([panel.right.low, panel.right.high])
-    np.testing.assert_allclose([panel.y.low, panel.y.high], 0.12 + 0.94 * ends)
+    figure = drawn(product)
+    assert figure.words.startswith("No usable value above zero")
+    assert figure.panels[0].bar is None
 
 
 def test_a_beam_that_is_nearly_horizontal_is_drawn_against_range():
     product = signal(times(START, 5, 60.0), bins=40)
     product["altitude"] = ("range", 120.0 + 0.01 * product["range"].values)
     panel = drawn(product).panels[0]
-    assert (panel.y.label, panel.right) == ("range (km)", None)
+    assert panel.y.label == "range (km)"
+
+
+def test_altitude_rises_also_where_a_beam_looks_down():
+    """And in the thumbnail, too."""
+    product = signal(times(START, 40, 60.0), bins=40)
+    product["quality_flag"][:] = 0
+    product["signal_standard_error"][:] = 1.0
+    product["signal"][:] = 1e3 * np.where(np.arange(40) < 20, 10.0, 1.0)
+    product["altitude"] = ("range", 5000.0 - product["range"].values)
+    figure = drawn(product)
+    (panel,) = figure.panels
+    np.testing.assert_allclose([panel.y.low, panel.y.high], [4.4, 5.0])
+    with Pictures.open(io.BytesIO(browser.thumbnail(figure))) as picture:
+        shown = np.asarray(picture)
+    assert (shown[10] == shown.max()).all()
+    assert (shown[-10] < shown.max()).all()
+    assert (shown[-10] > BLANK).all()
 
 
 def test_a_quicklook_shows_the_lowest_15_km():
     product = signal(times(START, 5, 60.0), bins=4000, bin_width=15.0)
     product["signal_standard_error"].values[:] = 1e-3 * np.abs(product["signal"].values)
-    assert drawn(product).panels[0].right.high == pytest.approx(15.0, rel=0.02)
-
-
-def test_share_with_care_is_that_of_the_product():
-    product = signal(times(START, 60, 60.0), bins=4000, bin_width=15.0)
-    share = ((product["quality_flag"].values & int(Quality.PILE_UP)) != 0).mean()
-    assert share > 0.0015
-    assert f"; {percent(share)} of all bins: use with care (pile_up)" in drawn(product).words
+    assert drawn(product).panels[0].y.high == pytest.approx(0.12 + 0.94 * 15.0, rel=0.02)
 
 
 def test_far_noise_is_left_out_with_a_note():
@@ -132,7 +135,7 @@ def test_a_quantity_that_noise_hides_is_shown_as_far_as_it_is_usable():
     product["signal"].values[:] = 0.0
     product["quality_flag"].values[:] = 0
     product["quality_flag"].values[:, 400:] = flags_of("signal").rejecting
-    assert drawn(product).panels[0].right.high == pytest.approx(7.2, rel=0.02)
+    assert drawn(product).panels[0].y.high == pytest.approx(0.12 + 0.94 * 7.2, rel=0.02)
 
 
 def test_triangles_mark_the_lowest_cloud_bases():
@@ -174,14 +177,6 @@ def test_short_pauses_between_profiles_are_filled_and_said():
     assert "measured in 20.3 % of the time that is filled" in figure.words
     whole = drawn(measured(signal(times(START, 60, 60.0), bins=100), 60.0))
     assert "that is filled" not in whole.words
-
-
-def test_the_background_stands_at_the_time_of_its_profile():
-    product = measured(signal(times(START, 12, 600.0), bins=100), 60.0)
-    main, below = drawn(product).panels
-    (line,) = (layer for layer in below.layers if hasattr(layer, "mark"))
-    since = product["time"].values - product["time_bnds"].values[0, 0]
-    np.testing.assert_allclose(line.x - main.x.low, since / np.timedelta64(1, "D"), atol=1e-9)
 
 
 def test_means_at_or_below_zero_are_grey():

@@ -13,14 +13,13 @@ from support.products.fabricated import START, signal, times
 
 from lidarops.errors import ProductError
 from lidarops.figures import raster
-from lidarops.figures.raster import read_raster, share_with_care
+from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
-read = partial(read_raster, quantity="signal", kind="signal")
+read = partial(read_raster, quantity="signal")
 BITS = list(flags_of("signal"))
 BAD = flags_of("signal").rejecting
-CARE = [int(bit) for bit in BITS if not bit & BAD]
 
 
 def oracle(product, columns, rows):
@@ -52,7 +51,6 @@ def test_blocks_are_means_of_usable_bins(count, bins, profiles, seed):
     columns = [slice(i, min(i + profiles, count)) for i in range(0, count, profiles)]
     rows = [slice(j, j + 1) for j in range(bins)]
     np.testing.assert_allclose(image.mean, oracle(product, columns, rows), rtol=1e-5, atol=1e-3)
-    assert image.with_care == np.isin(flag, CARE).sum()
     visible = BAD & ~int(Quality.INPUT_MISSING)
     rejected = [(flag[c] & visible != 0).mean(axis=0) for c in columns]
     np.testing.assert_array_equal(image.flagged, np.array(rejected) >= 0.5)
@@ -67,8 +65,8 @@ def test_rows_merge_without_loss(bins, share):
     assert cut.edges.size - 1 <= raster.ROWS
     assert cut.edges[-1] >= share * bins * 5.0 - 1e-6 or cut.edges[-1] == image.edges[-1]
     rows = int(np.searchsorted(image.edges, cut.edges[-1]))
-    np.testing.assert_allclose(cut.total.sum(), image.total[:, :rows].sum(), rtol=1e-4)
-    assert cut.used.sum() == image.used[:, :rows].sum()
+    np.testing.assert_allclose(cut.sums[0].sum(), image.sums[0, :, :rows].sum(), rtol=1e-4)
+    assert cut.sums[2].sum() == image.sums[2, :, :rows].sum()
     assert cut.bins.sum() == image.bins[:rows].sum()
 
 
@@ -78,8 +76,7 @@ def test_many_bins_are_read_in_blocks(monkeypatch):
     assert whole.mean.shape == (8, 3000)
     monkeypatch.setattr(raster, "_READ_BYTES", 1)
     in_blocks = read(product, profiles=4)
-    np.testing.assert_array_equal(whole.total, in_blocks.total)
-    np.testing.assert_array_equal(whole.rejected, in_blocks.rejected)
+    np.testing.assert_array_equal(whole.sums, in_blocks.sums)
     rows = [slice(j, j + 3) for j in range(0, 9000, 3)]
     columns = [slice(i, min(i + 4, 30)) for i in range(0, 30, 4)]
     np.testing.assert_allclose(whole.mean, oracle(product, columns, rows), rtol=1e-4, atol=0.1)
@@ -118,16 +115,6 @@ def test_columns_touch_where_one_minute_in_ten_is_measured():
     np.testing.assert_array_equal(image.start[1:], image.stop[:-1])
 
 
-def test_background_is_the_mean_with_its_error():
-    product = signal(times(START, 6, 60.0))
-    product["background"].values[4:] = np.nan
-    image = read(product, profiles=2)
-    expected = product["background"].values[:4].reshape(2, 2).mean(axis=1)
-    np.testing.assert_allclose(image.background[:2], expected, rtol=1e-6)
-    np.testing.assert_allclose(image.background_error[:2], 4e-3 / np.sqrt(2), rtol=1e-6)
-    assert np.isnan(image.background[2])
-
-
 def test_reach_ends_where_noise_dominates():
     product = signal(times(START, 60, 60.0), bins=2000, bin_width=15.0)
     product["signal"].values[:, 400:] = (
@@ -157,24 +144,25 @@ def test_altitude_is_a_line_in_range():
 def test_unsorted_times_are_sorted():
     product = signal(times(START, 12, 60.0))
     backwards = product.isel(time=slice(None, None, -1))
-    np.testing.assert_array_equal(read(product).total, read(backwards).total)
-
-
-def test_share_with_care_is_over_all_bins():
-    product = signal(times(START, 5, 60.0), bins=100)
-    product["quality_flag"].values[:] = 0
-    product["quality_flag"].values[:, :25] = int(Quality.PILE_UP)
-    assert share_with_care([read(product)]) == 0.25
-    # A rejected value is not one to use with care, as on all other pages.
-    product["quality_flag"].values[:, :10] |= int(Quality.SATURATED)
-    assert share_with_care([read(product)]) == pytest.approx(0.15)
-    assert share_with_care([]) == 0.0
+    np.testing.assert_array_equal(read(product).sums, read(backwards).sums)
 
 
 @pytest.mark.parametrize("name", ["signal", "quality_flag", "range"])
 def test_missing_variable_is_named(name):
     with pytest.raises(ProductError, match=f"{name}: is missing"):
         read(signal(times(START, 3, 60.0)).drop_vars(name))
+
+
+def test_of_an_unknown_kind_usable_tells_what_bits_mean():
+    product = signal(times(START, 4, 60.0), bins=10).assign_attrs(lidarops_kind="wind")
+    product["quality_flag"].values[:] = 0
+    product["quality_flag"].attrs |= {"flag_masks": [1, 2], "flag_meanings": "calm stormy"}
+    product["quality_flag"].values[0], product["quality_flag"].values[1] = 1, 3
+    assert read(product).flagged.any(axis=1).tolist() == [True, True, False, False]
+    verdict = np.zeros((4, 10), np.int8)
+    verdict[0], verdict[1] = 1, 2
+    product["usable"] = ("time", "range"), verdict
+    assert read(product).flagged.any(axis=1).tolist() == [False, True, False, False]
 
 
 def test_empty_product_is_refused():

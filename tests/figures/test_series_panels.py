@@ -141,38 +141,3 @@ def test_one_profile_and_all_flagged_and_all_missing():
 def test_a_foreign_product_is_refused():
     with pytest.raises(ProductError, match="total_extinction"):
         drawn(signal(times(START, 3, 60.0)))
-
-
-def test_scores_are_normalised_errors_of_unflagged_values():
-    time = times(START, 300, 60.0)
-    product = homogeneous(time, flagged=0.2)
-    figure = drawn(product, truth=truth_of(time), **INSTRUMENT)[1]
-    assert len(figure.panels) == 3
-    marks = [layer for layer in figure.panels[0].layers if getattr(layer, "mark", None)]
-    for k, curve in enumerate(marks):
-        good = product["quality_flag"].values[:, k] == 0
-        score = (product["total_extinction"].values[:, k] - fab.true_extinction(time)) / product[
-            "total_extinction_standard_error"
-        ].values[:, k]
-        np.testing.assert_allclose(curve.y, score[good], rtol=1e-4, atol=1e-4)
-        assert f"of {good.sum()} within 3" in curve.label
-        assert curve.label in figure.words
-    curves = [layer for layer in figure.panels[0].layers if isinstance(layer, Curve)]
-    lines = {float(curve.y[0]) for curve in curves if curve.joined}
-    assert lines == {-3.0, 0.0, 3.0}
-
-
-def test_far_off_scores_are_drawn_at_the_edge_and_counted():
-    time = times(START, 20_000, 4.0)
-    product = homogeneous(time, flagged=0.0, sections=SECTIONS[:1])
-    product["total_extinction"].values[777, 0] += 1.0
-    figure = drawn(product, truth=truth_of(time), **INSTRUMENT)[1]
-    (curve,) = (layer for layer in figure.panels[0].layers if getattr(layer, "mark", None))
-    assert curve.y.max() == 10.0
-    assert curve.y.size < 2000
-    assert "1 beyond 10 drawn there" in curve.label
-
-
-def test_without_a_truth_of_the_instrument_there_is_no_comparison():
-    time = times(START, 5, 60.0)
-    assert len(drawn(homogeneous(time), truth=truth_of(time), instrument="none")) == 1

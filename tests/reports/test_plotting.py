@@ -15,7 +15,7 @@ from support.products.made_products import MAKERS, context
 from typer.testing import CliRunner
 
 from lidarops.cli import app
-from lidarops.figures.panels import Curve, Image
+from lidarops.figures.panels import Band, Curve, Image
 from lidarops.netcdf.write import write_product
 from lidarops.reports.plotting import Selection, draw_file
 
@@ -58,6 +58,15 @@ def test_a_variable_is_drawn_as_an_image_or_against_time(elastic: Path):
             main = figure.panels[0].layers
             assert isinstance(main[0], Image) is (dims == 2)
             assert ET.parse(plotted(elastic, "--variable", name)).getroot().tag.endswith("svg")
+
+
+def test_a_variable_of_an_unknown_kind_is_drawn_too(elastic: Path):
+    with xr.open_dataset(elastic, decode_timedelta=False) as opened:
+        product = opened.load().assign_attrs(lidarops_kind="wind")
+    product.to_netcdf(elastic.with_name("wind.nc"))
+    for name, layer in (("aerosol_backscatter", Image), ("reference_top", Band)):
+        (figure,) = draw_file(elastic.with_name("wind.nc"), Selection(name))
+        assert isinstance(figure.panels[0].layers[0], layer)
 
 
 def test_times_ranges_and_altitudes_are_chosen(elastic: Path):

@@ -141,8 +141,8 @@ class TestSimulatedRun:
             simulated.scenes[0].plan.hash, "a" * 64, "retrieve",
         ):  # fmt: skip
             assert words in page.text
-        # Retrieval, truth, quicklook.
-        assert page.figures == 3
+        # Retrieval, quicklook.
+        assert page.figures == 2
         products = [link for link in page.links if link.endswith(".nc")]
         assert [page.target(link).resolve().name for link in products] == [
             "extinction.nc", "signal.nc",
@@ -255,7 +255,7 @@ class TestUnusableFiles:
         assert "foreign.nc background: is missing from the product" in listed
         assert str(archive.root) not in listed
         assert "(file missing)" in page.text
-        assert page.figures == 3
+        assert page.figures == 2
 
     @pytest.mark.parametrize("content_", [None, b"", b"nonsense"])
     def test_an_unusable_truth_is_listed_too(self, simulated, tmp_path, content_):

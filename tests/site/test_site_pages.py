@@ -21,7 +21,8 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CatalogError
-from lidarops.figures.panels import number
+from lidarops.figures import image_panels
+from lidarops.figures.panels import Axis, number
 from lidarops.figures.wording import percent
 from lidarops.flags import Quality
 from lidarops.site import build, values
@@ -125,6 +126,18 @@ def test_what_cannot_be_shown_does_not_cost_the_page(
     assert made.products == 1
     assert made.problems[0].reason.endswith(": no memory")
     assert "no memory" in page_of(output, "signal").read_text("utf-8")
+
+
+def test_an_axis_that_is_not_finite_is_a_problem_of_the_product(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "out"
+    add(output, "signal")
+    monkeypatch.setattr(image_panels, "time_axis", lambda *_: Axis("time", 0.0, np.nan))
+    made = build_site(output)
+    assert made.products == 1
+    assert "it cannot be drawn as signal" in made.problems[0].reason
+    assert "NaN" not in page_of(output, "signal").read_text("utf-8")
 
 
 def fields(profiles: int, bins: int) -> xr.Dataset:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -17,17 +18,16 @@ from lidarops.figures.kind_figures import KindFigures, ProductSource, View
 from lidarops.figures.panels import Figure, units
 from lidarops.figures.series_data import (
     Comparison,
-    Section,
     SeriesEstimate,
+    TimeSeries,
     compare,
     float_values,
     join,
-    quality_bits,
     require,
 )
-from lidarops.figures.series_panels import Quantity, score_figures, series_figures
-from lidarops.figures.time_axis import Times
-from lidarops.products.homogeneous.variables import FLAGS
+from lidarops.figures.series_panels import Quantity, series_figures
+from lidarops.figures.time_axis import Times, usual_step
+from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
 from lidarops.records import Role
 
 Floats = NDArray[np.float64]
@@ -51,7 +51,7 @@ def read_sections(
     channel: str = "",
     paths: Sequence[str] = (),
     dark_subtracted: bool = True,
-) -> list[Section]:
+) -> list[TimeSeries]:
     """Return the sections of a homogeneous product.
 
     Parameters
@@ -71,7 +71,7 @@ def read_sections(
 
     Returns
     -------
-    list of Section
+    list of TimeSeries
         Sorted by near end; truth is NaN where unknown.
 
     Raises
@@ -88,6 +88,7 @@ def read_sections(
         for name, variables in _true_variables(channel, dark_subtracted=dark_subtracted).items()
     }
     flags = quality_bits(product["quality_flag"])[order]
+    rejecting = rejecting_mask(bits_of(product))
     bounds = product["section_bounds"].values.astype(np.float64)
     sections = []
     for k in np.argsort(bounds[:, 0], kind="stable"):
@@ -100,8 +101,10 @@ def read_sections(
             )
             for name in QUANTITIES
         }
-        near, far = float(bounds[k, 0]), float(bounds[k, 1])
-        sections.append(Section(time, flags[:, k], FLAGS.rejecting, estimates, near, far))
+        near, far = bounds[k].tolist()
+        label = f"{near / 1e3:g}\N{EN DASH}{far / 1e3:g} km"
+        section = TimeSeries(time, flags[:, k], rejecting, estimates, label, (near, far))
+        sections.append(section)
     return sections
 
 
@@ -131,57 +134,30 @@ def _truth(
     paths: Sequence[str],
     variables: Sequence[str],
 ) -> Floats:
+    """Return a true value of every profile: of its raw file, else of the nearest in time."""
     if truth is None or variables[0] not in truth.variables or truth.sizes["granule"] == 0:
         return np.full(time.size, np.nan)
     # Photon counting has no dark offset.
     terms = [float_values(truth, name) for name in variables if name in truth.variables]
-    index = _match(time, truth, instrument, paths)
-    return np.where(index >= 0, np.sum(terms, axis=0)[index], np.nan)
+    table = pd.DataFrame(
+        {
+            "path": truth["path"].values.astype(np.str_),
+            "instrument": truth["instrument"].values.astype(np.str_),
+            "value": np.sum(terms, axis=0),
+        },
+        index=truth["time"].values.astype("datetime64[ns]"),
+    )
+    table = table[table["instrument"] == instrument] if instrument else table
+    by_path = table.set_index("path")["value"]
+    if len(paths) and by_path.index.is_unique and by_path.index.isin(paths).sum() == len(paths):
+        return np.asarray(by_path.loc[list(paths)])
+    by_time = table["value"].sort_index()
+    by_time = by_time[~by_time.index.duplicated()]
+    step = usual_step(by_time.index.to_numpy())
+    return np.asarray(by_time.reindex(time, method="nearest", tolerance=0.6 * step))
 
 
-def _match(
-    time: Times, truth: xr.Dataset, instrument: str, paths: Sequence[str]
-) -> NDArray[np.intp]:
-    """Return the index of the truth of every profile, -1 without one."""
-    granules = np.arange(truth.sizes["granule"])
-    if instrument:
-        granules = granules[_texts(truth["instrument"]) == instrument]
-    if paths:
-        index = {
-            path: int(i) for i, path in zip(granules, _texts(truth["path"])[granules], strict=True)
-        }
-        matched = np.array([index.get(path, -1) for path in paths], dtype=np.intp)
-        if (matched >= 0).all():
-            return matched
-    return _nearest(time, truth["time"].values.astype("datetime64[ns]")[granules], granules)
-
-
-def _nearest(time: Times, known: Times, granules: NDArray[np.intp]) -> NDArray[np.intp]:
-    if known.size == 0:
-        return np.full(time.size, -1, dtype=np.intp)
-    order = np.argsort(known, kind="stable")
-    known, granules = known[order], granules[order]
-    after = np.clip(np.searchsorted(known, time), 1, max(known.size - 1, 1))
-    after = np.minimum(after, known.size - 1)
-    before = np.maximum(after - 1, 0)
-    to_before, to_after = np.abs(time - known[before]), np.abs(time - known[after])
-    # The truth may state starts of granules, but profiles have middles: of two about equally
-    # near neighbours, the earlier one is taken.
-    step = np.median(np.diff(known)) if known.size > 1 else np.timedelta64(120, "s")
-    earlier = to_before <= to_after + step * 0.1
-    best = np.where(earlier, before, after)
-    near = np.where(earlier, to_before, to_after) <= step * 0.6
-    return np.where(near, granules[best], -1)
-
-
-def _texts(strings: xr.DataArray) -> NDArray[np.str_]:
-    values = strings.values
-    if values.dtype.kind == "S":
-        return np.char.decode(values, "utf-8")
-    return np.asarray(values, dtype=np.str_)
-
-
-def _read(product: xr.Dataset, source: ProductSource) -> list[Section] | None:
+def _read(product: xr.Dataset, source: ProductSource) -> list[TimeSeries] | None:
     scene = source.scene
     steps = scene.plan.steps if scene and scene.plan else ()
     sections = read_sections(
@@ -197,22 +173,21 @@ def _read(product: xr.Dataset, source: ProductSource) -> list[Section] | None:
     return [section for section in sections if section.time.size] or None
 
 
-def _sections(contents: Sequence[list[Section]]) -> list[Section]:
+def _sections(contents: Sequence[list[TimeSeries]]) -> list[TimeSeries]:
     return join(section for sections in contents for section in sections)
 
 
-def _draw(contents: Sequence[list[Section]]) -> Iterator[Figure]:
+def _draw(contents: Sequence[list[TimeSeries]]) -> Iterator[Figure]:
     sections = _sections(contents)
     background = units(sections[0].estimates["background"].units)
     quantities = (
         Quantity("total_extinction", 1e3, "km⁻¹"),
         Quantity("background", 1.0, background),
     )
-    yield from series_figures(sections, quantities, "Extinction and background of range sections")
-    yield from score_figures(sections, QUANTITIES)
+    return series_figures(sections, quantities, "Extinction and background of range sections")
 
 
-def _compare(contents: Sequence[list[Section]]) -> Iterator[Comparison | None]:
+def _compare(contents: Sequence[list[TimeSeries]]) -> Iterator[Comparison | None]:
     for section in _sections(contents):
         yield from (compare(section, quantity) for quantity in QUANTITIES)
 

@@ -24,8 +24,8 @@ from lidarops.figures.panels import (
 )
 from lidarops.figures.series_data import (
     Comparison,
-    NumberedSeries,
     SeriesEstimate,
+    TimeSeries,
     compare,
     float_values,
     join,
@@ -63,13 +63,11 @@ _SAME_BEAM: Final = 0.2
 """degree; files of the truth within this zenith angle of a beam belong to it."""
 _FLAT: Final = 0.2
 """Smallest horizontal extent of a map that shows the ground, relative to the larger extent."""
-_ACROSS: Final = 868.0
-"""Width of a panel without a colour bar, in units of the figure."""
 _HEIGHT: Final = 464.0
 _ROOM: Final = 0.08
 """Margin on each side, relative to the extent."""
-_LEAST: Final = 0.05
-"""km, smallest span of an axis."""
+_NARROW: Final = 0.3
+"""Smallest extent of an axis of a map, relative to the other one."""
 _QUANTITIES: Final = (Quantity("visibility", 1.0, "km"), Quantity("total_extinction", 1e3, "km⁻¹"))
 
 
@@ -86,10 +84,6 @@ class NetworkMap:
     numbers: tuple[int, ...]
     visibility: Floats
     """(crossing,) km, median over time of usable values; NaN without any."""
-    used: NDArray[np.intp]
-    """(crossing,) Number of usable values."""
-    values: int
-    """Number of values of a crossing."""
     axes: tuple[str, str]
     """Labels of the two axes."""
     instruments: tuple[str, ...]
@@ -107,7 +101,7 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
 
 def read_crossings(
     product: xr.Dataset, truth: xr.Dataset | None = None, *, instruments: Sequence[str] = ()
-) -> list[NumberedSeries]:
+) -> list[TimeSeries]:
     """Return the series at each crossing of a product.
 
     Parameters
@@ -121,7 +115,7 @@ def read_crossings(
 
     Returns
     -------
-    list of NumberedSeries
+    list of TimeSeries
         Standard errors include the systematic error. The truth is the mean over the beams at the
         crossing.
 
@@ -145,7 +139,7 @@ def read_crossings(
             true_extinction > 0, _contrast_constant(value, visibility) / true_extinction, np.nan
         )
     return [
-        NumberedSeries(
+        TimeSeries(
             time=time,
             flag=flags[:, v],
             rejecting=flags_of("visibility").rejecting,
@@ -160,10 +154,10 @@ def read_crossings(
                     "km",
                 ),
             },
-            noun="crossing",
-            number=int(product["crossing_id"].values[v]),
+            label=f"crossing {number}",
+            key=(number,),
         )
-        for v in range(product.sizes["crossing"])
+        for v, number in enumerate(product["crossing_id"].values.tolist())
     ]
 
 
@@ -205,20 +199,13 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
         product["quality_flag"].values.astype(np.int64) & flags_of("visibility").rejecting
     ) != 0
     visibility = np.where(rejected, np.nan, float_values(product, "visibility_in_air")) / 1e3
-    used = np.isfinite(visibility).sum(axis=0)
+    medians = [np.nanmedian(own) if np.isfinite(own).any() else np.nan for own in visibility.T]
     return NetworkMap(
         stations=origin[:, pair] / 1e3,
         ends=ends[:, pair] / 1e3,
         crossings=crossings[:, pair] / 1e3,
         numbers=tuple(int(number) for number in product["crossing_id"].values),
-        visibility=np.array(
-            [
-                np.nanmedian(column) if count else np.nan
-                for column, count in zip(visibility.T, used, strict=True)
-            ]
-        ),
-        used=used,
-        values=product.sizes["time"],
+        visibility=np.array(medians),
         axes=names,
         instruments=tuple(instruments) or tuple(f"beam {beam}" for beam in range(len(beams))),
     )
@@ -290,7 +277,7 @@ def _along(
 # Figures -----------------------------------------------------------------------------------------
 
 
-def _read_crossings(product: xr.Dataset, source: ProductSource) -> list[NumberedSeries] | None:
+def _read_crossings(product: xr.Dataset, source: ProductSource) -> list[TimeSeries] | None:
     instruments = instruments_of(source.scene) if source.scene else ()
     return read_crossings(product, source.truth, instruments=instruments) or None
 
@@ -299,94 +286,64 @@ def _read_map(product: xr.Dataset, source: ProductSource) -> NetworkMap:
     return read_map(product, instruments_of(source.scene) if source.scene else ())
 
 
-def _crossings(contents: Sequence[list[NumberedSeries]]) -> list[NumberedSeries]:
+def _crossings(contents: Sequence[list[TimeSeries]]) -> list[TimeSeries]:
     return join(crossing for crossings in contents for crossing in crossings)
 
 
-def _draw_crossings(contents: Sequence[list[NumberedSeries]]) -> Iterator[Figure]:
+def _draw_crossings(contents: Sequence[list[TimeSeries]]) -> Iterator[Figure]:
     title = "Visibility and extinction at the crossings"
     return series_figures(_crossings(contents), _QUANTITIES, title)
 
 
-def _compare(contents: Sequence[list[NumberedSeries]]) -> Iterator[Comparison | None]:
+def _compare(contents: Sequence[list[TimeSeries]]) -> Iterator[Comparison | None]:
     return (compare(crossing, "total_extinction") for crossing in _crossings(contents))
 
 
 def _draw_map(contents: Sequence[NetworkMap]) -> list[Figure]:
     """Return beams and crossings to scale, with the median visibility at each crossing."""
     network = contents[0]
-    x, y = _axes(network)
     known = np.isfinite(network.visibility)
     texts = tuple(
-        f"{crossing}: {_km(value)}" if has else f"{crossing}: no value"
+        f"{crossing}: {number(float(f'{value:.3g}'))} km" if has else f"{crossing}: no value"
         for crossing, value, has in zip(network.numbers, network.visibility, known, strict=True)
     )
-    crossings: list[Layer] = [
-        _points(network.crossings[where], style, Mark.DISC, label)
-        for where, style, label in (
-            (known, "c0", "crossing, with median visibility"),
-            (~known, "soft hollow", "crossing without a usable value"),
-        )
-        if where.any()
-    ]
-    layers = (
-        *_beams(network),
-        *crossings,
-        Words(network.crossings[:, 0], network.crossings[:, 1], texts),
-    )
-    panel = Panel(x, y, layers, _HEIGHT, to_scale=True)
-    return [Figure("Map of beams and crossings", _in_words(network), (panel,))]
-
-
-def _axes(network: NetworkMap) -> tuple[Axis, Axis]:
-    """Return axes of equal scale that contain all points."""
-    points = np.concatenate([network.stations, network.ends, network.crossings])
-    low, high = points.min(axis=0), points.max(axis=0)
-    span = np.maximum(high - low, _LEAST) * (1.0 + 2.0 * _ROOM)
-    length = max(span[0] / _ACROSS, span[1] / _HEIGHT)
-    half = 0.5 * length * np.array([_ACROSS, _HEIGHT])
-    middle = (low + high) / 2.0
-    ends = zip(network.axes, middle - half, middle + half, strict=True)
-    x, y = (Axis(label, float(start), float(stop)) for label, start, stop in ends)
-    return x, y
-
-
-def _beams(network: NetworkMap) -> list[Layer]:
-    """Return the beams of each instrument, with a mark at their station."""
     layers: list[Layer] = []
     gap = np.full(2, np.nan)
     for index, name in enumerate(dict.fromkeys(network.instruments)):
-        of = [number_ for number_, other in enumerate(network.instruments) if other == name]
-        ends = [point for beam in of for point in (network.stations[beam], network.ends[beam], gap)]
+        beams = [beam for beam, other in enumerate(network.instruments) if other == name]
+        ends = [
+            part for beam in beams for part in (network.stations[beam], network.ends[beam], gap)
+        ]
         layers.append(_points(np.array(ends), f"c1 d{index % 5}"))
-        stations = network.stations[of]
         mark = SERIES_MARKS[-1 - index % len(SERIES_MARKS)]
-        layers.append(_points(stations, "c1", mark, name))
-    return layers
+        layers.append(_points(network.stations[beams], "c1", mark, name))
+    for where, style, label in (
+        (known, "c0", "crossing, with median visibility"),
+        (~known, "soft hollow", "crossing without a usable value"),
+    ):
+        if where.any():
+            layers.append(_points(network.crossings[where], style, Mark.DISC, label))
+    layers.append(Words(network.crossings[:, 0], network.crossings[:, 1], texts))
+    points = np.concatenate([network.stations, network.ends, network.crossings])
+    span = np.ptp(points, axis=0)
+    half = (0.5 + _ROOM) * np.maximum(span, _NARROW * span.max())
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    x, y = (
+        Axis(label, float(start), float(stop))
+        for label, start, stop in zip(network.axes, middle - half, middle + half, strict=True)
+    )
+    words = (
+        f"{counted(len(network.stations), 'beam')} of"
+        f" {counted(len(set(network.instruments)), 'instrument')}; median visibility at each"
+        f" crossing: {', '.join(texts)}"
+    )
+    panel = Panel(x, y, tuple(layers), _HEIGHT, to_scale=True)
+    return [Figure("Map of beams and crossings", words, (panel,))]
 
 
-def _points(
-    points: NDArray[np.float64], style: str, mark: Mark | None = None, label: str = ""
-) -> Curve:
+def _points(points: Floats, style: str, mark: Mark | None = None, label: str = "") -> Curve:
     """Return points of a map, shape (point, 2), as a line or marked."""
     return Curve(points[:, 0], points[:, 1], style, mark, joined=mark is None, label=label)
-
-
-def _km(visibility: float) -> str:
-    return f"{number(float(f'{visibility:.3g}'))} km"
-
-
-def _in_words(network: NetworkMap) -> str:
-    medians = zip(network.numbers, network.visibility, network.used, strict=True)
-    known = [
-        f"{_km(visibility)} at crossing {crossing} ({used} of {counted(network.values, 'value')})"
-        for crossing, visibility, used in medians
-        if np.isfinite(visibility)
-    ]
-    beams = counted(len(network.stations), "beam")
-    instruments = counted(len(set(network.instruments)), "instrument")
-    medians_ = ", ".join(known) or "no usable value"
-    return f"{beams} of {instruments}; median visibility: {medians_}"
 
 
 FIGURES: Final = KindFigures(

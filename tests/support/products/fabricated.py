@@ -93,6 +93,7 @@ def homogeneous(
             "section_range": ("section", bounds.mean(axis=1), {"units": "m"}),
             "wavelength": ((), 532.0, {"units": "nm"}),
         },
+        attrs={"lidarops_kind": "homogeneous"},
     )
 
 
@@ -150,6 +151,7 @@ def signal(
             "altitude": ("range", 120.0 + 0.94 * span, {"units": "m"}),
             "wavelength": ((), 532.0, {"units": "nm"}),
         },
+        attrs={"lidarops_kind": "signal"},
     )
 
 

@@ -1,0 +1,219 @@
+"""One profile of a product against range or altitude: values with errors, flags, error budget."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from lidarops.figures.kind_figures import ProductSource, View
+from lidarops.figures.panels import (
+    Axis,
+    Band,
+    Curve,
+    Figure,
+    Layer,
+    Mark,
+    Panel,
+    decade_axis,
+    percentile_axis,
+    span_in_words,
+)
+from lidarops.figures.series_data import require
+from lidarops.figures.wording import counted, utc
+from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_HEIGHT: Final = 366
+_MARKS: Final = 30
+"""About the largest number of marks of one kind in a panel."""
+_UNCLEAR: Final = 10.0
+"""Lower quartiles of the errors beyond which an error does not set the axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileQuantity:
+    """A quantity as a panel of a profile shows it."""
+
+    name: str
+    """Name of its variable, beside which there is a standard error."""
+    label: str
+    """Name with the displayed unit."""
+    factor: float = 1.0
+    """From the unit of the product to the displayed unit."""
+    more_errors: tuple[str, ...] = ()
+    """Ends of the names of independent errors that products of some channels have beside it."""
+    bound: str = ""
+    """End of the name of a bound of systematic errors, drawn around the band of errors."""
+    reference: str = ""
+    """Another variable along the profile to compare with, such as that of molecules."""
+    window: tuple[str, ...] = ()
+    """Names of the two ends of a window along the profile that the values depend on."""
+    budget: tuple[str, ...] = ()
+    """Causes of errors, of which a further panel shows each and their total."""
+
+    @property
+    def errors(self) -> tuple[str, ...]:
+        """Names of the variables of errors that all products have."""
+        bound = (f"{self.name}_{self.bound}",) if self.bound else ()
+        causes = (f"{self.name}_error_{cause}" for cause in self.budget)
+        return f"{self.name}_standard_error", *bound, *causes
+
+
+def profile_view(name: str, quantities: Sequence[ProfileQuantity], along: str) -> View[xr.Dataset]:
+    """Return the view of the clearest profile of a product; the first quantity is the main one."""
+    dims = _dims(quantities, along)
+    more = tuple(f"{one.name}_{part}" for one in quantities for part in one.more_errors)
+    read = partial(_read, quantities[0].name, along, dims, more)
+    return View(name, (*dims, *more), read, partial(_draw, quantities, along), first=True)
+
+
+def _dims(quantities: Sequence[ProfileQuantity], along: str) -> dict[str, tuple[str, ...]]:
+    """Return the variables that all products have, with their dimensions."""
+    both = [name for quantity in quantities for name in (quantity.name, *quantity.errors)]
+    beside = [one.reference for one in quantities if one.reference]
+    dims: dict[str, tuple[str, ...]] = {"time": ("time",), along: (along,)}
+    dims |= dict.fromkeys(beside, (along,))
+    dims |= dict.fromkeys((end for one in quantities for end in one.window), ("time",))
+    return dims | dict.fromkeys([*both, "quality_flag"], ("time", along))
+
+
+def _read(
+    main: str,
+    along: str,
+    dims: dict[str, tuple[str, ...]],
+    more: tuple[str, ...],
+    product: xr.Dataset,
+    _: ProductSource,
+) -> xr.Dataset | None:
+    """Return the profile with the most unflagged values, up to the last usable one.
+
+    Among equals, that with the most usable values, then the first; None without any usable value.
+    `rejected` and `with_care` of it are the verdicts of its values.
+    """
+    require(product, dims)
+    flag = quality_bits(product["quality_flag"])
+    rejected = (flag & rejecting_mask(bits_of(product))) != 0
+    usable = np.isfinite(product[main].values) & ~rejected
+    if not usable.any():
+        return None
+    earlier = -np.arange(len(usable))
+    clear = (usable & (flag == 0)).sum(axis=1)
+    index = int(np.lexsort((earlier, usable.sum(axis=1), clear))[-1])
+    shown = slice(0, int(np.flatnonzero(usable[index])[-1]) + 1)
+    profile = product[[name for name in (*dims, *more) if name in product.variables]]
+    return (
+        profile.isel({"time": index, along: shown})
+        .load()
+        .assign(
+            rejected=(along, rejected[index, shown]),
+            with_care=(along, (flag[index, shown] != 0) & ~rejected[index, shown]),
+        )
+    )
+
+
+def _draw(
+    quantities: Sequence[ProfileQuantity], along: str, profiles: Sequence[xr.Dataset]
+) -> list[Figure]:
+    profile = profiles[0]
+    place = profile[along].values.astype(np.float64) / 1e3
+    y = Axis(f"{along} (km)", float(place[0]), float(place[-1]) + 0.02)
+    panels: list[Panel] = []
+    for quantity in quantities:
+        if np.isfinite(profile[quantity.name].values).any():
+            panels.append(_panel(profile, quantity, place, y))
+            if quantity.budget:
+                panels.append(_budget(profile, quantity, place, y))
+    main = quantities[0]
+    usable = main.factor * profile[main.name].where(~profile["rejected"]).values
+    flagged = int((profile["rejected"] | profile["with_care"]).sum())
+    words = (
+        f"{main.label}: {span_in_words(usable, '')}; {flagged} of {place.size} values flagged;"
+        " bands are standard errors"
+    )
+    time = utc(np.datetime64(profile["time"].item(), "ns"))
+    caption = f"Profile at {time} (most unflagged values)"
+    return [Figure(caption, words, tuple(panels), beside=True)]
+
+
+def _panel(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axis) -> Panel:
+    def values(name: str) -> Floats:
+        return quantity.factor * np.asarray(profile[name].values, dtype=np.float64)
+
+    name = quantity.name
+    rejected, care = profile["rejected"].values, profile["with_care"].values
+    whole = values(name)
+    value = np.where(rejected, np.nan, whole)
+    more = [part for part in quantity.more_errors if f"{name}_{part}" in profile]
+    parts = [
+        values(f"{name}_standard_error"),
+        *(np.nan_to_num(values(f"{name}_{p}")) for p in more),
+    ]
+    error = np.sqrt(np.sum(np.square(parts), axis=0))
+    label = ", with the ".join(["standard error", *(part.replace("_", " ") for part in more)])
+    layers: list[Layer] = []
+    if quantity.window:
+        ends = np.array([profile[end].item() / 1e3 for end in quantity.window])
+        far = 2.0 * np.nanmax(np.abs(value) + error) * np.ones(2)
+        words = quantity.window[0].rpartition("_")[0]
+        layers.append(Band(ends, -far, far, "soft wide", upright=True, label=f"{words} window"))
+    if quantity.bound:
+        wide = error + np.nan_to_num(values(f"{name}_{quantity.bound}"))
+        words = f"largest {quantity.bound.replace('_', ' ')}"
+        layers.append(Band(place, value - wide, value + wide, "c0 wide", upright=True, label=words))
+    layers.append(Band(place, value - error, value + error, upright=True, label=label))
+    layers.append(Curve(value, place, label="retrieved"))
+    clear = _clear(value, error)
+    spans = [(value - error)[clear], (value + error)[clear]]
+    if quantity.reference:
+        beside = values(quantity.reference)
+        layers.append(Curve(beside, place, "c1 d2", label=quantity.reference.replace("_", " ")))
+        spans.append(beside)
+    marked = np.isfinite(whole)
+    for where, style, mark, words in (
+        (marked & care, "ink hollow", Mark.DISC, "use with care"),
+        (marked & rejected, "soft hollow", Mark.CROSS, "do not use"),
+    ):
+        index = np.flatnonzero(where)
+        if index.size:
+            some = index[:: -(-index.size // _MARKS)]
+            label = f"{words}: {counted(index.size, 'value')}"
+            layers.append(Curve(whole[some], place[some], style, mark, joined=False, label=label))
+    return Panel(percentile_axis(quantity.label, spans, 0.5, 0.08), y, tuple(layers), _HEIGHT)
+
+
+def _clear(value: Floats, error: Floats) -> Mask:
+    """Return which values set the axis: not those whose errors would hide all others."""
+    known = np.isfinite(value) & np.isfinite(error)
+    if not known.any():
+        return known
+    low, middle = np.percentile(error[known], [25.0, 50.0])
+    usual = np.abs(value[known & (error <= middle)]).max()
+    return np.asarray(known & (error <= max(_UNCLEAR * low, usual)))
+
+
+def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axis) -> Panel:
+    """Return the absolute errors of a quantity by cause."""
+    good = ~profile["rejected"].values
+
+    def errors(name: str) -> Floats:
+        return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)
+
+    causes = {
+        cause.replace("_", " "): errors(f"{quantity.name}_error_{cause}")
+        for cause in quantity.budget
+    }
+    total = errors(f"{quantity.name}_standard_error")
+    lines = [
+        Curve(values, place, f"c{number} d{number}", label=cause)
+        for number, (cause, values) in enumerate(causes.items())
+    ]
+    x = decade_axis(f"error of {quantity.label}", [*causes.values(), total])
+    return Panel(x, y, (*lines, Curve(total, place, "ink thick", label="total")), _HEIGHT)
