@@ -1,7 +1,8 @@
-"""Compiled weighted least squares of a constant and a known shape, one profile at a time.
+"""Compiled least squares of a constant and a known shape, from sums over blocks of bins.
 
-Sums are centred on weighted means, so that a background 1e8 times the signal costs no digits
-of the signal. All sums of a profile run over its bins from near to far.
+One pass over the bins of a profile sums them in `BLOCKS` equal blocks. Nested windows that begin at
+the edges of blocks are then fitted, weighted and tested by these sums alone. Powers are summed less
+that of the last bin, so that a background 1e8 times the signal costs no digits of the signal.
 """
 
 from __future__ import annotations
@@ -11,403 +12,305 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import HUGE, Array, Indices
+from lidarops.retrieve.common.arrays import HUGE, Array
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 
-GROUPS: Final = 16
-"""Groups of neighbouring bins whose mean residuals are tested."""
-FEWEST_GROUPS: Final = 4
-SINGULAR: Final = 1e-14
+BLOCKS: Final = 14
+"""Blocks of the longest window, whose mean residuals are tested."""
+STEP: Final = 2
+"""Blocks from the start of one window to that of the next shorter one."""
+WINDOWS: Final = 5
+_PASSES: Final = 2
+"""Times that the counts of a window are weighed by a fit of it."""
+_SINGULAR: Final = 1e-14
 """Squared contrast of the shape, relative to its mean, below which only rounding is left."""
+_DEPENDENT: Final = 1e-9
+"""Squared share of the tilted shape outside the fitted ones, below which it is rounding."""
 
-BACKGROUND: Final = 0
-AMPLITUDE: Final = 1
-BACKGROUND_VARIANCE: Final = 2
-AMPLITUDE_VARIANCE: Final = 3
-CHI2: Final = 4
-BINS: Final = 5
-CONDITION: Final = 6
-CURVATURE: Final = 7
-WAVES: Final = 8
-WINDOW: Final = 9
-CONSTANT: Final = 10
-COLUMNS: Final = 11
+# Sums of a block: bins, weights, weighted powers of shape and power.
+BINS, WEIGHT, SHAPE, SHAPE2, POWER, PRODUCT, POWER2 = range(7)
 
-
-class ShapeNoise(NamedTuple):
-    """Noise from which the weights follow."""
-
-    variance: Array
-    """(profile or 1, bin), in the square of the power's unit; not used for counts."""
-    exposure: Array
-    """(profile or 1,), counts per unit of power; NaN where the noise is not Poisson noise."""
+ROW: Final = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "background", "background_variance", "amplitude", "amplitude_variance", "chi2",
+            "bins", "condition", "curvature", "waves", "window", "constant", "first", "past",
+        )
+    ]
+)  # fmt: skip
+"""Fit of a window: fields of `known_shape.KnownShapeResult`; number of the window, whether all
+powers are equal, first bin and first one past the window."""
 
 
 class Limits(NamedTuple):
-    """Limits of the two tests for a window free of aerosol, and the odds that it has some."""
+    """Limits of the tests for a window without aerosol, and the odds that it has some."""
 
-    waves: float
-    """Limit of the chi-square of the mean residuals of `GROUPS` groups (it uses 2 degrees of
-    freedom)."""
+    nearest: float
+    """Start of the longest window over the farthest usable range."""
+    waves: Array
+    """Limits of the chi-square of the mean residuals of blocks, one for each window."""
     deviation: float
     """Limit of the curvature and of the differences of backgrounds, in standard errors."""
     aerosol: float
     """Odds that the next shorter window is the first one without aerosol."""
 
 
-@summing
-def _sums(values: Array, phi: Array, weights: Array) -> Any:
-    """Return total weight, weighted means of shape and power, and their centred sums."""
-    total = shape = power = 0.0
-    for i in range(weights.size):
-        total += weights[i]
-        shape += weights[i] * phi[i]
-        power += weights[i] * values[i]
-    shape /= total
-    power /= total
-    square = product = 0.0
-    for i in range(weights.size):
-        lever = weights[i] * (phi[i] - shape)
-        square += lever * (phi[i] - shape)
-        product += lever * (values[i] - power)
-    return total, shape, power, square, product
+class _Weights(NamedTuple):
+    """Model of the counts whose inverse variances are the weights of a window."""
+
+    exposure: float
+    """Not positive for the weights of the sums themselves."""
+    background: float
+    amplitude: float
 
 
 @summing
-def _bend(phi: Array, lever: Array, weights: Array, shape: float) -> Any:
-    """Return the weighted sum of shape times distance, and its product with the centred shape."""
-    bend = cross = 0.0
-    for i in range(weights.size):
-        tilted = weights[i] * phi[i] * lever[i]
-        bend += tilted
-        cross += tilted * (phi[i] - shape)
-    return bend, cross
-
-
-@summing
-def _group(residuals: Array, phi: Array, lever: Array, weights: Array, tilt: Any) -> Any:
-    """Return chi-square, weight and sum of residuals; norm and score of the curvature."""
-    bend, slope, shape = tilt
-    chi2 = weight = total = norm = score = 0.0
-    for i in range(weights.size):
-        curved = phi[i] * lever[i] - bend - slope * (phi[i] - shape)
-        weighted = weights[i] * residuals[i]
-        chi2 += weighted * residuals[i]
-        weight += weights[i]
-        total += weighted
-        norm += weights[i] * curved * curved
-        score += weighted * curved
-    return chi2, weight, total, norm, score
-
-
-@summing
-def _fill_counts(
-    weights: Array,
-    phi: Array,
-    usable: Array,
-    exposure: float,
-    background: float,
-    amplitude: float,
+def _sum_block(
+    power: Array, shape: Array, weights: Array, reference: float, block: int, sums: Array
 ) -> None:
-    for i in range(weights.size):
-        weights[i] = usable[i] * exposure / (background + amplitude * phi[i])
+    bins = weight = of_shape = of_shape2 = of_power = product = of_power2 = 0.0
+    for i in range(power.size):
+        good = (abs(power[i]) < HUGE) & (weights[i] > 0.0)
+        w = weights[i] if good else 0.0
+        value = power[i] - reference if good else 0.0
+        shaped = w * shape[i]
+        bins += 1.0 if good else 0.0
+        weight += w
+        of_shape += shaped
+        of_shape2 += shaped * shape[i]
+        of_power += w * value
+        product += shaped * value
+        of_power2 += w * value * value
+    sums[BINS, block], sums[WEIGHT, block] = bins, weight
+    sums[SHAPE, block], sums[SHAPE2, block] = of_shape, of_shape2
+    sums[POWER, block], sums[PRODUCT, block], sums[POWER2, block] = of_power, product, of_power2
 
 
 @inlined
-def _weigh_counts(
-    values: Array,
-    phi: Array,
-    usable: Array,
-    exposure: float,
-    bins: float,
+def _sum_blocks(
+    power: Array,
+    shape: Array,
     weights: Array,
+    first: int,
+    past: int,
+    reference: float,
+    sums: Array,
 ) -> None:
-    """Fill the weights of counts by the variance of the fitted model, in two passes."""
-    weights[:] = usable
-    for _ in range(2):
-        _, shape, power, square, product = _sums(values, phi, weights)
-        amplitude = max(product / square, 0.0) if square > 0.0 else 0.0
-        background = power - amplitude * shape
+    bins = past - first
+    for block in range(BLOCKS):
+        span = slice(first + block * bins // BLOCKS, first + (block + 1) * bins // BLOCKS)
+        _sum_block(power[span], shape[span], weights[span], reference, block, sums)
+
+
+@summing
+def _weight(sums: Array, by: _Weights, k: int) -> float:
+    """Return the factor on the sums of a block."""
+    bins = sums[WEIGHT, k]
+    counted = by.exposure * bins / (by.background * bins + by.amplitude * sums[SHAPE, k])
+    return (counted if bins > 0.0 else 0.0) if by.exposure > 0.0 else 1.0
+
+
+@summing
+def _solve(sums: Array, by: _Weights, first: int) -> tuple[float, float, float, float, float]:
+    """Return weight, mean shape and power, squared deviation of the shape, and amplitude."""
+    weight = of_shape = of_shape2 = of_power = product = 0.0
+    for k in range(first, BLOCKS):
+        factor = _weight(sums, by, k)
+        weight += factor * sums[WEIGHT, k]
+        of_shape += factor * sums[SHAPE, k]
+        of_shape2 += factor * sums[SHAPE2, k]
+        of_power += factor * sums[POWER, k]
+        product += factor * sums[PRODUCT, k]
+    mean_shape, mean_power = of_shape / weight, of_power / weight
+    square = of_shape2 - mean_shape * of_shape
+    square = square if square > _SINGULAR * of_shape2 else 0.0
+    return weight, mean_shape, mean_power, square, (product - mean_shape * of_power) / square
+
+
+@inlined
+def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) -> None:
+    """Fit and test a window, of which 0 is the longest."""
+    first, size = STEP * window, 0.0
+    row.window, row.bins = window, 0.0
+    for k in range(first, BLOCKS):
+        row.bins += sums[BINS, k]
+        size += sums[POWER2, k]
+    row.constant = size == 0.0
+    if row.bins == 0.0:
+        return
+    by = _Weights(0.0, 1.0, 0.0)
+    weight, mean_shape, mean_power, square, amplitude = _solve(sums, by, first)
+    for _ in range(_PASSES if exposure > 0.0 else 0):
+        one = 1.0 / (row.bins * exposure)
+        mean = reference + mean_power
+        amplitude = max(amplitude, 0.0) if square > 0.0 else 0.0
         # A zero background is known to its standard error only, and to one count at best.
-        level = max(power, 0.0) / (bins * exposure)
-        least = math.sqrt(level) + 1.0 / (bins * exposure)
-        _fill_counts(weights, phi, usable, exposure, max(background, least), amplitude)
-
-
-@inlined
-def _test_residuals(
-    residuals: Array, phi: Array, lever: Array, weights: Array, sums: Any, row: Array
-) -> None:
-    """Fill the chi-square of all residuals and of their group means, and the curvature."""
-    total, shape, square = sums
-    bend, cross = _bend(phi, lever, weights, shape)
-    tilt = (bend / total, cross / square, shape)
-    chi2 = norm = score = waves = 0.0
-    groups = edge = 0
-    for group in range(GROUPS):
-        until = (group + 1) * weights.size // GROUPS
-        bins = slice(edge, until)
-        group_chi2, weight, total_residual, group_norm, group_score = _group(
-            residuals[bins], phi[bins], lever[bins], weights[bins], tilt
-        )
-        chi2 += group_chi2
-        norm += group_norm
-        score += group_score
-        if weight > 0.0:
-            groups += 1
-            waves += total_residual * total_residual / weight
-        edge = until
-    row[CHI2] = chi2
+        least = math.sqrt(max(mean, 0.0) * one) + one
+        by = _Weights(exposure, max(mean - amplitude * mean_shape, least), amplitude)
+        weight, mean_shape, mean_power, square, amplitude = _solve(sums, by, first)
+    if square == 0.0:
+        row.condition = np.inf
+        return
+    level = mean_power - amplitude * mean_shape
+    row.background, row.amplitude = reference + level, amplitude
+    row.amplitude_variance = 1.0 / square
+    row.background_variance = 1.0 / weight + mean_shape * mean_shape / square
+    row.condition = math.sqrt(row.background_variance * weight)
+    chi2, row.waves, score, norm, with_level, with_shape = _residuals(
+        sums, by, first, level, amplitude
+    )
+    row.chi2 = chi2
+    with_shape -= mean_shape * with_level
+    left = norm - with_level * with_level / weight - with_shape * with_shape / square
     # The tilted shape may be a mere combination of the shape and a constant.
-    least = SINGULAR * square * lever[-1] ** 2
-    row[CURVATURE] = score / math.sqrt(norm) if norm > least else 0.0
-    row[WAVES] = waves if groups >= FEWEST_GROUPS else 0.0
+    row.curvature = score / math.sqrt(left) if left > _DEPENDENT * norm else 0.0
 
 
 @summing
-def _subtract(values: Array, phi: Array, row: Array, residuals: Array) -> None:
-    background, amplitude = row[BACKGROUND], row[AMPLITUDE]
-    for i in range(residuals.size):
-        residuals[i] = values[i] - background - amplitude * phi[i]
+def _residuals(
+    sums: Array, by: _Weights, first: int, level: float, amplitude: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return chi-square, that of block means, and products with the shape times range.
 
-
-@summing
-def _count(usable: Array) -> int:
-    bins = 0
-    for i in range(usable.size):
-        bins += 1 if usable[i] > 0.0 else 0
-    return bins
-
-
-@compiled
-def _is_constant(values: Array, usable: Array) -> bool:
-    first = -1
-    for i in range(values.size):
-        if usable[i] == 0.0:
-            continue
-        if first < 0:
-            first = i
-        elif values[i] != values[first]:
-            return False
-    return True
+    These are of the residuals, of itself, of a constant, and of the shape.
+    """
+    chi2 = waves = score = norm = with_level = with_shape = 0.0
+    for k in range(first, BLOCKS):
+        factor = _weight(sums, by, k)
+        weight, of_shape = factor * sums[WEIGHT, k], factor * sums[SHAPE, k]
+        residual = factor * sums[POWER, k] - level * weight - amplitude * of_shape
+        inverse = 1.0 / weight if weight > 0.0 else 0.0
+        tilted = of_shape * inverse * (k - first)
+        waves += residual * residual * inverse
+        score += residual * tilted
+        norm += weight * tilted * tilted
+        with_level += weight * tilted
+        with_shape += of_shape * tilted
+        products = level * sums[POWER, k] + amplitude * sums[PRODUCT, k]
+        chi2 += factor * (sums[POWER2, k] - products)
+    return chi2, waves, score, norm, with_level, with_shape
 
 
 @inlined
-def _fit(
-    values: Array,
-    phi: Array,
-    lever: Array,
-    usable: Array,
-    exposure: float,
-    weights: Array,
-    residuals: Array,
-    row: Array,
-) -> None:
-    """Fit one window of one profile; `usable` is 0 or the weight of the bin."""
-    row[:] = np.nan
-    bins = _count(usable)
-    row[BINS] = bins
-    row[CONSTANT] = _is_constant(values, usable)
-    if bins == 0:
-        return
-    if exposure > 0.0:
-        _weigh_counts(values, phi, usable, exposure, float(bins), weights)
-    else:
-        weights[:] = usable
-    total, shape, power, square, product = _sums(values, phi, weights)
-    if not square > SINGULAR * total * shape * shape:
-        row[CONDITION] = np.inf
-        return
-    row[AMPLITUDE] = product / square
-    row[BACKGROUND] = power - row[AMPLITUDE] * shape
-    row[AMPLITUDE_VARIANCE] = 1.0 / square
-    row[BACKGROUND_VARIANCE] = 1.0 / total + shape * shape / square
-    row[CONDITION] = math.sqrt(row[BACKGROUND_VARIANCE] * total)
-    _subtract(values, phi, row, residuals)
-    sums = (total, shape, square)
-    _test_residuals(residuals, phi, lever, weights, sums, row)
+def _passes(row: Any, limits: Limits) -> bool:
+    waves = row.waves <= limits.waves[int(row.window)]
+    return bool(abs(row.curvature) <= limits.deviation and waves)
 
 
-@compiled
-def _passes(row: Array, limits: Limits) -> bool:
-    return bool(abs(row[CURVATURE]) <= limits.deviation and row[WAVES] <= limits.waves)
-
-
-@compiled
-def _choose(rows: Array, limits: Limits) -> int:
+@inlined
+def _choose(rows: Any, limits: Limits) -> int:
     """Return the longest window that passes and agrees with all shorter ones, else the shortest."""
-    shortest = rows.shape[0] - 1
+    shortest = rows.size - 1
     for k in range(shortest):
-        if not (rows[k, BINS] > 0 and _passes(rows[k], limits)):
-            continue
-        agrees = True
-        for j in range(k + 1, rows.shape[0]):
+        agrees = _passes(rows[k], limits)
+        for j in range(k + 1, rows.size):
             # The variance of a difference of nested fits is the difference of their variances.
-            gap = rows[j, BACKGROUND_VARIANCE] - rows[k, BACKGROUND_VARIANCE]
-            step = rows[j, BACKGROUND] - rows[k, BACKGROUND]
-            if step * step > limits.deviation**2 * gap:
-                agrees = False
+            gap = rows[j].background_variance - rows[k].background_variance
+            step = rows[j].background - rows[k].background
+            agrees = agrees and not step * step > limits.deviation**2 * gap
         if agrees:
-            return int(k)
+            return k
     return int(shortest)
 
 
 @inlined
-def _relative_odds(rows: Array, chosen: int, limits: Limits, odds: Array) -> None:
-    """Fill how likely it is that the far range is clean from each window on, relative to others.
+def _variance_with_choice(rows: Any, chosen: int, limits: Limits) -> float:
+    """Return the variance of the chosen background, which includes the choice.
 
-    Steps of the background between neighbouring windows are independent. Those beyond the first
-    clean window are noise; each one before it has the odds of aerosol instead.
+    It is the mean square about the chosen background over all windows that pass, weighted by the
+    odds that the far range is clean from each on. Steps of the background between neighbouring
+    windows are independent. Those beyond the first clean window are noise; each one before it has
+    the odds of aerosol instead.
     """
-    odds[:] = 0.0
-    misfit = 0.0
+    total = square = misfit = 0.0
     shorter = -1
-    for k in range(rows.shape[0] - 1, -1, -1):
-        if not math.isfinite(rows[k, BACKGROUND]):
+    for k in range(rows.size - 1, -1, -1):
+        if not math.isfinite(rows[k].background):
             continue
-        gap = rows[shorter, BACKGROUND_VARIANCE] - rows[k, BACKGROUND_VARIANCE]
+        gap = rows[shorter].background_variance - rows[k].background_variance
         if shorter >= 0 and gap > 0.0:
-            step = rows[shorter, BACKGROUND] - rows[k, BACKGROUND]
-            misfit += step * step / gap
+            misfit += (rows[shorter].background - rows[k].background) ** 2 / gap
         shorter = k
         if k == chosen or _passes(rows[k], limits):
-            odds[k] = limits.aerosol**k * math.exp(-0.5 * misfit)
+            odds = limits.aerosol**k * math.exp(-0.5 * misfit)
+            step = rows[k].background - rows[chosen].background
+            total += odds
+            square += odds * (rows[k].background_variance + step * step)
+    return square / total
 
 
-@compiled
-def _include_choice(rows: Array, chosen: int, limits: Limits, odds: Array, row: Array) -> None:
-    """Fill the fit of the chosen window; the variance of its background includes the choice.
-
-    It is the mean square about the chosen background, over all windows from which on the far
-    range may be clean.
-    """
-    row[:] = rows[chosen]
-    _relative_odds(rows, chosen, limits, odds)
-    total = square = 0.0
-    for k in range(rows.shape[0]):
-        if odds[k] > 0.0:
-            step = rows[k, BACKGROUND] - row[BACKGROUND]
-            total += odds[k]
-            square += odds[k] * (rows[k, BACKGROUND_VARIANCE] + step * step)
-    if total > 0.0:
-        row[BACKGROUND_VARIANCE] = square / total
+@inlined
+def _span(
+    power: Array, weights: Array, range_: Array, nearest: float, start: float, stop: float
+) -> tuple[int, int]:
+    """Return the first bin of the longest window and the one past its last usable bin."""
+    past = int(np.searchsorted(range_, stop, side="right"))
+    while past > 0 and not (abs(power[past - 1]) < HUGE and weights[past - 1] > 0.0):
+        past -= 1
+    if math.isnan(start):
+        start = nearest * range_[max(past - 1, 0)]
+    return min(int(np.searchsorted(range_, start)), past), past
 
 
-@summing
-def _prepare(
+@inlined
+def _fit_profiles(
     power: Array,
     shape: Array,
-    mask: Array,
-    variance: Array,
-    usable: Array,
-    values: Array,
-    scaled: Array,
-) -> float:
-    """Copy usable bins, with the shape divided by its mean; return that mean."""
-    total = count = 0.0
-    for i in range(values.size):
-        weight = 1.0 / variance[i]
-        value = power[i]
-        good = (abs(value) < HUGE) & (shape[i] > 0.0) & (shape[i] < HUGE)
-        good &= (weight > 0.0) & (weight < HUGE) & (mask[i] > 0.0)
-        usable[i] = weight if good else 0.0
-        values[i] = value if good else 0.0
-        scaled[i] = shape[i] if good else 0.0
-        total += scaled[i]
-        count += 1.0 if good else 0.0
-    unit = total / count if total > 0.0 else 1.0
-    for i in range(values.size):
-        scaled[i] /= unit
-    return unit
-
-
-@compiled
-def _tilt(range_: Array, lever: Array) -> None:
-    for i in range(range_.size):
-        lever[i] = range_[i] - range_[0]
-
-
-@compiled
-def fill_pasts(power: Array, mask: Array, pasts: Indices) -> None:
-    """Lower the end of each window to the bin past its last usable bin.
-
-    Parameters
-    ----------
-    power : (profile, bin) float64
-    mask : (profile or 1, bin) float64
-    pasts : (profile,) int
-    """
-    for k in range(pasts.size):
-        allowed = mask[k % mask.shape[0]]
-        past = pasts[k]
-        while past > 0 and not (abs(power[k, past - 1]) < HUGE and allowed[past - 1] > 0.0):
-            past -= 1
-        pasts[k] = past
+    weights: Array,
+    exposure: Array,
+    range_: Array,
+    edges: tuple[Array, Array],
+    limits: Limits,
+    sums: Array,
+    rows: Any,
+    out: Any,
+) -> None:
+    starts, stops = edges
+    for k in range(power.shape[0]):
+        row, air, weight = power[k], shape[k % shape.shape[0]], weights[k % weights.shape[0]]
+        start, stop = starts[k % starts.size], stops[k % stops.size]
+        first, past = _span(row, weight, range_, limits.nearest, start, stop)
+        reference = row[past - 1] if past > 0 else 0.0
+        _sum_blocks(row, air, weight, first, past, reference, sums)
+        for j in range(rows.size):
+            rows[j] = out[k]
+            _fit(sums, exposure[k % exposure.size], reference, j, rows[j])
+        chosen = _choose(rows, limits)
+        out[k] = rows[chosen]
+        out[k].background_variance = _variance_with_choice(rows, chosen, limits)
+        out[k].first = first + STEP * chosen * (past - first) // BLOCKS
+        out[k].past = past
 
 
 @compiled
 def fit_shape(
     power: Array,
     shape: Array,
+    weights: Array,
+    exposure: Array,
     range_: Array,
-    mask: Array,
-    noise: ShapeNoise,
-    firsts: Indices,
-    pasts: Indices,
+    edges: tuple[Array, Array],
     limits: Limits,
-    out: Array,
+    out: Any,
 ) -> None:
     """Fit every profile in its windows, and keep the fit of the chosen window.
 
     Parameters
     ----------
     power : (profile, bin) float64
-    shape, mask : (profile or 1, bin) float64
-        Bins are skipped where the mask is 0.
+    shape, weights : (profile or 1, bin) float64
+        The weight is 0 where a bin is left out, 1 elsewhere for counts; the shape is finite.
+    exposure : (profile or 1,) float64
+        Counts per unit of power; 0 where the weights are inverse variances.
     range_ : (bin,) float64
         m, ascending.
-    noise : ShapeNoise
-    firsts : (profile or 1, window) int
-        First bins of nested windows, the longest first.
-    pasts : (profile or 1,) int
-        First bins past the windows.
+    edges : ((profile or 1,) float64, (profile or 1,) float64)
+        m, start and stop; NaN for a start at a share of the farthest usable range.
     limits : Limits
-    out : (profile, COLUMNS) float64
+        With a limit of the waves of every window.
+    out : (profile,) `ROW`
+        NaN before.
     """
-    count, bins = power.shape
-    windows = firsts.shape[1]
-    usable, values, scaled = np.empty(bins), np.empty(bins), np.empty(bins)
-    weights, residuals, lever = np.empty(bins), np.empty(bins), np.empty(bins)
-    rows, odds = np.empty((windows, COLUMNS)), np.empty(windows)
-    for k in range(count):
-        exposure = noise.exposure[k % noise.exposure.shape[0]]
-        first_bins = firsts[k % firsts.shape[0]]
-        past = pasts[k % pasts.shape[0]]
-        full = slice(first_bins[0], max(past, first_bins[0]))
-        unit = _prepare(
-            power[k][full],
-            shape[k % shape.shape[0]][full],
-            mask[k % mask.shape[0]][full],
-            noise.variance[k % noise.variance.shape[0]][full],
-            usable[full],
-            values[full],
-            scaled[full],
-        )
-        for j in range(windows):
-            window = slice(first_bins[j], max(past, first_bins[j]))
-            _tilt(range_[window], lever[window])
-            _fit(
-                values[window],
-                scaled[window],
-                lever[window],
-                usable[window],
-                exposure,
-                weights[window],
-                residuals[window],
-                rows[j],
-            )
-            rows[j, WINDOW] = j
-        chosen = _choose(rows, limits) if windows > 1 else 0
-        _include_choice(rows, chosen, limits, odds, out[k])
-        out[k, AMPLITUDE] /= unit
-        out[k, AMPLITUDE_VARIANCE] /= unit * unit
+    sums, rows = np.empty((7, BLOCKS)), np.empty(limits.waves.size, ROW)
+    _fit_profiles(power, shape, weights, exposure, range_, edges, limits, sums, rows, out)

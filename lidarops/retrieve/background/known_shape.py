@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.background import _shape_fit
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers, frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Flags, Integers, frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,8 @@ class KnownShapeResult:
     """Slope along range of the residuals relative to the shape, in standard errors; positive
     where the signal falls less steeply than the shape."""
     waves: Array
-    """Chi-square of the mean residuals of 16 equal parts of the window; the expectation is 14."""
+    """Chi-square of the mean residuals of blocks of the window; the expectation is 12 for the 14
+    blocks of a given window or of the longest one, and 2 less for each shorter one."""
     start: Array
     """m, range of the first bin of the window."""
     stop: Array
@@ -115,9 +117,10 @@ def fit_known_shape(
     with weighted means and :math:`w = 1 / v`. This is equation (4) of potapova2021 with the
     molecular shape in place of that of a homogeneous path. There is no iteration.
 
-    The variance of counts is that of the fitted model, :math:`v = (b + C \varphi) / E`, from two
-    fixed passes after an unweighted one. Weights from the counts themselves would follow their
-    noise and bias the background low.
+    All sums are those of 14 equal blocks of the longest window. The variance of counts is that of
+    the fitted model, :math:`v = (b + C \bar\varphi) / E` with the mean shape of a block, from two
+    fits of the same sums. Weights from the counts themselves would follow their noise and bias the
+    background low.
 
     Parameters
     ----------
@@ -135,11 +138,11 @@ def fit_known_shape(
         For Poisson counts: counts per unit of power. That is the number of shots where power is
         a mean count per shot, and shots times bin time in microseconds where it is in MHz.
     start, stop : (...) float, optional
-        m, ends of the window. Where `start` is not given, windows from each of
-        `Thresholds.start_shares` of the farthest usable range are tried. The result is that of
-        the longest window whose residuals show neither curvature nor waves and whose background
-        agrees with those of all shorter windows (each at 1 % false alarms), else that of the
-        shortest.
+        m, ends of the window. Where `start` is not given, five windows are tried: from
+        `Thresholds.nearest_start` of the farthest usable range on, and without the first one to
+        four sevenths of its bins. The result is that of the longest window whose residuals show
+        neither curvature nor waves and whose background agrees with those of all shorter windows
+        (each at `Thresholds.rejection`), else that of the shortest.
     mask : (..., range) bool, optional
         True where a bin may be used; broadcast against `power`.
 
@@ -165,30 +168,35 @@ def fit_known_shape(
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
     rows = frozen(rows.astype(np.float64, copy=False))
-    shapes = frozen(inputs.noise_rows(shape, "shape", grid, leading))
-    allowed = _mask_rows(mask, grid, leading)
-    noise = _noise(variance, exposure, grid, leading)
-    pasts = _pasts(rows, allowed, stop, grid, leading)
-    firsts = _firsts(start, pasts, grid, leading)
-    out = np.full((len(rows), _shape_fit.COLUMNS), np.nan)
-    limits = _limits(THRESHOLDS.rejection)
-    _shape_fit.fit_shape(rows, shapes, frozen(grid), allowed, noise, firsts, pasts, limits, out)
-    window = np.nan_to_num(out[:, _shape_fit.WINDOW]).astype(np.intp)
-    first = np.take_along_axis(
-        np.broadcast_to(firsts, (len(rows), firsts.shape[1])), window[:, np.newaxis], axis=1
-    )[:, 0]
+    air = inputs.noise_rows(shape, "shape", grid, leading)
+    counts = _exposures(variance, exposure, leading)
+    weights = _weights(variance, mask, air, grid, leading)
+    starts = inputs.profile_values(start, "start", leading)
+    if starts is not None and np.any(starts > grid[-1]):
+        raise RetrievalInputError(
+            f"lies beyond the range, which ends at {grid[-1]:g} m", field="start"
+        )
+    stops = inputs.profile_values(stop, "stop", leading)
+    edges = (
+        frozen(np.full(1, np.nan) if starts is None else starts),
+        frozen(np.full(1, np.inf) if stops is None else stops),
+    )
+    limits = _limits(THRESHOLDS.rejection, _shape_fit.WINDOWS if starts is None else 1)
+    out = np.full(len(rows), np.nan, _shape_fit.ROW)
+    _shape_fit.fit_shape(
+        rows, frozen(np.where(weights > 0, air, 0.0)), weights, counts, frozen(grid), edges,
+        limits, out,
+    )  # fmt: skip
     if exposure is not None:
         # In the dark, a whole window may be without a count.
-        out[:, _shape_fit.CONSTANT] = 0.0
-    return _result(out, grid, first, pasts, leading)
+        out["constant"] = 0.0
+    return inputs.with_leading_axes(_result(out, grid), leading)
 
 
-def _noise(
-    variance: npt.ArrayLike | None,
-    exposure: npt.ArrayLike | None,
-    grid: Array,
-    leading: tuple[int, ...],
-) -> _shape_fit.ShapeNoise:
+def _exposures(
+    variance: npt.ArrayLike | None, exposure: npt.ArrayLike | None, leading: tuple[int, ...]
+) -> Array:
+    """Return counts per unit of power, (profile or 1,); 0 where variances are given."""
     if (variance is None) == (exposure is None):
         raise RetrievalInputError(
             "is given for counts" if exposure is not None else "is missing",
@@ -200,108 +208,76 @@ def _noise(
         raise RetrievalInputError(
             "is not positive", field="exposure", remedy="mask profiles without shots"
         )
-    return _shape_fit.ShapeNoise(
-        frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
-        frozen(np.full(1, np.nan) if counts is None else counts),
+    return frozen(np.zeros(1) if counts is None else counts)
+
+
+def _weights(
+    variance: npt.ArrayLike | None,
+    mask: npt.ArrayLike | None,
+    air: Array,
+    grid: Array,
+    leading: tuple[int, ...],
+) -> Array:
+    """Return inverse variances, or ones for counts, (profile or 1, bin); 0 in unusable bins."""
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
+    with np.errstate(divide="ignore"):
+        weights = 1.0 / noise
+    usable = (weights > 0) & (weights < HUGE) & (air > 0) & (air < HUGE)
+    if mask is not None:
+        allowed = np.asarray(mask)
+        if allowed.dtype != np.bool_:
+            raise RetrievalInputError(
+                f"holds {allowed.dtype}", field="mask", remedy="give True where a bin may be used"
+            )
+        usable = usable & (inputs.noise_rows(allowed.astype(float), "mask", grid, leading) > 0)
+    return frozen(np.where(usable, weights, 0.0))
+
+
+@cache
+def _limits(false_alarm: float, windows: int) -> _shape_fit.Limits:
+    """Return the limits of waves and curvature for a joint rate of false alarms."""
+    rate = 0.5 * false_alarm
+    freedom = _shape_fit.BLOCKS - _shape_fit.STEP * np.arange(windows) - 2.0
+    return _shape_fit.Limits(
+        nearest=THRESHOLDS.nearest_start,
+        waves=frozen(special.chdtri(freedom, rate)),
+        deviation=float(-special.ndtri(0.5 * rate)),
+        aerosol=THRESHOLDS.aerosol_odds,
     )
 
 
-def _mask_rows(mask: npt.ArrayLike | None, grid: Array, leading: tuple[int, ...]) -> Array:
-    if mask is None:
-        return frozen(np.ones((1, grid.size)))
-    allowed = np.asarray(mask)
-    if allowed.dtype != np.bool_:
-        raise RetrievalInputError(
-            f"holds {allowed.dtype}", field="mask", remedy="give True where a bin may be used"
-        )
-    return frozen(inputs.noise_rows(allowed.astype(np.float64), "mask", grid, leading))
-
-
-def _pasts(
-    rows: Array,
-    allowed: Array,
-    stop: npt.ArrayLike | None,
-    range_: Array,
-    leading: tuple[int, ...],
-) -> Indices:
-    """Return the bin past the window of each profile: past its last usable bin, or its stop."""
-    pasts = np.full(len(rows), range_.size, dtype=np.intp)
-    stops = inputs.profile_values(stop, "stop", leading)
-    if stops is not None:
-        pasts[:] = np.searchsorted(range_, stops, side="right")
-    _shape_fit.fill_pasts(rows, allowed, pasts)
-    return pasts
-
-
-def _firsts(
-    start: npt.ArrayLike | None,
-    pasts: Indices,
-    range_: Array,
-    leading: tuple[int, ...],
-) -> Indices:
-    """Return the first bins of the windows, (profile or 1, window)."""
-    starts = inputs.profile_values(start, "start", leading)
-    if starts is not None:
-        if np.any(starts > range_[-1]):
-            raise RetrievalInputError(
-                f"lies beyond the range, which ends at {range_[-1]:g} m", field="start"
-            )
-        return np.searchsorted(range_, starts, side="left").astype(np.intp)[:, np.newaxis]
-    farthest = range_[np.maximum(pasts - 1, 0)]
-    earliest: Array = farthest[:, np.newaxis] * np.array(THRESHOLDS.start_shares)
-    return np.searchsorted(range_, earliest, side="left").astype(np.intp)
-
-
-def _limits(false_alarm: float) -> _shape_fit.Limits:
-    """Return the limits of waves and curvature for a joint rate of false alarms."""
-    rate = 0.5 * false_alarm
-    waves = special.chdtri(_shape_fit.GROUPS - 2.0, rate)
-    deviation = -special.ndtri(0.5 * rate)
-    return _shape_fit.Limits(float(waves), float(deviation), THRESHOLDS.aerosol_odds)
-
-
-def _result(
-    out: Array,
-    range_: Array,
-    first: Indices,
-    pasts: Indices,
-    leading: tuple[int, ...],
-) -> KnownShapeResult:
-    bins = out[:, _shape_fit.BINS].astype(np.int64)
-    freedom = np.maximum(bins - 2, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        curvature, waves = out[:, _shape_fit.CURVATURE], out[:, _shape_fit.WAVES]
-        amplitude_error = np.sqrt(out[:, _shape_fit.AMPLITUDE_VARIANCE])
-        limits = _limits(THRESHOLDS.false_alarm)
-        poor = (np.abs(curvature) > limits.deviation) | (waves > limits.waves)
-        negative = out[:, _shape_fit.AMPLITUDE] < -THRESHOLDS.negative * amplitude_error
-    condition = out[:, _shape_fit.CONDITION]
-    unsolved = (bins > 0) & ~np.isfinite(out[:, _shape_fit.BACKGROUND])
-    singular = (condition > THRESHOLDS.largest_condition) | unsolved
+def _result(out: npt.NDArray[np.void], grid: Array) -> KnownShapeResult:
+    """Return the fits of the kernel as a result of (profile,)."""
+    fit = {name: np.ascontiguousarray(out[name]) for name in _shape_fit.ROW.names or ()}
+    bins, condition = fit["bins"], fit["condition"]
+    amplitude_error = np.sqrt(fit["amplitude_variance"])
+    limits = _limits(THRESHOLDS.false_alarm, _shape_fit.WINDOWS)
+    poor = np.abs(fit["curvature"]) > limits.deviation
+    poor |= fit["waves"] > limits.waves[fit["window"].astype(np.intp)]
+    few, empty = bins < THRESHOLDS.fewest_bins, bins == 0
     quality = np.zeros(len(out), dtype=np.int32)
-    quality[bins == 0] |= np.int32(Quality.INPUT_MISSING)
-    quality[(bins > 0) & (bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
-    constant = (bins >= THRESHOLDS.fewest_bins) & (out[:, _shape_fit.CONSTANT] > 0)
-    quality[constant] |= np.int32(Quality.NO_SIGNAL)
-    quality[negative] |= np.int32(Quality.NEGATIVE_AMPLITUDE)
-    quality[poor] |= np.int32(Quality.NOT_HOMOGENEOUS)
-    empty = bins == 0
-    start = np.where(empty, np.nan, range_[np.minimum(first, range_.size - 1)])
-    stop = np.where(empty, np.nan, range_[np.maximum(pasts - 1, 0)])
-    error = np.sqrt(out[:, _shape_fit.BACKGROUND_VARIANCE])
+    for bit, found in (
+        (Quality.INPUT_MISSING, empty),
+        (Quality.TOO_FEW_BINS, few & ~empty),
+        (Quality.NO_SIGNAL, ~few & (fit["constant"] > 0)),
+        (Quality.NEGATIVE_AMPLITUDE, fit["amplitude"] < -THRESHOLDS.negative * amplitude_error),
+        (Quality.NOT_HOMOGENEOUS, poor),
+    ):
+        quality[found] |= np.int32(bit)
+    first, past = (np.where(empty, 1, fit[name]).astype(np.intp) for name in ("first", "past"))
     return KnownShapeResult(
-        background=out[:, _shape_fit.BACKGROUND].reshape(leading),
-        background_standard_error=error.reshape(leading),
-        amplitude=out[:, _shape_fit.AMPLITUDE].reshape(leading),
-        amplitude_standard_error=amplitude_error.reshape(leading),
-        chi2=out[:, _shape_fit.CHI2].reshape(leading),
-        degrees_of_freedom=freedom.reshape(leading),
-        condition=condition.reshape(leading),
-        curvature=curvature.reshape(leading),
-        waves=waves.reshape(leading),
-        start=start.reshape(leading),
-        stop=stop.reshape(leading),
-        poor_fit=poor.reshape(leading),
-        singular=singular.reshape(leading),
-        quality=quality.reshape(leading),
+        background=fit["background"],
+        background_standard_error=np.sqrt(fit["background_variance"]),
+        amplitude=fit["amplitude"],
+        amplitude_standard_error=amplitude_error,
+        chi2=fit["chi2"],
+        degrees_of_freedom=np.maximum(bins - 2, 0).astype(np.int64),
+        condition=condition,
+        curvature=fit["curvature"],
+        waves=fit["waves"],
+        start=np.where(empty, np.nan, grid[first]),
+        stop=np.where(empty, np.nan, grid[past - 1]),
+        poor_fit=poor,
+        singular=~(condition <= THRESHOLDS.largest_condition) & ~empty,
+        quality=quality,
     )

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numba
 from numba import config
@@ -18,15 +18,18 @@ _CONSTANTS: Final = ("constants.py", "flags.py")
 """Modules of lidarops beside the sources whose constants are compiled in."""
 
 compiled: Final = numba.njit(cache=True, nogil=True, error_model="numpy")
-inlined: Final = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+# Forced inlining lets functions share loops. Without the runtime they cannot allocate, and count no
+# references to arrays, which takes longer than a loop.
+_BARE: Final[dict[str, Any]] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "forceinline": True,
+    "_nrt": False,
+}
+inlined: Final = numba.njit(**_BARE)
 """Compile what calls a sum and is called by compiled code, for the reason that `summing` gives."""
-summing: Final = numba.njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    forceinline=True,
-    fastmath={"reassoc", "contract", "nsz"},
-)
+summing: Final = numba.njit(**_BARE, fastmath={"reassoc", "contract", "nsz"})
 """Compile a sum whose terms the compiler may reassociate, so that it vectorises.
 
 NaN and infinity keep their meaning. The function has to be inlined. As a symbol of its own it would

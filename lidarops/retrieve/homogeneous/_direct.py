@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from lidarops.retrieve.common.arrays import HUGE, Array
-from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 from lidarops.retrieve.homogeneous._misfit import Left, judge_residuals
 from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._projection import (
@@ -28,14 +28,12 @@ from lidarops.retrieve.homogeneous._projection import (
     Sums,
     at,
     evaluate,
-    inlined,
     largest_energy,
     load,
     make_scratch,
     mean_place,
     power_of_two,
     rescale,
-    summing,
     total_of,
     weigh,
 )

@@ -6,15 +6,14 @@ import math
 from typing import Any, NamedTuple
 
 from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.compiled_code import inlined, summing
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
     Point,
     Scratch,
     Sums,
     evaluate,
-    inlined,
     largest_energy,
-    summing,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 

@@ -17,6 +17,7 @@ import numba
 import numpy as np
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Integers, frozen
+from lidarops.retrieve.common.compiled_code import inlined, summing
 
 NODES: Final = 24
 """Extinctions of the search."""
@@ -25,20 +26,6 @@ BLOCK: Final = 8
 """Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
 GROUP: Final = 4
 """The search runs on the bins of the first block and on sums over as many bins beyond."""
-
-# Forced inlining lets functions share loops. Without the runtime they cannot allocate, and count no
-# references to arrays, which takes longer than a loop.
-_BARE: Final[dict[str, Any]] = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "forceinline": True,
-    "_nrt": False,
-}
-inlined = numba.njit(**_BARE)
-# Functions that may be reassociated have to be inlined: see
-# `lidarops.retrieve.common.compiled_code.summing`.
-summing = numba.njit(**_BARE, fastmath={"reassoc", "contract", "nsz"})
 
 
 class Grid(NamedTuple):
