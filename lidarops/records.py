@@ -320,6 +320,11 @@ class Plan:
         """Steps that are products."""
         return products_of(self.steps)
 
+    @cached_property
+    def product_keys(self) -> tuple[tuple[str, str], ...]:
+        """Kind and channel of each product, in the order of the steps."""
+        return tuple(dict.fromkeys((step.name, step.channel) for step in self.products))
+
     def as_dict(self) -> dict[str, Any]:
         """Return the plan as plain JSON types."""
         return {

@@ -140,9 +140,7 @@ def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> SceneEntry:
     files = [
         InputRecord(granule.path, Role.SIGNAL, str(granule.sha256)) for granule in scene.granules
     ]
-    products = tuple(
-        _product(judge, campaign, scene, key, files) for key in dependence.planned_products(plan)
-    )
+    products = tuple(_product(judge, campaign, scene, key, files) for key in plan.product_keys)
     outcome = SceneOutcome(
         scene.id,
         scene.station,
@@ -152,7 +150,7 @@ def _entry(judge: Judge, campaign: Campaign, scene: Scene) -> SceneEntry:
         plan,
         products=tuple(product.record for product in products),
     )
-    judgement = judge.judgement(scene, plan)
+    judgement = judge.judgement(scene, plan, dependence.ancillary_files(plan.steps))
     return SceneEntry(outcome, judgement.day, judge.key(judgement), final=True, products=products)
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Final
 
-from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, channel_facts
+from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
 from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.store import Store
 from lidarops.raw.header import Layout, label_of, named_layout, recorder_names
@@ -27,7 +27,14 @@ from lidarops.records import (
     is_glued,
 )
 from lidarops.run.options import Selection
-from lidarops.scene.case import ABSENT, LAG_STEP, UNMATCHED, missing_channels, named_channels
+from lidarops.scene.case import (
+    ABSENT,
+    LAG_STEP,
+    UNMATCHED,
+    joined_layout,
+    missing_channels,
+    named_channels,
+)
 
 _ROUNDING_OF_WAVELENGTHS: Final = 1e-9
 """m; headers hold whole nanometres."""
@@ -132,7 +139,9 @@ def _lacking(
         until is None or facts.valid_from < until
     )
     reasons = {}
-    for left in missing_channels(holding.layout, instrument.products.requested, facts):
+    requested = instrument.products.requested
+    glued = joined_layout(holding.layout, named_channels(requested))
+    for left in missing_channels(holding.layout, glued, requested, facts):
         if left.rule == ABSENT and (not selection.kinds or left.name in selection.kinds):
             reasons[left.name, left.channel] = left.reason
         elif left.rule == UNMATCHED and touched and left.name != LAG_STEP:
@@ -167,8 +176,9 @@ def period_of(facts: InstrumentFacts) -> str:
 
 def overridden_wavelengths(layout: Layout, facts: InstrumentFacts) -> Iterator[str]:
     """Yield facts of the campaign that override the wavelengths of headers."""
-    for channel in layout if facts.channels else ():
-        wavelength = channel_facts(facts, channel.name).wavelength
+    for channel in layout:
+        given = facts.channels.get(channel.name)
+        wavelength = given.wavelength if given else None
         # Not where the wavelength of the header is implausible, and so NaN.
         if wavelength and abs(wavelength - channel.wavelength) > _ROUNDING_OF_WAVELENGTHS:
             yield (

@@ -77,7 +77,8 @@ class DayStates:
         self._ancillaries: dict[str, str] = {}
         self._problems: dict[tuple[str, Role], str] = {}
         if known is not None:
-            self.base, self.names = known.base, known.names
+            self.base, self.names, self.refused = known.base, known.names, known.refused
+            self.read_by_months = known.read_by_months
 
     def signatures(self, days: Collection[int] | None = None) -> dict[int, Signature]:
         """Return the state of every day.
@@ -101,7 +102,7 @@ class DayStates:
         with self.store.all_products() as rows:
             for made in rows:
                 products[made.day].update(f"{made.path}\0{made.sha256}\0".encode())
-                if made.kind in self._read_by_months:
+                if made.kind in self.read_by_months:
                     month = first_of_month(made.day)
                     months[month].update(f"{made.path}\0{made.sha256}\0".encode())
                 if not _looks_right(root, made):
@@ -131,7 +132,7 @@ class DayStates:
         )
 
     @cached_property
-    def _read_by_months(self) -> frozenset[str]:
+    def read_by_months(self) -> frozenset[str]:
         """Kinds of which requested products of months are made."""
         months = kinds_of(Scope.MONTH)
         requested = requested_kinds(self.campaign) if months else ()
@@ -139,7 +140,7 @@ class DayStates:
 
     def months(self, days: Iterable[int]) -> list[int]:
         """Return the first days of the months of some days; none where no product reads a month."""
-        return sorted(set(map(first_of_month, days))) if self._read_by_months else []
+        return sorted(set(map(first_of_month, days))) if self.read_by_months else []
 
     def is_settled(self, signature: Signature, verdict: Verdict | None) -> bool:
         """Return whether nothing has changed on a day since its verdict."""

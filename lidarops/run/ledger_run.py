@@ -151,7 +151,7 @@ class LedgerRun:
         entry = SceneEntry(
             outcome=outcome,
             day=judged.day,
-            key=judge.key(judged, internal=bool(outcome.internal)),
+            key=judge.key(judged, internal=True) if outcome.internal else judged.key,
             final=final and len(new) == reported,
             products=tuple(new),
             digests=_unknown_digests(judged.scene, outcome),

@@ -90,7 +90,7 @@ def scenes_without_product(planned: Sequence[Planned], campaign: Campaign) -> di
     }
     reasons = {}
     for scene, plan in planned:
-        if dependence.planned_products(plan):
+        if plan.product_keys:
             continue
         networks = _networks_of_member(scene, campaign)
         if not networks:
@@ -160,7 +160,7 @@ class Leftovers:
         wanted = {
             product_file(scene, product)
             for scene, plan in self.planned.values()
-            for product in dependence.planned_products(plan)
+            for product in plan.product_keys
         }
         orphans = []
         for product in made:
@@ -192,7 +192,7 @@ class Leftovers:
     def _left_out(self, product: RecordedProduct) -> tuple[str, bool]:
         """Return why the plan of its scene gives a product no more, and whether it is kept."""
         scene, plan = self.planned[product.scene]
-        if (product.kind, product.channel) in dependence.planned_products(plan):
+        if (product.kind, product.channel) in plan.product_keys:
             return "it has another name now", False
         omissions = [
             left

@@ -396,7 +396,7 @@ class Judge(DayStates):
         judged = guarded(lambda: self._planned(scene, made))
         if isinstance(judged, Failure):
             failure, plan = judged, Plan(scene.id, (), ())
-            judged = replace(self.judgement(scene, plan), failure=failure, planned=False)
+            judged = replace(self.judgement(scene, plan, {}), failure=failure, planned=False)
         suspect = last is not None and last.crashes > 0
         judged = replace(judged, key=self.key(judged), suspect=suspect)
         if last is None or self._force or not (judged.due and last.final and last.error):
@@ -419,14 +419,14 @@ class Judge(DayStates):
         }
         whole = dependence.without_unusable_files(planned, problems) if problems else planned
         # Also files that cannot be used: the day is judged again when they change.
-        judged = replace(self.judgement(scene, whole), ancillaries=self._ancillary_records(planned))
+        judged = self.judgement(scene, whole, files)
         stale: list[Stale] = []
         frozen: list[Stale] = []
         kept: list[Stale] = []
         frozen_period = not self._thaw and self.campaign.is_frozen(scene.start)
         kinds_ = self.selection.kinds
         requested = dependence.plan_of_kinds(whole, kinds_) if kinds_ else whole
-        products = dependence.planned_products(requested)
+        products = requested.product_keys
         for kind, channel in products:
             path = product_file(scene, (kind, channel))
             known = made.get(path)
@@ -470,17 +470,19 @@ class Judge(DayStates):
         remedy = "only a copy restores this version, --thaw makes a new one"
         return replace(frozen, reason=f"{frozen.reason}; {remedy}")
 
-    def judgement(self, scene: Scene, whole: Plan) -> Judgement:
-        """Return a judgement by which every product of a scene is stale."""
-        stale = tuple(Stale(*one, "requested") for one in dependence.planned_products(whole))
-        day, files = day_of(scene.start), self._ancillary_records(whole)
-        return Judgement(scene, whole, whole, day, files, stale)
+    def judgement(self, scene: Scene, whole: Plan, files: Mapping[str, Role]) -> Judgement:
+        """Return a judgement by which every product of a scene is stale.
 
-    def _ancillary_records(self, plan: Plan) -> tuple[InputRecord, ...]:
-        return tuple(
-            InputRecord(name, role, self.ancillary(name))
-            for name, role in sorted(ancillary_files(plan.steps).items())
-        )
+        Parameters
+        ----------
+        scene : Scene
+        whole : Plan
+        files : mapping of str to Role
+            Ancillary files of the scene, by path; see `ancillary_files`.
+        """
+        stale = tuple(Stale(*one, "requested") for one in whole.product_keys)
+        used = (InputRecord(name, files[name], self.ancillary(name)) for name in sorted(files))
+        return Judgement(scene, whole, whole, day_of(scene.start), tuple(used), stale)
 
     def key(self, judged: Judgement, *, internal: bool = False) -> str:
         """Return the digest of everything that may change the outcome of a scene.
@@ -496,7 +498,7 @@ class Judge(DayStates):
             or in another package, so the key depends on all of them.
         """
         scene, whole = judged.scene, judged.plan
-        products = dependence.planned_products(whole)
+        products = whole.product_keys
         software = [source_version(), package_versions()] if internal else []
         return digest(
             [

@@ -76,6 +76,11 @@ class ChannelCase(Generic[R_co]):
         """Far end of the last bin, m, without range offset."""
         return self.channel.bins * self.channel.bin_width
 
+    @property
+    def range_offset(self) -> float:
+        """Shift of the ranges of the channel, m: the given offset minus the given lag."""
+        return range_offset(self.channel, self.facts_of_channel)
+
     def run(
         self,
         name: str,
@@ -173,15 +178,15 @@ def product_channel(
 
 
 def estimated_against(
-    channel: ChannelLayout, facts: InstrumentFacts, layout: Iterable[ChannelLayout]
+    channel: ChannelLayout, facts: ChannelFacts, layout: Iterable[ChannelLayout]
 ) -> str:
     """Return the analog channel against which the dead time of a channel is to be estimated.
 
     Empty where none is requested, or the files hold none with the same bin width.
     """
-    if channel.mode is not DetectionMode.PHOTON or is_glued(channel.name):
+    if facts.dead_time != "estimate" or channel.mode is not DetectionMode.PHOTON:
         return ""
-    if channel_facts(facts, channel.name).dead_time != "estimate":
+    if is_glued(channel.name):
         return ""
     analog = channel.name.replace("photon_", "analog_", 1)
     same = (other for other in layout if other.name == analog)
@@ -215,11 +220,10 @@ def joined_layout(
     return tuple(glued)
 
 
-def range_offset(channel: ChannelLayout, facts: InstrumentFacts) -> float:
+def range_offset(channel: ChannelLayout, facts: ChannelFacts) -> float:
     """Return the shift of the ranges of a channel, m: the given offset minus the given lag."""
-    of_channel = channel_facts(facts, channel.name)
-    late = of_channel.lag * channel.bin_width if isinstance(of_channel.lag, float) else 0.0
-    return (of_channel.range_offset or 0.0) - late
+    late = facts.lag * channel.bin_width if isinstance(facts.lag, float) else 0.0
+    return (facts.range_offset or 0.0) - late
 
 
 def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
@@ -238,7 +242,7 @@ def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
     raise SceneError(f"the files hold no channel {name}, only {held}")
 
 
-def channel_ranges(channel: ChannelLayout, facts: InstrumentFacts) -> npt.NDArray[np.float64]:
+def channel_ranges(channel: ChannelLayout, facts: ChannelFacts) -> npt.NDArray[np.float64]:
     """Return the ranges of the bin centres of a channel, m."""
     middles = (np.arange(channel.bins) + 0.5) * channel.bin_width
     return np.asarray(middles + range_offset(channel, facts))
@@ -257,7 +261,8 @@ def named_channels(requested: Mapping[str, ChannelProduct]) -> list[str]:
 
 
 def missing_channels(
-    layout: tuple[ChannelLayout, ...],
+    layout: Iterable[ChannelLayout],
+    glued: Iterable[ChannelLayout],
     requested: Mapping[str, ChannelProduct],
     facts: InstrumentFacts,
 ) -> Iterator[LeftOut]:
@@ -265,18 +270,20 @@ def missing_channels(
 
     Parameters
     ----------
-    layout : tuple of ChannelLayout
+    layout : iterable of ChannelLayout
         Channels of the files.
+    glued : iterable of ChannelLayout
+        Those of the requested channels that can be glued from them.
     requested : mapping of str to ChannelProduct
         Settings of the products that are requested of the instrument, by kind.
     facts : InstrumentFacts
         The facts about it at the time of the files.
     """
     present = {channel.name: channel for channel in layout}
-    glued = [channel.name for channel in joined_layout(layout, named_channels(requested))]
+    made = {*present, *(channel.name for channel in glued)}
     for kind, settings in requested.items():
         for name in settings.named:
-            if name not in present and name not in glued:
+            if name not in made:
                 reason = _why_absent(name, present, channel_facts(facts, name).recorder)
                 yield LeftOut(kind, name, reason, rule=ABSENT, product=kind)
     for name, facts_of_channel in facts.channels.items():

@@ -20,7 +20,7 @@ from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.scene.case import ChannelCase, Entry, prepared_channels, range_offset
+from lidarops.scene.case import ChannelCase, Entry, prepared_channels
 from lidarops.settings import SettingsModel, quantity
 
 FEWEST_BINS: Final = BACKGROUND.fewest_bins
@@ -266,7 +266,7 @@ def bins_with_noise(nearest: float, farthest: float, case: ChannelCase[Any]) -> 
     (int, int)
         The first bin, and the one past the last, which may lie beyond the channel.
     """
-    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+    width, offset = case.channel.bin_width, case.range_offset
     # Two for rounding.
     before, behind = (
         max(math.ceil(THRESHOLDS.noise_window * distance / width), MIN_NOISE_BINS) + 2
@@ -281,7 +281,7 @@ def bins_within(nearest: float, farthest: float, case: ChannelCase[Any]) -> tupl
 
     For bins that are averaged: the noise at the ends then comes from fewer bins.
     """
-    width, offset = case.channel.bin_width, range_offset(case.channel, case.facts)
+    width, offset = case.channel.bin_width, case.range_offset
     # Two for rounding.
     first = math.floor((nearest - offset) / width) - 2
     return max(first, 0), max(math.ceil((farthest - offset) / width) + 2, 0)

@@ -52,11 +52,6 @@ def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
     return tuple((name, channel or step.channel) for channel, _, name in parts if name in reads)
 
 
-def planned_products(plan: Plan) -> tuple[ProductKey, ...]:
-    """Return kind and channel of the products that a plan makes, in its order."""
-    return tuple(dict.fromkeys((step.name, step.channel) for step in plan.products))
-
-
 def plan_closure(plan: Plan, products: Collection[ProductKey]) -> Plan:
     """Return the part of a plan that the given products need.
 
@@ -117,7 +112,7 @@ def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
     """
     kept, left_out = [], []
     without: dict[ProductKey, str] = {}
-    for kind, channel in planned_products(plan):
+    for kind, channel in plan.product_keys:
         steps = plan_closure(plan, [(kind, channel)]).steps
         reasons = [
             f"{name}: {problems[name]}" for name in ancillary_files(steps) if name in problems
@@ -166,7 +161,7 @@ def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
         Kinds of product.
     """
     chosen = with_read(selected)
-    products = [product for product in planned_products(plan) if product[0] in chosen]
+    products = [product for product in plan.product_keys if product[0] in chosen]
     closure = plan_closure(plan, products)
     names = {*chosen, READ_STEP}
     left_out = tuple(

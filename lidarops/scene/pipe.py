@@ -41,7 +41,6 @@ from lidarops.scene.case import (
     estimated_against,
     lag_is_unknown,
     prepared_channels,
-    range_offset,
 )
 from lidarops.scene.profiles import ChannelSignal, FileProfiles, Source, bin_ranges
 from lidarops.settings import SettingsModel, quantity
@@ -109,7 +108,7 @@ class RangeOffsetSettings(SettingsModel):
 
 def plan_range_offset(case: ChannelCase[Any]) -> Entry:
     """Shift the ranges of the bins where the campaign gives an offset or a lag."""
-    offset, lag = range_offset(case.channel, case.facts), case.facts_of_channel.lag
+    offset, lag = case.range_offset, case.facts_of_channel.lag
     if offset:
         reason = "given by the campaign"
         if isinstance(lag, float):
@@ -213,7 +212,7 @@ def plan_dead_time(case: ChannelCase[Any]) -> Entry:
 
 def _plan_estimate(case: ChannelCase[Any]) -> Entry:
     """Estimate the dead time against the analog channel of the detector."""
-    analog = estimated_against(case.channel, case.facts, case.scene.layout)
+    analog = estimated_against(case.channel, case.facts_of_channel, case.scene.layout)
     if case.member:
         reason = "dead times are not estimated for a network; pile-up is flagged"
     elif not enough_bins(case.channel.bins):

@@ -7,7 +7,7 @@ is a sentence that a user can check against the campaign file.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from lidarops.campaign.model import (
 from lidarops.kinds import Scope, kinds, kinds_of
 from lidarops.netcdf.context import product_of_path
 from lidarops.records import (
+    ChannelLayout,
     LeftOut,
     Plan,
     PlannedStep,
@@ -97,8 +98,10 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
     # A scene never spans an edge of a validity period, so the facts of its first granule hold.
     facts = scene_facts(campaign, scene)
     wanted = campaign.instruments[scene.instrument].products.requested
-    yield from missing_channels(scene.layout, wanted, facts)
-    cases = list(_cases(scene, campaign, facts, wanted))
+    layout = scene.layout
+    glued = joined_layout(layout, named_channels(wanted))
+    yield from missing_channels(layout, glued, wanted, facts)
+    cases = list(_cases(scene, campaign, facts, glued))
     entries = [entry for case in cases for entry in _channel_entries(case)]
     yield from entries
     # Those of all channels are decided by now.
@@ -109,7 +112,7 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
         for of_pipe in cases if kind.reads else ():
             case = replace(of_pipe, product=kind.name, request=settings)
             name = case.channel.name
-            if settings and settings.covers(name, of_files=case.channel in scene.layout):
+            if settings and settings.covers(name, of_files=case.channel in layout):
                 derived = list(_derived_entries(case, made))
                 made |= _made(derived)
                 yield from derived
@@ -127,11 +130,11 @@ def _cases(
     scene: Scene,
     campaign: Campaign,
     facts: InstrumentFacts,
-    wanted: Mapping[str, ChannelProduct],
+    glued: Sequence[ChannelLayout],
 ) -> Iterator[ChannelCase[Any]]:
     """Yield the cases of the channels of the files, and of those glued from them."""
     layout = scene.layout
-    glued = joined_layout(layout, named_channels(wanted))
+    wanted = campaign.instruments[scene.instrument].products.requested
     requested = {kind: one for kind, one in wanted.items() if not kinds()[kind].reads}
     readers: defaultdict[str, dict[str, None]] = defaultdict(dict)
     for other in glued:
@@ -141,15 +144,17 @@ def _cases(
         for own in settings.named:
             for companion in settings.companions(own):
                 readers[companion][own] = None
+    channels = (*layout, *glued)
+    of_channels = {channel.name: channel_facts(facts, channel.name) for channel in channels}
     for other in layout:
-        readers[estimated_against(other, facts, layout)][other.name] = None
-    for channel in (*layout, *glued):
+        readers[estimated_against(other, of_channels[other.name], layout)][other.name] = None
+    for channel in channels:
         name = channel.name
         yield ChannelCase(
             scene,
             channel,
             facts,
-            channel_facts(facts, name),
+            of_channels[name],
             None,
             all_steps=campaign.all_steps,
             requests={

@@ -20,6 +20,7 @@ import dask.local
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
+from lidarops.campaign.model import channel_facts
 from lidarops.errors import ProductError, RawFormatError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import Context, path_of_product, product_of_path, product_path
@@ -51,7 +52,6 @@ from lidarops.scene.case import (
 from lidarops.scene.choices import read_windows
 from lidarops.scene.dependence import (
     ancillary_files,
-    planned_products,
     read_products,
     scene_facts,
 )
@@ -117,7 +117,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
 def _process(job: Job) -> tuple[SceneOutcome, bool]:
     laps = _Laps()
     failure = Failure("").outcome(job.scene, job.plan)
-    order = planned_products(job.plan)
+    order = job.plan.product_keys
     if not order:
         return replace(failure, error=nothing_to_do(job.plan)), True
     with local_files(job.campaign.archive, job.scene) as (root, denied):
@@ -425,5 +425,7 @@ class _Network(_Work):
                 job.campaign.stations[planned.station],
                 signal,
                 product_settings(steps, product.product, product.channel, planned.instrument),
-                channel_ranges(layout, scene_facts(job.campaign, planned)),
+                channel_ranges(
+                    layout, channel_facts(scene_facts(job.campaign, planned), layout.name)
+                ),
             )

@@ -33,7 +33,7 @@ from lidarops.run.archive import (
     reprocess,
 )
 from lidarops.run.ledger_run import LedgerRun
-from lidarops.scene.dependence import plan_closure, planned_products
+from lidarops.scene.dependence import plan_closure
 from lidarops.system.files import only_one
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
@@ -94,7 +94,7 @@ def test_a_run_records_why_products_are_left_out(archive: Archive) -> None:
     assert {scene.instrument for scene in record.scenes} == {"rich"}
     for scene in record.scenes:
         assert scene.plan is not None
-        assert scene.plan.hash == plan_closure(scene.plan, planned_products(scene.plan)).hash
+        assert scene.plan.hash == plan_closure(scene.plan, scene.plan.product_keys).hash
         summary = [left.reason for left in scene.left_out if left.rule == "section_level"]
         assert len(summary) == 1
         assert "the beam climbs 750 m" in summary[0]

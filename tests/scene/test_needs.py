@@ -85,8 +85,8 @@ def test_the_places_of_needed_steps_are_those_that_the_plan_names(plan: Plan) ->
 @given(st.sampled_from(sorted(SCENES)), st.sets(st.sampled_from(sorted(REQUESTS)), min_size=1))
 def test_the_plan_of_a_product_does_not_depend_on_other_products(scene, kinds):
     plan = planned(scene, kinds)
-    products = dependence.planned_products(plan)
-    of_all = dependence.planned_products(PLANS[scene])
+    products = plan.product_keys
+    of_all = PLANS[scene].product_keys
     assert set(products) == {product for product in of_all if product[0] in kinds}
     for product in products:
         alone = dependence.plan_closure(plan, [product])
@@ -96,9 +96,9 @@ def test_the_plan_of_a_product_does_not_depend_on_other_products(scene, kinds):
 
 def test_the_scenes_give_products_of_all_kinds():
     """Otherwise the tests of this module say little."""
-    kinds = {kind for plan in PLANS.values() for kind, _ in dependence.planned_products(plan)}
+    kinds = {kind for plan in PLANS.values() for kind, _ in plan.product_keys}
     assert kinds == {*REQUESTS, "visibility"}
-    assert ("elastic", "glued_532o") in dependence.planned_products(PLANS["up"])
+    assert ("elastic", "glued_532o") in PLANS["up"].product_keys
 
 
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)

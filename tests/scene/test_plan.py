@@ -86,7 +86,7 @@ def test_a_channel_without_any_product_is_not_read() -> None:
 )
 def test_steps_of_a_plan_are_those_that_its_products_need(products: dict[str, object]) -> None:
     result = plan_scene(_scene(), factories.campaign(products=products))
-    needed = dependence.plan_closure(result, dependence.planned_products(result))
+    needed = dependence.plan_closure(result, result.product_keys)
     assert [(s.channel, s.name, s.settings) for s in result.steps] == [
         (s.channel, s.name, s.settings) for s in needed.steps
     ]

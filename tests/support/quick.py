@@ -39,7 +39,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     except LidarOpsError as error:
         return Failure(str(error)).outcome(job.scene, job.plan), True
     products = []
-    for kind, channel in dependence.planned_products(job.plan):
+    for kind, channel in job.plan.product_keys:
         closure = dependence.plan_closure(job.plan, [(kind, channel)])
         used = sorted(record.sha256 for record in dependence.product_inputs(closure, inputs))
         settings = recorded_settings(job, job.scene, closure, (kind, channel))

@@ -22,7 +22,6 @@ from lidarops.scene.case import (
     Entries,
     Entry,
     NoSettings,
-    range_offset,
 )
 from lidarops.scene.choices import (
     AverageSettings,
@@ -63,7 +62,7 @@ def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
     stretch = 1.0 / math.cos(math.radians(zenith))
     window = case.request.reference
     # A window is a set of bin centres.
-    reach = case.last - 0.5 * case.channel.bin_width + range_offset(case.channel, case.facts)
+    reach = case.last - 0.5 * case.channel.bin_width + case.range_offset
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if top - bottom < window.width * stretch * (1.0 - 1e-9):
         return (

@@ -104,7 +104,7 @@ class MemberCase:
                 if (direction := _granule_pointing(granule, self.facts)) is not None
             }
         )
-        end = float(channel_ranges(self.channel, self.facts)[-1])
+        end = float(channel_ranges(self.channel, channel_facts(self.facts, self.channel.name))[-1])
         farthest = min(end, self.settings.farthest or end)
         distinct: list[tuple[float, float]] = []
         for direction in directions:

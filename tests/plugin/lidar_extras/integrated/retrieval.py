@@ -43,7 +43,7 @@ def needs(case: ChannelCase[IntegratedSettings]) -> Entries:
         reason = f"background_range {start:g}-{stop:g} m holds fewer than {FEWEST_BINS} bins"
         yield case.leave("integrated", reason, number=bins)
         return
-    centres = channel_ranges(case.channel, case.facts)
+    centres = channel_ranges(case.channel, case.facts_of_channel)
     kept = []
     for near, far in case.request.windows:
         if ((near <= centres) & (centres < far)).any():
