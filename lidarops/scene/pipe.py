@@ -27,7 +27,11 @@ from lidarops.constants import (
 from lidarops.records import DetectionMode, Granule, LeftOut, PlannedStep, Role, is_glued
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
-from lidarops.retrieve.signal.dead_time import DeadTimeEstimate, estimate_dead_time
+from lidarops.retrieve.signal.dead_time import (
+    DeadTimeEstimate,
+    ProfileGroup,
+    estimate_dead_time,
+)
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.retrieve.signal.lag import enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
@@ -256,10 +260,10 @@ def _estimated_dead_time(
     archive, profiles = photon.source.archive, analog.profiles
     channel = photon.channel
     width = archive[channel].attrs["bin_width"]
-    groups: list[tuple[Array, ...]] = []
+    groups: list[ProfileGroup] = []
 
     def records() -> Iterator[tuple[Array, Array]]:
-        """Yield the records for an estimate of the lag, and keep their sums."""
+        """Yield the records for an estimate of the lag, and keep those of profiles with shots."""
         for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
             raw = archive.isel(time=rows)
             counts = raw[channel].to_numpy().astype(np.float64)
@@ -269,11 +273,11 @@ def _estimated_dead_time(
             power, variance, length = (
                 part[name].to_numpy() for name in ("power", "variance", CORRELATION_LENGTH)
             )
-            share = (exposure / max(exposure.sum(), 1e-300))[:, np.newaxis]
-            of_mean = (variance * length[:, np.newaxis] * share**2).sum(axis=0)
-            groups.append(
-                (counts.sum(axis=0), exposure.sum(), (power * share).sum(axis=0), of_mean)
-            )
+            if (shot := exposure > 0.0).any():
+                share = (exposure[shot] / exposure.sum())[:, np.newaxis]
+                noise = variance[shot] * length[shot, np.newaxis]
+                mean, of_mean = (power[shot] * share).sum(axis=0), (noise * share**2).sum(axis=0)
+                groups.append(ProfileGroup(counts[shot], exposure[shot], mean, of_mean))
             yield power, counts / np.maximum(exposure, 1e-300)[:, np.newaxis]
 
     distance = bin_ranges(archive, channel, photon.range_offset)
@@ -283,11 +287,7 @@ def _estimated_dead_time(
     else:
         for _ in records():
             pass
-    kept = [group for group in groups if group[1] > 0.0]
-    if not kept:
-        return None
-    counts, exposure, power, variance = (np.stack(parts) for parts in zip(*kept, strict=True))
-    return estimate_dead_time(counts, exposure, power, variance, lag)
+    return estimate_dead_time(groups, lag) if groups else None
 
 
 class NoiseSettings(SettingsModel):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -16,7 +17,9 @@ _TAIL: Final = 10
 _PASSES: Final = 12
 """Gauss-Newton steps of a solution."""
 _ROUNDS: Final = 6
-"""Solutions, each with the bins up to the load of the one before."""
+"""Solutions, each with the bins up to the load of the one before, and by its dead time."""
+_HIGHEST: Final = 0.99
+"""Load of a profile to which it is corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,14 +29,26 @@ class DeadTimeEstimate:
     dead_time: float
     """s."""
     standard_error: float
-    """s: of noise, and half of how far the dead time of low rates differs from that of all."""
+    """s: of noise, of an analog record that is not linear, and half of how far the dead time of low
+    rates differs from that of all."""
     highest_load: float
     """Largest share of dead time among the bins."""
 
 
-def estimate_dead_time(
-    counts: Array, exposure: Array, analog: Array, analog_variance: Array, lag: float
-) -> DeadTimeEstimate | None:
+class ProfileGroup(NamedTuple):
+    """Profiles of a photon counter, and their mean by the analog record of the detector."""
+
+    counts: Array
+    """(profile, range)."""
+    exposure: Array
+    """(profile,): microseconds for which a bin was open, above 0."""
+    analog: Array
+    """(range,): mV, mean of the profiles weighted by exposure; NaN where missing."""
+    variance: Array
+    """(range,): mV2, of this mean."""
+
+
+def estimate_dead_time(groups: Sequence[ProfileGroup], lag: float) -> DeadTimeEstimate | None:
     r"""Return the dead time by which photon counting is proportional to analog, or None.
 
     With the analog signal :math:`a` without background, the measured rate :math:`m` of photon
@@ -42,20 +57,21 @@ def estimate_dead_time(
     .. math:: m = \frac{r}{1 + \tau r}, \qquad r = s a + b,
 
     is solved for :math:`s` and :math:`\tau` by least squares, with the Poisson variance of the
-    counts and the variance of :math:`s a`. Profiles are summed before, because the noise of
-    :math:`a` would make :math:`s` too small. Bins up to a load :math:`\tau m` of 0.95 count: those
-    of a high load depend least on a distorted analog record. The error contains half the change of
-    the dead time if only those up to half of it count: a detector whose pulses differ in height is
-    no non-paralysable counter.
+    counts and the variance of :math:`s a`. Analog is the mean of a group, because its noise would
+    make :math:`s` too small. The rate :math:`m` is that of the mean light of the group, by
+    profiles: :math:`r` is the mean of :math:`m_j / (1 - \tau m_j)`, because the mean of measured
+    rates is lower where laser or air vary. Poisson noise adds the factor :math:`1 + \tau / t` to
+    that mean, with the time :math:`t` of a profile; :math:`s` takes it up. Bins up to a load
+    :math:`\tau m` of 0.95 in all profiles of a group count: those of a high load depend least on a
+    distorted analog record. The error contains half the change of the dead time if only those up
+    to half of it count: a detector whose pulses differ in height is no non-paralysable counter. It
+    also contains the change by an analog record whose largest signal is 1 percent too large, and
+    smaller ones by less in proportion: the data cannot tell that from a dead time.
 
     Parameters
     ----------
-    counts : (group, range) float
-        Sums of the counts of several profiles.
-    exposure : (group,) float
-        Microseconds for which a bin of a group was open.
-    analog, analog_variance : (group, range) float
-        mV, mV2: means of the same profiles, weighted by shots; NaN where missing.
+    groups : sequence of ProfileGroup
+        With equal numbers of bins.
     lag : float
         Bins by which analog is late.
 
@@ -69,44 +85,78 @@ def estimate_dead_time(
     ----------
     licel2023
     """
-    bins = min(counts.shape[1], analog.shape[1])
-    tail = slice(bins - max(bins // _TAIL, 1), bins)
+    bins = min(groups[0].counts.shape[1], groups[0].analog.size)
+    analog, variance = (
+        np.stack([part[:bins] for part in parts])
+        for parts in ([g.analog for g in groups], [g.variance for g in groups])
+    )
+    tail = _tail(bins)
     dark = np.isfinite(analog[:, tail])
     if not dark.any(axis=1).all():
         return None
     level = np.where(dark, analog[:, tail], 0.0).sum(axis=1) / dark.sum(axis=1)
     place = np.arange(bins) + lag
     signal, variance = (
-        np.stack([np.interp(place, np.arange(bins), row, np.nan, np.nan) for row in part[:, :bins]])
-        for part in (analog, analog_variance)
+        _blocks(np.stack([np.interp(place, np.arange(bins), r, np.nan, np.nan) for r in part]))
+        for part in (analog - level[:, np.newaxis], variance)
     )
-    signal = signal - level[:, np.newaxis]
-    rate = counts[:, :bins] / exposure[:, np.newaxis]
-    sky = rate[:, tail].mean(axis=1, keepdims=True)
-    skies = np.repeat(sky, bins, axis=1)
-    open_for = np.repeat(THRESHOLDS.dead_time_block * exposure[:, np.newaxis], bins, axis=1)
-    cells = _Cells(
-        *map(_blocks, (rate, signal, variance / THRESHOLDS.dead_time_block, skies, open_for))
-    )
-    whole = _fit(cells, THRESHOLDS.highest_load)
-    low = _fit(cells, 0.5 * THRESHOLDS.highest_load)
+    counted = _Counted(groups, bins)
+    variance /= THRESHOLDS.dead_time_block
+    whole = _fit(counted, signal, variance, THRESHOLDS.highest_load)
+    low = _fit(counted, signal, variance, 0.5 * THRESHOLDS.highest_load)
     if whole is None or low is None:
         return None
     dead_time, noise, load = whole
     if not dead_time > THRESHOLDS.least_dead_time * noise or load < THRESHOLDS.least_load:
         return None
-    error = math.hypot(noise, 0.5 * (dead_time - low[0]))
+    # A quadratic analog record looks like a dead time: this changes the largest signal by a share.
+    bent = THRESHOLDS.analog_nonlinearity * (1.0 - load) / load * dead_time
+    error = math.hypot(noise, 0.5 * (dead_time - low[0]), bent)
     return DeadTimeEstimate(1e-6 * dead_time, 1e-6 * error, load)
 
 
-class _Cells(NamedTuple):
-    """Means over a few bins, (group, cell)."""
+class _Counted:
+    """Rates of the profiles of groups, MHz, for means over cells of a few bins.
 
-    rate: Array
-    analog: Array
-    variance: Array
-    sky: Array
-    exposure: Array
+    Attributes
+    ----------
+    peak, exposure : ndarray, shape (group, cell)
+        Largest rate of a profile, and microseconds for which the bins of a cell were open.
+    """
+
+    def __init__(self, groups: Sequence[ProfileGroup], bins: int) -> None:
+        self._rates = [g.counts[:, :bins] / g.exposure[:, np.newaxis] for g in groups]
+        self._weights = [g.exposure / g.exposure.sum() for g in groups]
+        self.peak = np.stack([_blocks(rate).max(axis=0) for rate in self._rates])
+        open_for = THRESHOLDS.dead_time_block * np.array([g.exposure.sum() for g in groups])
+        self.exposure = np.repeat(open_for[:, np.newaxis], self.peak.shape[1], axis=1)
+
+    def mean_light(self, dead_time: float) -> tuple[Array, Array]:
+        """Return the rates that the mean light would give, and that of the background.
+
+        Parameters
+        ----------
+        dead_time : float
+            Microseconds, by which each profile is corrected before the mean; 0 for mean rates.
+
+        Returns
+        -------
+        rate : ndarray, shape (group, cell)
+            As measured by a counter of that dead time.
+        background : ndarray, shape (group, cell)
+            Without dead time, equal in all cells.
+        """
+        # A load of 1 has no light; such cells are not used.
+        corrected = (m / (1.0 - np.minimum(dead_time * m, _HIGHEST)) for m in self._rates)
+        light = np.stack([w @ part for w, part in zip(self._weights, corrected, strict=True)])
+        sky = light[:, _tail(light.shape[1])].mean(axis=1, keepdims=True)
+        cells = _blocks(light)
+        return cells / (1.0 + dead_time * cells), np.broadcast_to(sky, cells.shape)
+
+
+def _tail(bins: int) -> slice:
+    """Return the bins that hold the background."""
+    return slice(bins - max(bins // _TAIL, 1), bins)
 
 
 def _blocks(values: Array) -> Array:
@@ -117,23 +167,36 @@ def _blocks(values: Array) -> Array:
     )
 
 
-def _fit(cells: _Cells, highest: float) -> tuple[float, float, float] | None:
+def _fit(
+    counted: _Counted, analog: Array, variance: Array, highest: float
+) -> tuple[float, float, float] | None:
     """Return dead time and its error by noise, microseconds, and the load of cells below one.
 
     None where the cells do not determine them.
+
+    Parameters
+    ----------
+    counted : _Counted
+    analog, variance : (group, cell) float
+        mV without background, mV2.
+    highest : float
+        Load up to which cells count.
     """
-    known = np.isfinite(cells.analog) & np.isfinite(cells.variance)
-    known &= cells.analog > THRESHOLDS.least_analog * np.sqrt(np.where(known, cells.variance, 1.0))
-    known &= cells.rate > THRESHOLDS.least_rate
-    fastest = math.inf
+    known = np.isfinite(analog) & np.isfinite(variance)
+    known &= analog > THRESHOLDS.least_analog * np.sqrt(np.where(known, variance, 1.0))
+    known &= counted.mean_light(0.0)[0] > THRESHOLDS.least_rate
+    fastest, dead_time = math.inf, 0.0
     solution: tuple[float, float, float] | None = None
     for _ in range(_ROUNDS):
-        used = known & (cells.rate < fastest)
-        solution = _solve(*(part[used] for part in cells)) if used.any() else None
+        used = known & (counted.peak < fastest)
+        rate, sky = counted.mean_light(dead_time)
+        parts = (rate, analog, variance, sky, counted.exposure)
+        solution = _solve(*(part[used] for part in parts)) if used.any() else None
         if solution is None:
             return None
+        dead_time = solution[0]
         # Only ever less, so that the rounds converge.
-        fastest = min(fastest, highest / solution[0])
+        fastest = min(fastest, highest / dead_time)
     return solution
 
 

@@ -144,6 +144,10 @@ class Thresholds(NamedTuple):
     least_dead_time: float = 5.0
     """Standard errors of noise below which there is no dead time: else weak light gives up to 100
     ns (`test_noise_shows_no_dead_time`)."""
+    analog_nonlinearity: float = 0.01
+    """Share by which the largest analog signal may be wrong, and smaller ones by less in
+    proportion. Assumed; without it the error is 3 to 10 times too small
+    (`test_a_nonlinear_analog_record_lies_within_the_error`)."""
     least_rate: float = 1.0
     """MHz, rate from which bins count: below, noise gives 100 ns (the same test)."""
     least_analog: float = 3.0

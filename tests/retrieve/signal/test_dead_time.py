@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from lidarops.retrieve.signal.dead_time import estimate_dead_time
+from lidarops.retrieve.signal.dead_time import ProfileGroup, estimate_dead_time
 
 DISTANCE = 7.5 * (np.arange(4000) + 0.5)
 LIGHT = 400.0 * (300.0 / DISTANCE) ** 2 * np.exp(-2e-4 * DISTANCE)
@@ -18,17 +20,76 @@ SLOPE = 60.0
 def record(
     rng, dead_time, *, light=LIGHT, sky=0.5, groups=4, shots=600, paralysable=False, baseline=0.0
 ):
-    """Return counts, exposure, and analog with its variance, of groups of profiles."""
-    true = np.where(DISTANCE > 150.0, light, 0.0) + sky
+    """Return groups of one profile each, of the same light."""
+    return [
+        group(rng, dead_time, [light], [shots], sky, paralysable=paralysable, baseline=baseline)
+        for _ in range(groups)
+    ]
+
+
+def group(rng, dead_time, lights, shots, sky=0.5, *, paralysable=False, baseline=0.0, bend=0.0):
+    """Return a group of profiles, whose largest analog signal is too large by a share `bend`."""
+    true = np.where(DISTANCE > 150.0, np.stack(lights), 0.0) + sky
     load = dead_time * 1e6 * true
     rate = true * np.exp(-load) if paralysable else true / (1.0 + load)
-    exposure = np.full(groups, shots * 0.05)
-    counts = rng.poisson(rate * exposure[:, np.newaxis]).astype(np.float64)
-    noise = 2e-3
-    clear = np.interp(np.arange(DISTANCE.size) - LAG, np.arange(DISTANCE.size), true) / SLOPE
+    exposure = np.array(shots) * 0.05
+    mean_counts = rate * exposure[:, np.newaxis]
+    # The dead time makes counts more regular than Poisson.
+    regular = 1.0 if paralysable else 1.0 / (1.0 + load)
+    counts = mean_counts + regular * (rng.poisson(mean_counts) - mean_counts)
+    noise = 2e-3 * np.sqrt(600.0 / exposure.sum() * 0.05)
+    mean = exposure / exposure.sum() @ true
+    clear = np.interp(np.arange(DISTANCE.size) - LAG, np.arange(DISTANCE.size), mean) / SLOPE
+    clear *= 1.0 + bend * clear / clear.max()
     clear += baseline * np.exp(-DISTANCE / 3000.0)
-    analog = 4.8 + clear + rng.normal(0.0, noise, (groups, DISTANCE.size))
-    return counts, exposure, analog, np.full(analog.shape, noise**2)
+    analog = 4.8 + clear + rng.normal(0.0, noise, DISTANCE.size)
+    return ProfileGroup(counts, exposure, analog, np.full(analog.shape, noise**2))
+
+
+def varying_air(rng, number):
+    """Return the light of profiles through layers that rise, of different strength."""
+    height, strength = 300.0 + 100.0 * number, rng.uniform(0.0, 3.0)
+    return LIGHT * (1.0 + strength * np.exp(-(((DISTANCE - height) / 150.0) ** 2)))
+
+
+SCENES = {
+    "like profiles": lambda _rng, _number: LIGHT,
+    "a laser that varies": lambda rng, _number: LIGHT * max(rng.normal(1.0, 0.4), 0.05),
+    "air that varies": varying_air,
+    "a scan": lambda _rng, number: (
+        LIGHT * np.exp(2e-4 * DISTANCE * (1.0 - 1.0 / math.cos(math.radians(2.5 * number))))
+    ),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("dead_time", [4e-9, 8e-9])
+def test_profiles_need_not_be_alike(scene, dead_time):
+    """Errors are those of noise: a mean over profiles of different light has another rate."""
+    rng = np.random.default_rng(7)
+    light = SCENES[scene]
+    deviations = []
+    for _ in range(4):
+        groups = [
+            group(rng, dead_time, [light(rng, number) for number in range(32)], [600] * 32)
+            for _ in range(4)
+        ]
+        estimate = estimate_dead_time(groups, LAG)
+        assert estimate.standard_error < 0.01 * dead_time
+        deviations.append((estimate.dead_time - dead_time) / estimate.standard_error)
+    assert np.max(np.abs(deviations)) < 2.0
+
+
+def test_a_nonlinear_analog_record_lies_within_the_error():
+    """One percent at the largest signal, of varying light."""
+    rng = np.random.default_rng(8)
+    light = SCENES["a laser that varies"]
+    groups = [
+        group(rng, 4e-9, [light(rng, 0) for _ in range(32)], [600] * 32, bend=0.01)
+        for _ in range(4)
+    ]
+    estimate = estimate_dead_time(groups, LAG)
+    assert abs(estimate.dead_time - 4e-9) < 2.0 * estimate.standard_error
 
 
 @pytest.mark.parametrize("dead_time", [2e-9, 6e-9, 1.2e-8])
@@ -37,7 +98,7 @@ def test_the_dead_time_lies_within_its_error(dead_time, sky):
     rng = np.random.default_rng(1)
     deviations = []
     for _ in range(20):
-        estimate = estimate_dead_time(*record(rng, dead_time, sky=sky), LAG)
+        estimate = estimate_dead_time(record(rng, dead_time, sky=sky), LAG)
         assert estimate.standard_error < 0.1 * dead_time
         deviations.append((estimate.dead_time - dead_time) / estimate.standard_error)
     assert np.sqrt(np.mean(np.square(deviations))) < 1.5
@@ -45,30 +106,31 @@ def test_the_dead_time_lies_within_its_error(dead_time, sky):
 
 def test_a_distorted_analog_record_widens_the_error():
     """Analog 3 percent too large beyond 1 km: true within the error, which is larger."""
-    counts, exposure, analog, variance = record(np.random.default_rng(2), 6e-9)
-    clean = estimate_dead_time(counts, exposure, analog, variance, LAG)
-    bent = 4.8 + (analog - 4.8) * np.where(DISTANCE > 1000.0, 1.03, 1.0)
-    estimate = estimate_dead_time(counts, exposure, bent, variance, LAG)
+    groups = record(np.random.default_rng(2), 6e-9)
+    clean = estimate_dead_time(groups, LAG)
+    gain = np.where(DISTANCE > 1000.0, 1.03, 1.0)
+    bent = [group._replace(analog=4.8 + (group.analog - 4.8) * gain) for group in groups]
+    estimate = estimate_dead_time(bent, LAG)
     assert estimate.standard_error > 2.0 * clean.standard_error
     assert abs(estimate.dead_time - 6e-9) < 2.0 * estimate.standard_error
 
 
 def test_a_paralysable_counter_has_no_certain_dead_time():
     parts = record(np.random.default_rng(3), 6e-9, paralysable=True)
-    estimate = estimate_dead_time(*parts, LAG)
+    estimate = estimate_dead_time(parts, LAG)
     assert estimate.standard_error > 0.1 * estimate.dead_time
 
 
 def test_weak_light_shows_no_dead_time():
     parts = record(np.random.default_rng(4), 4e-9, light=0.01 * LIGHT)
-    assert estimate_dead_time(*parts, LAG) is None
+    assert estimate_dead_time(parts, LAG) is None
 
 
 @pytest.mark.parametrize("light", [0.001, 0.003])
 def test_noise_shows_no_dead_time(light):
     rng = np.random.default_rng(1)
     for _ in range(40):
-        assert estimate_dead_time(*record(rng, 6e-9, light=light * LIGHT), LAG) is None
+        assert estimate_dead_time(record(rng, 6e-9, light=light * LIGHT), LAG) is None
 
 
 # The largest load is 0.08 and 0.10.
@@ -78,7 +140,7 @@ def test_a_baseline_shows_no_dead_time(light, baseline, shown):
     rng = np.random.default_rng(1)
     for _ in range(4):
         night = {"groups": 40, "shots": 6000, "baseline": baseline}
-        estimate = estimate_dead_time(*record(rng, 4e-9, light=light * LIGHT, **night), LAG)
+        estimate = estimate_dead_time(record(rng, 4e-9, light=light * LIGHT, **night), LAG)
         assert (estimate is not None) is shown
         assert not shown or abs(estimate.dead_time - 4e-9) < 3.0 * estimate.standard_error
 
@@ -88,7 +150,7 @@ def test_few_bins_with_light_show_a_dead_time_within_its_error():
     light = np.where(DISTANCE < 900.0, LIGHT, 0.0)
     deviations = []
     for _ in range(20):
-        estimate = estimate_dead_time(*record(rng, 6e-9, light=light, groups=1), LAG)
+        estimate = estimate_dead_time(record(rng, 6e-9, light=light, groups=1), LAG)
         deviations.append((estimate.dead_time - 6e-9) / estimate.standard_error)
     assert np.sqrt(np.mean(np.square(deviations))) < 1.5
 
@@ -96,14 +158,19 @@ def test_few_bins_with_light_show_a_dead_time_within_its_error():
 @pytest.mark.parametrize("clipped", [5.5, 7.0, 8.0])
 def test_a_clipped_analog_record_shows_no_dead_time(clipped):
     """All bins with light have the same analog signal."""
-    counts, exposure, analog, variance = record(np.random.default_rng(3), 6e-9)
-    analog = np.where(analog > clipped, clipped, 4.8)
-    assert estimate_dead_time(counts, exposure, analog, variance, LAG) is None
+    groups = [
+        group._replace(analog=np.where(group.analog > clipped, clipped, 4.8))
+        for group in record(np.random.default_rng(3), 6e-9)
+    ]
+    assert estimate_dead_time(groups, LAG) is None
 
 
 def test_missing_analog_bins_do_not_count():
-    counts, exposure, analog, variance = record(np.random.default_rng(5), 6e-9)
-    analog[:, :60] = np.nan
-    estimate = estimate_dead_time(counts, exposure, analog, variance, LAG)
+    groups = record(np.random.default_rng(5), 6e-9)
+    for group in groups:
+        group.analog[:60] = np.nan
+    estimate = estimate_dead_time(groups, LAG)
     assert abs(estimate.dead_time - 6e-9) < 3.0 * estimate.standard_error
-    assert estimate_dead_time(counts, exposure, np.full_like(analog, np.nan), variance, LAG) is None
+    for group in groups:
+        group.analog[:] = np.nan
+    assert estimate_dead_time(groups, LAG) is None
