@@ -73,15 +73,17 @@ def inline(figure: Figure) -> Markup:
 class _Packed:
     """Arrays, one after the other."""
 
-    parts: list[bytes] = field(default_factory=list)
+    parts: dict[bytes, int] = field(default_factory=dict)
+    """Where each begins; equal ones are stored once."""
     size: int = 0
 
     def add(self, values: NDArray[Any]) -> int:
         """Append values; return where they begin."""
-        at, content = self.size, values.tobytes()
-        self.parts.append(content)
-        self.size += len(content)
-        return at
+        content = values.tobytes()
+        if content not in self.parts:
+            self.parts[content] = self.size
+            self.size += len(content)
+        return self.parts[content]
 
     def positions(self, values: NDArray[np.float64], axis: Axis) -> dict[str, Any]:
         """Append positions along an axis; return what they mean, as logarithms on a log axis."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import xarray as xr
 
 from lidarops.figures.image_panels import ImageQuantity, image_figure
@@ -79,14 +80,20 @@ def image_view(
     return View(
         kind if kind == variable else f"{kind}-{variable.replace('_', '-')}",
         raster_variables(variable, along),
-        partial(_read_raster, variable, along),
+        partial(_read_raster, variable, along, quantity.farthest),
         lambda rasters: [image_figure(rasters, quantity, along)],
         shows=variable,
     )
 
 
-def _read_raster(variable: str, along: str, product: xr.Dataset, source: ProductSource) -> Raster:
-    return read_raster(product, quantity=variable, profiles=source.profiles, along=along)
+def _read_raster(
+    variable: str, along: str, farthest: float, product: xr.Dataset, source: ProductSource
+) -> Raster:
+    names = [name for name in raster_variables(variable, along) if name in product.variables]
+    part = product[names]
+    if along in part:
+        part = part.isel({along: slice(0, int(np.searchsorted(part[along].values, farthest)))})
+    return read_raster(part, quantity=variable, profiles=source.profiles, along=along)
 
 
 def figures_of(kind: str) -> KindFigures | None:

@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _HEIGHT: Final = 366
+_POINTS: Final = 300
+"""Most values that are drawn of a longer profile: every second one, or fewer."""
 _MARKS: Final = 30
 """About the largest number of marks of one kind in a panel."""
 _UNCLEAR: Final = 10.0
@@ -107,7 +109,8 @@ def _read(
     earlier = -np.arange(len(usable))
     clear = (usable & (flag == 0)).sum(axis=1)
     index = int(np.lexsort((earlier, usable.sum(axis=1), clear))[-1])
-    shown = slice(0, int(np.flatnonzero(usable[index])[-1]) + 1)
+    last = int(np.flatnonzero(usable[index])[-1]) + 1
+    shown = slice(0, last, -(-last // _POINTS))
     profile = product[[name for name in (*dims, *more) if name in product.variables]]
     return (
         profile.isel({"time": index, along: shown})

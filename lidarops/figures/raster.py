@@ -30,9 +30,9 @@ Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
 """Computed in double and kept in single precision, enough for an image."""
 
-COLUMNS: Final = 400
+COLUMNS: Final = 240
 """Most columns of an image, but for those that gaps in time add."""
-ROWS: Final = 300
+ROWS: Final = 180
 """Most rows of an image."""
 _READ_ROWS: Final = 4096
 """Most rows while reading, because the range to show is known only afterwards."""
@@ -169,7 +169,9 @@ def read_raster(
     require(product, dims | dict.fromkeys(_along_both(quantity), ("time", along)))
     if product.sizes["time"] < 1 or product.sizes[along] < 2:
         raise ProductError("holds no profile of at least 2 bins", field=quantity)
-    product = product.isel(time=np.argsort(product["time"].values, kind="stable"))
+    time = product["time"].values
+    if np.any(time[1:] < time[:-1]):
+        product = product.isel(time=np.argsort(time, kind="stable"))
     ranges = product[along].values.astype(np.float64)
     starts, stops = profile_bounds(product)
     columns = column_starts(starts, stops, profiles or -(-starts.size // COLUMNS))

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 SERIES: Final = len(SERIES_MARKS)
 """Most series in a panel."""
-_POINTS: Final = 600
+_POINTS: Final = 300
 """More values than this are drawn as block means."""
 _BARS: Final = 160
 """Most values with marks and error bars; more values get a band."""

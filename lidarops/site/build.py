@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from itertools import pairwise
@@ -25,10 +23,10 @@ from lidarops.figures import any_kind, browser
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
-from lidarops.figures.quality_panel import QualityOverTime, quality_figure, read_quality
+from lidarops.figures.time_axis import TIME_BOUNDS
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import with_current_flags
-from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.site import pages, product_contents
 from lidarops.site.links import BESIDE, Links
 from lidarops.site.neighbours import with_neighbours
@@ -41,6 +39,7 @@ from lidarops.site.paths import (
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
+from lidarops.site.quality import Quality, read_quality
 from lidarops.site.values import read_values
 from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
@@ -53,9 +52,12 @@ from lidarops.system.files import (
     within,
     write_atomically,
 )
-from lidarops.system.processes import end_with_parent
+from lidarops.system.processes import Processes
 
 _FORMAT: Final = "lidarops site"
+_READ_BYTES: Final = 16_000_000
+"""Most bytes of a variable that is read as a whole."""
+_ALWAYS: Final = "time", TIME_BOUNDS, QUALITY_FLAG, USABLE
 _EMPTY: Final = "No figure of the product"
 _OURS: Final = ("product", "station", COPIES)
 """Folders that only the site writes to."""
@@ -160,57 +162,21 @@ def _collect(
     tasks: Sequence[_Task], workers: int, progress: Callable[[int], None] | None
 ) -> tuple[list[Entry], list[Problem], int]:
     entries, problems, made = [], [], 0
-    for outcome, new in _outcomes(tasks, workers):
-        if isinstance(outcome, Problem):
-            problems.append(outcome)
-        else:
-            entries.append(outcome)
-            made += new
-            if outcome.problem:
-                problems.append(Problem(outcome.path, outcome.problem))
-        if progress is not None:
-            progress(1)
+    with Processes(workers, None) as processes:
+        for _, (outcome, new) in processes.map_items(_page, tasks, at_a_time=1):
+            if isinstance(outcome, Problem):
+                problems.append(outcome)
+            else:
+                entries.append(outcome)
+                made += new
+                if outcome.problem:
+                    problems.append(Problem(outcome.path, outcome.problem))
+            if progress is not None:
+                progress(1)
     return entries, problems, made
 
 
-def _outcomes(tasks: Sequence[_Task], workers: int) -> Iterator[_Outcome]:
-    """Yield the outcome of each product, in their order."""
-    if workers == 1:
-        yield from map(_page, tasks)
-        return
-    rest = list(tasks)
-    while rest:
-        done = 0
-        with _pool(min(workers, len(rest))) as pool:
-            futures = [pool.submit(_page, task) for task in rest]
-            for future in futures:
-                try:
-                    outcome = future.result()
-                except BrokenExecutor:
-                    break
-                done += 1
-                yield outcome
-        if done < len(rest):
-            yield _alone(rest[done])
-            done += 1
-        rest = rest[done:]
-
-
-def _pool(workers: int) -> ProcessPoolExecutor:
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent)
-
-
-def _alone(task: _Task) -> _Outcome:
-    """Make a page in a separate process, after the product may have crashed another."""
-    with _pool(1) as pool:
-        try:
-            return pool.submit(_page, task).result()
-        except BrokenExecutor:
-            return Problem(task.path, "reading it crashed the process"), True
-
-
-def _page(task: _Task) -> _Outcome:
+def _page(_: None, task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
     try:
         file = within(task.products, task.path)
@@ -240,19 +206,22 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
 
 
 def _make(task: _Task, file: Path, sha256: str) -> Entry:
-    with opened_product(file, decode_timedelta=False) as opened:
-        quality = product_contents.count_quality(opened, task.below)
-        origin = product_contents.origin(opened)
-        span = product_contents.span(opened)
-        kind = attribute(opened, "lidarops_kind")
-        over_time, no_quality = _guarded(
-            lambda: read_quality(opened), "its quality over time cannot be drawn"
+    with opened_product(file, decode_cf=False) as stored:
+        kind = attribute(stored, "lidarops_kind")
+        opened = _decoded(stored, kind)
+        quality, no_quality = _guarded(
+            lambda: read_quality(opened, task.below), "its quality over time cannot be drawn"
         )
-        figures, problem = _draw(opened, kind, over_time)
-        page = product_page(task.path)
+        quality = quality or Quality()
         values, no_values = _guarded(
             lambda: read_values(opened, kind), "its values cannot be shown"
         )
+        figures, not_drawn = _draw(stored, opened, kind, quality.figure)
+        origin = product_contents.origin(opened)
+        start, stop = product_contents.span(opened)
+        no_flags = "" if QUALITY_FLAG in opened else "the product has no quality flags"
+        problems = (not_drawn, no_values, no_quality, origin["problem"], no_flags)
+        page = product_page(task.path)
         station = attribute(opened, "lidarops_station")
         instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
@@ -274,24 +243,49 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             longitude=product_contents.middle(opened, "longitude"),
             altitude=scalar(opened, "station_altitude"),
             license=attribute(opened, "license", ""),
-            start=span.start,
-            stop=span.stop,
-            values=quality.values,
-            usable=quality.usable,
-            unflagged=quality.unflagged,
+            start=start,
+            stop=stop,
+            values=quality.verdicts.values,
+            usable=quality.verdicts.usable,
+            unflagged=quality.verdicts.good,
             profiles=quality.profiles,
             available=quality.available,
             lacking=quality.lacking,
             alt=figures[0][0].text if figures else _EMPTY,
-            problem=_joined(problem, no_values, no_quality, origin.problem, _missing_flags(opened)),
+            problem="; ".join(filter(None, problems)),
         )
         contents = (
-            pages.product(entry, opened, quality, origin, figures, values or ()),
+            pages.product(entry, stored, quality, origin, figures, values or ()),
             browser.thumbnail(figures[0][0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):
         _write(task.site, name, content)
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
+
+
+def _decoded(stored: xr.Dataset, kind: str) -> xr.Dataset:
+    """Return the variables of a product that its page shows, decoded.
+
+    Of an unknown kind, any variable may be shown. What several parts of the page need is read once,
+    unless it is large.
+    """
+    shown = {*_ALWAYS, *product_contents.USED}
+    figures = figures_of(kind)
+    often = {quantity.name for quantity in figures.values} if figures is not None else set()
+    often |= {f"{name}_standard_error" for name in often} | {QUALITY_FLAG}
+    if figures is not None:
+        shown.update(*(view.variables for view in figures.views), often)
+    used = {
+        name: variable
+        for name, variable in stored.variables.items()
+        if figures is None or name in shown
+    }
+    whole = xr.Dataset(used, attrs=stored.attrs)
+    opened = xr.decode_cf(whole, decode_coords=False, decode_timedelta=False)
+    for name, variable in opened.variables.items():
+        if name in often and variable.nbytes <= _READ_BYTES:
+            variable.load()
+    return opened
 
 
 def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
@@ -302,11 +296,10 @@ def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
         return None, f"{failure}: {error}"
 
 
-def _with_quality(figures: list[Figure], quality: QualityOverTime | None) -> list[Figure]:
+def _with_quality(figures: list[Figure], shown: Figure | None) -> list[Figure]:
     """Return figures with the quality over time below the first, or after it."""
-    if quality is None:
+    if shown is None:
         return figures
-    shown = quality_figure(quality)
     if not figures or not figures[0].panels[-1].x.time:
         return [*figures[:1], shown, *figures[1:]]
     first, (panel,) = figures[0], shown.panels
@@ -316,7 +309,7 @@ def _with_quality(figures: list[Figure], quality: QualityOverTime | None) -> lis
 
 
 def _draw(
-    opened: xr.Dataset, kind: str, quality: QualityOverTime | None
+    stored: xr.Dataset, opened: xr.Dataset, kind: str, quality: Figure | None
 ) -> tuple[list[_Drawn], str]:
     """Draw a product; if it does not fit its kind, as a product of unknown kind."""
     figures = figures_of(kind)
@@ -327,13 +320,14 @@ def _draw(
     except UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        return _figures(opened, [any_kind.view_of(kind)], quality), problem
+        whole = xr.decode_cf(stored, decode_timedelta=False)
+        return _figures(whole, [any_kind.view_of(kind)], quality), problem
     except UNREADABLE as error:
         return [], problem or f"it cannot be drawn: {error}"
 
 
 def _figures(
-    opened: xr.Dataset, views: Sequence[View[Any]], quality: QualityOverTime | None
+    opened: xr.Dataset, views: Sequence[View[Any]], quality: Figure | None
 ) -> list[_Drawn]:
     contents = ((view, view.read(opened, ProductSource())) for view in views)
     figures = [
@@ -343,14 +337,6 @@ def _figures(
         for figure in view.draw([content])
     ]
     return [(figure, browser.inline(figure)) for figure in _with_quality(figures, quality)]
-
-
-def _missing_flags(opened: xr.Dataset) -> str:
-    return "" if QUALITY_FLAG in opened else "the product has no quality flags"
-
-
-def _joined(*problems: str) -> str:
-    return "; ".join(problem for problem in problems if problem)
 
 
 def _write(site: Path, name: str, content: bytes | Path) -> None:

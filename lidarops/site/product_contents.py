@@ -1,180 +1,27 @@
-"""The content of a product for its page: quality counts, provenance, variables, times."""
+"""The content of a product for its page: times, position, provenance, variables, citation."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from lidarops.figures.product_names import attribute, scalar
-from lidarops.figures.wording import named_shares, percent
-from lidarops.netcdf.stored_flags import (
-    READ_VALUES,
-    FlagCounter,
-    StoredBit,
-    bits_of,
-    blocks,
-    quality_bits,
-    rejecting_mask,
-)
-from lidarops.netcdf.variables import QUALITY_FLAG
-from lidarops.site.paths import CALENDAR_HEIGHT
+from lidarops.figures.product_names import attribute
 
 PROVENANCE: Final = "provenance"
+USED: Final = (
+    *(PROVENANCE, "range", "altitude", "latitude", "longitude", "station_altitude", "wavelength"),
+)
+"""Variables that the page of any product reads."""
 
 
-@dataclass(frozen=True, slots=True)
-class FlagRow:
-    """Count of one quality bit."""
+def span(product: xr.Dataset) -> tuple[str, str]:
+    """Return start and end of the data, UTC, ISO 8601 to the second.
 
-    bit: str
-    severity: str
-    css: str
-    meaning: str
-    count: int
-    share: str
-    width: int
-    """Whole percent, for a bar."""
-
-
-@dataclass(frozen=True, slots=True)
-class QualityCounts:
-    """Counts of the values of a product by quality."""
-
-    values: int
-    usable: int
-    unflagged: int
-    profiles: int
-    available: int
-    """Number of profiles with a usable value below a height above the station."""
-    rows: tuple[FlagRow, ...]
-
-    @property
-    def lacking(self) -> str:
-        """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
-        if self.usable or not self.values:
-            return ""
-        rejecting = ((row.meaning, row.count) for row in self.rows if row.css == "bad")
-        return named_shares(rejecting, self.values)
-
-
-@dataclass(frozen=True, slots=True)
-class StepRow:
-    """A step that was carried out or left out."""
-
-    name: str
-    channel: str
-    """Channel; in a network with its instrument."""
-    settings: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class InputRow:
-    """An input file of a product."""
-
-    path: str
-    role: str
-    sha256: str
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Provenance of a product from its PROV-JSON; empty without it."""
-
-    id: str = ""
-    plan_hash: str = ""
-    code_version: str = ""
-    versions: tuple[str, ...] = ()
-    settings: str = ""
-    steps: tuple[StepRow, ...] = ()
-    left_out: tuple[StepRow, ...] = ()
-    inputs: tuple[InputRow, ...] = ()
-    problem: str = ""
-    """Why the provenance is missing or incomplete."""
-
-
-@dataclass(frozen=True, slots=True)
-class VariableRow:
-    """A variable of a product."""
-
-    name: str
-    dims: str
-    units: str
-    about: str
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """Start and end of the data of a product, UTC, ISO 8601 to the second."""
-
-    start: str
-    stop: str
-
-
-def count_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> QualityCounts:
-    """Count the values of a product by quality bit, and the profiles with a usable value.
-
-    Parameters
-    ----------
-    product : Dataset
-        May be lazy; flags are read in blocks of bounded memory.
-    below : float, optional
-        Height above the station, m, below which a profile must have a usable value to count.
-    """
-    if QUALITY_FLAG not in product:
-        return QualityCounts(0, 0, 0, 0, 0, ())
-    bits = bits_of(product)
-    rejecting = rejecting_mask(bits)
-    counts = FlagCounter(rejecting)
-    profiles = available = 0
-    low = _low(product, below)
-    for block in blocks(product[QUALITY_FLAG], READ_VALUES):
-        flags = np.atleast_1d(quality_bits(block))
-        accepted = (flags & np.int64(rejecting)) == 0
-        profiles += len(flags)
-        seen = accepted[:, low].reshape(len(flags), -1) if accepted.ndim > 1 else accepted[:, None]
-        available += int(np.count_nonzero(seen.any(axis=1)))
-        counts.add(flags)
-    verdicts, carried = counts.verdicts, counts.carried
-    rows = [
-        _flag_row(bit, carried[bit.mask], verdicts.values) for bit in bits if bit.mask in carried
-    ]
-    return QualityCounts(
-        verdicts.values, verdicts.usable, verdicts.good, profiles, available, tuple(rows)
-    )
-
-
-def _low(product: xr.Dataset, below: float) -> NDArray[np.bool_] | slice:
-    """Return which places of a profile are below a height above the station; all if unknown."""
-    ground = {"altitude": scalar(product, "station_altitude"), "range": 0.0}
-    for name, start in ground.items():
-        along = product.variables.get(name)
-        if start is not None and along is not None and along.dims == product[QUALITY_FLAG].dims[1:]:
-            return np.asarray(along.values.astype(np.float64) - start <= below)
-    return slice(None)
-
-
-def _flag_row(bit: StoredBit, count: int, values: int) -> FlagRow:
-    severity = "do not use" if bit.rejects else "use with care"
-    return FlagRow(
-        bit=bit.word,
-        severity="unknown" if bit.severity is None else severity,
-        css="bad" if bit.rejects else "care",
-        meaning=bit.description,
-        count=count,
-        share=percent(count / values),
-        width=max(1, round(100 * count / values)),
-    )
-
-
-def span(product: xr.Dataset) -> Span:
-    """Return start and end of the data from the attributes, else from the times.
+    They are those of the attributes, else of the times.
 
     Raises
     ------
@@ -188,7 +35,7 @@ def span(product: xr.Dataset) -> Span:
         if time.size == 0 or time.dtype.kind != "M":
             raise ValueError("has no time of measurement, neither as attributes nor as a variable")
         ends = [str(time.min()), str(time.max())]
-    return Span(*(_second(text) for text in ends))
+    return _second(ends[0]), _second(ends[1])
 
 
 def _second(text: str) -> str:
@@ -199,17 +46,16 @@ def _second(text: str) -> str:
     return str(moment)
 
 
-def variables(product: xr.Dataset) -> list[VariableRow]:
-    """Return one row per variable except the provenance, coordinates first."""
-    names = [*product.coords, *product.data_vars]
+def variables(product: xr.Dataset) -> list[tuple[str, str, str, str]]:
+    """Return name, dimensions, units and meaning of all variables but the provenance."""
     return [
-        VariableRow(
-            name=str(name),
-            dims=", ".join(f"{dim} {size}" for dim, size in product[name].sizes.items()),
-            units=str(product[name].attrs.get("units", "")),
-            about=str(product[name].attrs.get("long_name", "")),
+        (
+            str(name),
+            ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
+            str(variable.attrs.get("units", "")),
+            str(variable.attrs.get("long_name", "")),
         )
-        for name in names
+        for name, variable in product.variables.items()
         if name != PROVENANCE
     ]
 
@@ -257,60 +103,58 @@ def contact(product: xr.Dataset) -> str:
     return ""
 
 
-def origin(product: xr.Dataset) -> Origin:
-    """Read the provenance of a product; problems are stated in the result, not raised."""
+def origin(product: xr.Dataset) -> dict[str, Any]:
+    """Return the provenance of a product as its page shows it, or `problem`: why there is none."""
     if PROVENANCE not in product:
-        return Origin(problem="the product has no provenance")
+        return {"problem": "the product has no provenance"}
     try:
-        document = json.loads(str(product[PROVENANCE].item()))
-        return _origin(document)
+        return _origin(json.loads(str(product[PROVENANCE].item())))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        return Origin(problem=f"the provenance cannot be read: {error!r:.200}")
+        return {"problem": f"the provenance cannot be read: {error!r:.200}"}
 
 
-def _origin(document: Mapping[str, Any]) -> Origin:
+def _origin(document: Mapping[str, Any]) -> dict[str, Any]:
     entities = document["entity"]
     product, plan = entities["lidarops:product"], entities["lidarops:plan"]
     software = document["agent"]["lidarops:software"]
     planned = json.loads(plan["lidarops:json"])
-    return Origin(
-        id=str(product["lidarops:id"]),
-        plan_hash=str(plan["lidarops:sha256"]),
-        code_version=str(software["lidarops:code_version"]),
-        versions=tuple(str(item) for item in software["lidarops:versions"]),
-        settings=json.dumps(
-            json.loads(product["lidarops:settings"]), indent=1, sort_keys=True, ensure_ascii=False
-        ),
-        steps=tuple(_step(item) for item in planned["steps"]),
-        left_out=tuple(_step(item) for item in planned["left_out"]),
-        inputs=tuple(_inputs(document)),
+    settings = json.loads(product["lidarops:settings"])
+    return {
+        "problem": "",
+        "id": product["lidarops:id"],
+        "plan": plan["lidarops:sha256"],
+        "code_version": software["lidarops:code_version"],
+        "versions": ", ".join(software["lidarops:versions"]),
+        "settings": json.dumps(settings, indent=1, sort_keys=True, ensure_ascii=False),
+        "steps": [_step(item) for item in planned["steps"]],
+        "left_out": [(name, of, why) for name, of, _, why in map(_step, planned["left_out"])],
+        "inputs": _inputs(document),
+    }
+
+
+def _step(item: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """Return name, channel (in a network with its instrument), settings and reason of a step."""
+    settings = {
+        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        for key, value in sorted(item.get("settings", {}).items())
+    }
+    return (
+        str(item["name"]),
+        " ".join(str(item[key]) for key in ("instrument", "channel") if item.get(key)),
+        "\n".join(f"{key}: {value}" for key, value in settings.items()) or "none",
+        str(item["reason"]),
     )
 
 
-def _step(item: Mapping[str, Any]) -> StepRow:
-    settings = item.get("settings", {})
-    return StepRow(
-        name=str(item["name"]),
-        channel=" ".join(str(item[key]) for key in ("instrument", "channel") if item.get(key)),
-        settings="\n".join(f"{key}: {_plain(settings[key])}" for key in sorted(settings)),
-        reason=str(item["reason"]),
-    )
-
-
-def _plain(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _inputs(document: Mapping[str, Any]) -> list[InputRow]:
+def _inputs(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return path, role and sha256 of the raw files, signals first."""
     roles: dict[str, set[str]] = {}
     for use in document["used"].values():
         roles.setdefault(use["prov:entity"], set()).add(str(use["prov:role"]))
     rows = []
     for key, entity in document["entity"].items():
-        if "lidarops:path" in entity:
-            paths = entity["lidarops:path"]
+        paths = entity.get("lidarops:path", [])
+        for path in [paths] if isinstance(paths, str) else paths:
             role = ", ".join(sorted(roles.get(key, {"not stated"})))
-            digest = str(entity["lidarops:sha256"])
-            named = [paths] if isinstance(paths, str) else paths
-            rows += [InputRow(str(path), role, digest) for path in named]
-    return sorted(rows, key=lambda row: (row.role != "signal", row.role, row.path))
+            rows.append((str(path), role, str(entity["lidarops:sha256"])))
+    return sorted(rows, key=lambda row: (row[1] != "signal", row[1], row[0]))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,14 +16,13 @@ from lidarops.figures.wording import percent
 from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
 from lidarops.netcdf.variables import QUALITY_FLAG
 
-READ_BYTES: Final = 16_000_000
+READ_BYTES: Final = 1_000_000
 """Most bytes of a variable that are read. Of a longer one, every second profile is, or fewer."""
 _SHARES: Final = (5.0, 50.0, 95.0)
 
 
-@dataclass(frozen=True, slots=True)
-class ValueRow:
-    """The usable values of one quantity, in the displayed unit."""
+class ValueRow(NamedTuple):
+    """The usable values of one quantity, in the displayed unit, in words."""
 
     title: str
     """Name and unit."""
@@ -66,20 +64,22 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
 
 
 def _row(product: xr.Dataset, quantity: Quantity) -> ValueRow:
-    every = -(-product[quantity.name].nbytes // READ_BYTES)
+    whole = product[quantity.name]
+    every = -(-whole.nbytes // READ_BYTES)
 
-    def read(name: str) -> NDArray[Any]:
-        return product[name][::every].values
+    def along(name: str) -> xr.DataArray | None:
+        """Return another variable of the same dimensions; None without one."""
+        has = name in product and product[name].dims == whole.dims
+        return product[name][::every] if has else None
 
-    values = quantity.factor * read(quantity.name).astype(np.float64)
+    values = quantity.factor * whole[::every].values.astype(np.float64)
     usable = np.isfinite(values)
-    if QUALITY_FLAG in product and product[QUALITY_FLAG].dims == product[quantity.name].dims:
-        rejecting = rejecting_mask(bits_of(product))
-        usable &= (quality_bits(product[QUALITY_FLAG][::every]) & rejecting) == 0
-    error = f"{quantity.name}_standard_error"
+    flags, error = along(QUALITY_FLAG), along(f"{quantity.name}_standard_error")
+    if flags is not None:
+        usable &= (quality_bits(flags) & rejecting_mask(bits_of(product))) == 0
     errors = np.full(values.shape, np.nan)
-    if error in product and product[error].dims == product[quantity.name].dims:
-        errors = quantity.factor * read(error).astype(np.float64)
+    if error is not None:
+        errors = quantity.factor * error.values.astype(np.float64)
     known = usable & np.isfinite(errors)
     title = quantity.label
     return ValueRow(

@@ -136,7 +136,7 @@ def test_a_missing_variable_is_named(made, tmp_path, name):
     assert caught.value.field == name
 
 
-IMAGES = ("elastic-aerosol-backscatter", "elastic-attenuated-backscatter")
+IMAGES = ("elastic-aerosol-backscatter",)
 
 
 class TestGallery:

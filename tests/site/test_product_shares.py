@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 
 from lidarops.site import pages
-from lidarops.site.product_contents import count_quality
 from lidarops.site.product_entry import Entry, ShareGrade, mean_availability
+from lidarops.site.quality import read_quality
 
 
 def entry(available: int, profiles: int = 100, kind: str = "raman", lacking: str = "") -> Entry:
@@ -75,10 +75,10 @@ def product(first_usable: int, name: str = "range") -> xr.Dataset:
 @pytest.mark.parametrize("name", ["range", "altitude"])
 def test_a_profile_counts_where_a_value_is_usable_below_a_height(name: str):
     for first_usable, below, available in ((4, 5e3, 1), (5, 5e3, 0), (5, 6e3, 1)):
-        counted = count_quality(product(first_usable, name), below)
+        counted = read_quality(product(first_usable, name), below)
         assert (counted.profiles, counted.available) == (3, available)
 
 
 def test_a_product_without_usable_values_says_why():
-    assert count_quality(product(9)).lacking == ""
-    assert count_quality(product(10)).lacking.endswith("(100 %)")
+    assert read_quality(product(9)).lacking == ""
+    assert read_quality(product(10)).lacking.endswith("(100 %)")

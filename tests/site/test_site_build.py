@@ -158,8 +158,8 @@ def test_product_page_has_flags_provenance_and_download(archive: Path, site: Pat
     assert file == archive.resolve() / "products" / page.relative_to(site / "product").with_suffix(
         ".nc"
     )
-    # Two images and a profile, with the quality below the first.
-    assert text.count('<div class="fig"') == 3
+    # An image and a profile, with the quality below the first.
+    assert text.count('<div class="fig"') == 2
     assert "On average" in text
     assert f'xarray.open_dataset("{file.name}")' in text.replace("&#34;", '"')
 

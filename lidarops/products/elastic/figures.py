@@ -14,12 +14,8 @@ _UNIT: Final = "Mm⁻¹ sr⁻¹"
 _CAUSES: Final = (
     *("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline"),
 )
-_IMAGES: Final = {
-    "aerosol_backscatter": ImageQuantity("aerosol backscatter", _MEGA, _UNIT, (0.01, 10.0)),
-    "attenuated_backscatter": ImageQuantity("attenuated backscatter", _MEGA, _UNIT, (0.1, 100.0)),
-}
-"""Images by variable; colours from background aerosol to dust and cirrus. The attenuated
-backscatter holds that of molecules, about 1 Mm-1 sr-1 near the ground at 532 nm."""
+_IMAGE: Final = ImageQuantity("aerosol backscatter", _MEGA, _UNIT, (0.01, 10.0))
+"""Colours from background aerosol to dust and cirrus."""
 _PROFILE: Final = ProfileQuantity(
     "aerosol_backscatter",
     f"backscatter ({_UNIT})",
@@ -31,7 +27,7 @@ _PROFILE: Final = ProfileQuantity(
 
 FIGURES: Final = KindFigures(
     (
-        *(image_view("elastic", name, image) for name, image in _IMAGES.items()),
+        image_view("elastic", "aerosol_backscatter", _IMAGE),
         profile_view("profile", (_PROFILE,), "range"),
     ),
     preferred="aerosol_backscatter",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.panels import Axis, Curve, Figure, Image, Mark, Panel, codes_of, finite
+from lidarops.figures.raster import COLUMNS, ROWS
 from lidarops.figures.series_data import require
 from lidarops.figures.wording import counted, utc
 from lidarops.retrieve.multiangle.scan_cycles import vertical_planes
@@ -25,9 +26,6 @@ VARIABLES: Final = (
     *("beam_signal", "beam_obstruction", "residual"),
 )
 """Variables that `read_scan` needs."""
-_WIDTH: Final = 400
-"""Columns of the image."""
-_ROWS: Final = 200
 _HEIGHT: Final = 420
 _FEWEST_AZIMUTHS: Final = 3
 """Beams at one elevation that make a map."""
@@ -160,7 +158,7 @@ def draw_scan(scans: Sequence[Scan]) -> list[Figure]:
 def _image(scan: Scan, x: Axis, y: Axis, bar: Axis) -> Image:
     """Return the signals at pixels: those of the nearest beam, at their distance."""
     left, up = (
-        np.linspace(axis.low, axis.high, size + 1) for axis, size in ((x, _WIDTH), (y, _ROWS))
+        np.linspace(axis.low, axis.high, size + 1) for axis, size in ((x, COLUMNS), (y, ROWS))
     )
     across, along = np.meshgrid(
         0.5 * (left[1:] + left[:-1]), 0.5 * (up[1:] + up[:-1]), indexing="ij"

@@ -13,6 +13,7 @@ import numpy as np
 from lidarops.figures import browser
 from lidarops.figures.kind_figures import ProductSource, figures_of
 from lidarops.figures.panels import BLANK, FIRST, Axis, Band, Curve, Figure, Image, Panel
+from lidarops.figures.raster import COLUMNS
 
 STEPS = 65534
 
@@ -50,7 +51,7 @@ def images(panel: Panel) -> list[Image]:
     return [layer for layer in panel.layers if isinstance(layer, Image)]
 
 
-def pixels(panel: Panel, height: int = 306, width: int = 400) -> Any:
+def pixels(panel: Panel, height: int = 306, width: int = COLUMNS) -> Any:
     """Return the codes of the images of a panel at pixels, the first row on top."""
     shown = np.full((height, width), BLANK, dtype=np.uint8)
     x = panel.x.low + (np.arange(width) + 0.5) / width * (panel.x.high - panel.x.low)
