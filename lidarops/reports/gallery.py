@@ -1,35 +1,107 @@
 """The figures of a run's report: reads products, draws them, compares them with the truth.
 
-A missing or unreadable product does not stop the report; it is listed as a problem.
+A missing or unreadable product does not stop the report; it is listed as a problem. Products are
+read in one process or several; figures and their order do not depend on the number.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.figures.any_kind import views_of
-from lidarops.figures.kind_figures import View
+from lidarops.figures.kind_figures import ProductSource, View
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words
-from lidarops.figures.wording import counted
+from lidarops.figures.raster import COLUMNS
+from lidarops.figures.series_data import Comparison
+from lidarops.figures.wording import counted, named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
-from lidarops.netcdf.read import UNREADABLE, opened_product
+from lidarops.netcdf.read import UNREADABLE, open_product, opened_product, profiles_in
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
-from lidarops.reports.reading import Compared, Group, Problem, Readers, Sources, reason
+from lidarops.system.processes import Processes
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
+FEWEST: Final = 50
+"""Fewest products per process for which starting the process pays."""
 _FLAG_ROWS: Final = 40
+_AT_A_TIME: Final = 8
+"""Products sent to a process together, so that it waits less."""
+_UNREADABLE: Final = (
+    *(ArithmeticError, LookupError, MemoryError, RuntimeError, ValueError, ProductError),
+)
+"""What values of a damaged product may raise; other errors are those of the program."""
+
+
+_Item = tuple[str, ProductSource]
+"""A product by its path, and what is known about it, without the truth."""
+_Task = Callable[[Path, ProductSource], Any]
+
+
+class Problem(NamedTuple):
+    """A file that could not be used for the report."""
+
+    path: str
+    reason: str
+
+
+class Compared(NamedTuple):
+    """A comparison with the truth, with its instrument and channel."""
+
+    instrument: str
+    channel: str
+    comparison: Comparison
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """All products of one kind, instrument and channel in a run."""
+
+    kind: str
+    instrument: str
+    channel: str
+    members: tuple[tuple[SceneOutcome, ProductRecord], ...]
+    root: Path
+    """Folder that product paths are relative to."""
+
+    @property
+    def label(self) -> str:
+        """Instrument and channel, for titles."""
+        return f"{self.instrument} \N{MIDDLE DOT} {self.channel}"
+
+    @property
+    def good(self) -> float:
+        """Share of values without a quality bit."""
+        values = sum(product.values for _, product in self.members)
+        return sum(product.unflagged for _, product in self.members) / values if values else 0.0
+
+    @property
+    def lacking(self) -> str:
+        """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
+        products = [product for _, product in self.members]
+        if self.kind not in kinds() or any(product.usable != 0 for product in products):
+            return ""
+        flags = flags_of(self.kind)
+        counts: Counter[str] = Counter()
+        for product in products:
+            counts.update(product.flagged)
+        rejecting = (
+            (bit.description, count)
+            for name, count in counts.items()
+            if (bit := flags.named(name)) is not None and bit.severity is Severity.REJECT
+        )
+        return named_shares(rejecting, sum(product.values for product in products))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,20 +151,84 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
     gallery = Gallery(flags=_shares(record))
     truth = _truth(record, gallery)
     products = sum(len(scene.products) for scene in record.scenes)
-    with Readers(workers, products, truth) as readers:
-        sources = Sources(readers, gallery.problems)
+    with Processes(min(workers, products // FEWEST), truth) as processes:
         for group in _groups(record):
             full = len(gallery.pictures) >= limit
             if full:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
             for view in views_of(group.kind):
                 compares = truth is not None and view.compare is not None
-                contents = list(sources.read(group, view)) if compares or not full else []
+                if full and not compares:
+                    continue
+                contents = list(_read(processes, truth, group, view, gallery.problems))
                 if contents and compares:
                     gallery.compared += _compared(view, contents, group)
                 for drawn in view.draw(contents) if contents and not full else ():
                     gallery.pictures.append(_picture(view.name, drawn, group))
     return gallery
+
+
+def _read(
+    processes: Processes[xr.Dataset | None],
+    truth: xr.Dataset | None,
+    group: Group,
+    view: View[Any],
+    problems: list[Problem],
+) -> Iterator[Any]:
+    """Yield what a view shows of every readable product of a group, or of the first."""
+    source = ProductSource(group.instrument, group.channel)
+    items = [(product.path, replace(source, scene=scene)) for scene, product in group.members]
+
+    def each(task: _Task, items: Sequence[_Item]) -> Iterator[tuple[_Item, Any]]:
+        """Yield what a task returns of each product; note those that it fails on."""
+        guarded = partial(_guarded, task, group.root)
+        alone = ((item, guarded(truth, item)) for item in items)
+        results = alone if view.first else processes.map_items(guarded, items, at_a_time=_AT_A_TIME)
+        for item, (content, reason) in results:
+            if not reason:
+                yield item, content
+            elif all(problem.path != item[0] for problem in problems):
+                problems.append(Problem(item[0], reason))
+
+    if view.shows:
+        # All products get the same resolution, which follows from their total length.
+        known = list(each(_length, items))
+        profiles = -(-sum(length for _, length in known) // COLUMNS)
+        items = [(path, replace(own, profiles=profiles)) for (path, own), _ in known]
+    for _, content in each(partial(_content, view.variables, view.read), items):
+        if content is not None:
+            yield content
+            if view.first:
+                return
+
+
+def _guarded(task: _Task, root: Path, truth: xr.Dataset | None, item: _Item) -> tuple[Any, str]:
+    """Return what a task returns of a product, or why the product cannot be read."""
+    path, source = item
+    try:
+        return task(root / path, replace(source, truth=truth)), ""
+    except _UNREADABLE as error:
+        return None, _reason(root / path, error)
+
+
+def _length(file: Path, _: ProductSource) -> int:
+    return profiles_in(file)
+
+
+def _content(
+    names: tuple[str, ...],
+    read: Callable[[xr.Dataset, ProductSource], Any],
+    file: Path,
+    source: ProductSource,
+) -> Any:
+    with open_product(file, names) as product:
+        return read(product, source)
+
+
+def _reason(path: Path, error: BaseException) -> str:
+    """Return the message of an error without the path, which is shown beside it."""
+    words = str(error).removeprefix(f"{path}: ").replace(str(path), path.name)
+    return words or type(error).__name__
 
 
 def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterator[Compared]:
@@ -205,7 +341,7 @@ def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
             if name not in truth.variables or truth[name].dims != ("granule",):
                 raise ProductError("is not a variable along granule", field=name)
     except UNREADABLE as error:
-        gallery.problems.append(Problem(record.truth, reason(path, error)))
+        gallery.problems.append(Problem(record.truth, _reason(path, error)))
         return None
     return truth
 

@@ -25,8 +25,7 @@ from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
 from lidarops.reports.findings import disagreement_rows, finding_rows, lacking, scene_note_rows
-from lidarops.reports.gallery import Gallery, Picture
-from lidarops.reports.reading import Compared
+from lidarops.reports.gallery import Compared, Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME, INDEX
 from lidarops.system.files import write_atomically
 

@@ -1,0 +1,123 @@
+"""Figures do not depend on the number of processes, nor on the loss of one."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.products.fabricated import (
+    START,
+    Archive,
+    homogeneous,
+    outcome,
+    run_record,
+    signal,
+    times,
+    truth_of,
+)
+
+from lidarops.records import InputRecord, Role, RunRecord
+from lidarops.reports import gallery, run_page
+
+SCENES = 6
+
+
+@pytest.fixture
+def many(archive: Archive, tmp_path: Path) -> RunRecord:
+    """Return a simulated run of several scenes with unreadable products of two kinds."""
+    scenes, all_times = [], []
+    for number in range(SCENES):
+        time = times(START + timedelta(hours=3 * number), 12, 900.0)
+        all_times.append(time)
+        products = (
+            archive.write(f"e{number}.nc", homogeneous(time, seed=number), "homogeneous"),
+            archive.write(f"s{number}.nc", signal(time, bins=80), "signal"),
+        )
+        inputs = tuple(
+            InputRecord(f"raw/h{12 * number + i:05d}", Role.SIGNAL, "b" * 64) for i in range(12)
+        )
+        scenes.append(outcome(f"horizontal_{number}", products=products, inputs=inputs))
+    (archive.root / "e2.nc").unlink()
+    (archive.root / "s3.nc").write_bytes(b"nonsense")
+    xr.open_dataset(archive.root / "s4.nc").load().drop_vars("signal_standard_error").to_netcdf(
+        archive.root / "s4.nc"
+    )
+    truth = tmp_path / "truth.nc"
+    truth_of(np.concatenate(all_times)).to_netcdf(truth)
+    return run_record(archive.root, scenes, truth=str(truth))
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+class TestFigures:
+    def test_do_not_depend_on_the_number_of_processes(self, many, tmp_path, monkeypatch):
+        filled = []
+        fill = gallery.fill
+
+        def noted(*arguments, **options):
+            filled.append(fill(*arguments, **options))
+            return filled[-1]
+
+        monkeypatch.setattr(gallery, "fill", noted)
+        run_page.build_report(many, tmp_path / "one")
+        monkeypatch.setattr(gallery, "FEWEST", 1)
+        monkeypatch.setattr(gallery, "_AT_A_TIME", 2)
+        run_page.build_report(many, tmp_path / "two", workers=2)
+        alone, together = filled
+        assert files(tmp_path / "one") == files(tmp_path / "two")
+        # Pages hold the figures, of which arrays have no single truth.
+        assert replace(together, pictures=[]) == replace(alone, pictures=[])
+        assert [problem.path for problem in alone.problems] == ["s3.nc", "s4.nc", "e2.nc"]
+        assert alone.problems[2].reason == "the file is missing"
+        assert alone.problems[1].reason == "signal_standard_error: is missing from the product"
+        assert alone.compared
+
+    def test_no_product_is_read_twice(self, many, tmp_path, monkeypatch):
+        read = []
+        before = gallery.open_product
+
+        def noted(path: Path, names: tuple[str, ...]) -> xr.Dataset:
+            read.append(path.name)
+            return before(path, names)
+
+        monkeypatch.setattr(gallery, "open_product", noted)
+        gallery.fill(many)
+        assert sorted(read) == sorted({*read})
+        assert len(read) == 2 * SCENES - 1
+
+    def test_do_not_depend_on_the_loss_of_a_process(self, many, monkeypatch, caplog):
+        alone = gallery.fill(many)
+        monkeypatch.setattr(gallery, "FEWEST", 1)
+        monkeypatch.setattr(gallery, "_content", deadly)
+        with caplog.at_level(logging.WARNING):
+            together = gallery.fill(many, workers=2)
+        assert replace(together, pictures=[]) == replace(alone, pictures=[])
+        assert caplog.text.count("a process was lost") == 1
+
+    def test_errors_of_the_program_are_not_hidden_as_file_errors(self, many, monkeypatch):
+        monkeypatch.setattr(gallery, "_content", lambda *_: len(3))
+        with pytest.raises(TypeError):
+            gallery.fill(many)
+
+
+CONTENT = gallery._content
+
+
+def deadly(names, read, file, source):
+    """End any process but the main one at a product."""
+    if multiprocessing.parent_process() is not None and file.name == "e1.nc":
+        os._exit(9)
+    return CONTENT(names, read, file, source)
