@@ -84,6 +84,9 @@ class Station(SettingsModel):
     )
 
 
+_DeadTime = Annotated[float, Field(ge=1e-10, le=2e-7)]
+
+
 class ChannelFacts(SettingsModel):
     """Facts about one channel in a validity period."""
 
@@ -95,11 +98,12 @@ class ChannelFacts(SettingsModel):
     wavelength: float | None = quantity(
         None, unit="m", gt=1e-7, lt=2e-5, description="where the header is wrong"
     )
-    dead_time: Annotated[float, Field(ge=1e-10, le=2e-7)] | Literal["estimate"] | None = quantity(
+    dead_time: _DeadTime | Literal[0, "estimate"] | None = quantity(
         None,
         unit="s",
-        description="time after a photon in which the counter is blind, from its data sheet; or"
-        " 'estimate', against the analog channel of the same detector",
+        description="time after a photon in which the counter is blind, from its data sheet; 0 of"
+        " counts that are corrected in the files; or 'estimate', against the analog channel of the"
+        " same detector",
     )
     dead_time_uncertainty: float | None = quantity(
         None, unit="1", ge=0, le=1, description="relative standard error of dead_time; 0.2 if none"

@@ -240,7 +240,8 @@ class Expected:
 
     def choices(self) -> list[str]:
         """Return the valid texts, where a list gives them."""
-        return [text for schema in self.schemas for text in _choices(schema)]
+        found = (choice for schema in self.schemas for choice in _choices(schema))
+        return [choice for choice in found if isinstance(choice, str)]
 
     def words(self) -> str:
         """Return what is expected, such as ``a number from 1 to 200 sr``."""

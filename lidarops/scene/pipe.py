@@ -207,7 +207,10 @@ def plan_dead_time(case: ChannelCase[Any]) -> Entry:
     if dead_time == "estimate":
         return _plan_estimate(case)
     reason, error = "given by the campaign", case.facts_of_channel.dead_time_uncertainty
-    if error is None:
+    if dead_time == 0.0:
+        reason = "0 by the campaign: the counts of the files are corrected"
+        error = 0.0
+    elif error is None:
         reason += f"; its uncertainty is not, and {DEAD_TIME_UNCERTAINTY:.0%} is assumed"
         error = DEAD_TIME_UNCERTAINTY
     settings = DeadTimeSettings(dead_time=dead_time, dead_time_uncertainty=error)

@@ -60,7 +60,7 @@ def _message(folder: Path, text: str) -> str:
             "dead_time: 3.0e-6",
             (
                 "line 14: instruments.lidar.facts.0.channels.photon_532o.dead_time: must be a"
-                " number from 1e-10 to 2e-07 s or 'estimate', not 3.0e-6"
+                " number from 1e-10 to 2e-07 s or 0 or 'estimate', not 3.0e-6"
             ),
         ),
         (
@@ -69,10 +69,14 @@ def _message(folder: Path, text: str) -> str:
             "photon_532o.dead_time_uncertainty: must be a number from 0 to 1 (no unit), not 20",
         ),
         # In ps, km and mm.
-        ("dead_time: 4.0e-9", "dead_time: 4.0e-12", "to 2e-07 s or 'estimate', not 4.0e-12"),
+        ("dead_time: 4.0e-9", "dead_time: 4.0e-12", "to 2e-07 s or 0 or 'estimate', not 4.0e-12"),
         ("[[750, 4500]]", "[[0.75, 4.5]]", "must be 0, or at least 10 m, not 0.75 m: is it in km?"),
         ("[[750, 4500]]", "[[750, 4500000]]", "from 0 to 150000 m, not 4500000"),
-        ("dead_time: 4.0e-9", "dead_time: 3e-6", "from 1e-10 to 2e-07 s or 'estimate', not '3e-6'"),
+        (
+            "dead_time: 4.0e-9",
+            "dead_time: 3e-6",
+            "from 1e-10 to 2e-07 s or 0 or 'estimate', not '3e-6'",
+        ),
         (
             "latitude: 46.4",
             "latitude: north",

@@ -106,6 +106,17 @@ def test_dark_only_where_there_are_dark_files(*, with_dark: bool) -> None:
     assert ("dark" in _left_out(result, "analog_532o")) is not with_dark
 
 
+def test_a_dead_time_of_zero_means_that_counts_are_corrected() -> None:
+    campaign = factories.campaign(facts=[{"channels": {"photon_532o": {"dead_time": 0}}}])
+    result = plan_scene(_scene(), campaign)
+    assert _steps(result, "photon_532o")["dead_time"] == {
+        "dead_time": 0.0,
+        "dead_time_uncertainty": 0.0,
+    }
+    reasons = {step.name: step.reason for step in result.steps if step.channel == "photon_532o"}
+    assert reasons["dead_time"] == "0 by the campaign: the counts of the files are corrected"
+
+
 def test_the_reason_names_an_unknown_dead_time() -> None:
     result = plan_scene(_scene(), factories.campaign(facts=[{}]))
     assert "dead_time" in _left_out(result, "photon_532o")["dead_time"]

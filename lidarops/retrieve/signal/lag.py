@@ -42,8 +42,8 @@ class ChannelLag:
     confidence: float = math.nan
     """Probability that noise without a common cause has no peak as high as that of the estimate."""
     significant: bool = False
-    """Whether it is estimated, with a confidence of at least 99.9 % and a peak that is not at the
-    largest lag."""
+    """Whether it is estimated, with a confidence of at least 99.9 %, a standard error of less than
+    2 bins, and a peak that is not at the largest lag."""
 
 
 def profile_groups(profiles: int) -> list[slice]:
@@ -110,12 +110,9 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> ChannelLag:
     deviation = estimates - estimates.mean()
     scatter = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
     confidence, defined = _confidence(total, lag), bool(np.isfinite(lag))
-    return ChannelLag(
-        bins=float(lag),
-        standard_error=float(np.hypot(scatter, systematic)) if defined else math.nan,
-        confidence=confidence,
-        significant=defined and confidence >= THRESHOLDS.confidence and not at_end,
-    )
+    error = float(np.hypot(scatter, systematic)) if defined else math.nan
+    significant = confidence >= THRESHOLDS.confidence and error < THRESHOLDS.largest_lag_error
+    return ChannelLag(float(lag), error, confidence, significant and not at_end)
 
 
 def enough_bins(bins: int) -> bool:

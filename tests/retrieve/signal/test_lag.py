@@ -81,6 +81,18 @@ def test_a_lag_beyond_the_largest_is_not_significant():
     assert not lag_of(*recorded(rng, 34.0)).significant
 
 
+def test_a_lag_that_parts_of_the_range_contradict_is_not_significant():
+    """Both of two lags are far above noise, and a part of the range decides which is higher."""
+    rng = np.random.default_rng(9)
+    for _ in range(8):
+        light, *others = rng.normal(size=(3, 12, BINS))
+        analog, photon = (light + other for other in others)
+        analog = np.where(np.arange(BINS) < BINS // 2, analog, np.roll(analog, 8, axis=1))
+        estimate = lag_of(analog, photon)
+        assert estimate.confidence > 0.999
+        assert not estimate.significant
+
+
 def test_gaps_dead_channels_and_spikes_do_not_mislead():
     rng = np.random.default_rng(7)
     analog, photon = recorded(rng, 8.6)
