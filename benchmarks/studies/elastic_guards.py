@@ -118,7 +118,6 @@ GUARDS: Final = (
             (reference_window.ReferenceWindow, "undetected_particles", property(_no_error))
         ),
     ),
-    Guard("least denominator", off=threshold(least_denominator=0.0)),
     Guard("least certainty", off=threshold(least_certainty=0.0)),
     Guard("skewed errors", off=threshold(skewed=0.0)),
     Guard("longest gap", off=threshold(longest_gap=np.inf)),

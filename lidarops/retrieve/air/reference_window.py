@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen
-from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 
 Codes = npt.NDArray[np.int32]
 
@@ -259,7 +259,7 @@ def choose_reference(
         frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
         frozen(shape),
         frozen(grid),
-        frozen(excluded > 0.0),
+        frozen(excluded),
         edges,
         statistics,
     )
@@ -405,52 +405,64 @@ def _detection_limit(
     return np.asarray((THRESHOLDS.most_deviation + _PROBABLE) * limit)
 
 
-@compiled
-def _usable(power: float, variance: float) -> bool:
-    return abs(power) < HUGE and 0.0 < variance < HUGE
+@summing
+def _weigh(power: Array, variance: Array, excluded: Array, inverse: Array, values: Array) -> None:
+    """Fill inverse variances and powers, 0 in bins that are not usable."""
+    for i in range(power.size):
+        good = (abs(power[i]) < HUGE) & (variance[i] > 0.0) & (variance[i] < HUGE)
+        inverse[i] = 1.0 / variance[i] if good & (excluded[i] == 0.0) else 0.0
+        values[i] = power[i] if good else 0.0
 
 
-@compiled
-def _fit(
-    power: Array, variance: Array, shape: Array, range_: Array, excluded: Booleans, out: Array
-) -> None:
-    """Fit the molecular shape times polynomials in range that are orthogonal under the noise."""
-    middle = 0.5 * (range_[0] + range_[-1])
-    half = max(0.5 * (range_[-1] - range_[0]), _SHORTEST)
-    s0 = s1 = s2 = s3 = s4 = y0 = y1 = y2 = level = 0.0
-    count, out[EXCLUDED_BINS] = 0, 0.0
-    for i in range(range_.size):
-        if excluded[i]:
-            out[EXCLUDED_BINS] += 1.0
-        if excluded[i] or not _usable(power[i], variance[i]):
-            continue
-        t = (range_[i] - middle) / half
-        f = shape[i]
-        w = f * f / variance[i]
-        y = f * power[i] / variance[i]
-        count += 1
-        level += f / variance[i]
+@summing
+def _moments(values: Array, inverse: Array, shape: Array, place: Array) -> tuple[float, ...]:
+    """Return the number of bins, the sums of f / v, w t^0 to w t^4 and y t^0 to y t^2.
+
+    With the shape f, w = f^2 / v and y = f P / v.
+    """
+    count = level = s0 = s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
+    for i in range(place.size):
+        scaled, t = shape[i] * inverse[i], place[i]
+        w, y, square = scaled * shape[i], scaled * values[i], t * t
+        count += 1.0 if inverse[i] > 0.0 else 0.0
+        level += scaled
         s0 += w
         s1 += w * t
-        s2 += w * t * t
-        s3 += w * t**3
-        s4 += w * t**4
+        s2 += w * square
+        s3 += w * square * t
+        s4 += w * square * square
         y0 += y
         y1 += y * t
-        y2 += y * t * t
+        y2 += y * square
+    return count, level, s0, s1, s2, s3, s4, y0, y1, y2
+
+
+@summing
+def _chi_square(values: Array, inverse: Array, shape: Array, scale: float) -> float:
+    total = 0.0
+    for i in range(values.size):
+        residual = values[i] - scale * shape[i]
+        total += residual * residual * inverse[i]
+    return total
+
+
+@inlined
+def _fit(
+    values: Array, inverse: Array, shape: Array, place: Array, half: float, out: Array
+) -> None:
+    """Fit the molecular shape times polynomials in range that are orthogonal under the noise."""
+    count, level, s0, s1, s2, s3, s4, y0, y1, y2 = _moments(values, inverse, shape, place)
     out[COUNT] = count
     if not s0 > 0.0:
         return
+    scale = y0 / s0
+    residual = _chi_square(values, inverse, shape, scale)
     # 1, t - a and t^2 - b (t - a) - c are orthogonal.
-    scale, a, c = y0 / s0, s1 / s0, s2 / s0
+    a, c = s1 / s0, s2 / s0
     norm1 = s2 - a * s1
     out[SCALE], out[SCALE_ERROR], out[RESPONSE] = scale, 1.0 / math.sqrt(s0), level / s0
-    residual = 0.0
-    for i in range(range_.size):
-        if not excluded[i] and _usable(power[i], variance[i]):
-            residual += (power[i] - scale * shape[i]) ** 2 / variance[i]
-    out[SCATTER] = residual / max(count - 1, 1)
-    if count < 3 or not norm1 > _DEPENDENT * s0:
+    out[SCATTER] = residual / max(count - 1.0, 1.0)
+    if count < 3.0 or not norm1 > _DEPENDENT * s0:
         return
     slope = (y1 - a * y0) / norm1
     out[SLOPE], out[SLOPE_ERROR] = slope / scale / half, 1.0 / math.sqrt(norm1) / abs(scale) / half
@@ -460,13 +472,38 @@ def _fit(
         out[CURVATURE] = (y2 - c * y0 - b * (y1 - a * y0)) / math.sqrt(norm2)
 
 
+@inlined
+def _fit_windows(
+    values: Array,
+    inverse: Array,
+    shape: Array,
+    range_: Array,
+    excluded: Array,
+    edges: npt.NDArray[np.int64],
+    place: Array,
+    out: Array,
+) -> None:
+    for j in range(edges.shape[0]):
+        first, stop = edges[j, 0], edges[j, 1]
+        if stop <= first:
+            continue
+        middle = 0.5 * (range_[first] + range_[stop - 1])
+        half = max(0.5 * (range_[stop - 1] - range_[first]), _SHORTEST)
+        out[j, EXCLUDED_BINS] = 0.0
+        for i in range(first, stop):
+            place[i] = (range_[i] - middle) / half
+            out[j, EXCLUDED_BINS] += excluded[i]
+        bins = slice(first, stop)
+        _fit(values[bins], inverse[bins], shape[bins], place[bins], half, out[j])
+
+
 @compiled
 def _compare_with_air(
     power: Array,
     variance: Array,
     shape: Array,
     range_: Array,
-    excluded: Booleans,
+    excluded: Array,
     edges: npt.NDArray[np.int64],
     out: Array,
 ) -> None:
@@ -478,7 +515,8 @@ def _compare_with_air(
     variance, shape : (profile or 1, bin) float64
     range_ : (bin,) float64
         m, ascending.
-    excluded : (profile or 1, bin) bool
+    excluded : (profile or 1, bin) float64
+        1 in excluded bins, else 0.
     edges : (window, 2) int64
         First bin of the window, and first bin beyond it.
     out : (profile, window, `FIELDS`) float64
@@ -487,13 +525,11 @@ def _compare_with_air(
         degrees of freedom, number of bins, number of excluded bins, change of the scale per change
         of the background.
     """
+    place, values, inverse = (
+        np.empty(range_.size), np.empty(range_.size), np.empty(range_.size),
+    )  # fmt: skip
     for k in range(power.shape[0]):
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
         masked = excluded[k % excluded.shape[0]]
-        for j in range(edges.shape[0]):
-            first, stop = edges[j, 0], edges[j, 1]
-            if stop > first:
-                _fit(
-                    power[k, first:stop], noise[first:stop], air[first:stop], range_[first:stop],
-                    masked[first:stop], out[k, j],
-                )  # fmt: skip
+        _weigh(power[k], noise, masked, inverse, values)
+        _fit_windows(values, inverse, air, range_, masked, edges, place, out[k])

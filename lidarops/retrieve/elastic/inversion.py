@@ -30,8 +30,6 @@ class Thresholds(NamedTuple):
 
     longest_gap: float = 150.0
     """m; a longer gap without data ends the integration. Assumed."""
-    least_denominator: float = 0.05
-    """Share of the denominator at the reference. Beyond, errors grow as its inverse. Assumed."""
     least_certainty: float = 5.0
     """Standard errors by which the denominator must exceed zero for first-order errors to hold.
     Simulations, with `skewed`."""
@@ -53,7 +51,6 @@ THRESHOLDS: Final = Thresholds()
 _LIMITS: Final = np.array(
     [
         THRESHOLDS.longest_gap,
-        THRESHOLDS.least_denominator,
         THRESHOLDS.least_certainty**2,
         THRESHOLDS.skewed**2,
     ]
@@ -228,8 +225,7 @@ def invert_elastic(
     -------
     ElasticResult
         There is no value where the reference window has no positive signal (`calibrated`),
-        beyond a gap of `Thresholds.longest_gap`, and where the denominator is below
-        `Thresholds.least_denominator` of its value at the reference or
+        beyond a gap of `Thresholds.longest_gap`, and where the denominator is below zero or
         `Thresholds.least_certainty` of its standard errors (`unstable`). Beyond the reference, no
         bin farther than an unstable one has a value. The lidar constant and quantities derived
         from it assume the particle extinction of the nearest solved bin from there down to the
@@ -274,7 +270,9 @@ def invert_elastic(
     change = inputs.noise_rows(baseline_error, "baseline_error", grid, leading)
     # Its shape is not known: that of the window and that of the other bins would cancel. The
     # inversion is not linear where it exceeds the signal of the window, so both signs are tried.
-    parts = [np.where(inside, change, 0.0) for inside in (window, ~window)]
+    parts = [
+        np.where(inside, change, 0.0) if change.any() else change for inside in (window, ~window)
+    ]
     baseline = np.hypot(*(solution.shifted(part, -part) for part in parts))
     if variance is None:
         solution.out[[_fernald.NOISE, _fernald.ATTENUATED_ERROR]] = np.nan
@@ -300,7 +298,7 @@ class _Solution:
     def shifted(self, *changes: Array) -> Array:
         """Return the largest change of the backscatter, and add those of others to their errors."""
         if not changes[0].any():
-            return np.zeros_like(self._rows)
+            return np.zeros((1, self._rows.shape[1]))
         others = [self._solved(self._rows + change) for change in changes]
         both, constant = [_fernald.BACKSCATTER, _fernald.ATTENUATED], _fernald.CONSTANT
         shift = _largest(self.out[both], [out[both] for out, _, _ in others])
