@@ -34,6 +34,8 @@ Mask = NDArray[np.bool_]
 _HEIGHT: Final = 366
 _POINTS: Final = 300
 """Most values that are drawn of a longer profile: every second one, or fewer."""
+_BEYOND: Final = 1.15
+"""A profile that depends on a window is shown to this many times its upper end."""
 _MARKS: Final = 30
 """About the largest number of marks of one kind in a panel."""
 _UNCLEAR: Final = 10.0
@@ -73,7 +75,7 @@ def profile_view(name: str, quantities: Sequence[ProfileQuantity], along: str) -
     """Return the view of the clearest profile of a product; the first quantity is the main one."""
     dims = _dims(quantities, along)
     more = tuple(f"{one.name}_{part}" for one in quantities for part in one.more_errors)
-    read = partial(_read, quantities[0].name, along, dims, more)
+    read = partial(_read, quantities[0], along, dims, more)
     return View(name, (*dims, *more), read, partial(_draw, quantities, along), first=True)
 
 
@@ -88,7 +90,7 @@ def _dims(quantities: Sequence[ProfileQuantity], along: str) -> dict[str, tuple[
 
 
 def _read(
-    main: str,
+    main: ProfileQuantity,
     along: str,
     dims: dict[str, tuple[str, ...]],
     more: tuple[str, ...],
@@ -97,19 +99,23 @@ def _read(
 ) -> xr.Dataset | None:
     """Return the profile with the most unflagged values, up to the last usable one.
 
-    Among equals, that with the most usable values, then the first; None without any usable value.
+    If it depends on a window, only to just beyond that. Among equals, that with the most usable
+    values, then the first; None without any usable value.
     `rejected` and `with_care` of it are the verdicts of its values.
     """
     require(product, dims)
     flag = quality_bits(product["quality_flag"])
     rejected = (flag & rejecting_mask(bits_of(product))) != 0
-    usable = np.isfinite(product[main].values) & ~rejected
+    usable = np.isfinite(product[main.name].values) & ~rejected
     if not usable.any():
         return None
     earlier = -np.arange(len(usable))
     clear = (usable & (flag == 0)).sum(axis=1)
     index = int(np.lexsort((earlier, usable.sum(axis=1), clear))[-1])
     last = int(np.flatnonzero(usable[index])[-1]) + 1
+    if main.window:
+        far = _BEYOND * float(product[main.window[-1]].values[index])
+        last = min(last, max(int(np.searchsorted(product[along].values, far)), 2))
     shown = slice(0, last, -(-last // _POINTS))
     profile = product[[name for name in (*dims, *more) if name in product.variables]]
     return (
@@ -137,8 +143,9 @@ def _draw(
     main = quantities[0]
     usable = main.factor * profile[main.name].where(~profile["rejected"]).values
     flagged = int((profile["rejected"] | profile["with_care"]).sum())
+    title = f"{main.label[:1].upper()}{main.label[1:]}"
     words = (
-        f"{main.label}: {span_in_words(usable, '')}; {flagged} of {place.size} values flagged;"
+        f"{title}: {span_in_words(usable, '')}; {flagged} of {place.size} values flagged;"
         " bands are standard errors"
     )
     time = utc(np.datetime64(profile["time"].item(), "ns"))

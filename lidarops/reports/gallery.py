@@ -23,7 +23,7 @@ from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.series_data import Comparison
-from lidarops.figures.wording import counted, named_shares
+from lidarops.figures.wording import counted, named_shares, percent
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.netcdf.read import UNREADABLE, open_product, opened_product, profiles_in
@@ -256,17 +256,6 @@ def _title(group: Group) -> str:
     return group.label
 
 
-def missing_products(record: RunRecord) -> frozenset[str]:
-    """Return the paths of recorded products whose file is missing."""
-    root = Path(record.products)
-    return frozenset(
-        product.path
-        for scene in record.scenes
-        for product in scene.products
-        if not (root / product.path).is_file()
-    )
-
-
 def _groups(record: RunRecord) -> list[Group]:
     """Return the groups in the order in which an operator looks at them.
 
@@ -346,16 +335,19 @@ def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
     return truth
 
 
-def comparisons_by_quantity(compared: Sequence[Compared]) -> Mapping[str, tuple[int, int, int]]:
-    """Return for each quantity the number of values compared, within 1 and within 3 errors."""
-    totals: dict[str, tuple[int, int, int]] = {}
-    for item in compared:
-        c = item.comparison
-        if c.count:
-            count, within_1, within_3 = totals.get(c.quantity, (0, 0, 0))
-            totals[c.quantity] = (
-                count + c.count,
-                within_1 + round(c.within_1 * c.count),
-                within_3 + round(c.within_3 * c.count),
-            )
-    return totals
+def compared_in_words(compared: Sequence[Compared]) -> Mapping[str, str]:
+    """Return for each quantity the shares of its values within 1 and 3 errors of the truth."""
+    totals: dict[str, Counter[str]] = defaultdict(Counter)
+    for _, _, one in compared:
+        total = totals[one.quantity]
+        total["all"] += one.count
+        if one.count:
+            total["1"] += round(one.within_1 * one.count)
+            total["3"] += round(one.within_3 * one.count)
+    return {
+        quantity: f"{percent(total['1'] / total['all'])} within 1 and"
+        f" {percent(total['3'] / total['all'])} within 3 standard errors of the truth, of"
+        f" {total['all']:,} unflagged values"
+        for quantity, total in totals.items()
+        if total["all"]
+    }

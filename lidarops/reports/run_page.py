@@ -5,9 +5,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Final
@@ -20,12 +20,18 @@ from lidarops.errors import CatalogError
 from lidarops.figures import browser
 from lidarops.figures.panels import Figure
 from lidarops.figures.templates import environment, page_style
-from lidarops.figures.wording import change_in_words, duration, percent, size
-from lidarops.records import RunRecord, SceneOutcome
+from lidarops.figures.wording import (
+    change_in_words,
+    duration,
+    percent,
+    size,
+    verdicts_in_words,
+)
+from lidarops.records import RunRecord
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
 from lidarops.reports.findings import disagreement_rows, finding_rows, lacking, scene_note_rows
-from lidarops.reports.gallery import Compared, Gallery, Picture
+from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.run_record import FILE_NAME, INDEX
 from lidarops.system.files import write_atomically
 
@@ -91,10 +97,10 @@ def build_report(
 
 
 def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
-    missing = gallery.missing_products(record)
-    problems = {problem.path: problem.reason for problem in filled.problems}
-    problems = dict.fromkeys(sorted(missing), "the file is missing") | problems
-    stages = run_tables.stages(record)
+    paths = (product.path for scene in record.scenes for product in scene.products)
+    missing = [path for path in paths if not _href(record, path, folder)]
+    problems = dict.fromkeys(sorted(missing), "the file is missing")
+    problems |= {problem.path: problem.reason for problem in filled.problems}
     pictures = _by_instrument([one for one in filled.pictures if not one.lacking])
     return _environment().get_template("run.html").render(
         record=record,
@@ -111,11 +117,9 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
             *scene_note_rows(record.scenes),
         ],
         instruments=run_tables.instruments(record),
-        stages=stages,
-        scenes=[
-            _scene_row(scene, record, folder, missing, [row["stage"] for row in stages])
-            for scene in record.scenes[:ROWS]
-        ],
+        stages=run_tables.stages(record),
+        scenes=record.scenes[:ROWS],
+        href=partial(_href, record, folder=folder),
         left_out=run_tables.left_out(record),
         without_product=run_tables.scenes_without_product(record),
         steps=run_tables.carried_out(record),
@@ -125,7 +129,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         internal=run_tables.internal_errors(record),
         problems=sorted(problems.items()),
         compared=filled.compared,
-        compared_words=_compared_words(filled.compared),
+        compared_words=gallery.compared_in_words(filled.compared),
         pictures=pictures,
         lacking=[picture for picture in filled.pictures if picture.lacking],
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
@@ -143,7 +147,9 @@ def _environment() -> Environment:
     own = environment("lidarops.reports")
     own.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
     own.filters |= {"lacking": lacking, "source_hash": _source_hash}
-    own.filters |= {"drawn": browser.inline, "words": change_in_words}
+    own.filters |= {"drawn": browser.inline, "words": change_in_words, "size": size}
+    own.filters |= {"duration": duration, "verdicts": verdicts_in_words}
+    own.filters |= {"outcome": run_tables.outcome_word}
     return own
 
 
@@ -152,42 +158,11 @@ def _source_hash(style: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()}"
 
 
-def _scene_row(
-    scene: SceneOutcome,
-    record: RunRecord,
-    folder: Path,
-    missing: frozenset[str],
-    stages: Sequence[str],
-) -> run_tables.Row:
-    """Return the row of a scene, with times in the order of stages."""
-    quality = run_tables.quality_words(scene)
-    return {
-        "scene": scene.scene,
-        "instrument": scene.instrument,
-        "start": run_tables.moment(scene.start).removesuffix(":00 UTC").removesuffix(" UTC"),
-        "granules": scene.granules,
-        "outcome": run_tables.outcome_word(scene),
-        "products": [
-            {
-                "label": f"{product.kind} {product.channel}",
-                "href": "" if product.path in missing else _href(record, product.path, folder),
-                "quality": quality[product.path],
-                "empty": product.usable == 0,
-                "size": size(product.size),
-                "sha256": product.sha256,
-                "path": product.path,
-            }
-            for product in scene.products
-        ],
-        "seconds": [
-            duration(scene.seconds[stage]) if stage in scene.seconds else "" for stage in stages
-        ],
-        "plan_hash": scene.plan.hash if scene.plan else "",
-    }
-
-
 def _href(record: RunRecord, product: str, folder: Path) -> str:
+    """Return the link from a report to a product; empty if its file is missing."""
     path = (Path(record.products) / product).resolve()
+    if not path.is_file():
+        return ""
     try:
         relative = os.path.relpath(path, folder.resolve())
     except ValueError:  # No relative path leads to another drive.
@@ -208,15 +183,6 @@ def _overview(pictures: Sequence[tuple[str, Sequence[Picture]]]) -> list[Picture
     turns = zip_longest(*(figures for _, figures in pictures))
     first = [picture for turn in turns for picture in turn if picture is not None][:_SHOWN]
     return sorted(first, key=lambda picture: picture.instrument)
-
-
-def _compared_words(compared: Sequence[Compared]) -> Mapping[str, str]:
-    totals = gallery.comparisons_by_quantity(compared)
-    return {
-        quantity: f"{percent(within_1 / count)} within 1 and {percent(within_3 / count)} within 3"
-        f" standard errors of the truth, of {count:,} unflagged values"
-        for quantity, (count, within_1, within_3) in totals.items()
-    }
 
 
 def _plan_hash(record: RunRecord) -> str:

@@ -16,7 +16,7 @@ from lidarops.figures.wording import (
     percent,
     verdicts_in_words,
 )
-from lidarops.flags import PLACES, FlagBit, Severity
+from lidarops.flags import PLACES, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import (
@@ -37,6 +37,7 @@ from lidarops.scene.choices import idle_window
 _T = TypeVar("_T")
 _MOST_NAMES: Final = 8
 """Most names listed in one cell."""
+_UNKNOWN: Final = "bit unknown to this version of lidarops"
 _LAST: Final = 1 << PLACES
 """Place of unknown bits in a table."""
 
@@ -243,13 +244,14 @@ def flags(record: RunRecord) -> list[Row]:
             if count:
                 counts[name.lower()].append(count)
         for name in sorted(counts, key=lambda name: (bits.get(name, _LAST), name)):
-            severity, description = _severity_and_meaning(bits.get(name))
+            bit = bits.get(name)
+            words = {Severity.REJECT: "do not use", Severity.CARE: "use with care"}
             rows.append(
                 {
                     "kind": kind,
                     "bit": name,
-                    "severity": severity,
-                    "description": description,
+                    "severity": words[bit.severity] if bit else "unknown",
+                    "description": bit.description if bit else _UNKNOWN,
                     "count": sum(counts[name]),
                     "share": percent(sum(counts[name]) / values) if values else "no value",
                     "products": len(counts[name]),
@@ -332,11 +334,6 @@ def outcome_word(scene: SceneOutcome) -> str:
     return "done" if scene.products else "no product"
 
 
-def quality_words(scene: SceneOutcome) -> Mapping[str, str]:
-    """Return the shares of good, care and reject values of each product of a scene, by path."""
-    return {product.path: verdicts_in_words(product.verdicts) for product in scene.products}
-
-
 def _verdicts_by_kind(record: RunRecord) -> list[tuple[str, Verdicts]]:
     products = [product for scene in record.scenes for product in scene.products]
     sums = {
@@ -363,10 +360,3 @@ def _instrument_row(name: str, scenes: Sequence[SceneOutcome], refused_before: i
         "quality": verdicts_in_words(Verdicts.total(product.verdicts for product in retrieved)),
         "time": duration(sum(sum(scene.seconds.values()) for scene in scenes)),
     }
-
-
-def _severity_and_meaning(bit: FlagBit | None) -> tuple[str, str]:
-    if bit is None:
-        return "unknown", "bit unknown to this version of lidarops"
-    word = "do not use" if bit.severity is Severity.REJECT else "use with care"
-    return word, bit.description
