@@ -111,11 +111,8 @@ def _throughput(files: Sequence[Path]) -> _Studies:
     return {
         Benchmark.ARCHIVE: archives.measure_archives,
         Benchmark.CAMPAIGNS: campaigns.measure_campaigns,
-        Benchmark.ELASTIC: retrievals.measure_elastic,
         Benchmark.HOMOGENEOUS: retrievals.measure_solvers,
         Benchmark.MEMORY: memory.measure_memory,
-        Benchmark.MULTIANGLE: retrievals.measure_scans,
-        Benchmark.NETWORK: retrievals.measure_networks,
         Benchmark.RAMAN: raman_night.measure_raman,
         Benchmark.READER: partial(readers.measure_readers, paths=files),
     }

@@ -9,7 +9,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Container, Mapping
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -119,13 +119,6 @@ def cpu_seconds() -> float:
     """Return the CPU time of this process so far, with that of its children that have ended."""
     usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
-
-
-def in_threads(function: Callable[[int], object], threads: int) -> None:
-    """Call ``function(0)`` to ``function(threads - 1)``, each in its own thread."""
-    with ThreadPoolExecutor(threads) as pool:
-        for future in [pool.submit(function, number) for number in range(threads)]:
-            future.result()
 
 
 def in_fresh_process(

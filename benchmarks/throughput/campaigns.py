@@ -88,7 +88,6 @@ _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
 _QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
 }
-_WORKER_SIZE: Final = CampaignSize(scenes=16, profiles=60)
 Cost = tuple[CampaignSize, dict[Stage, float]]
 """Size of a campaign, and its CPU time by stage, s."""
 
@@ -97,18 +96,15 @@ def measure_campaigns(
     effort: Effort,
     *,
     along: Mapping[str, Sequence[CampaignSize]] | None = None,
-    workers: Sequence[int] | None = None,
 ) -> Study:
     """Simulate campaigns of several sizes in temporary folders, and time their processing.
 
     Parameters
     ----------
     effort : Effort
-        A quick run has fewer and smaller campaigns, and one worker.
+        A quick run has fewer and smaller campaigns.
     along : mapping of str to sequence of CampaignSize, optional
         Sizes for each varied property, at least 2.
-    workers : sequence of int, optional
-        Numbers of processes to compare.
     """
     # The first campaign of a process includes imports and compilation; it is not counted.
     _cost(CampaignSize(scenes=1, profiles=15), effort)
@@ -116,34 +112,15 @@ def measure_campaigns(
         name: [_cost(size, effort) for size in sizes]
         for name, sizes in (along or (_QUICK if effort.quick else _ALONG)).items()
     }
-    counts = workers if workers is not None else (() if effort.quick else (1, 2))
-    walls = {count: _wall(count, effort) for count in counts}
-    size = _WORKER_SIZE
-    chapters = [
-        Chapter(
-            "Cost of each stage, and its growth",
-            "Simulated campaigns of one lidar, from raw files on disk to products and report, "
-            "in one process. CPU time; that of a run is divided among its stages in proportion to "
-            "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
-            "interval; 1 is linear.",
-            [growth(name, costs) for name, costs in growths.items()],
-        ),
-        Chapter(
-            "Processes",
-            "The same campaign on one machine.",
-            [
-                Results(
-                    "Wall time by number of processes",
-                    {("", f"{count}"): {"s": seconds, "speedup": walls[counts[0]] / seconds}
-                     for count, seconds in walls.items()},
-                    f"{size.scenes} scenes of {size.profiles} files; with the start of the "
-                    "processes.",
-                    method="processes",
-                )
-            ],
-        ),
-    ]  # fmt: skip
-    return Study("Campaigns: CPU time by stage", effort.date, chapters[: 2 if walls else 1])
+    chapter = Chapter(
+        "Cost of each stage, and its growth",
+        "Simulated campaigns of one lidar, from raw files on disk to products and report, "
+        "in one process. CPU time; that of a run is divided among its stages in proportion to "
+        "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
+        "interval; 1 is linear.",
+        [growth(name, costs) for name, costs in growths.items()],
+    )
+    return Study("Campaigns: CPU time by stage", effort.date, [chapter])
 
 
 def _cost(size: CampaignSize, effort: Effort) -> Cost:
@@ -171,17 +148,6 @@ def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[Stage, floa
                 laps[_SCENE_STAGES[name]] += lap
     laps[Stage.ORCHESTRATION] = wall - sum(laps.values())
     return {stage: max(cpu * lap / wall, _SHORTEST) for stage, lap in laps.items()}
-
-
-def _wall(workers: int, effort: Effort) -> float:
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        campaign = simulate_campaign(_WORKER_SIZE, Path(folder))
-        archive.update_catalog(campaign)
-        begin = time.perf_counter()
-        archive.reprocess(campaign, options=archive.Options(workers=workers))
-        seconds = time.perf_counter() - begin
-    effort.progress(1)
-    return seconds
 
 
 def _timed(call: Callable[[], object]) -> float:

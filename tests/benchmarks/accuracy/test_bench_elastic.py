@@ -13,10 +13,8 @@ from typer.testing import CliRunner
 from benchmarks import registry
 from benchmarks.__main__ import app
 from benchmarks.accuracy import elastic, elastic_cases, elastic_peers
-from benchmarks.accuracy.elastic import ALL_STEPS, background_score, inversion_score
+from benchmarks.accuracy.elastic import background_score, inversion_score
 from benchmarks.harness.results import Effort
-from benchmarks.harness.timing import CPU_TIME, READ
-from benchmarks.throughput import retrievals
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.background.known_shape import fit_known_shape
@@ -40,11 +38,6 @@ def accuracy(request):
         folder = None
     effort = Effort(quick=True, date="2024-01-01")
     return elastic.measure_elastic_accuracy(effort, draws=DRAWS, data=folder)
-
-
-@pytest.fixture(scope="module")
-def timed():
-    return retrievals.measure_elastic(Effort(date="2024-01-01", repeats=1), batches=(1, 20))
 
 
 # Signals --------------------------------------------------------------------------------------
@@ -290,21 +283,6 @@ def test_published_files_are_reproduced(data_root, accuracy):
         assert level > 1e5 or abs(inversions[name, "window given", "mean error"].value) < 0.01
         tail = backgrounds[name, elastic_cases.TAIL_MEAN, "error"].value
         assert level > 1e4 or tail == pytest.approx(2.75, abs=0.1)
-
-
-def test_times_are_multiples_of_the_read_of_their_batch(timed):
-    for batch in ("1 profile a call", "20 profiles a call"):
-        rows = timed.figures(batch)
-        read = rows[batch, READ, CPU_TIME].value
-        steps = {method for _, method, _ in rows}
-        assert (rows[batch, READ, "reads"].value, rows[batch, READ, "lidarops"].value) == (1, False)
-        assert {"known_shape", "layers.screen", "reference.choose", "elastic.solve"} <= steps
-        assert rows[batch, ALL_STEPS, "lidarops"].value
-        assert not rows[batch, "Klett, numpy", "lidarops"].value
-        for step in steps:
-            time = rows[batch, step, CPU_TIME].value
-            assert rows[batch, step, "reads"].value == pytest.approx(time / read)
-            assert 1 <= rows[batch, step, "profiles"].value <= 20
 
 
 # Pages and the command ------------------------------------------------------------------------

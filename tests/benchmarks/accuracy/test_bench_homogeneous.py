@@ -27,7 +27,7 @@ from benchmarks.accuracy.homogeneous_cases import (
 )
 from benchmarks.accuracy.homogeneous_peers import JIT, iterative_peers
 from benchmarks.harness.results import Effort, Study
-from benchmarks.harness.timing import CPU_TIME, READ, in_threads, least_times
+from benchmarks.harness.timing import CPU_TIME, READ, least_times
 from benchmarks.throughput import retrievals
 from lidarops.errors import CampaignError, RawFormatError
 
@@ -219,8 +219,6 @@ def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
         for method in methods_timed:
             time = rows[setting, method, CPU_TIME].value
             assert rows[setting, method, "reads"].value == pytest.approx(time / read)
-    gains = timed.figures("Gain of two threads")
-    assert {method for _, method, _ in gains} == {"direct"}
 
 
 def test_calls_alternate_and_the_least_time_counts(monkeypatch):
@@ -230,11 +228,6 @@ def test_calls_alternate_and_the_least_time_counts(monkeypatch):
     functions = {name: (lambda name=name: calls.append(name)) for name in "ab"}
     assert least_times(functions, 2) == {"a": 4.0, "b": 7.0}
     assert calls == ["a", "b"] * 3
-
-
-def test_threads_pass_errors_on():
-    with pytest.raises(ZeroDivisionError):
-        in_threads(lambda chapter: 1 / chapter, 2)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,7 @@ from benchmarks.accuracy.multiangle import StudySize
 from benchmarks.harness import statistics
 from benchmarks.harness.figure import Figure
 from benchmarks.harness.results import Effort
-from benchmarks.harness.timing import CPU_TIME, READ
-from benchmarks.throughput import retrievals
+from benchmarks.harness.timing import CPU_TIME
 from lidarops.retrieve.multiangle import mld
 
 pytestmark = pytest.mark.slow
@@ -37,11 +36,6 @@ def study():
         )
     assert steps == [1] * len(scenes)
     return result
-
-
-@pytest.fixture(scope="module")
-def timed():
-    return retrievals.measure_scans(Effort(date="2024-01-01", repeats=1), batches=(1, 2))
 
 
 def without_noise(scene):
@@ -256,17 +250,3 @@ def test_every_method_is_scored_in_every_scene(study):
         assert value("two_angle", DEPTH) > value("kano_hamilton", DEPTH)
         assert value("mld", "mean error") < 0.0
         assert all(value(name, CPU_TIME) > 0 for name in names)
-
-
-def test_times_are_multiples_of_the_read(timed):
-    for batch in ("1 profile a call", "2 profiles a call"):
-        rows = timed.figures(batch)
-        ours = {method for _, method, _ in rows if rows[batch, method, "lidarops"].value}
-        assert rows[batch, READ, "reads"].value == 1.0
-        assert READ not in ours
-        assert set(multiangle_cases.scan_methods()) < ours
-        assert not ours & set(multiangle_peers.scan_peers())
-        read = rows[batch, READ, CPU_TIME].value
-        for _, method, _ in rows:
-            time = rows[batch, method, CPU_TIME].value
-            assert rows[batch, method, "reads"].value == pytest.approx(time / read)

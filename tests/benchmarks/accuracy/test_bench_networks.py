@@ -12,8 +12,6 @@ from benchmarks.accuracy import network as network_benchmark
 from benchmarks.accuracy import network_cases, network_peers
 from benchmarks.harness.results import Effort
 from benchmarks.harness.statistics import mean_by_block, share_by_block
-from benchmarks.harness.timing import CPU_TIME, READ
-from benchmarks.throughput import retrievals
 
 pytestmark = pytest.mark.slow
 
@@ -25,11 +23,6 @@ def accuracy():
     return network_benchmark.measure_network(
         Effort(date="2024-01-01", repeats=1), profiles=PROFILES, peer_profiles=10
     )
-
-
-@pytest.fixture(scope="module")
-def throughput_result():
-    return retrievals.measure_networks(Effort(quick=True, date="2024-01-01", repeats=1))
 
 
 @pytest.fixture(scope="module")
@@ -261,12 +254,3 @@ def test_the_network_agrees_with_a_plain_fit(accuracy):
         mean = rows[*pair, "scipy least_squares, mean of 50 profiles, RMSE"].value
         ratio = rows[*pair, "network / scipy of means of 50"].value
         assert ratio == pytest.approx(ours / mean)
-
-
-def test_times_are_multiples_of_the_read(throughput_result):
-    for beams in ("3 beams", "6 beams"):
-        rows = throughput_result.figures(beams)
-        for _, method, _ in rows:
-            time = rows[beams, method, CPU_TIME].value / rows[beams, READ, CPU_TIME].value
-            assert rows[beams, method, "reads"].value == pytest.approx(time)
-            assert rows[beams, method, "lidarops"].value is (method != READ)

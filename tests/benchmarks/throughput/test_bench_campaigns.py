@@ -22,7 +22,6 @@ def study():
     result = campaigns.measure_campaigns(
         Effort(date="2024-01-01", progress=steps.append),
         along={"scenes": (replace(SMALL, scenes=1), SMALL)},
-        workers=(),
     )
     assert steps == [1, 1, 1]
     return result
