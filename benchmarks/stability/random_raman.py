@@ -36,6 +36,7 @@ _COMPARED: Final = 6000.0
 _EXPONENT: Final = 1.2
 _EXPONENT_ERROR: Final = 0.5
 _REFERENCE_ERROR: Final = 0.02
+_OVERLAP_ERROR: Final = RamanSettings().full_overlap_error
 _COUNTS: Final = (30.0, 5000.0)
 """Of a Raman bin at 1 km."""
 _LIDAR_RATIOS: Final = (25.0, 90.0)
@@ -55,6 +56,10 @@ class _Sky:
     aloft: float = 0.0
     """Particle over molecular backscatter in the reference window."""
     reference_error: float = 0.0
+    lacking: float = 0.0
+    """Of the overlap where it is stated to be full."""
+    scale: float = 1.0
+    """m, over which that falls."""
 
 
 def _hazy(rng: Random) -> _Sky:
@@ -73,12 +78,18 @@ def _with_particles_aloft(sky: _Sky, rng: Random) -> _Sky:
     return replace(sky, aloft=float(rng.uniform(0.0, 0.05)), reference_error=_REFERENCE_ERROR)
 
 
+def _with_overlap(sky: _Sky, rng: Random) -> _Sky:
+    return replace(sky, lacking=0.05, scale=float(rng.uniform(50.0, 300.0)))
+
+
 _COLOUR: Final = "two wavelengths do not show the colour of extinction: the stated error covers it"
 _ALIKE: Final = "particles that are mixed as air is look like air in the reference window"
+_NEAR: Final = "what overlap lacks looks like extinction: the stated error covers it"
 FAILURES: Final[tuple[tuple[Failure, Callable[[_Sky, Random], _Sky]], ...]] = (
     (Failure("none", satisfied=True), lambda sky, _: sky),
     (Failure("Angstrom exponent off as stated", unseen=_COLOUR), _of_other_colour),
     (Failure("particles in the reference window", unseen=_ALIKE), _with_particles_aloft),
+    (Failure("overlap 5 percent off", unseen=_NEAR), _with_overlap),
 )
 
 
@@ -105,6 +116,8 @@ def _air() -> tuple[AirColumn, Cells]:
 def _counts(sky: _Sky, air: AirColumn, light: float) -> tuple[Array, Array, Array]:
     """Return mean counts of the Raman and the elastic signal, and particle backscatter."""
     seen = np.minimum(_RANGE / _FULL_OVERLAP, 1.0) ** 2
+    beyond = np.maximum(_RANGE - _FULL_OVERLAP, 0.0)
+    seen = seen * (1.0 - sky.lacking * np.exp(-beyond / sky.scale))
     particles = _along(sky.extinction)
     longer = (_LASER / _RAMAN) ** sky.exponent
     raman = seen * air.density / _RANGE**2
@@ -145,6 +158,7 @@ def score_raman(cluster: int, profiles: int) -> Iterator[ScoredValues]:
             angstrom_standard_error=sky.assumed_error,
             molecular_relative_error=0.0,
             overlap_relative_error=0.0,
+            full_overlap_error=_OVERLAP_ERROR if sky.lacking else 0.0,
         )
         bits = np.repeat(quality[np.newaxis], profiles, axis=0)
         result = retrieve_raman(signals[0], signals[1], air, cells, settings, quality=bits)

@@ -110,6 +110,7 @@ def make_sky(
             angstrom_standard_error=0.0,
             molecular_relative_error=0.0,
             overlap_relative_error=0.0,
+            full_overlap_error=0.0,
         ),
     )
 

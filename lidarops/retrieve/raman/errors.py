@@ -13,6 +13,7 @@ from lidarops.retrieve.raman.backscatter import Backscatter
 from lidarops.retrieve.raman.depth_fit import DepthFit, Extinction, slope
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import AirColumn, CellSignal
+from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 EXTINCTION_CAUSES: Final = (
     "noise", "resolution", "background", "dead_time", "baseline", "angstrom", "molecular",
@@ -89,8 +90,26 @@ class Effects:
     partial: Booleans
 
     def causes(self) -> Iterator[Cause]:
-        """Yield the effect of one standard error of each cause."""
-        changes = [*self._instrument(), *self._air(), self._overlap()]
+        """Yield the effect of one standard error of each cause but an overlap stated to be full."""
+        yield from self._effects([*self._instrument(), *self._air(), self._overlap()])
+        yield from self._assumed()
+
+    def of_full_overlap(self) -> Iterator[Cause]:
+        """Yield the effect of what an overlap that is stated to be full from a range on may lack.
+
+        It falls with range at an unknown rate; a known overlap has its own error.
+        """
+        if (self.air.overlap != 1.0).any():
+            return
+        full = self.air.range[int(np.argmin(self.partial))]
+        beyond = np.maximum(self.air.range / full - 1.0, 0.0)
+        lacking = [
+            self.settings.full_overlap_error * np.exp(-beyond / scale)
+            for scale in THRESHOLDS.overlap_scales
+        ]
+        yield from self._effects([_Change("overlap", part, part, self._none) for part in lacking])
+
+    def _effects(self, changes: Sequence[_Change]) -> Iterator[Cause]:
         raman, elastic, beside = (
             np.stack([getattr(change, name) for change in changes], axis=-1)
             for name in ("raman", "elastic", "backscatter")
@@ -101,7 +120,6 @@ class Effects:
         beta = self._respond(elastic - np.where(partial, raman, 0.0), depth) + beside
         for change, *effects in zip(changes, alpha.T, beta.T, depth.T, strict=True):
             yield Cause(change.name, *effects)
-        yield from self._assumed()
 
     @property
     def _ratio(self) -> float:
@@ -147,7 +165,7 @@ class Effects:
         yield _Change("molecular", -error * self.air.range, self._none, beside)
 
     def _overlap(self) -> _Change:
-        """Return the change by the overlap, in proportion to the overlap itself."""
+        """Return the change by a known overlap, in proportion to what it lacks."""
         change = self.settings.overlap_relative_error * (1.0 / self.air.overlap - 1.0)
         return _Change("overlap", change, change, self._none)
 

@@ -187,10 +187,12 @@ def _solved(
     calibrated = calibrated_backscatter(ratio, profile.elastic.noise, fit.noise, assumed, window)
     effects = Effects(profile, calibrated, air, cells.step, settings, reference_error, partial)
     causes = list(effects.causes())
+    usable = ~partial & (fit.expected_error <= THRESHOLDS.most_uncertain)
+    # It is a finding that overlap is not full where it is stated to be.
+    negative = _negative(fit, [cause.depth for cause in causes], usable)
+    causes += effects.of_full_overlap()
     budget = summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
     budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
-    usable = ~partial & (fit.expected_error <= THRESHOLDS.most_uncertain)
-    negative = _negative(fit, [cause.depth for cause in causes], usable)
     if calibrated is None:
         empty = np.full(partial.size, np.nan)
         absent = dict.fromkeys(BACKSCATTER_CAUSES, empty)

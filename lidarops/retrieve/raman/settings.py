@@ -69,6 +69,16 @@ class RamanSettings:
     overlap_relative_error: Annotated[
         float, quantity(unit="1", ge=0, le=1, description="standard error of 1 - overlap, relative")
     ] = 0.1
+    full_overlap_error: Annotated[
+        float,
+        quantity(
+            unit="1",
+            ge=0,
+            le=1,
+            description="standard error of the overlap where it is stated to be full, without an"
+            " overlap_profile",
+        ),
+    ] = 0.02
     filter_width: Annotated[
         float | None,
         quantity(

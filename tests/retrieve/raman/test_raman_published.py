@@ -119,6 +119,7 @@ def case(request, data_root):
         angstrom_standard_error=0.3,
         molecular_relative_error=0.0,
         overlap_relative_error=0.0,
+        full_overlap_error=0.0,
     )
     return SimpleNamespace(
         name=name,
@@ -158,7 +159,7 @@ def retrieved(case, raman=None, elastic=None, air=None, settings=None):
 
 def by_default(case, *signals):
     """Return values with the reference and air that products have without settings of their own."""
-    settings = RamanSettings(overlap_relative_error=0.0)
+    settings = RamanSettings(overlap_relative_error=0.0, full_overlap_error=0.0)
     return retrieved(case, *signals, air=case.own_air, settings=settings)
 
 

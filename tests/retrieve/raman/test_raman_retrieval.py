@@ -123,6 +123,18 @@ def test_errors_of_the_overlap_are_the_change_by_it(sky):
         np.testing.assert_allclose(change, stated, rtol=0.03, atol=0.02 * stated.max())
 
 
+@pytest.mark.parametrize("scale", [60.0, 150.0, 300.0])
+def test_errors_cover_what_an_overlap_lacks_where_it_is_stated_to_be_full(sky, scale):
+    """Of 5 percent, which is 2.5 of its standard errors."""
+    seen = 1.0 - 0.05 * np.exp(-np.maximum(R - 300.0, 0.0) / scale)
+    before = retrieved(sky, full_overlap_error=0.02)
+    after = retrieved(replace(sky, raman=sky.raman * seen, elastic=sky.elastic * seen))
+    near = (R > 300.0) & (R < 5000.0)
+    change = np.abs(after.extinction - before.extinction)[0, near]
+    assert change.max() > 4.0 * retrieved(sky).extinction_standard_error[0, near].max()
+    assert np.all(change < 4.0 * before.extinction_standard_error[0, near])
+
+
 def test_errors_of_the_slope_of_air_are_the_change_by_it(sky):
     before = retrieved(sky, air={"slope_error": 1e-6})
     steeper, molecular = np.exp(1e-6 * R), sky.air.backscatter
