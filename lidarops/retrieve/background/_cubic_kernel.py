@@ -109,50 +109,32 @@ def largest_root(a: float, b: float, c: float) -> float:
 
 
 @compiled
-def _load(power: Array, p: Array) -> bool:
-    """Copy one profile; return whether all bins are usable."""
-    whole = True
-    for i in range(p.size):
-        p[i] = power[i]
-        whole = whole and abs(p[i]) < HUGE
-    return whole
+def _bends(p: Array, relative: Array) -> tuple[float, float, float]:
+    """Return the sums of squared fourth differences, of their neighbours' products, and the norm.
 
-
-@compiled
-def _difference_variance(p: Array, relative: Array) -> float:
-    """Estimate the variance of unit relative variance from fourth differences along range."""
-    total = norm = 0.0
-    for i in range(p.size - 4):
-        bend = p[i] - 4.0 * p[i + 1] + 6.0 * p[i + 2] - 4.0 * p[i + 3] + p[i + 4]
-        total += bend * bend
-        norm += relative[i] + relative[i + 4] + 36.0 * relative[i + 2]
-        norm += 16.0 * (relative[i + 1] + relative[i + 3])
-    return total / norm
-
-
-@compiled
-def _curved_share(p: Array) -> float:
-    """Return the share of the squared fourth differences that is signal, not noise.
-
-    Neighbouring differences have a correlation of -56 / 70 where they are noise, and of 1 where
-    they are curvature of the signal.
+    The sum over the norm is the variance of unit relative variance.
     """
-    total = product = before = 0.0
+    total = product = before = norm = 0.0
     for i in range(p.size - 4):
         bend = p[i] - 4.0 * p[i + 1] + 6.0 * p[i + 2] - 4.0 * p[i + 3] + p[i + 4]
         total += bend * bend
         product += bend * before
         before = bend
-    share = (product + 0.8 * total) / (1.8 * total)
-    return share if share > 0.0 else 0.0
+        norm += relative[i] + relative[i + 4] + 36.0 * relative[i + 2]
+        norm += 16.0 * (relative[i + 1] + relative[i + 3])
+    return total, product, norm
 
 
 @compiled
-def _all_finite(values: Array) -> bool:
-    finite = True
-    for i in range(values.size):
-        finite = finite and math.isfinite(values[i])
-    return finite
+def _noise_and_curvature(p: Array, relative: Array) -> tuple[float, float]:
+    """Return the variance of unit relative variance, and the share of it that is signal.
+
+    Neighbouring fourth differences have a correlation of -56 / 70 where they are noise, and of 1
+    where they are curvature of the signal.
+    """
+    total, product, norm = _bends(p, relative)
+    share = (product + 0.8 * total) / (1.8 * total)
+    return total / norm, share if share > 0.0 else 0.0
 
 
 @compiled
@@ -172,23 +154,6 @@ def _gradient(p: Array, v: Array, t: Triples, out: Array) -> None:
 
 
 @compiled
-def _centre(p: Array) -> float:
-    half = p.size // 2
-    total = 0.0
-    for i in range(half, p.size):
-        total += p[i]
-    return total / (p.size - half)
-
-
-@compiled
-def _spread(p: Array, centre: float) -> float:
-    largest = 0.0
-    for i in range(p.size):
-        largest = max(largest, abs(p[i] - centre))
-    return largest
-
-
-@compiled
 def _coarse(value: float, step: float) -> float:
     """Round to a multiple of `step`, a power of two, so that subtracting it is exact."""
     return math.floor(value / step + 0.5) * step
@@ -199,11 +164,11 @@ def _solve_profile(
     p: Array, v: Array, t: Triples, curved: float, gradient: Array, row: Array
 ) -> None:
     """Solve one loaded profile: the root about a rough centre, then one Newton step about it."""
-    if _spread(p, p[0]) == 0.0:
+    if np.all(p == p[0]):
         row[STATUS], row[BACKGROUND] = CONSTANT, p[0]
         return
-    centre = _centre(p)
-    largest = _spread(p, centre)
+    centre = float(np.mean(p[p.size // 2 :]))
+    largest = float(np.max(np.abs(p - centre)))
     scale = math.ldexp(1.0, math.frexp(largest)[1])
     centre = _coarse(centre, scale * 2.0**-20)
     for i in range(p.size):
@@ -230,11 +195,7 @@ def _solve_profile(
 @compiled
 def _all_alike(variance: Array) -> bool:
     """Return whether all variances are positive, or all 0; a 0 among others is not usable."""
-    noisy = variance[0] > 0.0
-    for value in variance:  # noqa: SIM110 - compiled
-        if not (value > 0.0 if noisy else value == 0.0):
-            return False
-    return True
+    return bool(np.all(variance > 0.0) or np.all(variance == 0.0))
 
 
 @compiled
@@ -262,20 +223,16 @@ def solve_cubic_profiles(
     out : (profile, column) float64
         Filled with NaN.
     """
-    n = power.shape[1]
-    p, v = np.empty(n), np.empty(n)
     for k in range(power.shape[0]):
-        whole = _load(power[k], p)
-        relative = variance[k % variance.shape[0]]
-        level = 1.0 if known_variance else _difference_variance(p, relative)
+        p, relative = power[k].copy(), variance[k % variance.shape[0]]
+        level, curved = (1.0, 0.0) if known_variance else _noise_and_curvature(p, relative)
         if not math.isfinite(level):
             level = 0.0
-        for i in range(n):
-            v[i] = level * relative[i]
-        if not (whole and _all_finite(v) and _all_alike(relative)):
+        v = level * relative
+        usable = np.all(np.abs(p) < HUGE) and np.all(np.isfinite(v))
+        if not (usable and _all_alike(relative)):
             out[k, STATUS] = MISSING
             continue
-        curved = 0.0 if known_variance else _curved_share(p)
         _solve_profile(p, v, t, curved, gradients[k % gradients.shape[0]], out[k])
         # Without a noise level there is no standard error: 0 / 0 gives NaN.
         out[k, VARIANCE] *= level / level

@@ -160,7 +160,8 @@ def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) 
     chi2, row.waves, score, norm, with_level, with_shape = _residuals(
         sums, by, first, level, amplitude
     )
-    row.chi2 = chi2
+    # Rounding of a fit without noise.
+    row.chi2 = max(chi2, 0.0)
     with_shape -= mean_shape * with_level
     left = norm - with_level * with_level / weight - with_shape * with_shape / square
     # The tilted shape may be a mere combination of the shape and a constant.

@@ -329,6 +329,8 @@ def fit_section(power: Array, range_: Array, variance: Array, background: Array)
     background : (profile,) float
         From which the steps begin.
     """
+    if range_.size < 3:
+        return SectionFit(*np.full((3, len(power)), np.nan))
     fall = (range_[0] / range_) ** 2
     with np.errstate(all="ignore"):
         along = (range_ - range_[0]) / (range_[-1] - range_[0])
@@ -336,7 +338,7 @@ def fit_section(power: Array, range_: Array, variance: Array, background: Array)
         root = 1.0 / np.sqrt(variance)
         for step in range(_STEPS):
             shape = fall * np.exp(-depth[:, np.newaxis] * along)
-            solved = _least_squares(root * power, (root, root * shape, root * shape * along))
+            solved = _least_squares(root * power, (root * shape, root * shape * along, root))
             change = np.clip(-solved.tilt / solved.amplitude, -_LARGEST_STEP, _LARGEST_STEP)
             usable = (solved.amplitude > 0.0) & np.isfinite(change) & (step < _STEPS - 1)
             depth = np.clip(depth + np.where(usable, change, 0.0), -_STEEPEST, _STEEPEST)
@@ -366,33 +368,14 @@ class _Solution(NamedTuple):
 
 
 def _least_squares(values: Array, columns: tuple[Array, Array, Array]) -> _Solution:
-    """Solve for three coefficients by orthogonalization, the background last."""
-    constant, shape, tilted = columns
-    residuals = np.broadcast_to(values, shape.shape).copy()
-    first, first_norm = _unit(shape)
-    on_tilted, on_constant = _along(first, tilted), _along(first, constant)
-    second, second_norm = _unit(tilted - on_tilted[:, np.newaxis] * first)
-    rest = constant - on_constant[:, np.newaxis] * first
-    second_on_constant = _along(second, rest)
-    third, third_norm = _unit(rest - second_on_constant[:, np.newaxis] * second)
-    products = []
-    for direction in (first, second, third):
-        product = _along(direction, residuals)
-        residuals -= product[:, np.newaxis] * direction
-        products.append(product)
-    background = products[2] / third_norm
-    tilt = (products[1] - second_on_constant * background) / second_norm
-    amplitude = (products[0] - on_tilted * tilt - on_constant * background) / first_norm
-    return _Solution(background, third_norm**-2.0, amplitude, tilt, residuals)
-
-
-def _unit(column: Array) -> tuple[Array, Array]:
-    norm = np.sqrt((column**2).sum(axis=-1))
-    return column / norm[:, np.newaxis], norm
-
-
-def _along(direction: Array, column: Array) -> Array:
-    return np.asarray((direction * column).sum(axis=-1))
+    """Solve for the coefficients of shape, tilted shape and constant, by orthogonalization."""
+    q, r = np.linalg.qr(np.stack(np.broadcast_arrays(*columns), axis=-1))
+    products = (q * values[..., np.newaxis]).sum(axis=-2)
+    residuals = values - (q * products[:, np.newaxis]).sum(axis=-1)
+    background = products[:, 2] / r[:, 2, 2]
+    tilt = (products[:, 1] - r[:, 1, 2] * background) / r[:, 1, 1]
+    amplitude = (products[:, 0] - r[:, 0, 1] * tilt - r[:, 0, 2] * background) / r[:, 0, 0]
+    return _Solution(background, r[:, 2, 2] ** -2.0, amplitude, tilt, residuals)
 
 
 def detected(left: Array, standard_error: Array) -> Array:

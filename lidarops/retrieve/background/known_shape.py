@@ -183,14 +183,17 @@ def fit_known_shape(
     )
     limits = _limits(THRESHOLDS.rejection, _shape_fit.WINDOWS if starts is None else 1)
     out = np.full(len(rows), np.nan, _shape_fit.ROW)
+    usable_air = np.where(weights > 0, air, 0.0)
+    # Squares of shapes and of powers must stay in the range of floats together.
+    unit = np.max(usable_air, axis=-1, keepdims=True, initial=0.0)
+    unit = np.where(unit > 0.0, unit, 1.0)
     _shape_fit.fit_shape(
-        rows, frozen(np.where(weights > 0, air, 0.0)), weights, counts, frozen(grid), edges,
-        limits, out,
-    )  # fmt: skip
+        rows, frozen(usable_air / unit), weights, counts, frozen(grid), edges, limits, out
+    )
     if exposure is not None:
         # In the dark, a whole window may be without a count.
         out["constant"] = 0.0
-    return inputs.with_leading_axes(_result(out, grid), leading)
+    return inputs.with_leading_axes(_result(out, grid, unit[:, 0]), leading)
 
 
 def _exposures(
@@ -246,11 +249,12 @@ def _limits(false_alarm: float, windows: int) -> _shape_fit.Limits:
     )
 
 
-def _result(out: npt.NDArray[np.void], grid: Array) -> KnownShapeResult:
-    """Return the fits of the kernel as a result of (profile,)."""
+def _result(out: npt.NDArray[np.void], grid: Array, unit: Array) -> KnownShapeResult:
+    """Return the fits of the kernel, with shapes in a unit, as a result of (profile,)."""
     fit = {name: np.ascontiguousarray(out[name]) for name in _shape_fit.ROW.names or ()}
     bins, condition = fit["bins"], fit["condition"]
-    amplitude_error = np.sqrt(fit["amplitude_variance"])
+    amplitude_error = np.sqrt(fit["amplitude_variance"]) / unit
+    amplitude = fit["amplitude"] / unit
     limits = _limits(THRESHOLDS.false_alarm, _shape_fit.WINDOWS)
     poor = np.abs(fit["curvature"]) > limits.deviation
     poor |= fit["waves"] > limits.waves[fit["window"].astype(np.intp)]
@@ -260,7 +264,7 @@ def _result(out: npt.NDArray[np.void], grid: Array) -> KnownShapeResult:
         (Quality.INPUT_MISSING, empty),
         (Quality.TOO_FEW_BINS, few & ~empty),
         (Quality.NO_SIGNAL, ~few & (fit["constant"] > 0)),
-        (Quality.NEGATIVE_AMPLITUDE, fit["amplitude"] < -THRESHOLDS.negative * amplitude_error),
+        (Quality.NEGATIVE_AMPLITUDE, amplitude < -THRESHOLDS.negative * amplitude_error),
         (Quality.NOT_HOMOGENEOUS, poor),
     ):
         quality[found] |= np.int32(bit)
@@ -268,7 +272,7 @@ def _result(out: npt.NDArray[np.void], grid: Array) -> KnownShapeResult:
     return KnownShapeResult(
         background=fit["background"],
         background_standard_error=np.sqrt(fit["background_variance"]),
-        amplitude=fit["amplitude"],
+        amplitude=amplitude,
         amplitude_standard_error=amplitude_error,
         chi2=fit["chi2"],
         degrees_of_freedom=np.maximum(bins - 2, 0).astype(np.int64),

@@ -14,7 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Integers, frozen, usable
-from lidarops.retrieve.common.compiled_code import compiled, summing
+from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
@@ -361,7 +361,7 @@ def _may_rise(sums: Array, start: int, length: int, contrast: float, limit: floa
     return count
 
 
-@compiled
+@inlined
 def _next_base(
     sums: Array,
     start: int,
