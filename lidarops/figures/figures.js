@@ -22,7 +22,7 @@ const clamp = (number, low, high) => Math.min(Math.max(number, low), high);
 function format(number, digits = 4) {
   let text = String(Number(number.toPrecision(digits)));
   const size = Math.abs(number);
-  if (size && (size < 1e-4 || size >= 1e6)) {
+  if (size && (size < 1e-4 || size >= 1e5)) {
     const [digit, power] = Number(number.toPrecision(digits)).toExponential().split("e");
     const raised = power.replace("+", "").replace(/./g, (c) => "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"["0123456789-".indexOf(c)]);
     text = `${digit}×10${raised}`.replace(/^1×/, "");
