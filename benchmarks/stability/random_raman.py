@@ -36,7 +36,6 @@ _COMPARED: Final = 6000.0
 _EXPONENT: Final = 1.2
 _EXPONENT_ERROR: Final = 0.5
 _REFERENCE_ERROR: Final = 0.02
-_OVERLAP_ERROR: Final = RamanSettings().full_overlap_error
 _COUNTS: Final = (30.0, 5000.0)
 """Of a Raman bin at 1 km."""
 _LIDAR_RATIOS: Final = (25.0, 90.0)
@@ -158,7 +157,6 @@ def score_raman(cluster: int, profiles: int) -> Iterator[ScoredValues]:
             angstrom_standard_error=sky.assumed_error,
             molecular_relative_error=0.0,
             overlap_relative_error=0.0,
-            full_overlap_error=_OVERLAP_ERROR if sky.lacking else 0.0,
         )
         bits = np.repeat(quality[np.newaxis], profiles, axis=0)
         result = retrieve_raman(signals[0], signals[1], air, cells, settings, quality=bits)

@@ -8,6 +8,7 @@ from typing import Final
 
 from lidarops.kinds import kinds
 from lidarops.records import Plan, PlannedStep, Scene
+from lidarops.retrieve.signal.labeled_gluing import LAG_PROFILES
 from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE
 from lidarops.scene.case import counted_channels, prepared_channels
 from lidarops.scene.profiles import CHUNK_BYTES
@@ -27,7 +28,8 @@ retrieval: 38 of 430 for an altitude of a beam."""
 _OF_A_DARK_BIN: Final = 24.0
 """Bytes per bin of a dark file: three arrays of float64 while sessions are averaged."""
 _OF_AN_ESTIMATE: Final = 105.0
-"""Bytes per bin of a profile from which a dead time is estimated, at the peak."""
+"""Bytes per bin of a profile of a group from which a dead time is estimated, at the peak; raw
+counts of all groups are held besides."""
 _OF_A_LAG_BIN: Final = 65.0
 """Bytes per bin of a profile from which a lag is estimated; gluing takes four times as many."""
 _COUNT: Final = 4
@@ -106,7 +108,8 @@ def _held_by_stage(step: PlannedStep, work: Workload) -> float:
         case "dark":
             return _OF_A_DARK_BIN * len(work.scene.dark) * work.bins
         case "dead_time" if "analog" in step.settings:
-            return _OF_AN_ESTIMATE * profiles * work.bins
+            counts = _COUNT * min(LAG_PROFILES, work.profiles)
+            return (_OF_AN_ESTIMATE * profiles + counts) * work.bins
         case "glue":
             return _OF_A_LAG_BIN * profiles * work.bins
         case _:

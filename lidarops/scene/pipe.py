@@ -269,7 +269,7 @@ def _estimated_dead_time(
         """Yield the records for an estimate of the lag, and keep those of profiles with shots."""
         for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
             raw = archive.isel(time=rows)
-            counts = raw[channel].to_numpy().astype(np.float64)
+            counts = raw[channel].to_numpy()
             shots = raw[f"{channel}_shots"].to_numpy()
             exposure = shots * (width / LICEL_RANGE_PER_MICROSECOND)
             part = profiles.of(raw)

@@ -31,13 +31,16 @@ def planned(
     return scene, plan_scene(scene, campaign)
 
 
-def test_an_estimate_of_the_dead_time_holds_profiles():
+@pytest.mark.parametrize("count", [20, 300])
+def test_an_estimate_of_the_dead_time_holds_profiles(count: int):
     given, estimated = (
-        planned(count=20, products=SIGNAL, dead_time=dead_time) for dead_time in (4e-9, "estimate")
+        planned(count=count, products=SIGNAL, dead_time=dead_time)
+        for dead_time in (4e-9, "estimate")
     )
     held = scene_memory(*estimated).held - scene_memory(*given).held
-    # Power, variance, quality and counts of the profiles of a group.
-    assert held > 20 * factories.PHOTON.bins * (8 + 8 + 4 + 8)
+    # Power, variance, quality and rates of the profiles of a group, and the counts of all groups.
+    of_a_group, of_all = min(count, 32) * (8 + 8 + 4 + 8), min(count, 256) * 4
+    assert held > factories.PHOTON.bins * (of_a_group + of_all)
 
 
 @pytest.mark.parametrize(("lowest", "more"), [(20.0, False), (19.5, True)])

@@ -28,7 +28,7 @@ _DEPENDENT: Final = 1e-9
 """Squared share of the tilted shape outside the fitted ones, below which it is rounding."""
 
 # Sums of a block: bins, weights, weighted powers of shape and power.
-BINS, WEIGHT, SHAPE, SHAPE2, POWER, PRODUCT, POWER2 = range(7)
+BINS, WEIGHT, SHAPE, SHAPE2, SHAPE3, POWER, PRODUCT, POWER2 = range(8)
 
 ROW: Final = np.dtype(
     [
@@ -69,7 +69,7 @@ class _Weights(NamedTuple):
 def _sum_block(
     power: Array, shape: Array, weights: Array, reference: float, block: int, sums: Array
 ) -> None:
-    bins = weight = of_shape = of_shape2 = of_power = product = of_power2 = 0.0
+    bins = weight = of_shape = of_shape2 = of_shape3 = of_power = product = of_power2 = 0.0
     for i in range(power.size):
         good = (abs(power[i]) < HUGE) & (weights[i] > 0.0)
         w = weights[i] if good else 0.0
@@ -79,11 +79,12 @@ def _sum_block(
         weight += w
         of_shape += shaped
         of_shape2 += shaped * shape[i]
+        of_shape3 += shaped * shape[i] * shape[i]
         of_power += w * value
         product += shaped * value
         of_power2 += w * value * value
     sums[BINS, block], sums[WEIGHT, block] = bins, weight
-    sums[SHAPE, block], sums[SHAPE2, block] = of_shape, of_shape2
+    sums[SHAPE, block], sums[SHAPE2, block], sums[SHAPE3, block] = of_shape, of_shape2, of_shape3
     sums[POWER, block], sums[PRODUCT, block], sums[POWER2, block] = of_power, product, of_power2
 
 
@@ -155,6 +156,8 @@ def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) 
     level = mean_power - amplitude * mean_shape
     row.background, row.amplitude = reference + level, amplitude
     row.amplitude_variance = 1.0 / square
+    if exposure > 0.0:
+        row.amplitude_variance = _scatter(sums, by, first, mean_shape) / (square * square)
     row.background_variance = 1.0 / weight + mean_shape * mean_shape / square
     row.condition = math.sqrt(row.background_variance * weight)
     chi2, row.waves, score, norm, with_level, with_shape = _residuals(
@@ -166,6 +169,21 @@ def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) 
     left = norm - with_level * with_level / weight - with_shape * with_shape / square
     # The tilted shape may be a mere combination of the shape and a constant.
     row.curvature = score / math.sqrt(left) if left > _DEPENDENT * norm else 0.0
+
+
+@summing
+def _scatter(sums: Array, by: _Weights, first: int, mean: float) -> float:
+    """Return the variance of the weighted sum of counts times the deviation of their shape.
+
+    Bins of a block share a weight, though near ones hold more counts.
+    """
+    total = 0.0
+    for k in range(first, BLOCKS):
+        factor = _weight(sums, by, k)
+        level = sums[SHAPE2, k] - 2.0 * mean * sums[SHAPE, k] + mean * mean * sums[WEIGHT, k]
+        shaped = sums[SHAPE3, k] - 2.0 * mean * sums[SHAPE2, k] + mean * mean * sums[SHAPE, k]
+        total += factor * factor * (by.background * level + by.amplitude * shaped)
+    return total / by.exposure
 
 
 @summing
@@ -313,5 +331,5 @@ def fit_shape(
     out : (profile,) `ROW`
         NaN before.
     """
-    sums, rows = np.empty((7, BLOCKS)), np.empty(limits.waves.size, ROW)
+    sums, rows = np.empty((8, BLOCKS)), np.empty(limits.waves.size, ROW)
     _fit_profiles(power, shape, weights, exposure, range_, edges, limits, sums, rows, out)

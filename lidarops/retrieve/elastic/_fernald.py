@@ -324,14 +324,14 @@ def _solve_bins(
 
 
 @compiled
-def _mark_unstable(start: int, work: Array, state: Codes) -> int:
+def _mark_unstable(start: int, least: float, work: Array, state: Codes) -> int:
     """Mark uncertain bins, and all farther than one beyond `start`; return the first valid bin."""
     stable_so_far, first = True, -1
     for i in range(state.size):
         if state[i] == MISSING:
             continue
         # NaN, an unknown error of a cause, does not make a bin unstable.
-        if work[DENOMINATOR, i] <= 0.0 or work[CERTAINTY, i] <= 0.0:
+        if work[DENOMINATOR, i] <= least or work[CERTAINTY, i] <= 0.0:
             state[i] = UNSTABLE
             stable_so_far = stable_so_far and i < start
         elif not stable_so_far:
@@ -424,9 +424,10 @@ def invert_fernald(
     power : (profile, bin) float64
         Background subtracted.
     given : Given
-    limits : (3,) float64
-        Longest gap that is integrated over, m; least square of the denominator over its variance;
-        that over the variance by noise below which errors are skewed.
+    limits : (4,) float64
+        Longest gap that is integrated over, m; least share of the denominator at the reference;
+        least square of the denominator over its variance; that over the variance by noise below
+        which errors are skewed.
     out : (`FIELDS`, profile, bin) float64
         Output: the fields named at the top of this module, NaN where there is no value.
     scalars : (profile, `SCALARS`) float64
@@ -468,8 +469,8 @@ def invert_fernald(
             work[OTHERS] *= cause[2]
             by_reference = -calibration[0] * cause[1] * calibration[4]
             _solve_bins(power[k], noise, path, by_reference, cause[0], work, k, out)
-            _measure_certainty(noise, by_reference, cause[0], path, limits[1:], work, out[NOISE, k])
-            nearest = _mark_unstable(start, work, state[k])
+            _measure_certainty(noise, by_reference, cause[0], path, limits[2:], work, out[NOISE, k])
+            nearest = _mark_unstable(start, limits[1] * calibration[0], work, state[k])
         if nearest >= 0:
             scale = _scale(nearest, noise, range_, path, by_reference, cause[0], work, out[:, k])
             _attenuate(

@@ -30,6 +30,10 @@ class Thresholds(NamedTuple):
 
     longest_gap: float = 150.0
     """m; a longer gap without data ends the integration. Assumed."""
+    least_denominator: float = 0.05
+    """Share of the denominator at the reference; errors grow as its inverse. It alone withholds
+    values beyond a cloud where no error of the lidar ratio is stated
+    (`test_integration_away_from_the_lidar_through_a_cloud_is_withheld`). Assumed."""
     least_certainty: float = 5.0
     """Standard errors by which the denominator must exceed zero for first-order errors to hold.
     Simulations, with `skewed`."""
@@ -51,6 +55,7 @@ THRESHOLDS: Final = Thresholds()
 _LIMITS: Final = np.array(
     [
         THRESHOLDS.longest_gap,
+        THRESHOLDS.least_denominator,
         THRESHOLDS.least_certainty**2,
         THRESHOLDS.skewed**2,
     ]
@@ -225,7 +230,8 @@ def invert_elastic(
     -------
     ElasticResult
         There is no value where the reference window has no positive signal (`calibrated`),
-        beyond a gap of `Thresholds.longest_gap`, and where the denominator is below zero or
+        beyond a gap of `Thresholds.longest_gap`, and where the denominator is below
+        `Thresholds.least_denominator` of its value at the reference or
         `Thresholds.least_certainty` of its standard errors (`unstable`). Beyond the reference, no
         bin farther than an unstable one has a value. The lidar constant and quantities derived
         from it assume the particle extinction of the nearest solved bin from there down to the

@@ -90,24 +90,29 @@ class Effects:
     partial: Booleans
 
     def causes(self) -> Iterator[Cause]:
-        """Yield the effect of one standard error of each cause but an overlap stated to be full."""
-        yield from self._effects([*self._instrument(), *self._air(), self._overlap()])
+        """Yield the effect of one standard error of each cause but overlap."""
+        yield from self._effects([*self._instrument(), *self._air()])
         yield from self._assumed()
 
-    def of_full_overlap(self) -> Iterator[Cause]:
-        """Yield the effect of what an overlap that is stated to be full from a range on may lack.
+    @property
+    def knows_overlap(self) -> bool:
+        """Whether the overlap is known; else it is stated to be full from a range on."""
+        return bool((self.air.overlap != 1.0).any())
 
-        It falls with range at an unknown rate; a known overlap has its own error.
+    def overlap(self) -> list[Cause]:
+        """Return the effects of the overlap.
+
+        A known one changes signals in proportion to what it lacks; one that is stated to be full
+        may still lack something there, which falls with range at an unknown rate.
         """
-        if (self.air.overlap != 1.0).any():
-            return
-        full = self.air.range[int(np.argmin(self.partial))]
-        beyond = np.maximum(self.air.range / full - 1.0, 0.0)
-        lacking = [
-            self.settings.full_overlap_error * np.exp(-beyond / scale)
-            for scale in THRESHOLDS.overlap_scales
-        ]
-        yield from self._effects([_Change("overlap", part, part, self._none) for part in lacking])
+        if self.knows_overlap:
+            shares = [self.settings.overlap_relative_error * (1.0 / self.air.overlap - 1.0)]
+        else:
+            full = self.air.range[int(np.argmin(self.partial))]
+            beyond = np.maximum(self.air.range / full - 1.0, 0.0)
+            error, scales = self.settings.full_overlap_error, THRESHOLDS.overlap_scales
+            shares = [error * np.exp(-beyond / scale) for scale in scales]
+        return list(self._effects([_Change("overlap", one, one, self._none) for one in shares]))
 
     def _effects(self, changes: Sequence[_Change]) -> Iterator[Cause]:
         raman, elastic, beside = (
@@ -163,11 +168,6 @@ class Effects:
         away = self.air.range - shares @ self.air.range
         beside = -error * away * self.air.backscatter
         yield _Change("molecular", -error * self.air.range, self._none, beside)
-
-    def _overlap(self) -> _Change:
-        """Return the change by a known overlap, in proportion to what it lacks."""
-        change = self.settings.overlap_relative_error * (1.0 / self.air.overlap - 1.0)
-        return _Change("overlap", change, change, self._none)
 
     def _assumed(self) -> Iterator[Cause]:
         """Yield the effects of the scattering ratio and the Angstrom exponent."""

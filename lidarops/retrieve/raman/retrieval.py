@@ -186,11 +186,12 @@ def _solved(
     assumed = settings.reference.scattering_ratio * air.backscatter
     calibrated = calibrated_backscatter(ratio, profile.elastic.noise, fit.noise, assumed, window)
     effects = Effects(profile, calibrated, air, cells.step, settings, reference_error, partial)
-    causes = list(effects.causes())
+    causes, of_overlap = list(effects.causes()), effects.overlap()
     usable = ~partial & (fit.expected_error <= THRESHOLDS.most_uncertain)
     # It is a finding that overlap is not full where it is stated to be.
-    negative = _negative(fit, [cause.depth for cause in causes], usable)
-    causes += effects.of_full_overlap()
+    known = of_overlap if effects.knows_overlap else []
+    negative = _negative(fit, [cause.depth for cause in (*causes, *known)], usable)
+    causes += of_overlap
     budget = summed(EXTINCTION_CAUSES, [(c.name, c.extinction) for c in causes])
     budget |= {"noise": extinction.noise_error, "resolution": extinction.resolution_error}
     if calibrated is None:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.common.arrays import Array, Integers
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _TAIL: Final = 10
@@ -18,6 +18,8 @@ _PASSES: Final = 12
 """Gauss-Newton steps of a solution."""
 _ROUNDS: Final = 6
 """Solutions, each with the bins up to the load of the one before, and by its dead time."""
+_ALIKE: Final = 1e10
+"""Variance of a dead time over that with a known slope, beyond which only rounding is left."""
 _HIGHEST: Final = 0.99
 """Load of a profile to which it is corrected."""
 
@@ -38,7 +40,7 @@ class DeadTimeEstimate:
 class ProfileGroup(NamedTuple):
     """Profiles of a photon counter, and their mean by the analog record of the detector."""
 
-    counts: Array
+    counts: Integers | Array
     """(profile, range)."""
     exposure: Array
     """(profile,): microseconds for which a bin was open, above 0."""
@@ -115,43 +117,50 @@ def estimate_dead_time(groups: Sequence[ProfileGroup], lag: float) -> DeadTimeEs
     return DeadTimeEstimate(1e-6 * dead_time, 1e-6 * error, load)
 
 
+class _Light(NamedTuple):
+    """What the mean light of groups of profiles gives by a counter, (group, cell); MHz."""
+
+    rate: Array
+    """As measured."""
+    change: Array
+    """Derivative of `rate` to the dead time, MHz2: above 0 where the light varies."""
+    background: Array
+    """Without dead time, equal in all cells."""
+
+
 class _Counted:
-    """Rates of the profiles of groups, MHz, for means over cells of a few bins.
+    """Profiles of groups, for means over cells of a few bins.
 
     Attributes
     ----------
     peak, exposure : ndarray, shape (group, cell)
-        Largest rate of a profile, and microseconds for which the bins of a cell were open.
+        Largest rate of a profile, MHz, and microseconds for which the bins of a cell were open.
     """
 
     def __init__(self, groups: Sequence[ProfileGroup], bins: int) -> None:
-        self._rates = [g.counts[:, :bins] / g.exposure[:, np.newaxis] for g in groups]
-        self._weights = [g.exposure / g.exposure.sum() for g in groups]
-        self.peak = np.stack([_blocks(rate).max(axis=0) for rate in self._rates])
+        self._groups, self._bins = groups, bins
+        self.peak = np.stack([_blocks(self._rates(group)).max(axis=0) for group in groups])
         open_for = THRESHOLDS.dead_time_block * np.array([g.exposure.sum() for g in groups])
         self.exposure = np.repeat(open_for[:, np.newaxis], self.peak.shape[1], axis=1)
 
-    def mean_light(self, dead_time: float) -> tuple[Array, Array]:
-        """Return the rates that the mean light would give, and that of the background.
+    def _rates(self, group: ProfileGroup) -> Array:
+        return group.counts[:, : self._bins] / group.exposure[:, np.newaxis]
 
-        Parameters
-        ----------
-        dead_time : float
-            Microseconds, by which each profile is corrected before the mean; 0 for mean rates.
-
-        Returns
-        -------
-        rate : ndarray, shape (group, cell)
-            As measured by a counter of that dead time.
-        background : ndarray, shape (group, cell)
-            Without dead time, equal in all cells.
-        """
-        # A load of 1 has no light; such cells are not used.
-        corrected = (m / (1.0 - np.minimum(dead_time * m, _HIGHEST)) for m in self._rates)
-        light = np.stack([w @ part for w, part in zip(self._weights, corrected, strict=True)])
-        sky = light[:, _tail(light.shape[1])].mean(axis=1, keepdims=True)
+    def light(self, dead_time: float) -> _Light:
+        """Return the mean light of profiles that are corrected for a dead time, microseconds."""
+        means, squares = [], []
+        for group in self._groups:
+            rates, weights = self._rates(group), group.exposure / group.exposure.sum()
+            # A load of 1 has no light; such cells are not used.
+            corrected = rates / (1.0 - np.minimum(dead_time * rates, _HIGHEST))
+            means.append(weights @ corrected)
+            squares.append(weights @ corrected**2)
+        light = np.stack(means)
+        sky = light[:, _tail(self._bins)].mean(axis=1, keepdims=True)
         cells = _blocks(light)
-        return cells / (1.0 + dead_time * cells), np.broadcast_to(sky, cells.shape)
+        share = 1.0 / (1.0 + dead_time * cells)
+        change = (_blocks(np.stack(squares)) - cells**2) * share**2
+        return _Light(cells * share, change, np.broadcast_to(sky, cells.shape))
 
 
 def _tail(bins: int) -> slice:
@@ -184,14 +193,14 @@ def _fit(
     """
     known = np.isfinite(analog) & np.isfinite(variance)
     known &= analog > THRESHOLDS.least_analog * np.sqrt(np.where(known, variance, 1.0))
-    known &= counted.mean_light(0.0)[0] > THRESHOLDS.least_rate
+    known &= counted.light(0.0).rate > THRESHOLDS.least_rate
     fastest, dead_time = math.inf, 0.0
     solution: tuple[float, float, float] | None = None
     for _ in range(_ROUNDS):
         used = known & (counted.peak < fastest)
-        rate, sky = counted.mean_light(dead_time)
-        parts = (rate, analog, variance, sky, counted.exposure)
-        solution = _solve(*(part[used] for part in parts)) if used.any() else None
+        light = _Light(*(part[used] for part in counted.light(dead_time)))
+        parts = (part[used] for part in (analog, variance, counted.exposure))
+        solution = _solve(light, dead_time, *parts) if used.any() else None
         if solution is None:
             return None
         dead_time = solution[0]
@@ -201,18 +210,23 @@ def _fit(
 
 
 def _solve(
-    rate: Array, analog: Array, variance: Array, sky: Array, exposure: Array
+    light: _Light, of_light: float, analog: Array, variance: Array, exposure: Array
 ) -> tuple[float, float, float] | None:
-    """Return dead time and its error by noise, microseconds, and the highest load; see `_fit`."""
-    dead_time = THRESHOLDS.first_dead_time
-    slope = float((rate - sky).sum() / analog.sum())
+    """Return dead time and its error by noise, microseconds, and the highest load; see `_fit`.
+
+    `of_light` is the dead time of `light`, in microseconds.
+    """
+    dead_time = of_light or THRESHOLDS.first_dead_time
+    slope = float((light.rate - light.background).sum() / analog.sum())
     error = math.inf
+    rate = light.rate
     for _ in range(_PASSES):
-        true = np.maximum(slope * analog + sky, 1e-6)
+        rate = light.rate + light.change * (dead_time - of_light)
+        true = np.maximum(slope * analog + light.background, 1e-6)
         share = 1.0 / (1.0 + dead_time * true)
         model, of_true = true * share, share**2
         noise = model / exposure + (slope * of_true) ** 2 * variance
-        jacobian = np.stack([-(true**2) * of_true, analog * of_true])
+        jacobian = np.stack([-(true**2) * of_true - light.change, analog * of_true])
         weighted = jacobian / noise
         normal = weighted @ jacobian.T
         try:
@@ -220,7 +234,8 @@ def _solve(
             square = float(np.linalg.inv(normal)[0, 0])
         except np.linalg.LinAlgError:
             return None
-        if square < 0.0:  # By rounding: all cells are alike.
+        # Else all cells are alike, but for rounding.
+        if not 0.0 <= square * normal[0, 0] < _ALIKE:
             return None
         error = math.sqrt(square)
         dead_time = float(np.clip(dead_time + change[0], *THRESHOLDS.dead_times))

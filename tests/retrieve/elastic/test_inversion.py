@@ -456,8 +456,7 @@ def test_integration_away_from_the_lidar_through_a_cloud_is_withheld():
     power = signal(FINE, backscatter=cloud)
     window = (2200.0, 2400.0)
     mean = 1.0 + float(np.mean(particles(np.linspace(*window)) / AIR.backscatter(2300.0, GREEN)))
-    setup = {**air(FINE), "lidar_ratio": 52.0, "lidar_ratio_standard_error": 2.0}
-    setup["reference"] = window
+    setup = {**air(FINE), "lidar_ratio": 52.0, "reference": window}
     result = invert_elastic(power, FINE, **setup, reference_scattering_ratio=mean)
     first = FINE[np.argmax(result.unstable)]
     # The transmission squared is 0.05 where 2 * 50 sr * beta integrates to 3.

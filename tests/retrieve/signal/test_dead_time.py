@@ -55,6 +55,9 @@ def varying_air(rng, number):
 SCENES = {
     "like profiles": lambda _rng, _number: LIGHT,
     "a laser that varies": lambda rng, _number: LIGHT * max(rng.normal(1.0, 0.4), 0.05),
+    "a laser that fails in half of the profiles": lambda _rng, number: (
+        LIGHT * (1.0 if number % 2 else 0.03)
+    ),
     "air that varies": varying_air,
     "a scan": lambda _rng, number: (
         LIGHT * np.exp(2e-4 * DISTANCE * (1.0 - 1.0 / math.cos(math.radians(2.5 * number))))
