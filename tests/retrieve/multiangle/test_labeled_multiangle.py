@@ -147,8 +147,8 @@ def test_unflagged_optical_depths_lie_within_three_standard_errors(
     zenith, noise, background, method
 ):
     off, plain = [], []
-    for seed in range(1, 5):
-        profiles = scan(32, zenith, seed, sigma=noise[0], scatter=noise[1])
+    for seed in range(1, 9):
+        profiles = scan(16, zenith, seed, sigma=noise[0], scatter=noise[1])
         product = solve(*profiles, method=method, **background)
         assert_explained(product)
         for kept, part in zip((off, plain), errors(product), strict=True):
