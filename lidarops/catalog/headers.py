@@ -118,6 +118,11 @@ def read_row(headers: Headers, due: UnreadFile) -> GranuleRow:
     return row_of(granule, headers.entered_as, RETRY if retry else due.scan_key)
 
 
+def unread_row(headers: Headers, due: UnreadFile, reason: str) -> GranuleRow:
+    """Return the row of a file whose reading came to no end, which every scan tries again."""
+    return row_of(_refused(due, f"{UNREADABLE}: {reason}"), headers.entered_as, RETRY)
+
+
 def read_header(headers: Headers, due: UnreadFile) -> Granule:
     """Return the granule of a file; if it is unusable, a refused one with the reason."""
     file = due.file

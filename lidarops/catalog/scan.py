@@ -10,19 +10,20 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from itertools import chain
 from typing import Final
 from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
-from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row
+from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row, unread_row
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import UNREADABLE, IdlePattern, Role, Status
 from lidarops.system.code_version import reading_version
-from lidarops.system.processes import Processes
+from lidarops.system.processes import CRASHED, Processes
 from lidarops.system.stores import without_keys
 
 _BATCH = 2000
@@ -115,12 +116,13 @@ def scan_archive(
     work = _Scan(campaign, store, progress, before_write)
     remote = isinstance(work.source, RemoteSource)
     processes = 1 if remote else min(workers, _MOST_PROCESSES)
-    with (
-        store.fingerprints() as known,
-        Processes(processes, Headers(work.source, campaign, store.campaign)) as readers,
-    ):
+    headers = Headers(work.source, campaign, store.campaign)
+    crashed = partial(unread_row, headers, reason=CRASHED)
+    with store.fingerprints() as known, Processes(processes, headers) as readers:
         due = work.due(_joined(work.source.files(work.is_claimed), known))
-        rows = readers.map_items(read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES)
+        rows = readers.map_items(
+            read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES, lost=crashed
+        )
         for _, row in rows:
             work.enter(row)
     return work.finish()

@@ -7,7 +7,7 @@ read in one process or several; figures and their order do not depend on the num
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
@@ -29,7 +29,7 @@ from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.netcdf.read import UNREADABLE, open_product, opened_product, profiles_in
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord, SceneOutcome
-from lidarops.system.processes import Processes
+from lidarops.system.processes import CRASHED, Processes
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
@@ -38,9 +38,11 @@ FEWEST: Final = 50
 _FLAG_ROWS: Final = 40
 _AT_A_TIME: Final = 8
 """Products sent to a process together, so that it waits less."""
+# fmt: off
 _UNREADABLE: Final = (
-    *(ArithmeticError, LookupError, MemoryError, RuntimeError, ValueError, ProductError),
+    ArithmeticError, LookupError, MemoryError, RuntimeError, ValueError, ProductError,
 )
+# fmt: on
 """What values of a damaged product may raise; other errors are those of the program."""
 
 
@@ -160,17 +162,17 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
                 compares = truth is not None and view.compare is not None
                 if full and not compares:
                     continue
-                contents = list(_read(processes, truth, group, view, gallery.problems))
+                contents = list(_read(processes, group, view, gallery.problems))
                 if contents and compares:
                     gallery.compared += _compared(view, contents, group)
                 for drawn in view.draw(contents) if contents and not full else ():
-                    gallery.pictures.append(_picture(view.name, drawn, group))
+                    title = _title(group, {problem.path for problem in gallery.problems})
+                    gallery.pictures.append(_picture(view.name, drawn, group, title))
     return gallery
 
 
 def _read(
     processes: Processes[xr.Dataset | None],
-    truth: xr.Dataset | None,
     group: Group,
     view: View[Any],
     problems: list[Problem],
@@ -182,8 +184,13 @@ def _read(
     def each(task: _Task, items: Sequence[_Item]) -> Iterator[tuple[_Item, Any]]:
         """Yield what a task returns of each product; note those that it fails on."""
         guarded = partial(_guarded, task, group.root)
-        alone = ((item, guarded(truth, item)) for item in items)
-        results = alone if view.first else processes.map_items(guarded, items, at_a_time=_AT_A_TIME)
+        results: Iterator[tuple[_Item, Any]]
+        if view.first:
+            # None ahead, because mostly the first one is enough.
+            single = (processes.later(guarded, item, lost=_crashed) for item in items)
+            results = zip(items, (result() for result in single), strict=True)
+        else:
+            results = processes.map_items(guarded, items, at_a_time=_AT_A_TIME, lost=_crashed)
         for item, (content, reason) in results:
             if not reason:
                 yield item, content
@@ -209,6 +216,10 @@ def _guarded(task: _Task, root: Path, truth: xr.Dataset | None, item: _Item) -> 
         return task(root / path, replace(source, truth=truth)), ""
     except _UNREADABLE as error:
         return None, _reason(root / path, error)
+
+
+def _crashed(_: _Item) -> tuple[Any, str]:
+    return None, CRASHED
 
 
 def _length(file: Path, _: ProductSource) -> int:
@@ -237,16 +248,19 @@ def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterato
             yield Compared(group.instrument, group.channel, comparison)
 
 
-def _picture(view: str, drawn: Figure, group: Group) -> Picture:
+def _picture(view: str, drawn: Figure, group: Group, title: str) -> Picture:
     scenes = counted(len(group.members), "scene")
     words = f"{scenes}. {drawn.words}."
-    caption = f"{drawn.caption}: {_title(group)}"
+    caption = f"{drawn.caption}: {title}"
     return Picture(view, drawn, group.instrument, caption, group.lacking, words)
 
 
-def _title(group: Group) -> str:
+def _title(group: Group, unreadable: Collection[str]) -> str:
     """Return channel and instrument as people call them, by the first product that can be read."""
     for _, product in group.members:
+        # What crashed another process would crash this one.
+        if product.path in unreadable:
+            continue
         try:
             with opened_product(group.root / product.path) as opened:
                 name = attribute(opened, "instrument", group.instrument)

@@ -52,7 +52,7 @@ from lidarops.system.files import (
     within,
     write_atomically,
 )
-from lidarops.system.processes import Processes
+from lidarops.system.processes import CRASHED, Processes
 
 _FORMAT: Final = "lidarops site"
 _READ_BYTES: Final = 16_000_000
@@ -132,7 +132,8 @@ def build_site(
     Returns
     -------
     Site
-        Unreadable products are listed in it and on the first page.
+        Unreadable products, and with several workers those whose reading ends its process, are
+        listed in it and on the first page.
 
     Raises
     ------
@@ -163,7 +164,7 @@ def _collect(
 ) -> tuple[list[Entry], list[Problem], int]:
     entries, problems, made = [], [], 0
     with Processes(workers, None) as processes:
-        for _, (outcome, new) in processes.map_items(_page, tasks, at_a_time=1):
+        for _, (outcome, new) in processes.map_items(_page, tasks, at_a_time=1, lost=_crashed):
             if isinstance(outcome, Problem):
                 problems.append(outcome)
             else:
@@ -187,6 +188,10 @@ def _page(_: None, task: _Task) -> _Outcome:
         return _make(task, file, sha256), True
     except ProductError as error:
         return Problem(task.path, _reason(task, error)), True
+
+
+def _crashed(task: _Task) -> _Outcome:
+    return Problem(task.path, CRASHED), True
 
 
 def _reason(task: _Task, error: BaseException) -> str:

@@ -1,7 +1,8 @@
 """Local processes and threads for work that can be split into items.
 
 Results and their order do not depend on the number of processes. If processes may not or cannot be
-started, or one is lost, this process does the work.
+started, this process does the work. If one is lost, one does the rest, an item at a time; what an
+item that ends this one and a fresh one amounts to, the caller states.
 """
 
 from __future__ import annotations
@@ -45,11 +46,15 @@ _LIBRARY_VARIABLES: Final = frozenset(
 )
 """Variables that dask, when it starts workers, netCDF4 and `preload_modules` set here, too."""
 
+CRASHED: Final = "reading it crashed the process"
+"""What to say of a file that ends each process that reads it."""
+
 _NO_MORE: Final[Any] = object()
 
 Kept = TypeVar("Kept")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Lost = Callable[[Item], Result] | None
 _LOG = logging.getLogger(__name__)
 
 
@@ -135,11 +140,8 @@ class Processes(Generic[Kept]):
         self._started: list[BaseProcess] = []
         # A daemonic process, such as a dask worker, may not have child processes.
         self._alone = number < 2 or bool(multiprocessing.current_process().daemon)
-
-    @property
-    def number(self) -> int:
-        """Largest number of further processes; 0 if this process does all the work."""
-        return 0 if self._alone else self._number
+        self._careful = False
+        """Whether a process was lost, and one does each task by itself."""
 
     def __enter__(self) -> Self:
         return self
@@ -155,6 +157,7 @@ class Processes(Generic[Kept]):
         *,
         at_a_time: int,
         fewest: int = 2,
+        lost: Lost[Item, Result] = None,
     ) -> Iterator[tuple[Item, Result]]:
         """Call a task for each item; items are consumed as needed, some ahead.
 
@@ -168,80 +171,145 @@ class Processes(Generic[Kept]):
             Number of items per batch for a process.
         fewest : int, optional
             Least number of items for which processes are started.
+        lost : callable, optional
+            Called with an item that ends each process that works on it (such as by a crash of a
+            library, or for its memory); returns the result. No such item is worked on here.
 
         Yields
         ------
         item, result
             In the order of items.
+
+        Raises
+        ------
+        BrokenProcessPool
+            For an item that ends its process, without `lost`.
         """
         rest = iter(items)
         if not self._alone:
             first = list(islice(rest, fewest))
             rest = chain(first, rest)
             if len(first) == fewest:
-                yield from self._each_in_processes(task, rest, at_a_time)
+                yield from self._each_in_processes(task, rest, at_a_time, lost)
                 return
         for item in rest:
             yield item, task(self._kept, item)
 
     def _each_in_processes(
-        self, task: Callable[[Kept, Item], Result], items: Iterator[Item], at_a_time: int
+        self,
+        task: Callable[[Kept, Item], Result],
+        items: Iterator[Item],
+        at_a_time: int,
+        lost: Lost[Item, Result],
     ) -> Iterator[tuple[Item, Result]]:
         batches = iter(lambda: list(islice(items, at_a_time)), [])
-        ahead: deque[tuple[list[Item], Callable[[], list[Result]]]] = deque()
+        ahead: deque[tuple[list[Item], Future[list[Result]] | None]] = deque()
         while True:
             for batch in islice(batches, _BATCHES_AHEAD * self._number - len(ahead)):
-                ahead.append((batch, self.later(partial(_run_batch, task), batch)))
+                ahead.append((batch, self._submit(partial(_run_batch, task), batch)))
             if not ahead:
                 return
-            batch, results = ahead.popleft()
-            yield from zip(batch, results(), strict=True)
+            batch, future = ahead.popleft()
+            results = self._wait(future)
+            if results is None:
+                yield from ((item, self._by_itself(task, item, lost)) for item in batch)
+            else:
+                yield from zip(batch, results[0], strict=True)
 
-    def later(self, task: Callable[[Kept, Item], Result], item: Item) -> Callable[[], Result]:
+    def later(
+        self,
+        task: Callable[[Kept, Item], Result],
+        item: Item,
+        *,
+        lost: Lost[Item, Result] = None,
+    ) -> Callable[[], Result]:
         """Start a task; return a function that waits for its result and returns or raises it.
 
-        Without processes, that function calls the task.
+        Without processes, that function calls the task. `lost` is that of `map_items`.
         """
-        run_here = partial(task, self._kept, item)
         future = self._submit(task, item)
-        return run_here if future is None else partial(self._wait, future, run_here)
+
+        def result() -> Result:
+            done = self._wait(future)
+            return self._by_itself(task, item, lost) if done is None else done[0]
+
+        return result
 
     def _submit(self, task: Callable[[Kept, Item], Result], item: Item) -> Future[Result] | None:
-        if self._alone:
+        """Start a task; None if it is to be called by itself, when its result is needed."""
+        if self._alone or self._careful:
             return None
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(
-                self._number,
-                mp_context=_context(self._started),
-                initializer=_prepare,
-                initargs=(self._kept,),
-            )
         try:
-            return self._pool.submit(_run_task, task, item)
+            return self._started_pool(self._number).submit(_run_task, task, item)
         # A process was lost, none can be started, or the server that forks them has ended.
         except (BrokenProcessPool, OSError, EOFError) as error:
             self._lost(error)
             return None
 
-    def _wait(self, future: Future[Result], run_here: Callable[[], Result]) -> Result:
+    def _started_pool(self, number: int) -> ProcessPoolExecutor:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                number,
+                mp_context=_context(self._started),
+                initializer=_prepare,
+                initargs=(self._kept,),
+            )
+        return self._pool
+
+    def _wait(self, future: Future[Result] | None) -> tuple[Result] | None:
+        """Return the result of a started task; None if its process was lost."""
         # Never cancel here: the thread that marks the tasks of a lost process would stop at a
         # cancelled future, and the remaining processes would wait for ever.
         try:
-            return future.result()
+            return None if future is None else (future.result(),)
         # A process was killed (e.g. for its memory), or could not be started.
         except (BrokenProcessPool, CancelledError) as error:
-            self._lost(error)
-        return run_here()
+            # Of several tasks of one lost pool, only the first one to be waited for says so.
+            if not self._careful:
+                self._lost(error)
+        return None
+
+    def _by_itself(
+        self, task: Callable[[Kept, Item], Result], item: Item, lost: Lost[Item, Result]
+    ) -> Result:
+        """Call a task in one process, which does nothing else meanwhile.
+
+        If that process is lost, too, in a fresh one, because what others left in it may be the
+        cause. Only where no process can be started is the task called here.
+        """
+        # The second process is fresh.
+        for _ in range(2):
+            if not self._starts_one():
+                return task(self._kept, item)
+            try:
+                return self._started_pool(1).submit(_run_task, task, item).result()
+            except BrokenProcessPool as error:
+                self._lost(error)
+        if lost is None:
+            raise BrokenProcessPool(f"{item!r:.200} ends each process that works on it")
+        return lost(item)
+
+    def _starts_one(self) -> bool:
+        """Whether a process for single tasks is at work, or can be started."""
+        if self._pool is None and not self._alone:
+            try:
+                self._started_pool(1).submit(os.getpid).result()
+            except (BrokenProcessPool, OSError, EOFError) as error:
+                self._lost(error)
+                _LOG.warning("no process can be started; this one does the work: %s", error)
+                self._alone = True
+        return not self._alone
 
     def _lost(self, error: BaseException) -> None:
-        if not self._alone:
-            _LOG.warning("a process was lost; this one does its work: %s", error)
-            self._alone = True
-            if self._pool is not None:
-                self._pool.shutdown(wait=False, cancel_futures=True)
-                self._pool = None
-            if isinstance(error, BrokenProcessPool):
-                self._kill()
+        """Forget a broken pool; from now on one process does each task by itself."""
+        if not self._careful:
+            _LOG.warning("a process was lost; from now on one does each task by itself: %s", error)
+            self._careful = True
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool = None
+        if isinstance(error, BrokenProcessPool):
+            self._kill()
 
     def _kill(self) -> None:
         """Kill what is left of a broken pool: it misses a process that it was just starting."""

@@ -26,10 +26,10 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 from lidarops.errors import CatalogError, ProductError
 from lidarops.flags import Quality
-from lidarops.site import paths
+from lidarops.site import build, paths
 from lidarops.site.build import build_site
-from lidarops.site.product_entry import ShareGrade
-from lidarops.system.files import within
+from lidarops.site.product_entry import Problem, ShareGrade
+from lidarops.system.files import product_paths, within
 
 FIRST_PAGE = 300_000
 """Most bytes that the first page may load."""
@@ -204,6 +204,28 @@ def test_equal_archives_give_equal_bytes_for_any_number_of_workers(
     # Workers also finish in another order.
     build_site(other, workers=2)
     assert contents(other / "site") == contents(site)
+
+
+_PAGE = build._page
+
+
+def _deadly_page(kept: None, task: build._Task) -> build._Outcome:
+    if task.path == sorted(product_paths(task.products))[0]:
+        os._exit(9)
+    return _PAGE(kept, task)
+
+
+def test_a_product_that_crashes_its_process_is_a_problem_and_the_others_have_pages(
+    archive: Path, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = _copy(archive, tmp_path / "elsewhere")
+    whole = build_site(other)
+    monkeypatch.setattr(build, "_page", _deadly_page)
+    built = build_site(_copy(archive, tmp_path / "deadly"), workers=2)
+    (first, *_) = sorted(product_paths(other / "products"))
+    assert Problem(first, "reading it crashed the process") in built.problems
+    assert built.products == whole.products - 1
+    assert first in built.index.read_text()
 
 
 def test_unchanged_pages_are_kept_and_pages_of_removed_products_deleted(

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Collection, Iterator
 from concurrent.futures import Future
-from concurrent.futures.process import _ExecutorManagerThread
+from concurrent.futures.process import BrokenProcessPool, _ExecutorManagerThread
 from itertools import count, islice
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -34,10 +34,34 @@ def process(kept: int, item: int) -> int:
 
 
 def deadly(kept: int, item: int) -> int:
-    """Kill any process but the main one."""
-    if multiprocessing.parent_process() is not None and item == 5:
+    """End each process at an item, also the main one."""
+    if item == 5:
         os._exit(9)
     return kept * item
+
+
+def deadly_once(kept: Path, item: int) -> int:
+    """End the first process that comes to an item."""
+    if item == 5 and not kept.exists():
+        kept.touch()
+        os._exit(9)
+    return 2 * item
+
+
+def worn_out(kept: int, item: int) -> int:
+    """End each process at its second item of these."""
+    if item >= 5:
+        WORN.append(item)
+    if len(WORN) > 1:
+        os._exit(9)
+    return kept * item
+
+
+WORN: list[int] = []
+
+
+def lost(item: int) -> int:
+    return -item
 
 
 def failing(kept: int, item: int) -> int:
@@ -98,15 +122,28 @@ class TestEach:
             assert list(pool.map_items(product, range(9), at_a_time=3)) == doubled(range(9))
             assert pool.later(product, 7)() == 14
 
-    def test_loses_nothing_with_a_process(self, caplog: pytest.LogCaptureFixture) -> None:
-        with caplog.at_level(logging.WARNING), Processes(2, 2) as pool:
-            last = pool.later(product, 7)
-            assert list(pool.map_items(deadly, range(40), at_a_time=2)) == doubled(range(40))
+    def test_loses_nothing_with_a_process(self, tmp_path, caplog) -> None:
+        with caplog.at_level(logging.WARNING), Processes(2, tmp_path / "lost") as pool:
+            last = pool.later(deadly_once, 7)
+            done = list(pool.map_items(deadly_once, range(40), at_a_time=2, lost=lost))
+            assert done == doubled(range(40))
             assert last() == 14
-            assert {results for _, results in pool.map_items(process, range(4), at_a_time=1)} == {
-                os.getpid()
-            }
+            (other,) = {one for _, one in pool.map_items(process, range(4), at_a_time=1)}
+            assert other != os.getpid()
         assert caplog.text.count("a process was lost") == 1
+
+    def test_reports_an_item_that_ends_each_process_and_never_works_on_it_here(self) -> None:
+        with Processes(2, 2) as pool:
+            done = dict(pool.map_items(deadly, range(40), at_a_time=3, lost=lost))
+            assert pool.later(deadly, 5, lost=lost)() == -5
+            with pytest.raises(BrokenProcessPool, match="5 ends each process"):
+                list(pool.map_items(deadly, range(9), at_a_time=1))
+        assert done == dict(doubled(range(40))) | {5: -5}
+
+    def test_an_item_is_tried_in_a_fresh_process(self) -> None:
+        with Processes(2, 2) as pool:
+            done = dict(pool.map_items(worn_out, range(12), at_a_time=2, lost=lost))
+        assert done == dict(doubled(range(12)))
 
     def test_leaves_none_behind_if_one_is_lost(self, monkeypatch) -> None:
         before = Future.set_exception
@@ -119,7 +156,7 @@ class TestEach:
         monkeypatch.setattr(Future, "set_exception", slowly)
         others = multiprocessing.active_children()
         with Processes(2, 2) as pool:
-            assert list(pool.map_items(deadly, range(40), at_a_time=2)) == doubled(range(40))
+            assert len(list(pool.map_items(deadly, range(40), at_a_time=2, lost=lost))) == 40
         assert not left_alive(others, 60.0)
 
     def test_ends_a_process_that_starts_while_another_is_lost(self, monkeypatch) -> None:
@@ -142,7 +179,7 @@ class TestEach:
         monkeypatch.setattr(BaseProcess, "start", slowly)
         monkeypatch.setattr(_ExecutorManagerThread, "terminate_broken", waiting)
         with Processes(2, 2) as pool:
-            assert list(pool.map_items(deadly, range(40), at_a_time=6)) == doubled(range(40))
+            assert len(list(pool.map_items(deadly, range(40), at_a_time=6, lost=lost))) == 40
         assert begun.is_set()
         assert not left_alive(others, 5.0)
 
