@@ -99,24 +99,24 @@ def _read(
 ) -> xr.Dataset | None:
     """Return the profile with the most unflagged values, up to the last usable one.
 
-    If it depends on a window, only to just beyond that. Among equals, that with the most usable
-    values, then the first; None without any usable value.
+    If it depends on a window, only values to just beyond that count and are shown. Among equals,
+    that with the most usable values, then the first; None without any usable value.
     `rejected` and `with_care` of it are the verdicts of its values.
     """
     require(product, dims)
     flag = quality_bits(product["quality_flag"])
     rejected = (flag & rejecting_mask(bits_of(product))) != 0
     usable = np.isfinite(product[main.name].values) & ~rejected
+    if main.window:
+        far = _BEYOND * product[main.window[-1]].values[:, None]
+        # All are shown where there is no window: it is NaN.
+        usable &= ~(product[along].values >= far)
     if not usable.any():
         return None
     earlier = -np.arange(len(usable))
     clear = (usable & (flag == 0)).sum(axis=1)
     index = int(np.lexsort((earlier, usable.sum(axis=1), clear))[-1])
-    last = int(np.flatnonzero(usable[index])[-1]) + 1
-    if main.window:
-        far = _BEYOND * float(product[main.window[-1]].values[index])
-        last = min(last, max(int(np.searchsorted(product[along].values, far)), 2))
-    shown = slice(0, last, -(-last // _POINTS))
+    shown = slice(0, max(int(np.flatnonzero(usable[index])[-1]) + 1, 2))
     profile = product[[name for name in (*dims, *more) if name in product.variables]]
     return (
         profile.isel({"time": index, along: shown})
@@ -157,7 +157,7 @@ def _panel(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axi
     def values(name: str) -> Floats:
         return quantity.factor * np.asarray(profile[name].values, dtype=np.float64)
 
-    name = quantity.name
+    name, thin = quantity.name, _thin(place)
     rejected, care = profile["rejected"].values, profile["with_care"].values
     whole = values(name)
     value = np.where(rejected, np.nan, whole)
@@ -170,21 +170,24 @@ def _panel(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axi
     label = ", with the ".join(["standard error", *(part.replace("_", " ") for part in more)])
     layers: list[Layer] = []
     if quantity.window:
-        ends = np.array([profile[end].item() / 1e3 for end in quantity.window])
+        window = np.array([profile[end].item() / 1e3 for end in quantity.window])
         far = 2.0 * np.nanmax(np.abs(value) + error) * np.ones(2)
         words = quantity.window[0].rpartition("_")[0]
-        layers.append(Band(ends, -far, far, "soft wide", upright=True, label=f"{words} window"))
+        layers.append(Band(window, -far, far, "soft wide", upright=True, label=f"{words} window"))
     if quantity.bound:
         wide = error + np.nan_to_num(values(f"{name}_{quantity.bound}"))
         words = f"largest {quantity.bound.replace('_', ' ')}"
-        layers.append(Band(place, value - wide, value + wide, "c0 wide", upright=True, label=words))
-    layers.append(Band(place, value - error, value + error, upright=True, label=label))
-    layers.append(Curve(value, place, label="retrieved"))
+        ends = (value - wide)[thin], (value + wide)[thin]
+        layers.append(Band(place[thin], *ends, "c0 wide", upright=True, label=words))
+    low, high = value - error, value + error
+    layers.append(Band(place[thin], low[thin], high[thin], upright=True, label=label))
+    layers.append(Curve(value[thin], place[thin], label="retrieved"))
     clear = _clear(value, error)
-    spans = [(value - error)[clear], (value + error)[clear]]
+    spans = [low[clear], high[clear]]
     if quantity.reference:
         beside = values(quantity.reference)
-        layers.append(Curve(beside, place, "c1 d2", label=quantity.reference.replace("_", " ")))
+        words = quantity.reference.replace("_", " ")
+        layers.append(Curve(beside[thin], place[thin], "c1 d2", label=words))
         spans.append(beside)
     marked = np.isfinite(whole)
     for where, style, mark, words in (
@@ -199,6 +202,11 @@ def _panel(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axi
     return Panel(percentile_axis(quantity.label, spans, 0.5, 0.08), y, tuple(layers), _HEIGHT)
 
 
+def _thin(place: Floats) -> slice:
+    """Return which values of a profile curves and bands show; all count and set the axis."""
+    return slice(None, None, -(-place.size // _POINTS))
+
+
 def _clear(value: Floats, error: Floats) -> Mask:
     """Return which values set the axis: not those whose errors would hide all others."""
     known = np.isfinite(value) & np.isfinite(error)
@@ -211,10 +219,10 @@ def _clear(value: Floats, error: Floats) -> Mask:
 
 def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axis) -> Panel:
     """Return the absolute errors of a quantity by cause."""
-    good = ~profile["rejected"].values
+    good, thin = ~profile["rejected"].values, _thin(place)
 
     def errors(name: str) -> Floats:
-        return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)
+        return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)[thin]
 
     causes = {
         cause.replace("_", " "): errors(f"{quantity.name}_error_{cause}")
@@ -222,8 +230,8 @@ def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Ax
     }
     total = errors(f"{quantity.name}_standard_error")
     lines = [
-        Curve(values, place, f"c{number} d{number}", label=cause)
+        Curve(values, place[thin], f"c{number} d{number}", label=cause)
         for number, (cause, values) in enumerate(causes.items())
     ]
     x = decade_axis(f"error of {quantity.label}", [*causes.values(), total])
-    return Panel(x, y, (*lines, Curve(total, place, "ink thick", label="total")), _HEIGHT)
+    return Panel(x, y, (*lines, Curve(total, place[thin], "ink thick", label="total")), _HEIGHT)

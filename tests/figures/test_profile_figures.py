@@ -92,6 +92,37 @@ def test_values_to_use_with_care_and_not_to_use_are_marked(made, tmp_path):
     assert made["range"].values[5] / 1e3 in crosses.y.round(9)
 
 
+def test_flagged_values_are_counted_before_some_are_left_out(tmp_path):
+    made = elastic(profiles=2, bins=700)
+    made["quality_flag"][:] = 0
+    for name in made.data_vars:
+        if made[name].dims == ("time", "range"):
+            made[name][:] = made[name].fillna(1e-6)
+    made["reference_top"][:] = 1e5
+    made["quality_flag"][:, 100:140] |= np.int32(Quality.PILE_UP)
+    figure = drawn(stored(tmp_path / "long.nc", made))
+    assert "40 of 700 values flagged" in figure.words
+    (marks,) = labelled(figure.panels[0], "use with care")
+    assert marks.label == "use with care: 40 values"
+    (line,) = labelled(figure.panels[0], "retrieved")
+    assert line.x.size <= 300
+
+
+@pytest.mark.filterwarnings("error")
+def test_only_values_up_to_just_beyond_the_window_choose_the_profile(made, tmp_path):
+    made["quality_flag"][:] |= np.int32(Quality.SATURATED)
+    beyond = np.flatnonzero(made["range"].values > 1.15 * 250.0)
+    made["quality_flag"][:6, beyond] = 0
+    product = stored(tmp_path / "beyond.nc", made)
+    assert PROFILE.read(product, None) is None
+    made["quality_flag"][6, 5:8] = 0
+    product = stored(tmp_path / "one.nc", made)
+    figure = drawn(product)
+    assert str(product["time"].values[6])[11:19] in figure.caption
+    (line,) = labelled(figure.panels[0], "retrieved")
+    assert np.isfinite(line.x).sum() == 3
+
+
 def test_none_without_a_usable_value(made, tmp_path):
     made["quality_flag"][:] |= np.int32(ElasticQuality.NO_REFERENCE)
     assert PROFILE.read(stored(tmp_path / "lost.nc", made), None) is None
