@@ -73,7 +73,10 @@ def bits_of(product: xr.Dataset) -> tuple[StoredBit, ...]:
     """
     kind = product.attrs.get("lidarops_kind")
     bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
-    if kind in set(kinds()) or USABLE not in product:
+    # A usable of other dimensions says nothing of single flags.
+    if USABLE not in product or product[USABLE].dims != product[QUALITY_FLAG].dims:
+        return bits
+    if kind in set(kinds()):
         return bits
     kept = 0
     for flags, usable in zip(

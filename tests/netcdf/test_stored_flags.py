@@ -20,6 +20,7 @@ from lidarops.kinds import flags_of
 from lidarops.netcdf.read import open_product
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
+    bits_of,
     recoding,
     rejecting_mask,
     stored_bits,
@@ -126,6 +127,15 @@ def test_bits_that_a_kind_no_longer_has_are_refused_only_where_they_are_raised()
 def test_masks_and_meanings_must_agree():
     with pytest.raises(ProductError, match="flag_meanings"):
         stored_bits({"flag_masks": np.array([1, 2]), "flag_meanings": "saturated"}, "signal")
+
+
+def test_a_usable_of_other_dimensions_says_nothing_of_bits():
+    flags = xr.DataArray(np.full((4, 5), 1 << 20, np.int32), dims=("time", "range"))
+    product = xr.Dataset({"quality_flag": flags, "usable": ("time", np.zeros(4, np.int8))})
+    product.attrs["lidarops_kind"] = "of another package"
+    assert rejecting_mask(bits_of(product)) & 1 << 20
+    product["usable"] = flags.dims, np.zeros((4, 5), np.int8)
+    assert not rejecting_mask(bits_of(product)) & 1 << 20
 
 
 @pytest.mark.parametrize("kind", [None, "of another package"])
