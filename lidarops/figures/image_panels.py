@@ -169,6 +169,12 @@ def _in_words(
         bits = {bit.word: bit for raster in rasters for bit in raster.bits if bit.rejects}
         bits.pop(Quality.INPUT_MISSING.word, None)
         words.append(f"light grey, {percent(flagged)}: flagged {', '.join(bits)}")
+    care = np.average([r.with_care for r in rasters], weights=[r.profiles.sum() for r in rasters])
+    if care:
+        caring = {bit.word for raster in rasters for bit in raster.bits if not bit.rejects}
+        words.append(
+            f"{percent(care)} of the bins shown: use with care ({', '.join(sorted(caring))})"
+        )
     clouds = np.concatenate([raster.clouds for raster in rasters])
     if np.isfinite(clouds).any():
         known = int(np.isfinite(clouds).sum())

@@ -61,8 +61,8 @@ class Raster:
     edges: Floats
     """(row + 1,) Edges of the rows along range, m."""
     sums: Sums
-    """(4, column, row) Sums of the usable bins, of their variances, of their number, and of the
-    number of bins that a quality bit rejects, without missing data."""
+    """(5, column, row) Sums of the usable bins, of their variances, of their number, of the number
+    of bins that a quality bit rejects, without missing data, and of bins to use with care."""
     bins: Floats
     """(row,) Number of bins along range in a row."""
     profiles: NDArray[np.int64]
@@ -80,7 +80,7 @@ class Raster:
     @property
     def mean(self) -> Floats:
         """(column, row) Mean over usable bins; NaN without any."""
-        total, _, used, _ = self.sums
+        total, _, used, *_ = self.sums
         return np.where(used > 0, total / np.maximum(used, 1), np.nan)
 
     @property
@@ -91,12 +91,18 @@ class Raster:
         return np.asarray((rejected > 0) & (2 * rejected >= blocks))
 
     @property
+    def with_care(self) -> float:
+        """Share of bins to use with care."""
+        bins = float(self.profiles.sum() * self.bins.sum())
+        return float(self.sums[4].sum(dtype=np.float64)) / bins
+
+    @property
     def reach(self) -> float:
         """Range up to which the signal exceeds its noise, m; 0 if it never does.
 
         Columns without any usable bin do not count.
         """
-        total, variance, used, _ = self.sums
+        total, variance, used, *_ = self.sums
         measured = used.any(axis=1)
         if not measured.any():
             return 0.0
@@ -220,7 +226,8 @@ def _sums(
     flag = quality_bits(product["quality_flag"])
     rejected, missing = ((flag & mask) != 0 for mask in masks)
     good = np.isfinite(signal) & ~rejected & ~missing
-    parts = np.where(good, signal, 0.0), np.where(good, error, 0.0) ** 2, good, rejected & ~missing
+    known = np.where(good, signal, 0.0), np.where(good, error, 0.0) ** 2
+    parts = *known, good, rejected & ~missing, good & (flag != 0)
     sums = np.zeros((len(parts), columns.size, rows.size), dtype=np.float32)
     for total, part in zip(sums, parts, strict=True):
         by_row = part.astype(np.float64, copy=False)

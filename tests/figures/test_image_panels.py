@@ -21,6 +21,7 @@ from lidarops.figures.image_panels import colour_limits
 from lidarops.figures.panels import BLANK, NEGATIVE, REJECTED
 from lidarops.figures.raster import COLUMNS, ROWS
 from lidarops.figures.time_axis import days
+from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
 
@@ -48,6 +49,14 @@ def test_codes_are_the_signal_and_its_flags():
     np.testing.assert_allclose(decoded(image.codes, panel.bar)[shown], value[shown], rtol=0.02)
     assert panel.bar.label == "range-corrected signal (MHz m²)"
     assert "light grey" in figure.words
+
+
+def test_words_give_the_share_of_bins_to_use_with_care():
+    product = signal(times(START, 48, 1800.0), bins=150)
+    product["quality_flag"][:] = 0
+    assert "use with care" not in drawn(product).words
+    product["quality_flag"][:12] = np.int32(Quality.PILE_UP)
+    assert "25.0 % of the bins shown: use with care (pile_up)" in drawn(product).words
 
 
 def test_gaps_in_time_are_blank():
