@@ -40,7 +40,7 @@ from lidarops.site.paths import (
 )
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.quality import Quality, read_quality
-from lidarops.site.values import read_values
+from lidarops.site.values import Values, read_values
 from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
     COPIES,
@@ -260,7 +260,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             problem="; ".join(filter(None, problems)),
         )
         contents = (
-            pages.product(entry, stored, quality, origin, figures, values or ()),
+            pages.product(entry, stored, quality, origin, figures, values or Values()),
             browser.thumbnail(figures[0][0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):

@@ -29,7 +29,7 @@ from lidarops.site.product_contents import citation, contact, variables
 from lidarops.site.product_entry import Entry, Problem, ShareGrade, mean_availability
 from lidarops.site.quality import Quality
 from lidarops.site.station_map import Place, station_map
-from lidarops.site.values import ValueRow
+from lidarops.site.values import Values
 
 INDEX: Final = "index.html"
 _INPUTS: Final = 12
@@ -99,7 +99,7 @@ def product(
     quality: Quality,
     origin: Mapping[str, Any],
     figures: Sequence[tuple[Figure, Markup]],
-    values: Sequence[ValueRow],
+    values: Values,
 ) -> bytes:
     """Return the page of a product; it depends only on the product and its path."""
     page = entry.page

@@ -38,7 +38,15 @@ class ValueRow(NamedTuple):
     """Median of the standard errors."""
 
 
-def read_values(product: xr.Dataset, kind: str) -> tuple[ValueRow, ...]:
+class Values(NamedTuple):
+    """Summary of the values of a product."""
+
+    rows: tuple[ValueRow, ...] = ()
+    every: int = 1
+    """Of how many profiles one counts."""
+
+
+def read_values(product: xr.Dataset, kind: str) -> Values:
     """Return a summary of each main quantity of a product; empty if none is over time.
 
     Parameters
@@ -48,7 +56,10 @@ def read_values(product: xr.Dataset, kind: str) -> tuple[ValueRow, ...]:
     kind : str
         Kind of the product, which states its main quantities; may be unknown.
     """
-    return tuple(_row(product, quantity) for quantity in _quantities(product, kind))
+    quantities = _quantities(product, kind)
+    largest = max((product[quantity.name].nbytes for quantity in quantities), default=1)
+    every = -(-largest // READ_BYTES)
+    return Values(tuple(_row(product, quantity, every) for quantity in quantities), every)
 
 
 def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
@@ -63,9 +74,8 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
     return tuple(q for q in known if product[q.name].dims[:1] == ("time",))
 
 
-def _row(product: xr.Dataset, quantity: Quantity) -> ValueRow:
+def _row(product: xr.Dataset, quantity: Quantity, every: int) -> ValueRow:
     whole = product[quantity.name]
-    every = -(-whole.nbytes // READ_BYTES)
 
     def along(name: str) -> xr.DataArray | None:
         """Return another variable of the same dimensions; None without one."""

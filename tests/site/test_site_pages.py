@@ -77,7 +77,7 @@ def test_values_are_summarised_as_in_the_file(output: Path, kind: str) -> None:
     file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
     factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
     with xr.open_dataset(file, decode_timedelta=False) as product:
-        row = read_values(product, kind)[0]
+        row = read_values(product, kind).rows[0]
         name = row.title.partition(" (")[0].lower().replace(" ", "_")
         usable = (product["usable"] < 2) & np.isfinite(product[name])
         values = factor * product[name].astype(float).values[usable]
@@ -89,13 +89,21 @@ def test_values_are_summarised_as_in_the_file(output: Path, kind: str) -> None:
     assert all(words in page.read_text("utf-8") for words in stated)
 
 
+def test_a_summary_of_some_profiles_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    product = fields(600, 40)
+    monkeypatch.setattr(values, "READ_BYTES", product["signal"].nbytes // 3)
+    assert read_values(product, "signal").every == 3
+    monkeypatch.undo()
+    assert read_values(product, "signal").every == 1
+
+
 def test_values_without_flags_are_usable_where_they_are_known(tmp_path: Path) -> None:
     product = xr.load_dataset(add_unknown(tmp_path)).drop_vars("quality_flag")
     product["quality_flag"] = "time", np.ones(product.sizes["time"], np.int32)
-    (row,) = read_values(product, "wind")
+    (row,) = read_values(product, "wind").rows
     assert (row.usable, row.error) == ("100 %", "0.2")
     product["speed"][:] = np.nan
-    (row,) = read_values(product, "wind")
+    (row,) = read_values(product, "wind").rows
     assert (row.usable, row.middle) == ("0 %", "\u2013")
 
 
