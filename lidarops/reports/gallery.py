@@ -38,11 +38,8 @@ FEWEST: Final = 50
 _FLAG_ROWS: Final = 40
 _AT_A_TIME: Final = 8
 """Products sent to a process together, so that it waits less."""
-# fmt: off
-_UNREADABLE: Final = (
-    ArithmeticError, LookupError, MemoryError, RuntimeError, ValueError, ProductError,
-)
-# fmt: on
+_DAMAGE: Final = ArithmeticError, LookupError, MemoryError, RuntimeError, ValueError
+_UNREADABLE: Final = *_DAMAGE, ProductError
 """What values of a damaged product may raise; other errors are those of the program."""
 
 

@@ -7,7 +7,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Final
@@ -97,9 +97,10 @@ def build_report(
 
 
 def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
-    paths = (product.path for scene in record.scenes for product in scene.products)
-    missing = [path for path in paths if not _href(record, path, folder)]
-    problems = dict.fromkeys(sorted(missing), "the file is missing")
+    paths = [product.path for scene in record.scenes for product in scene.products]
+    links = {path: _href(record, path, folder) for path in paths}
+    missing = sorted(path for path, link in links.items() if not link)
+    problems = dict.fromkeys(missing, "the file is missing")
     problems |= {problem.path: problem.reason for problem in filled.problems}
     pictures = _by_instrument([one for one in filled.pictures if not one.lacking])
     return _environment().get_template("run.html").render(
@@ -119,7 +120,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         instruments=run_tables.instruments(record),
         stages=run_tables.stages(record),
         scenes=record.scenes[:ROWS],
-        href=partial(_href, record, folder=folder),
+        links=links,
         left_out=run_tables.left_out(record),
         without_product=run_tables.scenes_without_product(record),
         steps=run_tables.carried_out(record),

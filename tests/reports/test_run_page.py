@@ -322,6 +322,13 @@ class TestDegenerateRuns:
         page = built(run_record(tmp_path, [outcome("quiet")]), tmp_path / "report")
         assert "20 no product" in page.text
 
+    @pytest.mark.parametrize(("second", "shown"), [(0, "18:30"), (5, "18:30:05")])
+    def test_the_start_of_a_scene_is_shown_to_the_second(self, tmp_path, second, shown):
+        scene = replace(outcome("s"), start=datetime(2026, 3, 1, 18, 30, second, tzinfo=UTC))
+        built(run_record(tmp_path, [scene]), tmp_path / "report")
+        page = (tmp_path / "report" / "index.html").read_text()
+        assert f">2026-03-01 {shown}</td>" in page
+
     def test_product_without_values(self, tmp_path):
         empty = ProductRecord("x.nc", "homogeneous", "c", "", 0, 0, {}, 0)
         page = built(run_record(tmp_path, [outcome("s", products=(empty,))]), tmp_path / "report")
