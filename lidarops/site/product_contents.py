@@ -12,9 +12,8 @@ import xarray as xr
 from lidarops.figures.product_names import attribute
 
 PROVENANCE: Final = "provenance"
-USED: Final = (
-    *(PROVENANCE, "range", "altitude", "latitude", "longitude", "station_altitude", "wavelength"),
-)
+_PLACES: Final = "range", "altitude", "latitude", "longitude", "station_altitude", "wavelength"
+USED: Final = PROVENANCE, *_PLACES
 """Variables that the page of any product reads."""
 
 
