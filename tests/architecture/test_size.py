@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 71_800,
-    "lines of code alone": 46_762,
-    "modules": 288,
-    "dataclasses": 273,
-    "lines of dataclasses": 6_947,
+    "lines": 70_271,
+    "lines of code alone": 45_655,
+    "modules": 287,
+    "dataclasses": 251,
+    "lines of dataclasses": 6_682,
     "tuning numbers": 254,
     "tuning numbers that are assumed": 86,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 6_040,
+    "lines of the largest package": 6_038,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 67, "functions": 634, "changes": 242},
-    "elastic": {"modules": 76, "functions": 780, "changes": 258},
+    "homogeneous": {"modules": 67, "functions": 634, "changes": 216},
+    "elastic": {"modules": 76, "functions": 777, "changes": 232},
 }
 
 

@@ -20,6 +20,8 @@ _ROUNDS: Final = 6
 """Solutions, each with the bins up to the load of the one before, and by its dead time."""
 _ALIKE: Final = 1e10
 """Variance of a dead time over that with a known slope, beyond which only rounding is left."""
+_LOWEST: Final = 1e-3
+"""Load of the highest rate by which a solution begins, and which no step goes below."""
 _HIGHEST: Final = 0.99
 """Load of a profile to which it is corrected."""
 
@@ -216,7 +218,8 @@ def _solve(
 
     `of_light` is the dead time of `light`, in microseconds.
     """
-    dead_time = of_light or THRESHOLDS.first_dead_time
+    shortest = _LOWEST / float(light.rate.max())
+    dead_time = of_light or shortest
     slope = float((light.rate - light.background).sum() / analog.sum())
     error = math.inf
     rate = light.rate
@@ -238,6 +241,6 @@ def _solve(
         if not 0.0 <= square * normal[0, 0] < _ALIKE:
             return None
         error = math.sqrt(square)
-        dead_time = float(np.clip(dead_time + change[0], *THRESHOLDS.dead_times))
+        dead_time = max(dead_time + float(change[0]), shortest)
         slope += float(change[1])
     return dead_time, error, float((rate * dead_time).max())

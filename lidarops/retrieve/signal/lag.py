@@ -111,7 +111,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> ChannelLag:
     scatter = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
     confidence, defined = _confidence(total, lag), bool(np.isfinite(lag))
     error = float(np.hypot(scatter, systematic)) if defined else math.nan
-    significant = confidence >= THRESHOLDS.confidence and error < THRESHOLDS.largest_lag_error
+    significant = confidence >= THRESHOLDS.confidence and error < 0.5 * THRESHOLDS.peak_width
     return ChannelLag(float(lag), error, confidence, significant and not at_end)
 
 

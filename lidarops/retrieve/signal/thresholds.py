@@ -101,10 +101,6 @@ class Thresholds(NamedTuple):
     """Bins; largest lag that is searched. Assumed."""
     confidence: float = 0.999
     """Least probability that noise without a common cause has a lower peak. Assumed."""
-    largest_lag_error: float = 2.0
-    """Bins; standard error up to which a lag is applied. It is 16 where parts of the range give
-    different lags (`test_a_lag_that_parts_of_the_range_contradict_is_not_significant`), and
-    1.2 after a shift by a part of a bin (`test_the_estimated_lag_aligns_the_signals`)."""
     fewest_lag_bins: int = 200
     """Bins between the largest lags. Assumed."""
     high_pass: int = 17
@@ -158,10 +154,6 @@ class Thresholds(NamedTuple):
     """Analog signal over its noise from which bins count; assumed."""
     dead_time_block: int = 2
     """Bins that are averaged; few, because the rate is no linear function of the light; assumed."""
-    first_dead_time: float = 4e-3
-    """Microseconds, first guess; the result does not depend on it."""
-    dead_times: tuple[float, float] = (1e-4, 0.1)
-    """Microseconds, smallest and largest dead time of a step; chosen."""
 
 
 THRESHOLDS: Final = Thresholds()
