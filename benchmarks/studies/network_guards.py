@@ -38,6 +38,7 @@ from lidarops.retrieve.network import (
     _beam_signals,
     _block_solution,
     _changing_field,
+    _condensed_signals,
     extinction_field,
     labeled,
     outlying_bins,
@@ -71,7 +72,7 @@ GUARDS: Final = (
     Guard("running means", off=_at(_block_solution, linear_change=1e30)),
     Guard("misfit of the mean", off=_at(extinction_field, largest_misfit=1e30)),
     Guard("default overlap error", off=_at(extinction_field, default_overlap_error=0.0)),
-    Guard("curvature errors", off=_at(_block_solution, profile_noise=1e30)),
+    Guard("curvature errors", off=_at(_condensed_signals, curvature_noise=1e30)),
     Guard("outlying bins", off=without((outlying_bins, "search", lambda *_: None))),
     Guard("weak signals", off=_at(_beam_signals, largest_bin_error=1e6)),
     Guard(

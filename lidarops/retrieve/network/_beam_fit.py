@@ -14,7 +14,7 @@ and P is the precision of the prior; then k changes by g' W (y - A x) / (g' W g)
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -88,6 +88,14 @@ def arrange(data: CondensedSignals, layout: FitLayout, reach: Indices) -> Beams:
     return Beams(value, integral, covariance, reach, select)
 
 
+def with_curvature(beams: Beams, curvature: Array, ratio: Array | float = 1.0) -> Beams:
+    """Return means with a multiple of their noise, and curved signals as noise."""
+    covariance = beams.covariance * np.asarray(ratio)[..., np.newaxis, np.newaxis]
+    place = np.arange(curvature.shape[2])
+    covariance[..., place, place] += curvature
+    return replace(beams, covariance=covariance)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
     """Beams linearised about constants."""
@@ -110,13 +118,6 @@ class Linear:
         return normal_matrix(self.information, select), normal_side(
             self.information, self.value, select
         )
-
-
-def carry(covariance: Array, information: Array, select: Array) -> Array:
-    """Return (profile, crossing, beam, passage) derivatives C A' M of the solution by y."""
-    by_beam = np.einsum("bpd,tbpq->tdbq", select, information)
-    flat = by_beam.reshape(len(covariance), select.shape[2], -1)
-    return np.asarray((covariance @ flat).reshape(by_beam.shape))
 
 
 def normal_matrix(information: Array, select: Array) -> Array:

@@ -126,3 +126,13 @@ def scale(beam: CleanBeam, layout: FitLayout, complete: Booleans, stop: int) -> 
         beam, factor, np.where(finite, power, 0.0), np.where(finite, variance, 0.0),
         kept & finite, doubt, weight,
     )  # fmt: skip
+
+
+def median(values: Array, known: Booleans) -> Array:
+    """Return medians over profiles of the known values; NaN where there is none."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
+    number, columns = known.sum(axis=0), np.arange(values.shape[1])
+    ordered = np.sort(np.where(known, values, np.inf), axis=0)
+    low, high = (ordered[place, columns] for place in (np.maximum(number - 1, 0) // 2, number // 2))
+    return np.where(number > 0, 0.5 * (low + high), np.nan)

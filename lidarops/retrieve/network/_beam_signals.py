@@ -20,7 +20,7 @@ from lidarops.retrieve.network._condensed_signals import (
     FitLayout,
     condense,
 )
-from lidarops.retrieve.network._curvature import median
+from lidarops.retrieve.network._beam_means import median
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 

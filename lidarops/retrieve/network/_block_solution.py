@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,10 +19,9 @@ import numpy as np
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network import _beam_fit, _beam_means, _changing_field
 from lidarops.retrieve.network._beam_fit import Beams, Linear, Solution
-from lidarops.retrieve.network._beam_means import ScaledBeam
+from lidarops.retrieve.network._beam_means import ScaledBeam, median
 from lidarops.retrieve.network._changing_field import Change, ChangingField, MeanPrior
 from lidarops.retrieve.network._condensed_signals import CleanBeam, FitLayout, condense
-from lidarops.retrieve.network._curvature import median
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _CONSTANT_PASSES: Final = 6
@@ -132,7 +131,7 @@ def solve_block(block: Block) -> BlockSolution | None:
     beams, derivatives, curvature = _arrange_means(means, layout)
     if not beams.reach.any():
         return None
-    curved = _with_curvature(beams, curvature)
+    curved = _beam_fit.with_curvature(beams, curvature)
     constants = _beam_fit.start_constants(beams, block.lengths)
     first = _beam_fit.solve(curved, block.priors[-1].precision, constants)
     normal, side = first.linear.normal(beams.select)
@@ -212,29 +211,16 @@ def _typical(ratio: Array) -> Array:
     return np.where(np.isfinite(middle), middle, 1.0)[np.newaxis]
 
 
-def _with_curvature(beams: Beams, curvature: Array, ratio: Array | float = 1.0) -> Beams:
-    """Return means with a multiple of their noise, and curved signals as noise."""
-    covariance = beams.covariance * np.asarray(ratio)[..., np.newaxis, np.newaxis]
-    place = np.arange(curvature.shape[2])
-    covariance[..., place, place] += curvature
-    return replace(beams, covariance=covariance)
-
-
 def _arrange_means(means: list[CleanBeam], layout: FitLayout) -> tuple[Beams, list[Array], Array]:
     """Return means of powers, condensed, the derivatives of each beam by its bins, and curvature.
 
-    Where a signal is curved beyond noise, the polynomial replaces the straight line. Curvature is
-    the (mean, beam, passage) variance that this adds to a value.
+    Curvature is the (mean, beam, passage) variance of values from curved signals.
     """
     data, derivatives = condense(means, layout)
     beams = _beam_fit.arrange(data, layout, reaches(data.usable, layout))
-    error, noise = np.moveaxis(data.curvature_error, -1, 0)
-    curved = data.usable & (error**2 > THRESHOLDS.profile_noise * noise)
     curvature = np.zeros(beams.value.shape)
     beam, place = _beam_fit.places(layout)
-    beams.value[:, beam, place] -= np.where(curved, error, 0.0)
-    left = noise + (THRESHOLDS.curvature_left * error) ** 2
-    curvature[:, beam, place] = np.where(curved, left, 0.0)
+    curvature[:, beam, place] = data.curvature
     return beams, derivatives, curvature
 
 
@@ -260,7 +246,7 @@ def _about(
     reach = np.where(np.isfinite(ratio), np.minimum(reach, beams.reach), 0)
     alone = len(beams.value) == 1
     typical = _typical(ratio) if alone else np.where(np.isfinite(ratio), ratio, 1.0)
-    noisy = _with_curvature(beams, curvature, typical)
+    noisy = _beam_fit.with_curvature(beams, curvature, typical)
     if alone:
         patterns, index = np.unique(reach, axis=0, return_inverse=True)
         linear = _beam_fit.linearise(noisy, constants, patterns)

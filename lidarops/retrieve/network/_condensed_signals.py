@@ -174,8 +174,8 @@ class CondensedSignals:
     variances known."""
     covariance: Array
     """(profile, packed) for each beam, covariance of its log values, then its integrals."""
-    curvature_error: Array
-    """(profile, passage, 2) difference of line and polynomial, and its variance by noise."""
+    curvature: Array
+    """(profile, passage) variance of a value from a curved signal, beside its noise."""
 
     def take(self, profiles: Indices) -> CondensedSignals:
         """Return the selected profiles."""
@@ -270,7 +270,7 @@ def condense(beams: Sequence[CleanBeam], layout: FitLayout) -> tuple[CondensedSi
         np.zeros((profiles, total)),
         np.zeros((profiles, total), dtype=np.bool_),
         np.zeros((profiles, int(layout.offset[-1]))),
-        np.zeros((profiles, total, 2)),
+        np.zeros((profiles, total)),
     )
     # Signals out of bounds have no value.
     with np.errstate(all="ignore"):
@@ -284,6 +284,7 @@ def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> 
     bins = layout.weights.shape[1]
     count = on_beam.stop - on_beam.start
     derivatives = np.zeros((len(row.logs), 2 * count - 1, row.logs.shape[1]))
+    bent = np.zeros((len(row.logs), count))
     for c in range(on_beam.start, on_beam.stop):
         window = slice(layout.window[c], layout.window[c] + bins)
         usable = window.stop <= row.stops
@@ -292,8 +293,12 @@ def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> 
         out.usable[:, c] = usable
         inside = slice(window.start - row.start, window.stop - row.start)
         derivatives[:, c - on_beam.start, inside] = usable[:, np.newaxis] * layout.weights[c]
-        for column, error in enumerate(row.values(window, layout.curvature_weights[c])):
-            out.curvature_error[:, c, column] = np.where(usable, error, 0.0)
+        error, noise = row.values(window, layout.curvature_weights[c])
+        # Where a signal is curved beyond noise, the polynomial replaces the line.
+        curved = usable & (error**2 > THRESHOLDS.curvature_noise * noise)
+        bent[:, c - on_beam.start] = np.where(curved, error, 0.0)
+        left = noise + (THRESHOLDS.curvature_left * error) ** 2
+        out.curvature[:, c] = np.where(curved, left, 0.0)
     first = on_beam.start
     scale = np.where(out.usable[:, first], out.log_value[:, first], 0.0)
     for c in range(on_beam.start, on_beam.stop - 1):
@@ -316,7 +321,7 @@ def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> 
     covariance += shift[:, :, np.newaxis] * shift[:, np.newaxis]
     packed = slice(layout.offset[beam], layout.offset[beam + 1])
     out.covariance[:, packed] = covariance.reshape(len(covariance), covariance.shape[1] ** 2)
-    out.log_value[:, on_beam] -= scale[:, np.newaxis]
+    out.log_value[:, on_beam] -= scale[:, np.newaxis] + bent
     return derivatives
 
 

@@ -37,7 +37,6 @@ from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
 from lidarops.retrieve.network._block_solution import Block, reaches, solve_block
 from lidarops.retrieve.network._changing_field import mean_priors
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
-from lidarops.retrieve.network._curvature import curvature_variance
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -219,21 +218,18 @@ def _solve_alone(beams: BeamSignals) -> Estimates:
     beam, place = _beam_fit.places(layout)
     reach = reaches(beams.usable, layout)
     fits = _beam_fit.arrange(beams.data, layout, reach)
+    curvature = np.zeros(fits.value.shape)
+    curvature[:, beam, place] = beams.data.curvature
+    fits = _beam_fit.with_curvature(fits, curvature)
     start = _beam_fit.start_constants(fits, _beam_fit.optical_lengths(layout, beams.exponent))
     nothing = np.zeros((measured.size, measured.size))
     solved = _beam_fit.solve(fits, nothing, start)
-    carried = _beam_fit.carry(solved.covariance, solved.linear.information, fits.select)
     chi_square, freedom, seen = _beam_fit.compare(fits, solved.linear, solved.logarithm)
     variance = np.diagonal(solved.covariance, axis1=1, axis2=2)
     known = seen & (variance < THRESHOLDS.largest_variance)
     extinction = np.where(known, np.exp(solved.logarithm), np.nan)
     out.extinction[:, measured] = extinction
-    for number in np.unique(beams.block):
-        rows = np.flatnonzero(beams.block == number)
-        curvature = curvature_variance(
-            beams.data.curvature_error[rows], beams.usable[rows], carried[rows][..., beam, place]
-        )
-        out.variance[np.ix_(rows, measured)] = extinction[rows] ** 2 * (variance[rows] + curvature)
+    out.variance[:, measured] = extinction**2 * variance
     out.settled[:] = solved.settled & (fits.reach > 0).any(axis=1)
     out.left_out[:] = ((fits.reach == 0) & (reach > 1))[:, beam]
     out.chi_square[:, :2], out.degrees_of_freedom[:, :2] = chi_square, freedom

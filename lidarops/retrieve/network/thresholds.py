@@ -71,13 +71,9 @@ class Thresholds(NamedTuple):
     curvature_left: float = 0.1
     """Share of the error of a straight line that a polynomial may leave: 0.24 of a Gaussian layer
     of 10 m, 0.05 of one of 15 m in bins of 5 m; calculated."""
-    shared_noise: float = 4.0
-    """Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08
-    of one variance on average; normal distribution."""
-    profile_noise: float = 9.0
-    """The same for a single profile, which leaves 0.005 of one variance; normal distribution."""
-    chance: float = 3.0
-    """Standard deviations by which a mean square of noise may be larger by chance; assumed."""
+    curvature_noise: float = 9.0
+    """Square of the difference of line and polynomial over its variance, beyond which a signal is
+    curved: noise alone exceeds it once in 400 fits; normal distribution."""
 
     # The field: ablation
     gradients: tuple[float, ...] = (0.3, 0.6, 1.2, 2.4)

@@ -27,7 +27,6 @@ import numpy.typing as npt
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
 from lidarops.retrieve.network._condensed_signals import FitLayout
-from lidarops.retrieve.network._curvature import curvature_variance
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 
@@ -109,11 +108,7 @@ def solve_triangles(beams: BeamSignals, multiplier: Array | None) -> Estimates:
                 given = None if multiplier is None else multiplier[members, crossing]
                 place = members, crossing
                 _solve_block(rows.take(members), triangle, given, out, carried, place)
-    for block in np.unique(beams.block):
-        members = np.flatnonzero(beams.block == block)
-        out.variance[members] += curvature_variance(
-            beams.data.curvature_error[members], beams.usable[members], carried[members]
-        )
+    out.variance[:] += (carried**2 * beams.data.curvature[:, np.newaxis]).sum(axis=2)
     out.variance[:] *= out.extinction**2
     return out
 
