@@ -224,7 +224,7 @@ class Solution:
 
 
 def solve(
-    beams: Beams, precision: Array, constants: Array, *, level: float = 0.0, passes: int = _PASSES
+    beams: Beams, precision: Array, constants: Array, *, passes: int = _PASSES
 ) -> Solution:
     """Solve each profile by Gauss-Newton steps of its constants.
 
@@ -235,12 +235,12 @@ def solve(
         Of the prior of ln extinction.
     constants : (profile, beam) float64
         Where to start.
-    level : float
-        Precision with which each crossing is drawn to the level of the profile, without a prior.
     passes : int
         Largest number of steps.
     """
     select, crossing = beams.select, beams.crossing
+    # Each crossing is drawn to the level of the profile a little, where nothing else determines it.
+    level = THRESHOLDS.weak_precision
     precision = precision + level * np.eye(len(precision))
     inside = np.arange(beams.value.shape[2]) < beams.reach[..., np.newaxis]
     number = np.maximum(inside.sum(axis=(1, 2)), 1)

@@ -53,8 +53,9 @@ class ScaledBeam:
         logs = np.where(known, source.exponent * (np.log(power) + self.factor), 0.0)
         noise = np.where(known, source.exponent**2 * variance / power**2, 0.0)
         doubt = np.nan_to_num(weights @ self.doubt / total)
-        lost = ~known[:, source.low - source.start : max(stop, source.low) - source.start]
-        stops = np.where(lost.any(axis=1), source.low + np.argmax(lost, axis=1), stop)
+        place = source.start + np.arange(known.shape[1])
+        lost = ~known & (place >= source.low) & (place < stop)
+        stops = np.where(lost.any(axis=1), source.start + np.argmax(lost, axis=1), stop)
         codes = np.where(known, GOOD, LOST).astype(np.uint8)
         return CleanBeam(
             source.number, source.start, source.low, power, variance, logs, noise, doubt, codes,

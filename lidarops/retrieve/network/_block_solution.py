@@ -238,8 +238,9 @@ def _solve_field(
         normal.mean(axis=0), rest - rest.mean(axis=0), position
     )
     field = ChangingField(normal, prior.precision, change)
-    x, covariance = field.solve(side[..., np.newaxis])
-    return field, x[..., 0], covariance
+    pull = -prior.precision @ mean
+    x, covariance = field.solve(rest[..., np.newaxis], pull[:, np.newaxis])
+    return field, mean + x[..., 0], covariance
 
 
 def _assess(

@@ -177,17 +177,20 @@ class ChangingField:
     """(crossing, crossing) precision of the mean field."""
     change: Change | None
 
-    def solve(self, side: Array) -> tuple[Array, Array]:
+    def solve(self, side: Array, pull: Array | float = 0.0) -> tuple[Array, Array]:
         """Return (profile, crossing, case) fields, and (profile, crossing, crossing) covariances.
 
         Parameters
         ----------
         side : (profile, crossing, case) float64
             Right sides h_t, of several cases.
+        pull : (crossing, case) float64
+            Right side of the mean field by its prior.
         """
+        prior = self.prior + THRESHOLDS.weak_precision * np.eye(len(self.prior))
         if self.change is None:
-            covariance = np.linalg.inv(self.normal.sum(axis=0) + self.prior)
-            field = covariance @ side.sum(axis=0)
+            covariance = np.linalg.inv(self.normal.sum(axis=0) + prior)
+            field = covariance @ (side.sum(axis=0) + pull)
             return (
                 np.broadcast_to(field, side.shape),
                 np.broadcast_to(covariance, self.normal.shape),
@@ -202,8 +205,8 @@ class ChangingField:
         by_side, by_mean = solved[..., :cases], solved[..., cases:]
         left = np.eye(len(self.prior)) - by_mean
         known = (self.normal @ left).sum(axis=0)
-        covariance = np.linalg.inv((known + known.T) / 2.0 + self.prior)
-        mean = covariance @ (side - self.normal @ by_side).sum(axis=0)
+        covariance = np.linalg.inv((known + known.T) / 2.0 + prior)
+        mean = covariance @ ((side - self.normal @ by_side).sum(axis=0) + pull)
         field = by_side + left @ mean
         return field, spread + left @ covariance @ left.swapaxes(1, 2)
 

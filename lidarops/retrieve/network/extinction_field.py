@@ -223,7 +223,7 @@ def _solve_alone(beams: BeamSignals) -> Estimates:
     fits = _beam_fit.arrange(beams.data, layout, reach)
     start = _beam_fit.start_constants(fits, _beam_fit.optical_lengths(layout, beams.exponent))
     nothing = np.zeros((measured.size, measured.size))
-    solved = _beam_fit.solve(fits, nothing, start, level=THRESHOLDS.weak_precision)
+    solved = _beam_fit.solve(fits, nothing, start)
     carried = _beam_fit.carry(solved.covariance, solved.linear.information, fits.select)
     chi_square, freedom, seen = _beam_fit.test(fits, solved.linear, solved.logarithm)
     variance = np.diagonal(solved.covariance, axis1=1, axis2=2)
@@ -270,7 +270,11 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
     limit = THRESHOLDS.largest_relative_error * estimate.extinction
     with np.errstate(invalid="ignore"):
         doubted = estimate.variance > limit**2
-    poor = np.any(_improbable(estimate.chi_square, estimate.degrees_of_freedom), axis=1)
+    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    improbable = _improbable(chi_square, freedom)
+    # A small misfit of the mean widens the stated errors instead.
+    improbable[:, 2] &= chi_square[:, 2] > THRESHOLDS.largest_misfit * freedom[:, 2]
+    poor = improbable.any(axis=1)
     converged = estimate.settled | ~np.isfinite(estimate.chi_square[:, 1])
     too_weak = beams.weak | (estimate.left_out & beams.usable)
     quality = np.zeros(shape, dtype=np.int32)
@@ -287,7 +291,7 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
     ):
         quality |= np.where(where, np.int32(bit), np.int32(0))
     crossings = (*beams.leading, shape[1])
-    freedom, chi_square = estimate.degrees_of_freedom[:, 0], estimate.chi_square[:, 0]
+    freedom, chi_square = freedom[:, 0], chi_square[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         reduced = np.where(freedom > 0, chi_square / freedom, np.nan)
     return NetworkResult(

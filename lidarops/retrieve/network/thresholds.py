@@ -98,6 +98,9 @@ class Thresholds(NamedTuple):
     """Profiles of running means, of which the most are taken that change little; simulations."""
     running_change: float = 0.2
     """Largest change of ln extinction within a running mean; simulations."""
+    largest_misfit: float = 9.0
+    """Chi-square of the mean over its degrees of freedom, beyond which a block is rejected; below,
+    it widens the stated errors; assumed."""
     default_overlap_error: float = 0.003
     """Relative error of the overlap at the nearest crossing, where no redundancy shows it."""
 
