@@ -110,7 +110,8 @@ def scale(beam: CleanBeam, layout: FitLayout, complete: Booleans, stop: int) -> 
     inside[:, : used.start], inside[:, used.stop :] = False, False
     energy = (power * inside).sum(axis=1)
     if not inside.all(axis=1).all():
-        first = (power / energy[:, np.newaxis])[complete & (energy > 0.0)].mean(axis=0)
+        counted = complete & (energy > 0.0)
+        first = (power[counted] / energy[counted, np.newaxis]).sum(axis=0) / counted.sum()
         energy = energy / (inside * first).sum(axis=1)
     energy = np.where(energy > 0.0, energy, np.nan)[:, np.newaxis]
     power, variance = power / energy, variance / energy**2

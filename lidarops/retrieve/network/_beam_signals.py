@@ -20,6 +20,7 @@ from lidarops.retrieve.network._condensed_signals import (
     FitLayout,
     condense,
 )
+from lidarops.retrieve.network._curvature import median
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -242,17 +243,17 @@ def _weak_passages(
     limit = THRESHOLDS.largest_bin_error**2
     for number in np.unique(block):
         rows = np.flatnonzero(block == number)
-        known = np.isfinite(level[rows]) & np.isfinite(spread[rows])
-        levels, spreads = (np.where(known, values[rows], np.nan) for values in (level, spread))
-        typical = np.nanmedian(levels, axis=0)
+        levels, spreads = level[rows], spread[rows]
+        known = np.isfinite(levels) & np.isfinite(spreads)
+        typical, middle = (median(values, known) for values in (levels, spreads))
         # Where noise rises, more than half of the profiles may be noisy.
-        counted = spreads <= THRESHOLDS.noisy_profile * np.nanmedian(spreads, axis=0)
-        typical_spread = np.nanmean(np.where(counted, spreads, np.nan), axis=0)
-        number_known = known.sum(axis=0)
-        error = np.sqrt(_MEDIAN_OVER_MEAN * typical_spread / (number_known * bins))
+        counted = known & (spreads <= THRESHOLDS.noisy_profile * middle)
+        mean = np.where(counted, spreads, 0.0).sum(axis=0) / counted.sum(axis=0)
+        profiles = known.sum(axis=0)
+        error = np.sqrt(_MEDIAN_OVER_MEAN * mean / (profiles * bins))
         negative[rows] = typical < -THRESHOLDS.negative * error
-        noisy = spreads > THRESHOLDS.noisy_profile * typical_spread
+        noisy = spreads > THRESHOLDS.noisy_profile * mean
         noisy &= spreads > limit * np.maximum(levels, 0.0) ** 2
-        averaged = number_known if together else 1.0
-        weak[rows] = noisy | (typical_spread / averaged > limit * np.maximum(typical, 0.0) ** 2)
+        averaged = profiles if together else 1.0
+        weak[rows] = noisy | (mean / averaged > limit * np.maximum(typical, 0.0) ** 2)
     return weak & ~negative, negative

@@ -24,7 +24,6 @@ from lidarops.retrieve.network._curvature import curvature_variance
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _CONSTANT_PASSES: Final = 6
-_RUNNING_PASSES: Final = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,12 +148,10 @@ def solve_block(block: Block) -> BlockSolution | None:
     mean = _beam_fit.solve(beams, prior.precision, first.constants)
     signals = _about(beams, mean.constants, derivatives, data.curvature_error, reach, scaled, means)
     field, x, covariance = _solve_field(signals, prior, block.position, mean.logarithm[0])
-    if field.change is not None:
-        for _ in range(_RUNNING_PASSES):
-            if np.sqrt(np.mean((x - x.mean(axis=0)) ** 2)) < THRESHOLDS.linear_change:
-                break
-            signals = _about_running_means(signals, x, scaled, stops, layout)
-            field, x, covariance = _solve_field(signals, prior, block.position, x.mean(axis=0))
+    moved = np.sqrt(np.mean((x - x.mean(axis=0)) ** 2))
+    if field.change is not None and moved > THRESHOLDS.linear_change:
+        signals = _about_running_means(signals, x, scaled, stops, layout)
+        field, x, covariance = _solve_field(signals, prior, block.position, x.mean(axis=0))
     return _assess(block, signals, field, (x, covariance), prior, bool(mean.settled[0]))
 
 

@@ -350,11 +350,18 @@ def _take_logarithms(
 
 
 def _negative_by_noise(power: Array, variance: Array) -> Booleans:
-    """Return (profile, bin) where a bin is not positive, but no outlier among its neighbours."""
+    """Return (profile, bin) where a bin is not positive, but no outlier among its neighbours.
+
+    The beam as a whole has a signal.
+    """
     negative = (power <= 0.0) & (variance < np.inf)
     if negative.any():
-        level = uniform_filter1d(np.nan_to_num(power), _NEIGHBOURS, axis=1, mode="nearest")
-        negative &= level - power < THRESHOLDS.outlier * np.sqrt(variance)
+        known = np.isfinite(power) & np.isfinite(variance)
+        values, noise = (np.where(known, array, 0.0) for array in (power, variance))
+        level = uniform_filter1d(values, _NEIGHBOURS, axis=1, mode="nearest")
+        negative &= level - power < THRESHOLDS.outlier * np.sqrt(noise)
+        whole = values.sum(axis=1) > THRESHOLDS.outlier * np.sqrt(noise.sum(axis=1))
+        negative &= whole[:, np.newaxis]
     return np.asarray(negative)
 
 

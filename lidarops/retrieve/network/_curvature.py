@@ -34,8 +34,7 @@ def curvature_variance(curvature_error: Array, usable: Booleans, carried: Array)
     """
     error, noise = np.moveaxis(curvature_error, -1, 0)
     number = usable.sum(axis=0)
-    known = np.where(usable, 1.0, np.nan)
-    shared, shared_noise = (np.nan_to_num(_median(v * known)) for v in (error, noise))
+    shared, shared_noise = (np.nan_to_num(median(values, usable)) for values in (error, noise))
     # The median of one or two is their mean.
     shared_noise *= np.where(number > 2, _MEDIAN_OVER_MEAN, 1.0) / np.maximum(number, 1)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -56,9 +55,11 @@ def curvature_variance(curvature_error: Array, usable: Booleans, carried: Array)
         return np.asarray(np.fmax(np.fmax(largest, excess), 0.0))
 
 
-def _median(values: Array) -> Array:
-    """Return medians over profiles of the finite values; NaN where there is none."""
-    known = np.isfinite(values).any(axis=0)
-    out = np.full(values.shape[1], np.nan)
-    out[known] = np.nanmedian(values[:, known], axis=0)
-    return out
+def median(values: Array, known: Booleans) -> Array:
+    """Return medians over profiles of the known values; NaN where there is none."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
+    number, columns = known.sum(axis=0), np.arange(values.shape[1])
+    ordered = np.sort(np.where(known, values, np.inf), axis=0)
+    low, high = (ordered[place, columns] for place in (np.maximum(number - 1, 0) // 2, number // 2))
+    return np.where(number > 0, 0.5 * (low + high), np.nan)

@@ -84,8 +84,9 @@ class Thresholds(NamedTuple):
     """Standard deviations of ln extinction at single crossings that are tried; assumed."""
     likelihood_tolerance: float = 4.0
     """Difference in -2 ln likelihood from the minimum: two standard errors."""
-    changes: tuple[float, ...] = tuple(np.geomspace(0.01, 1.0, 9).tolist())
-    """Standard deviations of ln extinction by changes within a block that are tried; assumed."""
+    changes: tuple[float, ...] = tuple(np.geomspace(0.01, 0.32, 7).tolist())
+    """Standard deviations of ln extinction by changes within a block that are tried. Larger ones
+    follow the noise of triangles: errors in a drifting plume grow by a fifth; simulations."""
     single_shares: tuple[float, ...] = (0.02, 0.3, 0.9)
     """Shares of single crossings in the variance of changes that are tried; assumed."""
     correlations: tuple[float, ...] = (0.6, 0.9, 0.97)
