@@ -218,9 +218,9 @@ def _running_shares(x: Array) -> Array:
     place = np.arange(len(x))
     for length in THRESHOLDS.running_profiles:
         shares = (np.abs(place[:, np.newaxis] - place) <= length // 2).astype(np.float64)
-        later = x[min(length, len(x) - 1) :]
-        change = np.sqrt(np.mean((later - x[: len(later)]) ** 2, axis=0)).max(initial=0.0)
-        if change < THRESHOLDS.running_change:
+        number = shares.sum(axis=1, keepdims=True)
+        spread = shares @ x**2 / number - (shares @ x / number) ** 2
+        if np.sqrt(spread.mean(axis=0).max()) < THRESHOLDS.linear_change:
             break
     return shares
 

@@ -295,7 +295,8 @@ def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> 
         derivatives[:, c - on_beam.start, inside] = usable[:, np.newaxis] * layout.weights[c]
         for column, error in enumerate(row.values(window, layout.curvature_weights[c])):
             out.curvature_error[:, c, column] = np.where(usable, error, 0.0)
-    scale = out.log_value[:, on_beam.start].copy()
+    first = on_beam.start
+    scale = np.where(out.usable[:, first], out.log_value[:, first], 0.0)
     for c in range(on_beam.start, on_beam.stop - 1):
         usable = out.usable[:, c + 1]
         cells = slice(layout.cell[c] - row.start, layout.cell[c + 1] - row.start + 1)

@@ -94,11 +94,10 @@ class Thresholds(NamedTuple):
     least_change: float = 9.0
     """Gain in -2 ln likelihood below which a field does not change: 3 standard errors."""
     linear_change: float = 0.05
-    """Change of ln extinction beyond which a block is linearised about running means."""
+    """Standard deviation of ln extinction in a mean of profiles, beyond which they are not linear
+    about it; simulations."""
     running_profiles: tuple[int, ...] = (15, 7, 3, 1)
-    """Profiles of running means, of which the most are taken that change little; simulations."""
-    running_change: float = 0.2
-    """Largest change of ln extinction within a running mean; simulations."""
+    """Profiles of running means that are tried; assumed."""
     largest_misfit: float = 9.0
     """Chi-square of the mean over its degrees of freedom, beyond which a block is rejected; below,
     it widens the stated errors; assumed."""

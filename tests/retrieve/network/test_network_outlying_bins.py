@@ -48,14 +48,26 @@ def solved(net, r, power, variance, **settings):
     return retrieve_network(power, r, net, variance=variance, **settings)
 
 
+class Condensed:
+    """Condensed signals with what is known about each beam."""
+
+    def __init__(self, data, beams):
+        self.__dict__.update({name: getattr(data, name) for name in data.__slots__})
+        self.bridged = np.stack([beam.bridged for beam in beams], axis=1)
+        self.status = np.stack([beam.status for beam in beams], axis=1)
+
+
 def condensed(net, r, power, variance, *, screened=True, nearest=100.0):
     ranges = np.tile(r, (net.beams, 1))
     layout = _condensed_signals.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
     variances = np.broadcast_to(variance, power.shape)
     patched = nullcontext() if screened else patch.object(outlying_bins, "search")
     with patched:
-        data = _condensed_signals.condense(power, variances, np.ones(net.beams), layout)
-    return data, layout
+        beams = _condensed_signals.clean(
+            power, variances, np.ones(net.beams), layout, together=False
+        )
+    data, _ = _condensed_signals.condense(beams, layout)
+    return Condensed(data, beams), layout
 
 
 def hit(power, variance, profile, beam, index, size):
