@@ -64,23 +64,27 @@ def arrange(data: CondensedSignals, layout: FitLayout, reach: Indices) -> Beams:
     shape = reach.shape[1], int(place.max(initial=0)) + 1
     profiles, most = len(reach), shape[1]
     value, integral = np.zeros((profiles, *shape)), np.zeros((profiles, *shape))
-    usable = place < reach[:, beam]
-    value[:, beam, place] = np.where(usable, data.log_value, 0.0)
-    integral[:, beam, place] = np.where(usable, data.integral, 0.0)
     covariance = np.zeros((profiles, shape[0], 2 * most, 2 * most))
     offsets = layout.offset[np.append(np.flatnonzero(np.diff(layout.first_passage)), -1)]
+    sound = np.ones(reach.shape, dtype=np.bool_)
     for b, (first, last) in enumerate(zip(offsets, offsets[1:], strict=False)):
         count = int(np.sum(beam == b))
         into = np.r_[:count, most : most + count - 1]
         square = data.covariance[:, first:last].reshape(profiles, 2 * count - 1, -1)
-        covariance[np.ix_(range(profiles), [b], into, into)] = square[:, np.newaxis]
+        # A beam without noise, or of unknown noise, has no weight.
+        used = np.arange(2 * count - 1) % count < reach[:, b, np.newaxis]
+        variances = np.diagonal(square, axis1=1, axis2=2)
+        known = np.isfinite(variances) & ((variances > 0.0) | (np.arange(2 * count - 1) >= count))
+        sound[:, b] = (known | ~used).all(axis=1)
+        covariance[np.ix_(range(profiles), [b], into, into)] = np.where(
+            sound[:, b, np.newaxis, np.newaxis], square, 0.0
+        )[:, np.newaxis]
+    reach = np.where(sound & (reach > 1), reach, 0)
+    value[:, beam, place] = np.where(place < reach[:, beam], data.log_value, 0.0)
+    integral[:, beam, place] = np.where(place < reach[:, beam] - 1, data.integral, 0.0)
     select = np.zeros((*shape, int(np.sum(layout.measured))))
     select[beam, place, (np.cumsum(layout.measured) - 1)[layout.passages.crossing]] = 1.0
-    variances = np.diagonal(covariance, axis1=2, axis2=3)[..., :most]
-    inside = np.arange(most) < reach[..., np.newaxis]
-    # A beam without noise, or of unknown noise, has no weight.
-    sound = (~inside | (np.isfinite(variances) & (variances > 0.0))).all(axis=2)
-    return Beams(value, integral, covariance, np.where(sound & (reach > 1), reach, 0), select)
+    return Beams(value, integral, covariance, reach, select)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +129,17 @@ def normal_side(information: Array, value: Array, select: Array) -> Array:
     """Return (profile, crossing) sum A' M y."""
     weighted = (information @ value[..., np.newaxis])[..., 0]
     return np.asarray(weighted.reshape(len(weighted), -1) @ select.reshape(-1, select.shape[2]))
+
+
+def changed_sides(linear: Linear, select: Array, change: Array) -> Array:
+    """Return (profile, crossing, case) changes of the right sides.
+
+    `change` is the (case, beam, 2 passage) change of u and I in all profiles.
+    """
+    turned = linear.turn @ change.transpose(1, 2, 0)
+    flat = select.reshape(-1, select.shape[2])
+    weighted = (linear.information @ turned).reshape(len(turned), len(flat), -1)
+    return np.asarray(flat.T @ weighted)
 
 
 def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> Linear:
@@ -244,19 +259,22 @@ def solve(
     precision = precision + level * np.eye(len(precision))
     inside = np.arange(beams.value.shape[2]) < beams.reach[..., np.newaxis]
     number = np.maximum(inside.sum(axis=(1, 2)), 1)
-    moved = np.zeros(len(constants))
+    step = np.full(constants.shape, np.inf)
     for _ in range(passes):
         linear = linearise(beams, constants)
         normal, side = linear.normal(select)
         mean = np.where(inside, linear.value, 0.0).sum(axis=(1, 2)) / number
         covariance = np.linalg.inv(normal + precision)
         x = (covariance @ (side + level * mean[:, np.newaxis])[..., np.newaxis])[..., 0]
-        step = (linear.gain * (linear.value - x[:, crossing])).sum(axis=2)
-        step = np.clip(step, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
-        constants = constants + step
-        moved = np.abs(step * linear.slope).max(axis=1, initial=0.0)
-        if np.all(moved < THRESHOLDS.converged_step**2):
+        # A profile that has settled does not depend on how long the others take.
+        going = np.abs(step).max(axis=1, initial=0.0) >= THRESHOLDS.converged_step**3
+        if not going.any():
             break
+        new = (linear.gain * (linear.value - x[:, crossing])).sum(axis=2)
+        new = np.clip(new, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
+        step = np.where(going[:, np.newaxis], new, step)
+        constants = constants + step * going[:, np.newaxis]
+    moved = np.abs(step * linear.slope).max(axis=1, initial=0.0)
     return Solution(x, covariance, constants, linear, moved < THRESHOLDS.converged_step)
 
 

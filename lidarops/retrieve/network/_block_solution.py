@@ -9,21 +9,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.network import _beam_fit, _beam_means, _changing_field
-from lidarops.retrieve.network._beam_fit import Beams, Linear
+from lidarops.retrieve.network._beam_fit import Beams, Linear, Solution
 from lidarops.retrieve.network._beam_means import ScaledBeam
-from lidarops.retrieve.network._changing_field import ChangingField, MeanPrior
+from lidarops.retrieve.network._changing_field import Change, ChangingField, MeanPrior
 from lidarops.retrieve.network._condensed_signals import CleanBeam, FitLayout, condense
-from lidarops.retrieve.network._curvature import curvature_variance
+from lidarops.retrieve.network._curvature import median
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _CONSTANT_PASSES: Final = 6
+_ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +53,8 @@ class _Signals:
     """Of each profile."""
     derivatives: list[Array]
     """For each beam, (mean, 2 passage - 1, bin)."""
-    curvature_error: Array
-    """(mean, passage, 2)."""
+    curvature: Array
+    """(mean, beam, passage) variance of u by curved signals within a fit."""
     reach: Indices
     """(profile, beam)."""
 
@@ -60,15 +62,6 @@ class _Signals:
         """Return normal matrices and right sides of the profiles."""
         return self.linear.normal(self.beams.select)
 
-    def sides(self, change: Array) -> Array:
-        """Return (profile, crossing, case) changes of the right sides.
-
-        `change` is the (case, beam, 2 passage) change of u and I in all profiles.
-        """
-        turned = np.einsum("tbpq,sbq->tbps", self.linear.turn, change)
-        weighted = self.linear.information @ turned
-        flat = self.beams.select.reshape(-1, self.beams.select.shape[2])
-        return np.asarray(flat.T @ weighted.reshape(len(weighted), len(flat), -1))
 
 
 def reaches(usable: Booleans, layout: FitLayout) -> Indices:
@@ -120,7 +113,6 @@ class BlockSolution:
     """Chi-square of the mean, and its degrees of freedom."""
     settled: bool
     prior: MeanPrior
-    changes: bool
 
 
 def solve_block(block: Block) -> BlockSolution | None:
@@ -137,22 +129,113 @@ def solve_block(block: Block) -> BlockSolution | None:
     profiles = len(reach)
     whole = np.ones((1, profiles))
     means = [each.mean(whole, stop) for each, stop in zip(scaled, stops, strict=True)]
-    data, derivatives = condense(means, layout)
-    beams = _beam_fit.arrange(data, layout, reaches(data.usable, layout))
+    beams, derivatives, curvature = _arrange_means(means, layout)
     if not beams.reach.any():
         return None
+    curved = _with_curvature(beams, curvature)
     constants = _beam_fit.start_constants(beams, block.lengths)
-    first = _beam_fit.solve(beams, block.priors[-1].precision, constants)
+    first = _beam_fit.solve(curved, block.priors[-1].precision, constants)
     normal, side = first.linear.normal(beams.select)
     prior = _changing_field.likeliest_prior(normal[0], side[0], block.priors)
-    mean = _beam_fit.solve(beams, prior.precision, first.constants)
-    signals = _about(beams, mean.constants, derivatives, data.curvature_error, reach, scaled, means)
-    field, x, covariance = _solve_field(signals, prior, block.position, mean.logarithm[0])
-    moved = np.sqrt(np.mean((x - x.mean(axis=0)) ** 2))
-    if field.change is not None and moved > THRESHOLDS.linear_change:
-        signals = _about_running_means(signals, x, scaled, stops, layout)
-        field, x, covariance = _solve_field(signals, prior, block.position, x.mean(axis=0))
-    return _assess(block, signals, field, (x, covariance), prior, bool(mean.settled[0]))
+    mean = _beam_fit.solve(curved, prior.precision, first.constants)
+    signals = _about(beams, mean.constants, derivatives, curvature, reach, scaled, means)
+    change = _likeliest_change(signals, block.position, mean.logarithm[0])
+    if change is None:
+        field = _steady(mean, beams.select, profiles)
+    else:
+        field = _changing(signals, change, prior, mean.logarithm[0])
+        if np.sqrt(np.mean((field.x - field.x.mean(axis=0)) ** 2)) > THRESHOLDS.linear_change:
+            signals = _about_running_means(signals, field.x, scaled, stops, layout)
+            middle = field.x.mean(axis=0)
+            change = _likeliest_change(signals, block.position, middle) or change
+            field = _changing(signals, change, prior, middle)
+    tested = mean.linear.information[0]
+    return _assess(block, signals, field, tested, prior, bool(mean.settled[0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Field:
+    """The solution of a block, and how it follows its signals."""
+
+    x: Array
+    """(profile, crossing) ln extinction."""
+    covariance: Array
+    """(profile, crossing, crossing)."""
+    respond: Callable[[Array], Array]
+    """From a (case, beam, 2 passage) change of u and I to a (profile, crossing, case) one of x."""
+    curved: float
+    """Share of the errors of curved signals that the covariance leaves out."""
+
+
+def _steady(mean: Solution, select: Array, profiles: int) -> _Field:
+    """Return the field of the mean for all profiles."""
+    shape = profiles, select.shape[2]
+
+    def respond(change: Array) -> Array:
+        response = mean.covariance @ _beam_fit.changed_sides(mean.linear, select, change)
+        return np.broadcast_to(response, (*shape, len(change)))
+
+    return _Field(
+        np.broadcast_to(mean.logarithm, shape),
+        np.broadcast_to(mean.covariance, (*shape, shape[1])), respond, 0.0,
+    )  # fmt: skip
+
+
+def _changing(signals: _Signals, change: Change, prior: MeanPrior, mean: Array) -> _Field:
+    """Return the field about a mean that changes as stated."""
+    normal, side = signals.normal()
+    field = ChangingField(normal, prior.precision, change)
+    x, covariance = field.solve(
+        (side - normal @ mean)[..., np.newaxis], (-prior.precision @ mean)[:, np.newaxis]
+    )
+
+    def respond(changed: Array) -> Array:
+        select = signals.beams.select
+        return field.solve(_beam_fit.changed_sides(signals.linear, select, changed))[0]
+
+    # Curved signals are alike in all profiles, which count them as noise.
+    return _Field(mean + x[..., 0], covariance, respond, 1.0 - 1.0 / len(normal))
+
+
+def _likeliest_change(signals: _Signals, position: Array, mean: Array) -> Change | None:
+    """Return how the profiles change about a mean field; None where they do not."""
+    normal, side = signals.normal()
+    rest = side - normal @ mean
+    return _changing_field.likeliest_change(
+        normal.mean(axis=0), rest - rest.mean(axis=0), position
+    )
+
+
+def _typical(ratio: Array) -> Array:
+    """Return (1, beam) medians over profiles of the finite ratios; 1 where there is none."""
+    middle = median(np.where(np.isfinite(ratio), ratio, 1.0), np.isfinite(ratio))
+    return np.where(np.isfinite(middle), middle, 1.0)[np.newaxis]
+
+
+def _with_curvature(beams: Beams, curvature: Array, ratio: Array | float = 1.0) -> Beams:
+    """Return means with a multiple of their noise, and curved signals as noise."""
+    covariance = beams.covariance * np.asarray(ratio)[..., np.newaxis, np.newaxis]
+    place = np.arange(curvature.shape[2])
+    covariance[..., place, place] += curvature
+    return replace(beams, covariance=covariance)
+
+
+def _arrange_means(
+    means: list[CleanBeam], layout: FitLayout
+) -> tuple[Beams, list[Array], Array]:
+    """Return means of powers, condensed, the derivatives of each beam by its bins, and curvature.
+
+    Curvature is the (mean, beam, passage) square of what straight lines miss where a signal is
+    curved beyond noise.
+    """
+    data, derivatives = condense(means, layout)
+    beams = _beam_fit.arrange(data, layout, reaches(data.usable, layout))
+    error, noise = np.moveaxis(data.curvature_error, -1, 0)
+    excess = np.maximum(error**2 - THRESHOLDS.profile_noise * noise, 0.0)
+    curvature = np.zeros(beams.value.shape)
+    beam, place = _beam_fit.places(layout)
+    curvature[:, beam, place] = np.where(data.usable, excess, 0.0)
+    return beams, derivatives, curvature
 
 
 def _about(
@@ -175,14 +258,17 @@ def _about(
         ratio[:, b] = each.noise_ratio(mean)
     ratio = np.where(np.isfinite(ratio) & (ratio > 0.0), ratio, np.inf)
     reach = np.where(np.isfinite(ratio), np.minimum(reach, beams.reach), 0)
-    if len(beams.value) == 1:
+    alone = len(beams.value) == 1
+    typical = _typical(ratio) if alone else np.where(np.isfinite(ratio), ratio, 1.0)
+    noisy = _with_curvature(beams, curvature, typical)
+    if alone:
         patterns, index = np.unique(reach, axis=0, return_inverse=True)
-        linear = _beam_fit.linearise(beams, constants, patterns)
+        linear = _beam_fit.linearise(noisy, constants, patterns)
         linear = Linear(*(getattr(linear, name)[index.ravel()] for name in linear.__slots__))
     else:
-        linear = _beam_fit.linearise(beams, constants, reach)
+        linear = _beam_fit.linearise(noisy, constants, reach)
     value = linear.value + (linear.turn @ change[..., np.newaxis])[..., 0]
-    information = linear.information / ratio[..., np.newaxis, np.newaxis]
+    information = linear.information * (typical / ratio)[..., np.newaxis, np.newaxis]
     linear = Linear(
         value, linear.turn, information, linear.gain, linear.slope, linear.determinant
     )
@@ -195,8 +281,7 @@ def _about_running_means(
     """Return the signals of all profiles about running means, with constants that fit a field."""
     shares = _running_shares(x)
     means = [each.mean(shares, stop) for each, stop in zip(scaled, stops, strict=True)]
-    data, derivatives = condense(means, layout)
-    beams = _beam_fit.arrange(data, layout, reaches(data.usable, layout))
+    beams, derivatives, curvature = _arrange_means(means, layout)
     around = (shares @ x) / shares.sum(axis=1, keepdims=True)
     constants = np.zeros(beams.reach.shape)
     end = np.take_along_axis(beams.value, np.maximum(beams.reach - 1, 0)[..., np.newaxis], axis=2)
@@ -208,9 +293,7 @@ def _about_running_means(
         linear = _beam_fit.linearise(beams, constants)
         step = (linear.gain * (linear.value - around[:, beams.crossing])).sum(axis=2)
         constants = constants + np.clip(step, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
-    return _about(
-        beams, constants, derivatives, data.curvature_error, signals.reach, scaled, means
-    )
+    return _about(beams, constants, derivatives, curvature, signals.reach, scaled, means)
 
 
 def _running_shares(x: Array) -> Array:
@@ -225,41 +308,29 @@ def _running_shares(x: Array) -> Array:
     return shares
 
 
-def _solve_field(
-    signals: _Signals, prior: MeanPrior, position: Array, mean: Array
-) -> tuple[ChangingField, Array, Array]:
-    """Return the field with its likeliest change, its values and their covariances."""
-    normal, side = signals.normal()
-    rest = side - normal @ mean
-    change = _changing_field.likeliest_change(
-        normal.mean(axis=0), rest - rest.mean(axis=0), position
-    )
-    field = ChangingField(normal, prior.precision, change)
-    pull = -prior.precision @ mean
-    x, covariance = field.solve(rest[..., np.newaxis], pull[:, np.newaxis])
-    return field, mean + x[..., 0], covariance
-
-
 def _assess(
-    block: Block, signals: _Signals, field: ChangingField, solved: tuple[Array, Array],
-    prior: MeanPrior, settled: bool,
+    block: Block, signals: _Signals, field: _Field,
+    tested: Array, prior: MeanPrior, settled: bool,
 ) -> BlockSolution:  # fmt: skip
-    """Return the solution with its errors and tests."""
-    x, covariance = solved
-    select, reach = signals.beams.select, signals.reach
+    """Return the solution with its errors and tests.
+
+    `tested` is the (beam, passage, passage) information of the mean.
+    """
+    x, select, reach = field.x, signals.beams.select, signals.reach
     information = signals.linear.information
     chi_square, freedom, seen = _beam_fit.test(signals.beams, signals.linear, x, reach)
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    variance = np.diagonal(field.covariance, axis1=1, axis2=2)
     known = seen & (variance < THRESHOLDS.largest_variance)
     # The misfit of the mean: residuals of all profiles together.
     inside = np.arange(select.shape[1]) < reach[..., np.newaxis]
     residual = np.where(inside, signals.linear.value - x[:, signals.beams.crossing], 0.0)
     weighted = (information @ residual[..., np.newaxis])[..., 0]
-    pooled = weighted.sum(axis=0)
-    inverse = np.linalg.pinv(information.sum(axis=0), rcond=1e-9, hermitian=True)
-    misfit = float(np.einsum("bp,bpq,bq->", pooled, inverse, pooled))
-    left = weighted.sum(axis=0).ravel() @ select.reshape(-1, select.shape[2])
-    misfit -= float(_beam_fit.taken_up(field.normal.sum(axis=0)[np.newaxis], left[np.newaxis])[0])
+    pooled = weighted.sum(axis=0)[..., np.newaxis]
+    average = np.linalg.pinv(information.sum(axis=0), rcond=_ROUNDING, hermitian=True) @ pooled
+    weighted = (tested @ average)[np.newaxis, ..., 0]
+    left = weighted.reshape(1, -1) @ select.reshape(-1, select.shape[2])
+    normal = _beam_fit.normal_matrix(tested[np.newaxis], select)
+    misfit = float((weighted * average[..., 0]).sum() - _beam_fit.taken_up(normal, left)[0])
     deepest = signals.beams.reach.max(axis=0)
     misfit_freedom = deepest.sum() - (deepest > 0).sum() - np.sum(seen.any(axis=0))
     curvature, overlap = _systematic(block, signals, field)
@@ -267,33 +338,27 @@ def _assess(
         np.where(known, x, np.nan), np.where(known, variance, np.nan), curvature, overlap,
         (reach == 0) & (reaches(block.usable, block.layout) > 1),
         chi_square, freedom, (misfit, float(misfit_freedom)),
-        settled, prior, field.change is not None,
+        settled, prior,
     )  # fmt: skip
 
 
-def _systematic(block: Block, signals: _Signals, field: ChangingField) -> tuple[Array, Array]:
-    """Return variances by curved signals, and changes by overlap errors at the near ends of beams."""
-    layout, shape = block.layout, signals.beams.value.shape
+def _systematic(block: Block, signals: _Signals, field: _Field) -> tuple[Array, Array]:
+    """Return variances by curved signals, and changes by overlap errors at the near ends of beams.
+
+    Both are (profile, crossing); the overlap errors are 1.
+    """
+    layout, (beams, most) = block.layout, signals.beams.value.shape[1:]
     beam, place = _beam_fit.places(layout)
-    passages = beam.size
-    change = np.zeros((passages + shape[1], shape[1], 2 * shape[2]))
-    change[np.arange(passages), beam, place] = 1.0
+    passages = np.arange(beam.size)
+    change = np.zeros((beam.size + beams, beams, 2 * most))
+    change[passages, beam, place] = 1.0
     for b, (row, derivative) in enumerate(zip(block.beams, signals.derivatives, strict=True)):
         first, last = layout.first_passage[row.number : row.number + 2]
         ranges = layout.range[row.number, row.start : row.start + derivative.shape[2]]
-        ends = layout.passages.range[[first, last - 1]]
-        weights = row.exponent * np.interp(ranges, ends, [1.0, 0.0])
+        weights = np.interp(ranges, layout.passages.range[[first, last - 1]], [1.0, 0.0])
         count = (derivative.shape[1] + 1) // 2
-        into = np.r_[:count, shape[2] : shape[2] + count - 1]
-        change[passages + b, b, into] = derivative.mean(axis=0) @ weights
-    response, _ = field.solve(signals.sides(change))
-    carried, by_overlap = response[..., :passages], response[..., passages:]
-    if len(signals.curvature_error) == 1:
-        carried = carried[:1]
-    curvature = curvature_variance(
-        signals.curvature_error, np.ones(signals.curvature_error.shape[:2], dtype=np.bool_), carried
-    )
-    return (
-        np.broadcast_to(curvature, response.shape[:2]),
-        np.sqrt((by_overlap**2).sum(axis=2)),
-    )
+        into = np.r_[:count, most : most + count - 1]
+        change[beam.size + b, b, into] = row.exponent * (derivative.mean(axis=0) @ weights)
+    response = field.respond(change) ** 2
+    curvature = field.curved * response[..., : beam.size] @ signals.curvature[:, beam, place, np.newaxis]
+    return curvature[..., 0], np.sqrt(response[..., beam.size :].sum(axis=2))

@@ -175,7 +175,7 @@ class ChangingField:
     """(profile, crossing, crossing) N_t."""
     prior: Array
     """(crossing, crossing) precision of the mean field."""
-    change: Change | None
+    change: Change
 
     def solve(self, side: Array, pull: Array | float = 0.0) -> tuple[Array, Array]:
         """Return (profile, crossing, case) fields, and (profile, crossing, crossing) covariances.
@@ -188,13 +188,6 @@ class ChangingField:
             Right side of the mean field by its prior.
         """
         prior = self.prior + THRESHOLDS.weak_precision * np.eye(len(self.prior))
-        if self.change is None:
-            covariance = np.linalg.inv(self.normal.sum(axis=0) + prior)
-            field = covariance @ (side.sum(axis=0) + pull)
-            return (
-                np.broadcast_to(field, side.shape),
-                np.broadcast_to(covariance, self.normal.shape),
-            )
         root = np.linalg.cholesky(
             self.change.covariance + _ROUNDING * np.trace(self.change.covariance) * np.eye(len(self.prior))
         )

@@ -357,7 +357,8 @@ def _quality_flags(
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
         bits[:, crossing] |= signals.warnings[:, index]
     with np.errstate(invalid="ignore"):
-        uncertain = ~(np.hypot(errors.random, errors.systematic) < result.extinction)
+        error = np.hypot(errors.random, errors.systematic)
+        uncertain = ~(error < THRESHOLDS.largest_relative_error * result.extinction)
     background_doubt = shifts(errors.tail_signal, errors.random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(
