@@ -6,10 +6,11 @@ The order of the retrieval, and the modules that do it:
 2. `_beam_signals`: the signals are validated, and those that noise hides are left out.
 3. `_condensed_signals`: outlying bins are bridged (`outlying_bins`). Each beam is
    condensed to its signal at the crossings and the integrals between them, with their covariance.
-4. `_joint_solution`: all beams of a profile are solved together for all crossings.
-5. `_empirical_prior`: each block chooses the prior of ln extinction over the crossings.
-6. `_block_errors`: the block adds errors that one profile cannot see.
-7. `extinction_field`: `retrieve_network` runs these steps and flags the values.
+4. `_beam_means`: the powers of a block are averaged, and profiles are deviations from the mean.
+5. `_beam_fit`: all beams are solved together for all crossings.
+6. `_changing_field`: the prior of the mean field, and how it changes within a block.
+7. `_block_solution`: a block of profiles as one field that changes slowly.
+8. `extinction_field`: `retrieve_network` runs these steps and flags the values.
 
 `labeled` runs the retrieval on xarray data and adds the errors that all bins of a beam share.
 """

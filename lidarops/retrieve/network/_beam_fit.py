@@ -13,6 +13,7 @@ and P is the precision of the prior; then k changes by g' W (y - A x) / (g' W g)
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Final
 
@@ -67,7 +68,7 @@ def arrange(data: CondensedSignals, layout: FitLayout, reach: Indices) -> Beams:
     covariance = np.zeros((profiles, shape[0], 2 * most, 2 * most))
     offsets = layout.offset[np.append(np.flatnonzero(np.diff(layout.first_passage)), -1)]
     sound = np.ones(reach.shape, dtype=np.bool_)
-    for b, (first, last) in enumerate(zip(offsets, offsets[1:], strict=False)):
+    for b, (first, last) in enumerate(itertools.pairwise(offsets)):
         count = int(np.sum(beam == b))
         into = np.r_[:count, most : most + count - 1]
         square = data.covariance[:, first:last].reshape(profiles, 2 * count - 1, -1)
@@ -181,15 +182,17 @@ def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> L
     known = (gain * lever).sum(axis=2)
     empty = reach < 2
     known = np.where(empty, 1.0, known)
-    information = inverse - gain[..., np.newaxis] * gain[..., np.newaxis, :] / known[
-        ..., np.newaxis, np.newaxis
-    ]
+    information = (
+        inverse
+        - gain[..., np.newaxis] * gain[..., np.newaxis, :] / known[..., np.newaxis, np.newaxis]
+    )
     information[np.broadcast_to(empty, shape[:2])] = 0.0
     determinant = np.linalg.slogdet(correlation)[1] + 2.0 * np.log(scale).sum(axis=2)
     determinant = np.where(empty, 0.0, determinant + np.log(known))
     value = np.where(inside, beams.value - np.log(weight), 0.0)
+    gain = np.where(empty[..., np.newaxis], 0.0, gain / known[..., np.newaxis])
     return Linear(
-        value, turn, information, np.where(empty[..., np.newaxis], 0.0, gain / known[..., np.newaxis]),
+        value, turn, information, gain,
         lever[..., 0], determinant.sum(axis=1),
     )  # fmt: skip
 
@@ -238,9 +241,7 @@ class Solution:
     """(profile,) True where the last pass changed no logarithm of w."""
 
 
-def solve(
-    beams: Beams, precision: Array, constants: Array, *, passes: int = _PASSES
-) -> Solution:
+def solve(beams: Beams, precision: Array, constants: Array, *, passes: int = _PASSES) -> Solution:
     """Solve each profile by Gauss-Newton steps of its constants.
 
     Parameters
@@ -275,10 +276,12 @@ def solve(
         step = np.where(going[:, np.newaxis], new, step)
         constants = constants + step * going[:, np.newaxis]
     moved = np.abs(step * linear.slope).max(axis=1, initial=0.0)
-    return Solution(x, covariance, constants, linear, moved < THRESHOLDS.converged_step)
+    return Solution(x, np.asarray(covariance), constants, linear, moved < THRESHOLDS.converged_step)
 
 
-def test(beams: Beams, linear: Linear, x: Array, reach: Indices | None = None) -> tuple[Array, Array, Booleans]:
+def compare(
+    beams: Beams, linear: Linear, x: Array, reach: Indices | None = None
+) -> tuple[Array, Array, Booleans]:
     """Return chi-squares, their degrees of freedom, and which crossings a profile sees.
 
     Returns

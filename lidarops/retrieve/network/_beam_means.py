@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.network._condensed_signals import CleanBeam, FitLayout
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -69,7 +69,7 @@ class ScaledBeam:
         return np.where(known, self.source.exponent * (ratio - 1.0), 0.0)
 
     def noise_ratio(self, mean: CleanBeam) -> Array:
-        """Return (profile,) variances of noise over those of a mean, for the bins of the profile."""
+        """Return (profile,) variances of noise over those of a mean, for the bins of each."""
         own, start = self.source.stops - self.source.start, self.source.low - self.source.start
         sums = [
             np.concatenate([np.zeros((len(own), 1)), np.cumsum(values, axis=1)], axis=1)

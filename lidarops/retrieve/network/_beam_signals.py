@@ -142,7 +142,7 @@ def prepare_signals(
     signal = np.where(np.isnan(ranges), np.nan, signal)
     beams = _condensed_signals.clean(signal, variances, exponents, layout, together=together)
     with np.errstate(all="ignore"):
-        weak, negative = _weak_passages(signal, variances, layout, block, together)
+        weak, negative = _weak_passages(signal, variances, layout, block, together=together)
     shape = weak.shape
     status, usable = np.zeros(shape, dtype=np.uint8), np.zeros(shape, dtype=np.bool_)
     bridged = np.zeros(shape, dtype=np.bool_)
@@ -227,7 +227,7 @@ def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
 
 
 def _weak_passages(
-    power: Array, variance: Array, layout: FitLayout, block: Indices, together: bool
+    power: Array, variance: Array, layout: FitLayout, block: Indices, *, together: bool
 ) -> tuple[Booleans, Booleans]:
     """Return (profile, passage) where noise hides the signal, and where the signal is negative.
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -63,14 +64,13 @@ class _Signals:
         return self.linear.normal(self.beams.select)
 
 
-
 def reaches(usable: Booleans, layout: FitLayout) -> Indices:
     """Return (profile, beam) numbers of usable passages before the first one that is not."""
     first = layout.first_passage
     return np.stack(
         [
             np.logical_and.accumulate(usable[:, a:b], axis=1).sum(axis=1)
-            for a, b in zip(first, first[1:], strict=False)
+            for a, b in itertools.pairwise(first)
             if b > a
         ],
         axis=1,
@@ -136,7 +136,10 @@ def solve_block(block: Block) -> BlockSolution | None:
     constants = _beam_fit.start_constants(beams, block.lengths)
     first = _beam_fit.solve(curved, block.priors[-1].precision, constants)
     normal, side = first.linear.normal(beams.select)
-    prior = _changing_field.likeliest_prior(normal[0], side[0], block.priors)
+    spare = beams.reach.sum() - np.sum(beams.reach > 0) - np.sum(np.diagonal(normal[0]) > 0.0)
+    prior = _changing_field.likeliest_prior(
+        normal[0], side[0], block.priors, tested=bool(spare >= 0)
+    )
     mean = _beam_fit.solve(curved, prior.precision, first.constants)
     signals = _about(beams, mean.constants, derivatives, curvature, reach, scaled, means)
     change = _likeliest_change(signals, block.position, mean.logarithm[0])
@@ -149,8 +152,7 @@ def solve_block(block: Block) -> BlockSolution | None:
             middle = field.x.mean(axis=0)
             change = _likeliest_change(signals, block.position, middle) or change
             field = _changing(signals, change, prior, middle)
-    tested = mean.linear.information[0]
-    return _assess(block, signals, field, tested, prior, bool(mean.settled[0]))
+    return _assess(block, signals, field, mean, prior)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,9 +203,7 @@ def _likeliest_change(signals: _Signals, position: Array, mean: Array) -> Change
     """Return how the profiles change about a mean field; None where they do not."""
     normal, side = signals.normal()
     rest = side - normal @ mean
-    return _changing_field.likeliest_change(
-        normal.mean(axis=0), rest - rest.mean(axis=0), position
-    )
+    return _changing_field.likeliest_change(normal.mean(axis=0), rest - rest.mean(axis=0), position)
 
 
 def _typical(ratio: Array) -> Array:
@@ -220,21 +220,21 @@ def _with_curvature(beams: Beams, curvature: Array, ratio: Array | float = 1.0) 
     return replace(beams, covariance=covariance)
 
 
-def _arrange_means(
-    means: list[CleanBeam], layout: FitLayout
-) -> tuple[Beams, list[Array], Array]:
+def _arrange_means(means: list[CleanBeam], layout: FitLayout) -> tuple[Beams, list[Array], Array]:
     """Return means of powers, condensed, the derivatives of each beam by its bins, and curvature.
 
-    Curvature is the (mean, beam, passage) square of what straight lines miss where a signal is
-    curved beyond noise.
+    Where a signal is curved beyond noise, the polynomial replaces the straight line. Curvature is
+    the (mean, beam, passage) variance that this adds to a value.
     """
     data, derivatives = condense(means, layout)
     beams = _beam_fit.arrange(data, layout, reaches(data.usable, layout))
     error, noise = np.moveaxis(data.curvature_error, -1, 0)
-    excess = np.maximum(error**2 - THRESHOLDS.profile_noise * noise, 0.0)
+    curved = data.usable & (error**2 > THRESHOLDS.profile_noise * noise)
     curvature = np.zeros(beams.value.shape)
     beam, place = _beam_fit.places(layout)
-    curvature[:, beam, place] = np.where(data.usable, excess, 0.0)
+    beams.value[:, beam, place] -= np.where(curved, error, 0.0)
+    left = noise + (THRESHOLDS.curvature_left * error) ** 2
+    curvature[:, beam, place] = np.where(curved, left, 0.0)
     return beams, derivatives, curvature
 
 
@@ -269,9 +269,7 @@ def _about(
         linear = _beam_fit.linearise(noisy, constants, reach)
     value = linear.value + (linear.turn @ change[..., np.newaxis])[..., 0]
     information = linear.information * (typical / ratio)[..., np.newaxis, np.newaxis]
-    linear = Linear(
-        value, linear.turn, information, linear.gain, linear.slope, linear.determinant
-    )
+    linear = Linear(value, linear.turn, information, linear.gain, linear.slope, linear.determinant)
     return _Signals(beams, linear, derivatives, curvature, reach)
 
 
@@ -303,22 +301,20 @@ def _running_shares(x: Array) -> Array:
         shares = (np.abs(place[:, np.newaxis] - place) <= length // 2).astype(np.float64)
         number = shares.sum(axis=1, keepdims=True)
         spread = shares @ x**2 / number - (shares @ x / number) ** 2
-        if np.sqrt(spread.mean(axis=0).max()) < THRESHOLDS.linear_change:
+        if np.sqrt(spread.mean(axis=0).max()) < THRESHOLDS.running_change:
             break
     return shares
 
 
 def _assess(
     block: Block, signals: _Signals, field: _Field,
-    tested: Array, prior: MeanPrior, settled: bool,
+    mean: Solution, prior: MeanPrior,
 ) -> BlockSolution:  # fmt: skip
-    """Return the solution with its errors and tests.
-
-    `tested` is the (beam, passage, passage) information of the mean.
-    """
+    """Return the solution with its errors and tests."""
+    tested = mean.linear.information[0]
     x, select, reach = field.x, signals.beams.select, signals.reach
     information = signals.linear.information
-    chi_square, freedom, seen = _beam_fit.test(signals.beams, signals.linear, x, reach)
+    chi_square, freedom, seen = _beam_fit.compare(signals.beams, signals.linear, x, reach)
     variance = np.diagonal(field.covariance, axis1=1, axis2=2)
     known = seen & (variance < THRESHOLDS.largest_variance)
     # The misfit of the mean: residuals of all profiles together.
@@ -338,7 +334,7 @@ def _assess(
         np.where(known, x, np.nan), np.where(known, variance, np.nan), curvature, overlap,
         (reach == 0) & (reaches(block.usable, block.layout) > 1),
         chi_square, freedom, (misfit, float(misfit_freedom)),
-        settled, prior,
+        bool(mean.settled[0]), prior,
     )  # fmt: skip
 
 
@@ -360,5 +356,7 @@ def _systematic(block: Block, signals: _Signals, field: _Field) -> tuple[Array, 
         into = np.r_[:count, most : most + count - 1]
         change[beam.size + b, b, into] = row.exponent * (derivative.mean(axis=0) @ weights)
     response = field.respond(change) ** 2
-    curvature = field.curved * response[..., : beam.size] @ signals.curvature[:, beam, place, np.newaxis]
+    curvature = (
+        field.curved * response[..., : beam.size] @ signals.curvature[:, beam, place, np.newaxis]
+    )
     return curvature[..., 0], np.sqrt(response[..., beam.size :].sum(axis=2))

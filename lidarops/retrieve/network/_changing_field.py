@@ -47,15 +47,16 @@ def smooth_fields(position: Array) -> tuple[Array, Array]:
     axes = axes[:, size > _ROUNDING * size[0]]
     fields = fields - axes @ (axes.T @ fields)
     fields[:, np.mean(fields**2, axis=0) <= _ROUNDING**2] = 0.0
-    linear, quadratic = (field @ field.T for field in (centred, fields))
-    return tuple(
-        covariance * (len(position) / max(float(np.trace(covariance)), _ROUNDING))
-        for covariance in (linear, quadratic)
-    )  # type: ignore[return-value]
+    return _unit(centred @ centred.T), _unit(fields @ fields.T)
+
+
+def _unit(covariance: Array) -> Array:
+    """Return a covariance with a mean variance of 1; 0 where there is none."""
+    return covariance * (len(covariance) / max(float(np.trace(covariance)), _ROUNDING))
 
 
 def precision(covariance: Array) -> Array:
-    """Return (..., crossing, crossing) precisions of fields with these covariances and a free level."""
+    """Return (..., crossing, crossing) precisions of covariances, with a free level."""
     inverse = np.linalg.inv(covariance)
     sums = inverse.sum(axis=-1)
     total = sums.sum(axis=-1)[..., np.newaxis, np.newaxis]
@@ -82,16 +83,17 @@ def mean_priors(position: Array) -> list[MeanPrior]:
     precisions = precision(
         np.array([a * a * (linear + quadratic) + s * s * unit for a, s in sizes])
     )
-    return [
-        MeanPrior(matrix, s, a) for matrix, (a, s) in zip(precisions, sizes, strict=True)
-    ]
+    return [MeanPrior(matrix, s, a) for matrix, (a, s) in zip(precisions, sizes, strict=True)]
 
 
-def likeliest_prior(normal: Array, side: Array, priors: list[MeanPrior]) -> MeanPrior:
+def likeliest_prior(
+    normal: Array, side: Array, priors: list[MeanPrior], *, tested: bool
+) -> MeanPrior:
     """Return the prior that the mean of a block supports.
 
     The smallest size of smooth fields that is not much less likely than the likeliest, because
-    the beams hardly show these; then the largest of single crossings.
+    the beams hardly show these, and the largest one where beams are too few to test it; then the
+    largest of single crossings.
     """
     matrices = np.array([prior.precision for prior in priors])
     # The level is free: the determinant of a precision is that of its other directions.
@@ -103,7 +105,8 @@ def likeliest_prior(normal: Array, side: Array, priors: list[MeanPrior]) -> Mean
     )
     shape = len(THRESHOLDS.gradients), len(THRESHOLDS.deviations)
     costs = cost.reshape(shape)
-    row = int(np.argmax(costs.min(axis=1) <= costs.min() + THRESHOLDS.likelihood_tolerance))
+    likely = costs.min(axis=1) <= costs.min() + THRESHOLDS.likelihood_tolerance
+    row = int(np.argmax(likely)) if tested else shape[0] - 1
     likely = costs[row] <= costs[row].min() + THRESHOLDS.likelihood_tolerance
     column = shape[1] - 1 - int(np.argmax(likely[::-1]))
     return priors[row * shape[1] + column]
@@ -189,7 +192,8 @@ class ChangingField:
         """
         prior = self.prior + THRESHOLDS.weak_precision * np.eye(len(self.prior))
         root = np.linalg.cholesky(
-            self.change.covariance + _ROUNDING * np.trace(self.change.covariance) * np.eye(len(self.prior))
+            self.change.covariance
+            + _ROUNDING * np.trace(self.change.covariance) * np.eye(len(self.prior))
         )
         cases = side.shape[2]
         sides = root.T @ np.concatenate([side, self.normal], axis=2)
@@ -201,7 +205,7 @@ class ChangingField:
         covariance = np.linalg.inv((known + known.T) / 2.0 + prior)
         mean = covariance @ ((side - self.normal @ by_side).sum(axis=0) + pull)
         field = by_side + left @ mean
-        return field, spread + left @ covariance @ left.swapaxes(1, 2)
+        return field, np.asarray(spread + left @ covariance @ left.swapaxes(1, 2))
 
 
 def _solve_chain(normal: Array, side: Array, rho: float) -> tuple[Array, Array]:
@@ -223,4 +227,4 @@ def _solve_chain(normal: Array, side: Array, rho: float) -> tuple[Array, Array]:
         both[t] -= link**2 * before
         sides[t] += link * before @ sides[t - 1]
     covariance = np.linalg.inv(both[:, 0] + both[::-1, 1] - own)
-    return covariance @ (sides[:, 0] + sides[::-1, 1] - side), covariance
+    return covariance @ (sides[:, 0] + sides[::-1, 1] - side), np.asarray(covariance)

@@ -247,16 +247,15 @@ def clean(
         beams = []
         for beam in np.flatnonzero(np.diff(layout.first_passage)):
             row = _take_logarithms(
-                int(beam), power[:, beam], variance[:, beam], float(exponent[beam]), layout, together
-            )
+                int(beam), power[:, beam], variance[:, beam], float(exponent[beam]), layout,
+                together=together,
+            )  # fmt: skip
             _bridge(row, layout.range[beam], layout.window[layout.first_passage[beam]])
             beams.append(row)
     return beams
 
 
-def condense(
-    beams: Sequence[CleanBeam], layout: FitLayout
-) -> tuple[CondensedSignals, list[Array]]:
+def condense(beams: Sequence[CleanBeam], layout: FitLayout) -> tuple[CondensedSignals, list[Array]]:
     """Condense clean beams to values at crossings and integrals between them.
 
     Returns
@@ -322,8 +321,9 @@ def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> 
 
 
 def _take_logarithms(
-    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout, together: bool
-) -> CleanBeam:
+    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout, *,
+    together: bool,
+) -> CleanBeam:  # fmt: skip
     """Return the logarithms of a beam, and why they end before its last used bin."""
     first, last = layout.first_passage[beam], layout.first_passage[beam + 1] - 1
     low, high = layout.window[first], layout.window[last] + layout.weights.shape[1]

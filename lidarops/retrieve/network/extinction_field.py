@@ -10,11 +10,10 @@ far one v therefore
 No calibration is needed: the constant of a lidar multiplies the whole row. The overlap does not
 cancel.
 
-In thin air or high noise, a gradient over the whole network looks like attenuation, and no test
-can separate them. The standard error is then mostly what the prior allows and what the rest of
-the block shows. Where the beams leave fewer equations
-than unknowns, values are flagged if the beams contradict the prior; a field so steep that few
-beams cannot show it goes undetected. ``docs/algorithms/network.md`` has the rates.
+The profiles of a block are one field that changes slowly
+(`lidarops.retrieve.network._block_solution`). In thin air or high noise, a gradient over the whole
+network looks like attenuation, and no test can separate them: the standard error is then mostly what the prior allows.
+``docs/algorithms/network.md`` has the rates of false values.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.network import _beam_fit, _beam_signals
 from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
 from lidarops.retrieve.network._block_solution import Block, reaches, solve_block
@@ -51,7 +50,7 @@ class FieldPrior(StrEnum):
     """Prior knowledge of the field that the network method uses."""
 
     BLOCK = "block"
-    """What the profiles of a block share: how much ln extinction deviates from a linear field."""
+    """The profiles of a block are one field that changes slowly."""
     NONE = "none"
 
 
@@ -62,10 +61,8 @@ class NetworkResult:
     extinction: Array
     """(..., crossing) m-1; NaN without a value, and at crossings that are far on all beams."""
     extinction_standard_error: Array
-    """m-1. From noise, from the error of a straight-line fit where the signal is curved, from a
-    field that deviates by twice the prior's standard deviation, or by four times the strongest
-    prior where the beams leave a crossing open, as far as the mean of a block allows, and from the
-    bias that noise gives all profiles of a block."""
+    """m-1. From noise and prior, widened by the misfit of the mean of a block, from the error of
+    fits where the signal is curved, and from an error of the overlap."""
     quality: Flags
     """(..., crossing) quality bits, by beams of the crossing or the whole network."""
     no_solution: Booleans
@@ -77,7 +74,7 @@ class NetworkResult:
     degrees_of_freedom: Array
     """(...)."""
     prior_deviation: Array
-    """(...) standard deviation of ln extinction about a linear field; inf without prior."""
+    """(...) standard deviation of ln extinction about smooth fields; inf without prior."""
     overlap_error: Array
     """(..., crossing) m-1, part of the standard error by `default_overlap_error` of the beams."""
     multiplier: Array
@@ -132,8 +129,8 @@ def retrieve_network(
     exponent : float or (beam,) float
         m of backscatter ~ extinction^(1/m) along a beam.
     blocks : (...) int, optional
-        Numbers of the blocks of profiles that share a prior; by default, all. Results of a block
-        depend on its own profiles only.
+        Numbers of the blocks of profiles, in order of time, that are one field; by default, all.
+        Results of a block depend on its own profiles only.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.
     multiplier : float or (..., crossing) float or "chosen", optional
@@ -198,7 +195,7 @@ def _solve_blocks(beams: BeamSignals, position: Array) -> Estimates:
         extinction = np.exp(solved.logarithm)
         chi_square, freedom = solved.misfit
         scale = max(chi_square / freedom, 1.0) if freedom > 0 else 1.0
-        overlap = THRESHOLDS.default_overlap_error * solved.overlap if freedom <= 0 else 0.0
+        overlap = THRESHOLDS.default_overlap_error * solved.overlap
         variance = scale * solved.variance + solved.curvature + overlap**2
         out.extinction[here] = extinction
         out.variance[here] = extinction**2 * variance
@@ -225,7 +222,7 @@ def _solve_alone(beams: BeamSignals) -> Estimates:
     nothing = np.zeros((measured.size, measured.size))
     solved = _beam_fit.solve(fits, nothing, start)
     carried = _beam_fit.carry(solved.covariance, solved.linear.information, fits.select)
-    chi_square, freedom, seen = _beam_fit.test(fits, solved.linear, solved.logarithm)
+    chi_square, freedom, seen = _beam_fit.compare(fits, solved.linear, solved.logarithm)
     variance = np.diagonal(solved.covariance, axis1=1, axis2=2)
     known = seen & (variance < THRESHOLDS.largest_variance)
     extinction = np.where(known, np.exp(solved.logarithm), np.nan)

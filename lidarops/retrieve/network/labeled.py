@@ -311,7 +311,9 @@ class _Errors:
             np.nan_to_num(signals.background_error)[..., np.newaxis], shape
         )
         by_background = solver.extinction_changes(result, background)
-        random = root_sum_square([result.extinction_standard_error, *by_background])
+        # The declared error of the overlap replaces the default.
+        stated = result.extinction_standard_error**2 - result.overlap_error**2
+        random = root_sum_square([np.sqrt(np.maximum(stated, 0.0)), *by_background])
         overlap = THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
         overlap_change = root_sum_square(solver.extinction_changes(result, overlap))
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -169,7 +169,7 @@ def _fits(row: tuple[Array, Array, float, Array, Array], codes: Codes, at: int) 
         first, second = plan[at, i], plan[at, _SIDE + i]
         gap -= first * logs[before] + second * logs[behind]
         spread += first * first * noise[before] + second * second * noise[behind]
-    return gap * gap < min(_CLEAR * spread, (0.5 * exponent) ** 2)
+    return bool(gap * gap < min(_CLEAR * spread, (0.5 * exponent) ** 2))
 
 
 @compiled

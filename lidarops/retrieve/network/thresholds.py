@@ -68,6 +68,9 @@ class Thresholds(NamedTuple):
     curvature_degree: int = 4
     """Degree of the polynomial. A parabola leaves half of the error from a layer of 10 m over 35 m;
     calculated."""
+    curvature_left: float = 0.1
+    """Share of the error of a straight line that a polynomial may leave: 0.24 of a Gaussian layer
+    of 10 m, 0.05 of one of 15 m in bins of 5 m; calculated."""
     shared_noise: float = 4.0
     """Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08
     of one variance on average; normal distribution."""
@@ -93,16 +96,19 @@ class Thresholds(NamedTuple):
     """Correlations of changes from one profile to the next that are tried; assumed."""
     least_change: float = 9.0
     """Gain in -2 ln likelihood below which a field does not change: 3 standard errors."""
-    linear_change: float = 0.05
-    """Standard deviation of ln extinction in a mean of profiles, beyond which they are not linear
-    about it; simulations."""
+    linear_change: float = 0.02
+    """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
+    its mean; simulations."""
+    running_change: float = 0.05
+    """The same in a running mean; simulations."""
     running_profiles: tuple[int, ...] = (15, 7, 3, 1)
     """Profiles of running means that are tried; assumed."""
     largest_misfit: float = 9.0
     """Chi-square of the mean over its degrees of freedom, beyond which a block is rejected; below,
     it widens the stated errors; assumed."""
-    default_overlap_error: float = 0.003
-    """Relative error of the overlap at the nearest crossing, where no redundancy shows it."""
+    default_overlap_error: float = 0.005
+    """Relative error of the overlap at the nearest crossing of each beam, which those of others do
+    not show where it is alike; products replace it by the declared one. Simulations."""
 
     # The solution
     longest_step: float = 1.5

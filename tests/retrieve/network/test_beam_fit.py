@@ -193,7 +193,7 @@ def test_solution_agrees_with_least_squares(deviation):
         precision = prior_precision(net, deviation)
     beams, result = solved(layout, data, precision)
     assert np.all(result.settled)
-    chi_square, freedom, _ = _beam_fit.test(beams, result.linear, result.logarithm)
+    chi_square, freedom, _ = _beam_fit.compare(beams, result.linear, result.logarithm)
     values, vectors = np.linalg.eigh(precision)
     prior = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     for n in range(3):
@@ -209,9 +209,7 @@ def test_solution_agrees_with_least_squares(deviation):
         # The fit adds a hundredth of information on the level.
         np.testing.assert_allclose(best.x[net.beams :], result.logarithm[n], atol=2e-3)
         covariance = np.linalg.inv(best.jac.T @ best.jac)[net.beams :, net.beams :]
-        np.testing.assert_allclose(
-            np.diag(covariance), np.diag(result.covariance[n]), rtol=0.02
-        )
+        np.testing.assert_allclose(np.diag(covariance), np.diag(result.covariance[n]), rtol=0.02)
         if not np.isfinite(deviation):
             assert 2 * best.cost == pytest.approx(chi_square[n, 0], rel=0.02)
     assert freedom[0, 0] == layout.passages.beam.size - net.beams - net.crossings
@@ -250,7 +248,7 @@ def test_standard_errors_are_the_scatter_of_solutions():
     errors = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
     score = (result.logarithm - truth) / errors
     np.testing.assert_allclose(score[:, net.near_crossing].std(axis=0), 1.0, atol=0.15)
-    chi_square, freedom, _ = _beam_fit.test(beams, result.linear, result.logarithm)
+    chi_square, freedom, _ = _beam_fit.compare(beams, result.linear, result.logarithm)
     assert np.mean(chi_square[:, 0] / freedom[:, 0]) == pytest.approx(1.0, abs=0.15)
 
 
@@ -271,9 +269,7 @@ def test_a_beam_with_singular_covariance_is_left_out(bad):
     without.usable[1, : layout.first_passage[1]] = 0
     data.covariance[1, : layout.offset[1]] = bad
     precision = prior_precision(net, 0.1)
-    (beams, result), (_, expected) = (
-        solved(layout, entry, precision) for entry in (data, without)
-    )
+    (beams, result), (_, expected) = (solved(layout, entry, precision) for entry in (data, without))
     assert beams.reach[1, 0] == 0
     np.testing.assert_array_equal(result.logarithm, expected.logarithm)
     np.testing.assert_array_equal(result.covariance, expected.covariance)

@@ -118,8 +118,8 @@ def test_the_error_covers_a_layer_that_a_line_cannot_fit(
     errors, relative_errors, stated = (np.concatenate(chunk) for chunk in zip(*chunks, strict=True))
     assert errors.size > 20
     assert np.mean(errors > 4.0) < 0.005
-    # The stated errors are not much too large.
-    assert np.median(stated) < 1.5 * np.median(relative_errors) + 3.0 * relative
+    # The stated errors are not much too large, where the polynomial leaves nearly none, too.
+    assert np.median(stated) < max(1.5 * np.median(relative_errors) + 3.0 * relative, 0.2)
 
 
 @pytest.mark.parametrize(("deep", "rise"), [(20.0, 40.0), (20.0, 100.0), (10.0, 100.0)])
