@@ -303,7 +303,7 @@ def _running_shares(x: Array) -> Array:
         spread = shares @ x**2 / number - (shares @ x / number) ** 2
         if np.sqrt(spread.mean(axis=0).max()) < THRESHOLDS.running_change:
             break
-    return shares
+    return np.asarray(shares)
 
 
 def _assess(

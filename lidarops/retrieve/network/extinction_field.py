@@ -12,7 +12,8 @@ cancel.
 
 The profiles of a block are one field that changes slowly
 (`lidarops.retrieve.network._block_solution`). In thin air or high noise, a gradient over the whole
-network looks like attenuation, and no test can separate them: the standard error is then mostly what the prior allows.
+network looks like attenuation, and no test can separate them: the standard error is then mostly
+what the prior allows.
 ``docs/algorithms/network.md`` has the rates of false values.
 """
 
