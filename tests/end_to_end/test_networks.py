@@ -120,11 +120,11 @@ def test_the_range_window_does_not_change_the_product(tmp_path):
 def test_optically_thin_air_is_flagged(tmp_path):
     air = {
         "homogeneous": {
-            "extinction": {"minimum": 3e-6, "maximum": 3e-6, "hour_of_maximum": 12},
+            "extinction": {"minimum": 2e-5, "maximum": 2e-5, "hour_of_maximum": 12},
             "molecules_constant": True,
         }
     }
-    campaign, truth = made.written(tmp_path, made.tree(air, rate=1.0))
+    campaign, truth = made.written(tmp_path, made.tree(air, rate=0.1))
     (outcome,) = reprocess_network(campaign).scenes
     product = opened(campaign, outcome)
     true = made.truth_at(product, truth, beams_of(outcome))
