@@ -119,8 +119,8 @@ def read_row(headers: Headers, due: UnreadFile) -> GranuleRow:
 
 
 def unread_row(headers: Headers, due: UnreadFile, reason: str) -> GranuleRow:
-    """Return the row of a file whose reading came to no end, which every scan tries again."""
-    return row_of(_refused(due, f"{UNREADABLE}: {reason}"), headers.entered_as, RETRY)
+    """Return the row of a file whose reading came to no end: it is read again once it changed."""
+    return row_of(_refused(due, f"{UNREADABLE}: {reason}"), headers.entered_as, due.scan_key)
 
 
 def read_header(headers: Headers, due: UnreadFile) -> Granule:

@@ -58,7 +58,7 @@ def read_values(product: xr.Dataset, kind: str) -> Values:
     """
     quantities = _quantities(product, kind)
     largest = max((product[quantity.name].nbytes for quantity in quantities), default=1)
-    every = -(-largest // READ_BYTES)
+    every = max(-(-largest // READ_BYTES), 1)
     return Values(tuple(_row(product, quantity, every) for quantity in quantities), every)
 
 

@@ -340,7 +340,7 @@ class TestManyFiles:
             assert (second.changed, second.moved, second.vanished) == (8, 1, 1)
             assert _rows(two) == _rows(one)
 
-    def test_refuse_a_file_that_crashes_its_process_and_try_it_again(
+    def test_refuse_a_file_that_crashes_its_process_until_it_changes(
         self, campaign: Campaign, store: Store, monkeypatch, caplog
     ) -> None:
         _fill(campaign, 20)
@@ -350,7 +350,10 @@ class TestManyFiles:
         assert refused.path == "coast/h13"
         assert refused.reason == "cannot be read: reading it crashed the process"
         assert "a process was lost" in caplog.text
+        # It would end this process.
+        assert scan_archive(campaign, store).refused == 1
         monkeypatch.undo()
+        raw_archives.write(Path(campaign.archive) / refused.path, raw_archives.content(99))
         assert scan_archive(campaign, store).refused == 0
         assert len(store.granules(status=Status.GOOD)) == 21
 

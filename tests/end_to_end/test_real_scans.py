@@ -342,6 +342,9 @@ def test_dead_times_are_estimated_against_analog(data_root, tmp_path):
         # The reference fits sums of profiles, which vary with elevation: 6.8 ns is 1.2 errors high.
         assert abs(value - expected) < 2.0 * error < 0.5 * value
         assert (found["usable"] < 2).mean() >= 0.95
+        deviations = deviation(found, product.channel)
+        assert np.all(deviations[:, 1:] < 1.0)
+        assert np.all(deviations[:, 0] < 2.0)
         part = at_heights(found).isel(altitude=0)
         depth = REFERENCE[product.channel][0][0]
         assert (np.abs(part["vertical_optical_depth"] - depth) < 0.016).all()

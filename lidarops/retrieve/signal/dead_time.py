@@ -19,9 +19,9 @@ _PASSES: Final = 12
 _ROUNDS: Final = 6
 """Solutions, each with the bins up to the load of the one before, and by its dead time."""
 _ALIKE: Final = 1e10
-"""Variance of a dead time over that with a known slope, beyond which only rounding is left."""
-_LOWEST: Final = 1e-3
-"""Load of the highest rate by which a solution begins, and which no step goes below."""
+"""Variance over that with a known slope, beyond which only rounding is left (clipped analog)."""
+_LOADS: Final = (1e-3, 1.0)
+"""Loads of the highest rate between which a solution is sought, from the lower one on."""
 _HIGHEST: Final = 0.99
 """Load of a profile to which it is corrected."""
 
@@ -33,8 +33,7 @@ class DeadTimeEstimate:
     dead_time: float
     """s."""
     standard_error: float
-    """s: of noise, of an analog record that is not linear, and half of how far the dead time of low
-    rates differs from that of all."""
+    """s: of noise, a nonlinear analog record, and half the change by low rates alone."""
     highest_load: float
     """Largest share of dead time among the bins."""
 
@@ -198,7 +197,7 @@ def _fit(
     known &= counted.light(0.0).rate > THRESHOLDS.least_rate
     fastest, dead_time = math.inf, 0.0
     solution: tuple[float, float, float] | None = None
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         used = known & (counted.peak < fastest)
         light = _Light(*(part[used] for part in counted.light(dead_time)))
         parts = (part[used] for part in (analog, variance, counted.exposure))
@@ -206,8 +205,8 @@ def _fit(
         if solution is None:
             return None
         dead_time = solution[0]
-        # Only ever less, so that the rounds converge.
-        fastest = min(fastest, highest / dead_time)
+        # Of varying light, the first rounds give too long ones. Only ever less, so that it ends.
+        fastest = min(fastest, highest / dead_time) if number else fastest
     return solution
 
 
@@ -218,8 +217,8 @@ def _solve(
 
     `of_light` is the dead time of `light`, in microseconds.
     """
-    shortest = _LOWEST / float(light.rate.max())
-    dead_time = of_light or shortest
+    least, most = np.array(_LOADS) / light.rate.max()
+    dead_time = of_light or least
     slope = float((light.rate - light.background).sum() / analog.sum())
     error = math.inf
     rate = light.rate
@@ -241,6 +240,6 @@ def _solve(
         if not 0.0 <= square * normal[0, 0] < _ALIKE:
             return None
         error = math.sqrt(square)
-        dead_time = max(dead_time + float(change[0]), shortest)
+        dead_time = float(np.clip(dead_time + change[0], least, most))
         slope += float(change[1])
     return dead_time, error, float((rate * dead_time).max())

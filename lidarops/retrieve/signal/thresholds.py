@@ -110,7 +110,8 @@ class Thresholds(NamedTuple):
     clip: float = 5.0
     """Standard deviations at which the noise is clipped, against spikes. Assumed."""
     peak_width: int = 4
-    """Bins on either side of a peak that belong to it. Assumed."""
+    """Bins on either side of a peak that belong to it; a lag is applied up to an error of half of
+    them (`test_a_lag_that_parts_of_the_range_contradict_is_not_significant`). Assumed."""
 
     # Gluing
     count_rates: tuple[float, float] = (0.5, 20.0)
