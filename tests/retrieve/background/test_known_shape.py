@@ -227,8 +227,8 @@ def test_a_window_must_show_neither_waves_nor_curvature(structure, curved, wavy)
     shape = air()
     power = 20.0 + 5.0 * shape + structure * ((RANGE > 4500.0) & (RANGE < 6000.0))
     longest = fit_known_shape(power, RANGE, shape, variance=0.09, start=4500.0)
-    # At a false alarm of .05 percent each, as windows are chosen.
-    assert (abs(longest.curvature) > 3.48, longest.waves > 34.8) == (curved, wavy)
+    # At a false alarm of 1 percent, nearly as windows are chosen.
+    assert (abs(longest.curvature) > 2.81, longest.waves > 28.3) == (curved, wavy)
     assert fit_known_shape(power, RANGE, shape, variance=0.09).start == 6007.5
 
 
