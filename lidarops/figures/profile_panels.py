@@ -222,7 +222,7 @@ def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Ax
     good, thin = ~profile["rejected"].values, _thin(place)
 
     def errors(name: str) -> Floats:
-        return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)[thin]
+        return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)
 
     causes = {
         cause.replace("_", " "): errors(f"{quantity.name}_error_{cause}")
@@ -230,8 +230,9 @@ def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Ax
     }
     total = errors(f"{quantity.name}_standard_error")
     lines = [
-        Curve(values, place[thin], f"c{number} d{number}", label=cause)
+        Curve(values[thin], place[thin], f"c{number} d{number}", label=cause)
         for number, (cause, values) in enumerate(causes.items())
     ]
     x = decade_axis(f"error of {quantity.label}", [*causes.values(), total])
-    return Panel(x, y, (*lines, Curve(total, place[thin], "ink thick", label="total")), _HEIGHT)
+    whole = Curve(total[thin], place[thin], "ink thick", label="total")
+    return Panel(x, y, (*lines, whole), _HEIGHT)
