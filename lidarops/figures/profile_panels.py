@@ -224,11 +224,9 @@ def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Ax
     def errors(name: str) -> Floats:
         return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)
 
-    causes = {
-        cause.replace("_", " "): errors(f"{quantity.name}_error_{cause}")
-        for cause in quantity.budget
-    }
-    total = errors(f"{quantity.name}_standard_error")
+    name = quantity.name
+    causes = {part.replace("_", " "): errors(f"{name}_error_{part}") for part in quantity.budget}
+    total = errors(f"{name}_standard_error")
     lines = [
         Curve(values[thin], place[thin], f"c{number} d{number}", label=cause)
         for number, (cause, values) in enumerate(causes.items())
