@@ -1,7 +1,7 @@
 """Compiled least squares of the homogeneous path, one profile at a time.
 
 The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
-compared at fixed nodes, on sums over groups of bins. Two Newton steps over all bins improve the
+compared at fixed nodes, on sums over blocks of bins. Two Newton steps over all bins improve the
 best node; a test of the last one gives a few profiles more. Every sum runs over the bins of one
 profile in a fixed order: a result does not depend on the rest of the batch. From a given extinction
 there is no search.
@@ -14,13 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import HUGE, Array
+from lidarops.retrieve.common.arrays import HUGE, Array, Integers
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 from lidarops.retrieve.homogeneous._misfit import Left, judge_residuals
 from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._projection import (
     BLOCK,
-    GROUP,
     NODES,
     Grid,
     Point,
@@ -31,10 +30,8 @@ from lidarops.retrieve.homogeneous._projection import (
     largest_energy,
     load,
     make_scratch,
-    mean_place,
     power_of_two,
     rescale,
-    total_of,
     weigh,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -59,19 +56,6 @@ _FLAT: Final = 1e-13
 
 
 @summing
-def _fill_groups(s: Scratch) -> None:
-    for i in range(BLOCK):
-        s.groups[0, i], s.groups[1, i] = s.w[i], s.w[i] * s.z[i]
-    for k in range(BLOCK, s.groups.shape[1]):
-        first = BLOCK + GROUP * (k - BLOCK)
-        weight = value = 0.0
-        for i in range(first, first + GROUP):
-            weight += s.w[i]
-            value += s.w[i] * s.z[i]
-        s.groups[0, k], s.groups[1, k] = weight, value
-
-
-@summing
 def _products(weights: Array, values: Array, shape: Array, square: Array) -> Any:
     of_shape = of_value = of_square = 0.0
     for k in range(shape.size):
@@ -82,27 +66,15 @@ def _products(weights: Array, values: Array, shape: Array, square: Array) -> Any
 
 
 @inlined
-def _multiply(weights: Array, values: Array, shapes: Array, out: Array) -> None:
-    """Fill the weighted sums of phi, of phi times the values and of phi^2, of all nodes."""
-    for j in range(NODES):
-        products = _products(weights, values, shapes[0, j], shapes[1, j])
-        out[0, j], out[1, j], out[2, j] = products
-
-
-@inlined
-def _explain(s: Scratch, sums: Sums) -> None:
-    """Overwrite the products of all nodes with values by the energy that the shape explains.
-
-    The background is projected out.
-    """
-    shapes, values, squares = s.products[0], s.products[1], s.products[2]
-    for j in range(NODES):
-        mean = sums.free * shapes[j] / sums.weight
-        norm = squares[j] - shapes[j] * mean
-        along = values[j] - mean * sums.value
-        # A shape that is flat over the valid bins, or gone before the first, holds no information.
-        informed = (norm > _FLAT * squares[j]) & (squares[j] > TINY)
-        values[j] = along * along / norm if informed else 0.0
+def _explained(weights: Array, values: Array, shapes: Array, j: int, sums: Sums) -> float:
+    """Return the energy that the shape of a node explains, with the background projected out."""
+    shape, value, square = _products(weights, values, shapes[0, j], shapes[1, j])
+    mean = shape * (sums.free / sums.weight)
+    norm = square - shape * mean
+    along = value - mean * sums.value
+    # A shape that is flat over the valid bins, or gone before the first, holds no information.
+    informed = (norm > _FLAT * square) & (square > TINY)
+    return along * along / norm if informed else 0.0
 
 
 @inlined
@@ -120,25 +92,44 @@ def _peak(f: Array, middle: int) -> float:
 
 
 @inlined
+def _best_node(
+    weights: Array, values: Array, shapes: Array, sums: Sums, explained: Array
+) -> tuple[int, int]:
+    """Return the node that explains most, of every third and the two at each side of the best.
+
+    The second number is the middle of five nodes about it whose energies are known.
+
+    Fills the energies that these nodes explain.
+    """
+    third, most = 1, -1.0
+    for j in range(1, NODES, 3):
+        explained[j] = _explained(weights, values, shapes, j, sums)
+        if explained[j] > most:
+            third, most = j, explained[j]
+    best = third
+    for j in range(max(third - 2, 0), min(third + 3, NODES)):
+        if j != third:
+            explained[j] = _explained(weights, values, shapes, j, sums)
+        if explained[j] > most:
+            best, most = j, explained[j]
+    middle = min(max(best, third - 1), third + 1)
+    return best, min(max(middle, 2), NODES - 3)
+
+
+@inlined
 def _start(g: Grid, s: Scratch, sums: Sums) -> float:
     """Return tau where the shape explains most of the profile.
 
     Among the nodes, and interpolated between the best one and its neighbours.
     """
-    # Opaque shapes differ in their first valid bins only, which groups would not resolve.
-    if total_of(s.w[:BLOCK]) > 0.0:
-        _fill_groups(s)
-        _multiply(s.groups[0], s.groups[1], g.group_shapes, s.products)
+    explained = s.explained
+    # Opaque shapes differ in their first valid bins only, which blocks would not resolve.
+    if s.w[:BLOCK].any():
+        best, middle = _best_node(s.points[0], s.points[1], g.block_shapes, sums, explained)
     else:
         for i in range(s.w.size):
             s.residual[i] = s.w[i] * s.z[i]
-        _multiply(s.w, s.residual, g.shapes, s.products)
-    _explain(s, sums)
-    explained, best, largest = s.products[1], 0, 0.0
-    for j in range(NODES):
-        if explained[j] > largest:
-            best, largest = j, explained[j]
-    middle = min(max(best, 2), NODES - 3)
+        best, middle = _best_node(s.w, s.residual, g.shapes, sums, explained)
     offset = middle - best + _peak(explained, middle)
     if not abs(offset) <= 1.0:
         return float(g.nodes[best])
@@ -191,7 +182,7 @@ def find_extinction(g: Grid, s: Scratch, sums: Sums) -> Point:
 
 
 @inlined
-def _describe(g: Grid, s: Scratch, p: Point, sums: Sums, row: Any) -> None:
+def _describe(g: Grid, p: Point, sums: Sums, row: Any) -> None:
     """Write parameters and variances of a least-squares fit, in the scaled variables."""
     free, weight = sums.free, sums.weight
     row.background = p.level
@@ -210,7 +201,7 @@ def _describe(g: Grid, s: Scratch, p: Point, sums: Sums, row: Any) -> None:
     )
     row.extinction_slope = -weight * p.mean_slope / (p.b * p.slope_norm)
     row.amplitude_slope = lever * row.extinction_slope - weight * p.mean_phi / (p.b * p.norm)
-    row.mean_range = mean_place(g.x, s.w, weight)
+    row.mean_range = sums.place / weight
     row.bounded = p.tau <= g.nodes[0] or p.tau >= g.nodes[-1]
 
 
@@ -304,7 +295,7 @@ def _last_usable(power: Any, s: Scratch) -> int:
 
 @inlined
 def _begin(
-    power: Any, mode: tuple[float, float, float], s: Scratch, row: Any
+    power: Any, mode: tuple[float, float, float], g: Grid, s: Scratch, row: Any
 ) -> tuple[float, float, Sums]:
     """Load a profile and write its status; return its reference, scale and sums.
 
@@ -325,27 +316,27 @@ def _begin(
     row.bins = bins
     if bins < THRESHOLDS.fewest_solved_bins:
         row.status = EMPTY if last < 0 else TOO_SHORT
-        return reference, 1.0, Sums(bins, total, 0.0, 0.0, free)
+        return reference, 1.0, Sums(bins, total, 0.0, 0.0, 0.0, free)
     if size < TINY:
         row.status = CONSTANT
         row.background = reference
         row.background_variance = 1.0 / (total * unit)
-        return reference, 1.0, Sums(bins, total, 0.0, 0.0, free)
+        return reference, 1.0, Sums(bins, total, 0.0, 0.0, 0.0, free)
     row.status = FITTED
     scale = power_of_two(size / bins)
-    value, square = rescale(s, 1.0 / scale)
+    place, value, square = rescale(1.0 / scale, g, s)
     if rounding > 0.0:
         levels = reference * reference * total / bins
-        energy = levels + scale * scale * largest_energy(s.w, s.z)
+        energy = levels + scale * scale * largest_energy(s.z, s)
         row.rounding = 2.0 * rounding * rounding * unit * energy
-    return reference, scale, Sums(bins, total, value, square, free)
+    return reference, scale, Sums(bins, total, place, value, square, free)
 
 
 @inlined
 def _fit(g: Grid, s: Scratch, sums: Sums, kind: int, given: float, spacing: int, row: Any) -> None:
     """Fit a loaded profile."""
     p = find_extinction(g, s, sums) if kind == BACKGROUND else evaluate(given, g, s, sums)
-    _describe(g, s, p, sums, row)
+    _describe(g, p, sums, row)
     if kind == PRIOR:
         p = at(evaluate(_take_step(g, p, row), g, s, sums), row.background, row.amplitude)
     left = judge_residuals(g, s, p, sums, spacing, row)
@@ -360,46 +351,52 @@ def _fit(g: Grid, s: Scratch, sums: Sums, kind: int, given: float, spacing: int,
 @inlined
 def _solve(
     power: Any,
-    noise: tuple[Array, bool, float],
+    noise: tuple[Array, bool, float, Integers],
     given: Array,
     kind: int,
     g: Grid,
     s: Scratch,
-    out: Any,
+    out: tuple[Any, Array, Array],
 ) -> None:
-    rows, is_variance, rounding = noise
-    unit = 1.0
+    rows, known, rounding, spacings = noise
+    records, fields, columns = out
+    row, unit = records[0], 1.0
     for k in range(power.shape[0]):
         # A row of noise for each profile, or one for all.
         if k < rows.shape[0]:
-            unit = weigh(rows[k], is_variance, s)
+            unit = weigh(rows[k], s)
+        fields[:] = math.nan
+        row.difference_count = row.trend_count = 0.0
         value = given[k % given.size]
         background = value if kind == BACKGROUND else math.nan
-        mode = (unit, 0.0 if is_variance else rounding, background)
-        reference, scale, sums = _begin(power[k], mode, s, out[k])
-        if out[k].status == FITTED:
-            spacing = 0 if is_variance else g.noise_spacing[k % g.noise_spacing.size]
-            _fit(g, s, sums, kind, g.length * value, spacing, out[k])
-            _unscale(g, reference, scale, unit, out[k])
+        mode = (unit, 0.0 if known else rounding, background)
+        reference, scale, sums = _begin(power[k], mode, g, s, row)
+        if row.status == FITTED:
+            spacing = 0 if known else spacings[k % spacings.size]
+            _fit(g, s, sums, kind, g.length * value, spacing, row)
+            _unscale(g, reference, scale, unit, row)
+        for j in range(fields.size):
+            columns[j, k] = fields[j]
 
 
 @compiled
 def solve_path(
     power: Any,
-    noise: tuple[Array, bool, float],
+    noise: tuple[Array, bool, float, Integers],
     given: Array,
     kind: int,
     g: Grid,
-    out: Any,
+    out: tuple[Any, Array, Array],
 ) -> None:
     """Fit every profile of a batch.
 
     Parameters
     ----------
     power : (profile, bin) float32 or float64
-    noise : ((profile or 1, bin) float64, bool, float)
-        Variances or weights, of which a bin is left out where its weight is not positive and
-        finite; whether they are variances; the relative rounding error of the power.
+    noise : ((profile or 1, bin) float64, bool, float, (profile or 1,) int)
+        Variances, or relative ones, of which a bin is left out where its weight is not positive and
+        finite; whether they are known; the relative rounding error of the power; the bins beyond
+        which noise is independent.
     given : (profile or 1,) float64
         Backgrounds, NaN where they are to be fitted; or extinctions, m-1.
     kind : int
@@ -407,7 +404,8 @@ def solve_path(
         step leads to that of the profile.
     g : Grid
         Of `make_grid`.
-    out : (profile,) `ROW`
-        Filled with NaN; receives the fields of `PathEstimate`.
+    out : ((1,) `ROW`, (field,) float64, (field, profile) float64)
+        A record, its memory as an array, and the columns that receive the fields of `PathEstimate`
+        of each profile, NaN where there is none.
     """
     _solve(power, noise, given, kind, g, make_scratch(g), out)

@@ -154,12 +154,14 @@ def curved_widening(relative_error: Any) -> Any:
 
 
 def _limits(fit: PathEstimate, unknowns: int, *, known_variance: bool) -> _Limits:
-    counts = [np.nan_to_num(count) for count in (fit.bins, fit.difference_count, fit.trend_count)]
+    counts = fit.bins, fit.difference_count, fit.trend_count
     # Limits depend on counts alone, which most profiles share: evaluate each combination once.
     key = np.zeros(fit.status.shape, dtype=np.int64)
     for count in counts:
         key = (key << 20) + count.astype(np.int64)
-    _, sample, kind = np.unique(key, return_index=True, return_inverse=True)
+    sample, kind = np.zeros(min(key.size, 1), dtype=np.int64), np.zeros_like(key)
+    if np.any(key != key[:1]):
+        _, sample, kind = np.unique(key, return_index=True, return_inverse=True)
     limits_of = _known_limits if known_variance else _estimated_limits
     bins, differences, shapes = (count[sample] for count in counts)
     limits = limits_of(bins, differences, shapes, unknowns)

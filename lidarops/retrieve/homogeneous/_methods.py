@@ -65,13 +65,11 @@ def solve_with_known_background(problem: PathProblem) -> HomogeneousResult:
 
 def solve_by_cubic(problem: PathProblem) -> HomogeneousResult:
     """Take the background from the cubic and propagate its error into the other parameters."""
-    with np.errstate(divide="ignore"):
-        variance = problem.noise if problem.known_variance else 1.0 / problem.noise
     estimate, gradients = solve_cubic(
         problem.power,
         problem.range,
         problem.lag,
-        variance,
+        problem.noise,
         known_variance=problem.known_variance,
         want_gradients=True,
     )
@@ -122,7 +120,7 @@ def _fit_above(
 
 def _weights(problem: PathProblem) -> Array:
     """Return the weights of all bins, 0 of those that are left out."""
-    weights = 1.0 / problem.noise if problem.known_variance else problem.noise
+    weights = 1.0 / problem.noise
     usable = (np.abs(problem.power) < HUGE) & (weights > 0.0) & (weights < HUGE)
     return np.where(usable, weights, 0.0)
 
@@ -133,16 +131,24 @@ def _row_sum(values: Array) -> Array:
 
 def _estimate(problem: PathProblem, given: Array, kind: int = _direct.BACKGROUND) -> PathEstimate:
     """Fit the profiles with what is given beside them."""
-    table = np.full(problem.power.shape[0], np.nan, ROW)
+    record = np.empty(1, ROW)
+    columns = np.empty((len(COLUMNS), problem.power.shape[0]))
     # Second differences over more than a twentieth of a section would hold its misfit.
     widest = min(SIGNAL.most_correlated_bins, problem.range.size // 20)
     spacing = np.where(problem.correlation_length > 1.0, max(widest, 1), 1).astype(np.int64)
-    grid = make_grid(problem.range, problem.bounds, spacing)
+    grid = make_grid(problem.range.tobytes(), problem.bounds)
     # Relative rounding of the power and of the kernels, as a standard deviation.
     rounding = 0.3 * float(np.finfo(problem.power.dtype).eps) + 8.0 * float(np.finfo(float).eps)
-    noise = (frozen(problem.noise), problem.known_variance, rounding)
-    _direct.solve_path(frozen(problem.power), noise, frozen(given), kind, grid, table)
-    return PathEstimate(**{name: np.ascontiguousarray(table[name]) for name in COLUMNS})
+    noise = (frozen(problem.noise), problem.known_variance, rounding, frozen(spacing))
+    _direct.solve_path(
+        frozen(problem.power),
+        noise,
+        frozen(given),
+        kind,
+        grid,
+        (record, record.view(float), columns),
+    )
+    return PathEstimate(*columns)
 
 
 def _solution(
@@ -192,6 +198,6 @@ def _solution(
         extinction_model_error=np.where(fitted, extinction_model, np.nan),
         signal_to_noise=np.where(fitted, signal_to_noise, np.nan),
         reduced_chi2=np.where(fitted, verdict.reduced_chi2, np.nan),
-        valid_bins=np.nan_to_num(fit.bins).astype(np.int32),
+        valid_bins=fit.bins.astype(np.int32),
         quality=verdict.quality | quality,
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import inlined, summing
 from lidarops.retrieve.homogeneous._projection import (
     Grid,
@@ -54,28 +53,20 @@ class _Residuals(NamedTuple):
     square: float
 
 
-@summing
-def _test_shapes(x: Array, w: Array, phi: Array, p: Point, free: float) -> _TestShapes:
-    b0 = b1 = b2 = q0 = q1 = q2 = bb = bq = qq = 0.0
-    for i in range(phi.size):
-        lever, first, square = x[i] - p.centroid, w[i] * phi[i], phi[i] * phi[i]
-        bent, weighted_square = first * lever * lever, w[i] * square
-        b0 += bent
-        b1 += bent * phi[i]
-        b2 += bent * phi[i] * lever
-        q0 += weighted_square
-        q1 += weighted_square * phi[i]
-        q2 += weighted_square * phi[i] * lever
-        bb += bent * phi[i] * lever * lever
-        bq += bent * square
-        qq += weighted_square * square
+@inlined
+def _test_shapes(p: Point, free: float) -> _TestShapes:
+    c, (q0, q1, q2), (p0, p1, p2, p3, p4) = p.centroid, p.sums_of_shape.phi, p.sums_of_shape.square
+    c0, c1, c2 = p.sums_of_shape.cube
     mean_phi, mean_slope = free * p.mean_phi, free * p.mean_slope
+    b0 = q2 - c * (2.0 * q1 - c * q0)
+    b1 = p2 - c * (2.0 * p1 - c * p0)
+    b2 = p3 - c * (3.0 * p2 - c * (3.0 * p1 - c * p0))
     return _TestShapes(
         (b0, b1 - mean_phi * b0, -2.0 * b2 - mean_slope * b0),
-        (q0, q1 - mean_phi * q0, -2.0 * q2 - mean_slope * q0),
-        bb,
-        bq,
-        qq,
+        (p0, c0 - mean_phi * p0, -2.0 * (c1 - c * c0) - mean_slope * p0),
+        p4 - c * (4.0 * p3 - c * (6.0 * p2 - c * (4.0 * p1 - c * p0))),
+        c2 - c * (2.0 * c1 - c * c0),
+        p.sums_of_shape.fourth,
     )
 
 
@@ -183,17 +174,17 @@ def judge_residuals(
     A spacing of 0 stands for a known variance.
     """
     w0, free = sums.weight, sums.free
-    shapes = _test_shapes(g.x, s.w, s.phi, p, free)
+    shapes = _test_shapes(p, free)
     _describe_bend(shapes, p, w0, free, row)
     residuals = _sum_residuals(g, s, p)
     row.misfit = residuals.energy
-    row.largest = math.sqrt(largest_energy(s.w, s.residual))
+    row.largest = math.sqrt(largest_energy(s.residual, s))
     if free > 0.0:
         row.trend, row.trend_count = _trend(shapes, residuals, p, w0)
     else:
         # The test shapes are orthogonal to the background even where it is given.
-        full = evaluate(p.tau, g, s, Sums(sums.bins, w0, sums.value, sums.square, 1.0))
-        shapes = _test_shapes(g.x, s.w, s.phi, full, 1.0)
+        full = evaluate(p.tau, g, s, Sums(sums.bins, w0, sums.place, sums.value, sums.square, 1.0))
+        shapes = _test_shapes(full, 1.0)
         row.trend, row.trend_count = _trend(shapes, residuals, full, w0)
     row.second_differences, row.difference_count = 0.0, 0.0
     if noise_spacing > 0:

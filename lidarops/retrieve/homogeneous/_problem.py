@@ -89,10 +89,9 @@ class PathProblem:
     range: Array
     """(bin,), m, ascending."""
     noise: Array
-    """(profile or 1, bin): variances or weights; a bin is left out where that is not positive
-    and finite."""
+    """(profile or 1, bin): variances; a bin whose weight is not positive and finite is left out."""
     known_variance: bool
-    """Whether `noise` holds variances, else weights up to a common factor."""
+    """Whether they are known, else up to a common factor."""
     bounds: tuple[float, float]
     """Lowest and highest extinction, m-1."""
     correlation_length: Array

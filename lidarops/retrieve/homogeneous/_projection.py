@@ -11,21 +11,21 @@ and divided by a power of two, the weights divided by a power of two.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numba
 import numpy as np
 
-from lidarops.retrieve.common.arrays import HUGE, Array, Integers, frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Integers
 from lidarops.retrieve.common.compiled_code import inlined, summing
 
 NODES: Final = 24
 """Extinctions of the search."""
 _WIDEST_SCALE: Final = 0.3
 BLOCK: Final = 8
-"""Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
-GROUP: Final = 4
-"""The search runs on the bins of the first block and on sums over as many bins beyond."""
+"""Profiles are padded with unused bins to whole blocks, so that loops have no remainder. The search
+runs on the bins of the first block and on the sums of each block beyond."""
 
 
 class Grid(NamedTuple):
@@ -43,18 +43,17 @@ class Grid(NamedTuple):
     scale: float
     shapes: Array
     """(2, node, bin): phi of every node, and its square."""
-    group_shapes: Array
-    """(2, node, group): phi averaged over groups of bins, and its square."""
+    block_shapes: Array
+    """(2, node, point): phi of the bins of the first block and averaged over each block beyond, and
+    its square."""
     start: float
     """R_0, m."""
     length: float
     """L, m."""
-    noise_spacing: Integers
-    """(profile or 1,): bins from one to the next of a second difference, which gives the noise."""
 
 
 class Scratch(NamedTuple):
-    """Arrays of one profile, (bin,) each but the last."""
+    """Arrays of one profile, (bin,) each but the last two."""
 
     given: Array
     """Weights by the noise alone, 0 where it is not usable."""
@@ -64,10 +63,13 @@ class Scratch(NamedTuple):
     """Values, 0 where not usable."""
     phi: Array
     residual: Array
-    groups: Array
-    """(2, group): sums of weights, and of weights times values."""
-    products: Array
-    """(3, node)."""
+    energy: Array
+    energy_bits: Integers
+    """The memory of `energy`."""
+    points: Array
+    """(2, point): sums of weights, and of weights times values."""
+    explained: Array
+    """(node,): energy that the shape explains."""
 
 
 class Sums(NamedTuple):
@@ -75,11 +77,27 @@ class Sums(NamedTuple):
 
     bins: float
     weight: float
+    place: float
+    """Of x."""
     value: float
     square: float
     """Of the squared values."""
     free: float
     """1 where the background is fitted, 0 where it is given."""
+
+
+class ShapeSums(NamedTuple):
+    """Weighted sums over the bins of powers of phi, each times powers of x."""
+
+    phi: tuple[float, float, float]
+    """Times 1, x, x^2; so for all but `square`."""
+    square: tuple[float, float, float, float, float]
+    """Of phi^2, up to x^4."""
+    cube: tuple[float, float, float]
+    fourth: float
+    """Of phi^4."""
+    value: tuple[float, float, float]
+    """Of phi z."""
 
 
 class Point(NamedTuple):
@@ -106,20 +124,23 @@ class Point(NamedTuple):
     curvature: float
     energy: float
     """Of the residuals, by differences: no better than the rounding of the squared values."""
+    sums_of_shape: ShapeSums
 
 
-def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integers) -> Grid:
-    """Return the tables common to the profiles of a call.
+@lru_cache(maxsize=8)
+def make_grid(ranges: bytes, bounds: tuple[float, float]) -> Grid:
+    """Return the tables common to the profiles of a section.
+
+    They take as long as fifty profiles, and the calls for the blocks of a scene share them.
 
     Parameters
     ----------
-    range_ : (bin,) float
-        m, ascending.
+    ranges : bytes
+        Of (bin,) float64, m, ascending.
     bounds : (float, float)
         Lowest and highest extinction, m-1.
-    noise_spacing : (profile or 1,) int
-        Bins; beyond it, noise is independent.
     """
+    range_ = np.frombuffer(ranges)
     bins = range_.size
     length = float(range_[-1] - range_[0]) if bins > 1 else 1.0
     x = (range_ - range_[0]) / length
@@ -134,11 +155,11 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integer
     nodes = scale * np.sinh(np.linspace(first, last, NODES))
     nodes[0], nodes[-1] = lowest, highest
     envelope = (range_[0] / (range_[0] + length * x)) ** 2
-    firsts = [*range(BLOCK), *range(BLOCK, x.size, GROUP)]
+    firsts = [*range(BLOCK), *range(BLOCK, x.size, BLOCK)]
     real = (np.arange(x.size) < bins)[:, np.newaxis]
     shapes = np.exp(-2.0 * nodes * x[:, np.newaxis]) * envelope[:, np.newaxis] * real
     widths = np.maximum(np.add.reduceat(1.0 * real, firsts), 1.0)
-    group_shapes = np.add.reduceat(shapes, firsts) / widths
+    block_shapes = np.add.reduceat(shapes, firsts) / widths
     return Grid(
         x=x,
         envelope=envelope,
@@ -148,26 +169,22 @@ def make_grid(range_: Array, bounds: tuple[float, float], noise_spacing: Integer
         spacing=(last - first) / (NODES - 1),
         scale=scale,
         shapes=np.ascontiguousarray([shapes.T, shapes.T**2]),
-        group_shapes=np.ascontiguousarray([group_shapes.T, group_shapes.T**2]),
+        block_shapes=np.ascontiguousarray([block_shapes.T, block_shapes.T**2]),
         start=float(range_[0]),
         length=length,
-        noise_spacing=frozen(noise_spacing),
     )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def make_scratch(g: Grid) -> Scratch:
     """Return the arrays of a profile."""
-    bins = g.x.size
+    n = g.x.size
+    given, w, z, phi = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    residual, energy = np.zeros(n), np.zeros(n)
+    points, explained = np.zeros((2, g.block_shapes.shape[2])), np.zeros(NODES)
     return Scratch(
-        np.zeros(bins),
-        np.zeros(bins),
-        np.zeros(bins),
-        np.zeros(bins),
-        np.zeros(bins),
-        np.zeros((2, g.group_shapes.shape[2])),
-        np.zeros((3, NODES)),
-    )
+        given, w, z, phi, residual, energy, energy.view(np.int64), points, explained
+    )  # fmt: skip
 
 
 @inlined
@@ -176,19 +193,22 @@ def power_of_two(value: float) -> float:
     return math.ldexp(1.0, math.frexp(value)[1])
 
 
+@inlined
+def _first_usable(variance: Array) -> float:
+    for i in range(variance.size):
+        if (variance[i] > 1.0 / HUGE) & (variance[i] < math.inf):
+            return float(variance[i])
+    return 1.0
+
+
 @summing
-def weigh(noise: Array, is_variance: bool, s: Scratch) -> float:  # noqa: FBT001 - compiled
-    """Fill the weights of a row of noise, and return their unit, a power of two."""
-    total = 0.0
-    for i in range(noise.size):
-        weight = 1.0 / noise[i] if is_variance else noise[i]
-        weight = weight if (weight > 0.0) & (weight < HUGE) else 0.0
-        s.given[i] = weight
-        total += weight
-    unit: float = power_of_two(total / noise.size)
-    for i in range(noise.size):
-        s.given[i] *= 1.0 / unit
-    return unit
+def weigh(variance: Array, s: Scratch) -> float:
+    """Fill the weights of a row of variances, and return their unit, a power of two."""
+    scale: float = power_of_two(_first_usable(variance))
+    for i in range(variance.size):
+        usable = (variance[i] > 1.0 / HUGE) & (variance[i] < math.inf)
+        s.given[i] = scale / variance[i] if usable else 0.0
+    return 1.0 / scale
 
 
 @summing
@@ -209,29 +229,42 @@ def load(power: Any, reference: float, s: Scratch) -> tuple[float, float, float]
     return count, total, size
 
 
-@inlined
-def largest_energy(w: Array, values: Array) -> float:
-    """Return the largest weighted square of a profile."""
-    a = b = c = d = 0.0
-    # Four maxima side by side do not wait for each other.
-    for i in range(0, w.size, 4):
-        a = max(a, w[i] * values[i] * values[i])
-        b = max(b, w[i + 1] * values[i + 1] * values[i + 1])
-        c = max(c, w[i + 2] * values[i + 2] * values[i + 2])
-        d = max(d, w[i + 3] * values[i + 3] * values[i + 3])
-    return max(a, b, c, d)
-
-
 @summing
-def rescale(s: Scratch, factor: float) -> tuple[float, float]:
-    """Scale a profile, and return the weighted sums of its values and of their squares."""
-    total = squares = 0.0
+def rescale(factor: float, g: Grid, s: Scratch) -> tuple[float, float, float]:
+    """Scale a profile, and fill the points of the search.
+
+    Returns the weighted sums of x, of the values and of their squares.
+    """
+    place = total = squares = 0.0
     for i in range(s.z.size):
         s.z[i] *= factor
         weighted = s.w[i] * s.z[i]
+        place += s.w[i] * g.x[i]
         total += weighted
         squares += weighted * s.z[i]
-    return total, squares
+    for i in range(BLOCK):
+        s.points[0, i], s.points[1, i] = s.w[i], s.w[i] * s.z[i]
+    for k in range(BLOCK, s.points.shape[1]):
+        first = BLOCK * (k - BLOCK + 1)
+        weight = value = 0.0
+        for i in range(first, first + BLOCK):
+            weight += s.w[i]
+            value += s.w[i] * s.z[i]
+        s.points[0, k], s.points[1, k] = weight, value
+    return place, total, squares
+
+
+@summing
+def largest_energy(values: Array, s: Scratch) -> float:
+    """Return the largest weighted square of an array."""
+    for i in range(values.size):
+        s.energy[i] = s.w[i] * values[i] * values[i]
+    most = np.int64(0)
+    # Floats that are not negative are ordered as their bits, whose maximum vectorises.
+    for i in range(values.size):
+        most = max(most, s.energy_bits[i])
+    s.energy_bits[0] = most
+    return float(s.energy[0])
 
 
 @inlined
@@ -253,24 +286,33 @@ def _fill_shape(tau: float, g: Grid, phi: Array) -> None:
 
 
 @summing
-def _moments(g: Grid, s: Scratch) -> tuple[float, ...]:
-    """Return the weighted sums of phi, phi^2 and phi z, each times 1, x and x^2."""
-    q0 = q1 = q2 = p0 = p1 = p2 = y0 = y1 = y2 = 0.0
+def _sum_shape(g: Grid, s: Scratch) -> ShapeSums:
+    """Return the sums of the shape over all bins."""
+    q0 = q1 = q2 = p0 = p1 = p2 = p3 = p4 = c0 = c1 = c2 = f0 = y0 = y1 = y2 = 0.0
     for i in range(s.phi.size):
         x, phi, z = g.x[i], s.phi[i], s.z[i]
         shape = s.w[i] * phi
-        lever = shape * x
-        bend = lever * x
+        square = shape * phi
+        cube = square * phi
+        xx = x * x
         q0 += shape
-        q1 += lever
-        q2 += bend
-        p0 += shape * phi
-        p1 += lever * phi
-        p2 += bend * phi
-        y0 += shape * z
-        y1 += lever * z
-        y2 += bend * z
-    return q0, q1, q2, p0, p1, p2, y0, y1, y2
+        q1 += shape * x
+        q2 += shape * xx
+        p0 += square
+        p1 += square * x
+        bend = square * xx
+        p2 += bend
+        p3 += bend * x
+        p4 += bend * xx
+        c0 += cube
+        c1 += cube * x
+        c2 += cube * xx
+        f0 += cube * phi
+        pull = shape * z
+        y0 += pull
+        y1 += pull * x
+        y2 += pull * xx
+    return ShapeSums((q0, q1, q2), (p0, p1, p2, p3, p4), (c0, c1, c2), f0, (y0, y1, y2))
 
 
 @inlined
@@ -278,7 +320,10 @@ def evaluate(tau: float, g: Grid, s: Scratch, sums: Sums) -> Point:
     """Return the linear fit at one extinction, from one pass over the bins."""
     w0, free = sums.weight, sums.free
     _fill_shape(tau, g, s.phi)
-    q0, q1, q2, p0, p1, p2, y0, y1, y2 = _moments(g, s)
+    of_shape = _sum_shape(g, s)
+    q0, q1, _ = of_shape.phi
+    p0, p1, p2, _, _ = of_shape.square
+    y0, y1, y2 = of_shape.value
     mean_phi, mean_z = q0 / w0, free * sums.value / w0
     norm = p0 - free * q0 * mean_phi
     centroid = (p1 - free * mean_phi * q1) / norm
@@ -288,49 +333,22 @@ def evaluate(tau: float, g: Grid, s: Scratch, sums: Sums) -> Point:
     # Residuals have no product with level and shape.
     level = mean_z - free * b * mean_phi
     first = y1 - level * q1 - b * p1
-    second = y2 - level * q2 - b * p2
+    second = y2 - level * of_shape.phi[2] - b * p2
     rt, rh = -2.0 * first, 4.0 * (second - 2.0 * centroid * first)
     tt = 4.0 * (p2 - centroid * (2.0 * p1 - centroid * p0)) - free * w0 * mean_slope * mean_slope
     energy = sums.square - mean_z * sums.value - b * along
     gauss = b * b * tt
     curvature = gauss - rt * rt / norm - b * rh
     return Point(
-        tau, level, b, mean_phi, mean_slope, centroid, norm, tt, b * rt, gauss, curvature, energy
-    )
+        tau, level, b, mean_phi, mean_slope, centroid, norm, tt,
+        b * rt, gauss, curvature, energy, of_shape,
+    )  # fmt: skip
 
 
 @inlined
 def at(p: Point, level: float, b: float) -> Point:
     """Return a point with another background and amplitude."""
     return Point(
-        p.tau,
-        level,
-        b,
-        p.mean_phi,
-        p.mean_slope,
-        p.centroid,
-        p.norm,
-        p.slope_norm,
-        p.gradient,
-        p.gauss,
-        p.curvature,
-        p.energy,
-    )
-
-
-@summing
-def mean_place(x: Array, w: Array, weight: float) -> float:
-    """Return the weighted mean of x."""
-    total = 0.0
-    for i in range(x.size):
-        total += w[i] * x[i]
-    return total / weight
-
-
-@summing
-def total_of(values: Array) -> float:
-    """Return the sum of an array."""
-    total = 0.0
-    for i in range(values.size):
-        total += values[i]
-    return total
+        p.tau, level, b, p.mean_phi, p.mean_slope, p.centroid, p.norm, p.slope_norm,
+        p.gradient, p.gauss, p.curvature, p.energy, p.sums_of_shape,
+    )  # fmt: skip

@@ -195,7 +195,7 @@ def fit_homogeneous_path(
     problem = PathProblem(
         power=rows,
         range=grid,
-        noise=_variances_or_weights(variance, grid, leading, relative=noise.relative),
+        noise=inputs.noise_rows(variance, "variance", grid, leading, negative=False),
         known_variance=known_variance,
         bounds=(
             THRESHOLDS.lowest_extinction / float(grid[-1]),
@@ -209,17 +209,6 @@ def fit_homogeneous_path(
         lag=lag,
     )
     return inputs.with_leading_axes(_SOLVERS[chosen_method](problem), leading)
-
-
-def _variances_or_weights(
-    variance: npt.ArrayLike | None, grid: Array, leading: tuple[int, ...], *, relative: bool
-) -> Array:
-    """Return variances, or weights of relative ones, as (profile or 1, bin); ones for None."""
-    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
-    if not relative:
-        return noise
-    with np.errstate(divide="ignore"):
-        return 1.0 / noise
 
 
 def _noise_of_profiles(
