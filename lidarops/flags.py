@@ -13,7 +13,7 @@ Readers of files go by the ``flag_masks`` and ``flag_meanings`` of the file
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, IntFlag
 from typing import Final, NamedTuple, Self
 
@@ -246,6 +246,10 @@ class Flags:
     def __iter__(self) -> Iterator[FlagBit]:
         """Iterate over the bits, rising."""
         return iter(self.bits)
+
+    def only(self, bits: Iterable[FlagBit]) -> Flags:
+        """Return the flags with some of the bits, at the same places."""
+        return replace(self, bits=tuple(sorted(bits)))
 
     def raised(self, value: int) -> tuple[FlagBit, ...]:
         """Return the bits that a value carries; bits that the kind does not have are left out."""

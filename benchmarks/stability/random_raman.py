@@ -12,7 +12,7 @@ from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.flags import RamanQuality, concerning
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
 from lidarops.retrieve.raman.signals import (
@@ -173,16 +173,28 @@ def _scored(
     low = np.maximum(cells.range - 0.5 * length, 0.0)
     high = np.minimum(cells.range + 0.5 * length, edges[-1])
     extinction = (np.interp(high, edges, whole) - np.interp(low, edges, whole)) / (high - low)
-    for quantity, error, stated in (
-        ("extinction", result.extinction - extinction, result.extinction_standard_error),
-        ("backscatter", result.backscatter - backscatter, result.backscatter_standard_error),
+    none = np.zeros_like(result.quality)
+    for quantity, name, error, stated in (
+        (
+            "extinction",
+            "aerosol_extinction",
+            result.extinction - extinction,
+            result.extinction_standard_error,
+        ),
+        (
+            "backscatter",
+            "aerosol_backscatter",
+            result.backscatter - backscatter,
+            result.backscatter_standard_error,
+        ),
         (
             "lidar ratio",
+            "lidar_ratio",
             result.lidar_ratio - sky.lidar_ratio,
             result.lidar_ratio_standard_error,
         ),
     ):
         yield ScoredValues(
             failure, quantity, error[:, inside], stated[:, inside], 0.0,
-            np.asarray(result.quality)[:, inside], RamanQuality,
+            concerning(name, result.quality, none)[:, inside], RamanQuality,
         )  # fmt: skip

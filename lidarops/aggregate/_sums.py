@@ -10,11 +10,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.aggregate.means_variables import Weights, averaged, budget_of, systematic
+from lidarops.aggregate.means_variables import (
+    Weights,
+    averaged,
+    budget_of,
+    share_names,
+    systematic,
+)
 from lidarops.flags import Quality
 from lidarops.netcdf.quantities import CLOUD_FRACTION, CLOUD_MASK
-from lidarops.netcdf.stored_flags import with_current_flags
-from lidarops.netcdf.variables import QUALITY_FLAG, Layout, Row, whole_error
+from lidarops.netcdf.stored_flags import flags_names, with_current_flags
+from lidarops.netcdf.variables import QUALITY_FLAG, Layout, Row, judging, whole_error
 
 _ALL_BITS: Final = np.int32(-1)
 _WEIGHED: Final = np.int32(Quality.LOW_SIGNAL_TO_NOISE)
@@ -154,10 +160,8 @@ class Profiles:
     """What means need of the profiles of one product, in memory."""
 
     samples: Mapping[str, Sample]
-    flags: NDArray[np.int32]
-    """Bits at the places of now, whatever their places in the file."""
-    usable: NDArray[np.bool_]
-    """Whether no quality bit rejects a value."""
+    flags: Mapping[str, NDArray[np.int32]]
+    """Variable of flags -> bits at the places of now, whatever their places in the file."""
     shots: Array
     clouds: Sample | None
     """Share of cloudy profiles of each value. None for kinds that seek no clouds."""
@@ -178,18 +182,18 @@ def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
     ProductError
         If it carries a quality bit that its kind does not have.
     """
-    flags = with_current_flags(product)[QUALITY_FLAG].values
-    usable = (flags & np.int32(layout.flags.rejecting)) == 0
+    current = with_current_flags(product)
+    flags = {name: current[name].values for name in flags_names(current)}
+    usable = {name: (bits & np.int32(layout.flags.rejecting)) == 0 for name, bits in flags.items()}
     return Profiles(
         {
-            row.name: _sample(product, row, usable)
+            row.name: _sample(product, row, usable[judging(row.name, flags)])
             for row in averaged(layout)
             if row.name in product
         },
         flags,
-        usable,
         product["shots"].values.astype(np.float64),
-        _clouds(product, layout, usable),
+        _clouds(product, layout, usable[QUALITY_FLAG]),
     )
 
 
@@ -209,7 +213,7 @@ def _clouds(product: xr.Dataset, layout: Layout, usable: NDArray[np.bool_]) -> S
 def _sample(product: xr.Dataset, row: Row, usable: NDArray[np.bool_]) -> Sample:
     values = _numbers(product, row.name)
     errors = _numbers(product, f"{row.name}_standard_error")
-    has_flags = row.dims == product[QUALITY_FLAG].dims
+    has_flags = row.dims == product[judging(row.name, flags_names(product))].dims
     return Sample(
         values,
         errors,
@@ -261,6 +265,42 @@ def _numbers(product: xr.Dataset, name: str) -> Array:
 
 
 @dataclass(slots=True)
+class FlagSums:
+    """Bits of the values of one period, with the shape of flags without time."""
+
+    usable: Any = 0
+    """Number of usable profiles."""
+    good: Any = 0
+    """Number of profiles whose value has no bit."""
+    all: Any = 0
+    """Bits of all values."""
+    kept: Any = 0
+    """Bits of the usable values."""
+    common: Any = _ALL_BITS
+    """Bits that all usable values have."""
+
+    def add(self, flags: NDArray[np.int32], rejecting: int) -> None:
+        """Add the flags of some profiles, of which some bits reject a value."""
+        usable = (flags & np.int32(rejecting)) == 0
+        self.usable = self.usable + usable.sum(axis=0)
+        self.good = self.good + (flags == 0).sum(axis=0)
+        self.all = self.all | np.bitwise_or.reduce(flags, axis=0)
+        # That of the mean, not of its members: see `PeriodSums.record`.
+        kept = np.where(usable, flags & ~_WEIGHED, np.int32(0))
+        self.kept = self.kept | np.bitwise_or.reduce(kept, axis=0)
+        common = np.bitwise_and.reduce(np.where(usable, flags, _ALL_BITS), axis=0)
+        self.common = self.common & common
+
+    def of_mean(self, cloud: int, partly: int) -> Any:
+        """Return the bits of a mean, of which some values or all in it are those of clouds."""
+        cloudy = ((self.kept & np.int32(cloud | partly)) != 0) & (
+            (self.common & np.int32(cloud)) == 0
+        )
+        kept = np.where(cloudy, self.kept & ~np.int32(cloud) | np.int32(partly), self.kept)
+        return np.where(self.usable > 0, kept, self.all)
+
+
+@dataclass(slots=True)
 class PeriodSums:
     """Sums of all quantities over one period."""
 
@@ -268,37 +308,21 @@ class PeriodSums:
     """Of the kind of product."""
     weights: Weights
     quantities: dict[str, Sums] = field(default_factory=dict)
+    flags: dict[str, FlagSums] = field(default_factory=dict)
     profiles: int = 0
-    usable: Any = 0
-    """Number of usable profiles, with the shape of the flags without time."""
-    good: Any = 0
-    """Number of profiles whose value has no bit."""
-    flags: Any = 0
-    """Bits of all values."""
-    usable_flags: Any = 0
-    """Bits of the usable values."""
-    common_flags: Any = _ALL_BITS
-    """Bits that all usable values have."""
     shots: float = 0.0
     clouds: Sums | None = None
 
     def add(self, profiles: Profiles, chosen: NDArray[np.intp]) -> None:
         """Add some of the profiles of a product."""
-        flags, usable = profiles.flags[chosen], profiles.usable[chosen]
         shots = profiles.shots[chosen]
         for name, sample in profiles.samples.items():
             part = sample.take(chosen)
             sums = self.quantities.setdefault(name, Sums())
             sums.add(part, _weights(self.weights, part, shots))
         self.profiles += chosen.size
-        self.usable = self.usable + usable.sum(axis=0)
-        self.good = self.good + (flags == 0).sum(axis=0)
-        self.flags = self.flags | np.bitwise_or.reduce(flags, axis=0)
-        # Of the mean, not of its members: see `record`.
-        kept = np.where(usable, flags & ~_WEIGHED, np.int32(0))
-        self.usable_flags = self.usable_flags | np.bitwise_or.reduce(kept, axis=0)
-        common = np.bitwise_and.reduce(np.where(usable, flags, _ALL_BITS), axis=0)
-        self.common_flags = self.common_flags & common
+        for name, flags in profiles.flags.items():
+            self.flags.setdefault(name, FlagSums()).add(flags[chosen], self.layout.flags.rejecting)
         self.shots += float(shots.sum())
         if profiles.clouds is not None:
             clouds = profiles.clouds.take(chosen)
@@ -309,35 +333,28 @@ class PeriodSums:
 
     def record(self) -> dict[str, NDArray[Any]]:
         """Return the variables of the period, without dimension time."""
-        variables: dict[str, NDArray[Any]] = {
-            "usable_share": self.usable / np.float64(self.profiles),
-            "good_share": self.good / np.float64(self.profiles),
-            "shots": np.asarray(self.shots),
-        }
-        usable_flags = self.usable_flags
+        variables: dict[str, NDArray[Any]] = {"shots": np.asarray(self.shots)}
+        cloud, partly = 0, 0
         if self.clouds is not None:
             variables[CLOUD_FRACTION] = self.clouds.mean(CLOUD_FRACTION)[CLOUD_FRACTION]
-            usable_flags = self._cloudy_flags()
-        flags = np.where(self.usable > 0, usable_flags, self.flags)
+            named = (self.layout.flags.named(word) for word in ("cloud", "partly_cloudy"))
+            cloud, partly = (int(bit or 0) for bit in named)
+        flags = {name: bits.of_mean(cloud, partly) for name, bits in self.flags.items()}
+        for name, bits in self.flags.items():
+            usable_share, good_share = share_names(name)
+            variables[usable_share] = bits.usable / np.float64(self.profiles)
+            variables[good_share] = bits.good / np.float64(self.profiles)
         for name, sums in self.quantities.items():
             variables |= sums.mean(name)
-            mean = variables[name]
+            mean, judge = variables[name], judging(name, flags)
             if name in self.layout.weighed:
                 error = whole_error(variables, name)
-                flags = flags | np.where(np.abs(mean) < error, _WEIGHED, np.int32(0))
-            if mean.shape == flags.shape:
+                flags[judge] = flags[judge] | np.where(np.abs(mean) < error, _WEIGHED, np.int32(0))
+            if mean.shape == flags[judge].shape:
                 # Usable values without an error for weighting give no mean: flag it as missing.
-                unflagged = ~np.isfinite(mean) & (flags == 0)
-                flags = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags)
-        return {**variables, QUALITY_FLAG: flags}
-
-    def _cloudy_flags(self) -> Any:
-        """Return the bits of a mean, of which some values or all in it are those of clouds."""
-        flags = self.usable_flags
-        bits = (self.layout.flags.named(word) for word in ("cloud", "partly_cloudy"))
-        cloud, partly = (np.int32(bit or 0) for bit in bits)
-        some = ((flags & (cloud | partly)) != 0) & ((self.common_flags & cloud) == 0)
-        return np.where(some, flags & ~cloud | partly, flags)
+                unflagged = ~np.isfinite(mean) & (flags[judge] == 0)
+                flags[judge] = np.where(unflagged, np.int32(Quality.INPUT_MISSING), flags[judge])
+        return variables | flags
 
 
 def _weights(weights: Weights, sample: Sample, shots: Array) -> Array:

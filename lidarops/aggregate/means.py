@@ -275,17 +275,22 @@ def _data(
 ) -> Iterator[tuple[str, xr.Variable]]:
     """Yield the variables of means, from their values in each period."""
     records = year.records
-    flags = np.stack([record[rows.QUALITY_FLAG] for record in records]).astype(np.int32)
+    flags = {
+        row.name: np.stack([record[row.name] for record in records]).astype(np.int32)
+        for row in table.judges
+        if row.name in records[0]
+    }
+    summaries = {rows.summary_of(name): bits for name, bits in flags.items()}
     # An optional variable may be in no product.
-    present = [row for row in table.variables if row.name in (rows.USABLE, *records[0])]
+    present = [row for row in table.variables if row.name in {*summaries, *records[0]}]
     names = {row.name for row in present}
     located = {row.name: frame[row.name] for row in table.coordinates if row.name in frame}
     for row in present:
         values: NDArray[Any]
-        if row.name == rows.USABLE:
-            values = rows.summarize_flags(flags, table.flags)
-        elif row.name == rows.QUALITY_FLAG:
-            values = flags
+        if row.name in summaries:
+            values = rows.summarize_flags(summaries[row.name], table.flags)
+        elif row.name in flags:
+            values = flags[row.name]
         else:
             values = as_stored(row, np.stack([record[row.name] for record in records]))
         known = replace(row, ancillaries=tuple(name for name in row.ancillaries if name in names))

@@ -21,6 +21,7 @@ from lidarops.netcdf.variables import (
     Row,
     completed,
     count,
+    judging,
     layout_of,
 )
 
@@ -154,11 +155,12 @@ _CLOUD_COMMENT: Final = (
 
 
 def _rows(source: Layout, weights: Weights) -> Iterator[Row]:
-    flags = source.row(QUALITY_FLAG)
-    shares = tuple(_shares(source, flags))
-    of_values = (*(row.name for row in shares), flags.name)
+    judges = {row.name: row for row in source.judges}
+    cloudy = (CLOUD_FRACTION,) if source.holds(CLOUD_FRACTION) else ()
     for row in averaged(source):
         names = systematic(row)
+        flags = judges[judging(row.name, judges)]
+        of_values = *share_names(flags.name), *cloudy, QUALITY_FLAG
         ancillaries = (*names, *of_values) if row.dims == flags.dims else names
         yield from _mean_rows(row, weights, ancillaries)
         for name in names:
@@ -169,21 +171,37 @@ def _rows(source: Layout, weights: Weights) -> Iterator[Row]:
                 comment=f"{error.comment} Averaged with the weights of {row.name}: it does not"
                 " decrease with the number of profiles.",
             )
-    yield from shares
-    clouds = _CLOUD_COMMENT if source.holds(CLOUD_FRACTION) else ""
-    yield replace(flags, comment=_FLAG_COMMENT + clouds)
+    for flags in source.judges:
+        yield from _shares(flags)
+        yield replace(flags, comment=_FLAG_COMMENT + (_CLOUD_COMMENT if cloudy else ""))
+    for name in cloudy:
+        fraction = source.row(name)
+        yield _averaged(
+            fraction,
+            fraction,
+            comment="Of the profiles whose value no bit of quality_flag rejects, weighted by shots"
+            " where the weights of values are their variances, else as values. One of which only"
+            " the mean shows a cloud is cloudy. Missing where no such profile was examined.",
+        )
     shots = source.row("shots")
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 
-def _shares(source: Layout, flags: Row) -> Iterator[Row]:
+def share_names(flags: str) -> tuple[str, str]:
+    """Return the names of the shares of usable and of good values, by a variable of flags."""
+    whose = flags.removesuffix(QUALITY_FLAG)
+    return f"{whose}usable_share", f"{whose}good_share"
+
+
+def _shares(flags: Row) -> Iterator[Row]:
     """Yield the rows that tell of which profiles a mean is made."""
+    usable, good = share_names(flags.name)
     for name, words, comment in (
-        ("usable_share", "no quality bit rejects", None),
+        (usable, f"no bit of {flags.name} rejects", None),
         (
-            "good_share",
-            "has no quality bit",
-            "The others of usable_share are to be used with care.",
+            good,
+            f"has no bit in {flags.name}",
+            f"The others of {usable} are to be used with care.",
         ),
     ):
         yield Row(
@@ -194,15 +212,7 @@ def _shares(source: Layout, flags: Row) -> Iterator[Row]:
             coverage=Coverage.QUALITY,
             valid_min=0.0,
             valid_max=1.0,
-        )
-    if source.holds(CLOUD_FRACTION):
-        fraction = source.row(CLOUD_FRACTION)
-        yield _averaged(
-            fraction,
-            fraction,
-            comment="Of the profiles whose value no quality bit rejects, weighted by shots where"
-            " the weights of values are their variances, else as values. One of which only the"
-            " mean shows a cloud is cloudy. Missing where no such profile was examined.",
+            optional=flags.optional,
         )
 
 

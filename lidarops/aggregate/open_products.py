@@ -25,7 +25,7 @@ from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
 from lidarops.aggregate.selection import ProductSelection, parse_selection
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
-from lidarops.netcdf.variables import USABLE
+from lidarops.netcdf.variables import judging, summary_of
 
 CARE: Final = 1
 ALL: Final = 2
@@ -59,8 +59,8 @@ def open_products(
         Only products that end after, or start before, this time; UTC without a time
         zone. Products are opened whole.
     usable : int
-        Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN.
-        ``quality_flag`` and ``usable`` are not masked.
+        Worst values to keep: 0 good, 1 also those to use with care, 2 all. Others are NaN. Each
+        quantity is masked by the flags that judge it; flags and ``usable`` are not masked.
     on_altitude : bool
         Whether the dimension ``range`` becomes ``altitude``, m above the geoid, so that values can
         be selected by it. Beams must go up and not move, as those of vertical lidars.
@@ -179,7 +179,7 @@ def _usable_values(data: xr.Dataset, worst: int, *, on_altitude: bool) -> xr.Dat
 
 
 def _masked(data: xr.Dataset, worst: int) -> xr.Dataset:
-    """Return data without the floating-point values whose ``usable`` is worse than `worst`."""
+    """Return data without the floating-point values that their flags call worse than `worst`."""
     if worst not in (0, CARE, ALL):
         raise RetrievalInputError(
             f"is {worst!r}",
@@ -188,11 +188,10 @@ def _masked(data: xr.Dataset, worst: int) -> xr.Dataset:
         )
     if worst == ALL:
         return data
-    quality = data[USABLE]
-    kept = quality <= worst
-    masked_values = {
-        name: variable.where(kept)
-        for name, variable in data.data_vars.items()
-        if variable.dtype.kind == "f" and variable.dims == quality.dims
-    }
+    names = [str(name) for name in data.data_vars]
+    masked_values = {}
+    for name in names:
+        variable, quality = data[name], data[summary_of(judging(name, names))]
+        if variable.dtype.kind == "f" and variable.dims == quality.dims:
+            masked_values[name] = variable.where(quality <= worst)
     return data.assign(masked_values)

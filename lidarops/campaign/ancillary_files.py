@@ -329,6 +329,8 @@ def _measured_lidar_ratio(raw: Table, name: str) -> LidarRatio:
     extinction, backscatter = raw["aerosol_extinction"][1], _as_resolved(raw)
     cloudy = (raw["quality_flag"][1].astype(np.int32) & np.int32(_CLOUDS)) != 0
     known = np.isfinite(extinction * backscatter) & (raw["usable"][1] < _REJECTED) & ~cloudy
+    # Former products have flags of all quantities together.
+    known &= raw.get("aerosol_backscatter_usable", raw["usable"])[1] < _REJECTED
     total = raw["aerosol_backscatter"][1] + raw["molecular_backscatter"][1]
     weight = _profile_weights(raw, np.where(known, total, np.nan))[:, np.newaxis] * known
     weight /= np.where(known.any(axis=0), weight.sum(axis=0), 1.0)

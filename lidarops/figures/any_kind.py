@@ -14,7 +14,7 @@ from lidarops.figures.panels import Figure, units
 from lidarops.figures.series_data import SeriesEstimate, TimeSeries, join
 from lidarops.figures.series_panels import SERIES, Quantity, series_figures
 from lidarops.kinds import kinds
-from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
+from lidarops.netcdf.stored_flags import judge
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE, layout_of
 
 _BULK: Final = 64_000_000
@@ -47,7 +47,9 @@ def view_of(kind: str, name: str | None = None) -> View[Content]:
     data = layout_of(kind).data if kind in kinds() and not name else ()
     uncertain = [row.name for row in data if row.uncertain]
     names = [name] if name else dict.fromkeys([*uncertain, *preferred_variables()])
-    variables = "time", QUALITY_FLAG, USABLE, *names, *(f"{name}_standard_error" for name in names)
+    errors = (f"{name}_standard_error" for name in names)
+    own = (f"{name}_{end}" for name in names for end in (QUALITY_FLAG, USABLE))
+    variables = "time", QUALITY_FLAG, USABLE, *names, *errors, *own
     return View(kind, variables, partial(_read, name), _draw)
 
 
@@ -77,10 +79,8 @@ def _read(name: str | None, product: xr.Dataset, _: ProductSource) -> Content | 
         table(which).values.reshape(shape).astype(np.float64)
         for which in (name, f"{name}_standard_error")
     )
-    flags, rejecting = np.zeros(values.shape, dtype=np.int64), 0
-    if QUALITY_FLAG in some and some[QUALITY_FLAG].dims == variable.dims:
-        flags = quality_bits(some[QUALITY_FLAG]).reshape(shape)
-        rejecting = rejecting_mask(bits_of(some))
+    judged = judge(some, name)
+    flags = judged.bits.reshape(shape)
     unit = str(variable.attrs.get("units", ""))
     unknown = np.full(len(values), np.nan)
     most_values = np.argsort(-np.isfinite(values).sum(axis=0), kind="stable")[:SERIES]
@@ -88,7 +88,7 @@ def _read(name: str | None, product: xr.Dataset, _: ProductSource) -> Content | 
         TimeSeries(
             time=some["time"].values.astype("datetime64[ns]"),
             flag=flags[:, k],
-            rejecting=rejecting,
+            rejecting=judged.rejecting,
             estimates={name: SeriesEstimate(values[:, k], errors[:, k], unknown, unit)},
             label=f"{variable.dims[1]} {k}" if variable.ndim > 1 else "",
             key=(k,),

@@ -26,7 +26,8 @@ from lidarops.figures.panels import (
 )
 from lidarops.figures.series_data import require
 from lidarops.figures.wording import counted, utc
-from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
+from lidarops.netcdf.stored_flags import flags_names, judge
+from lidarops.netcdf.variables import QUALITY_FLAG, judging
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -75,8 +76,9 @@ def profile_view(name: str, quantities: Sequence[ProfileQuantity], along: str) -
     """Return the view of the clearest profile of a product; the first quantity is the main one."""
     dims = _dims(quantities, along)
     more = tuple(f"{one.name}_{part}" for one in quantities for part in one.more_errors)
-    read = partial(_read, quantities[0], along, dims, more)
-    return View(name, (*dims, *more), read, partial(_draw, quantities, along), first=True)
+    flags = QUALITY_FLAG, *(f"{one.name}_{QUALITY_FLAG}" for one in quantities)
+    read = partial(_read, quantities, along, dims, more)
+    return View(name, (*dims, *more, *flags), read, partial(_draw, quantities, along), first=True)
 
 
 def _dims(quantities: Sequence[ProfileQuantity], along: str) -> dict[str, tuple[str, ...]]:
@@ -86,11 +88,11 @@ def _dims(quantities: Sequence[ProfileQuantity], along: str) -> dict[str, tuple[
     dims: dict[str, tuple[str, ...]] = {"time": ("time",), along: (along,)}
     dims |= dict.fromkeys(beside, (along,))
     dims |= dict.fromkeys((end for one in quantities for end in one.window), ("time",))
-    return dims | dict.fromkeys([*both, "quality_flag"], ("time", along))
+    return dims | dict.fromkeys(both, ("time", along))
 
 
 def _read(
-    main: ProfileQuantity,
+    quantities: Sequence[ProfileQuantity],
     along: str,
     dims: dict[str, tuple[str, ...]],
     more: tuple[str, ...],
@@ -99,14 +101,16 @@ def _read(
 ) -> xr.Dataset | None:
     """Return the profile with the most unflagged values, up to the last usable one.
 
-    If it depends on a window, only values to just beyond that count and are shown. Among equals,
-    that with the most usable values, then the first; None without any usable value.
-    `rejected` and `with_care` of it are the verdicts of its values.
+    Values of the main quantity, the first. If it depends on a window, only values to just beyond
+    that count and are shown. Among equals, that with the most usable values, then the first; None
+    without any usable value. ``<name>_rejected`` and ``<name>_with_care`` of it are the verdicts
+    of the values of a quantity.
     """
-    require(product, dims)
-    flag = quality_bits(product["quality_flag"])
-    rejected = (flag & rejecting_mask(bits_of(product))) != 0
-    usable = np.isfinite(product[main.name].values) & ~rejected
+    main = quantities[0]
+    flags = judging(main.name, flags_names(product))
+    require(product, dims | {flags: ("time", along)})
+    judged = {one.name: judge(product, one.name) for one in quantities}
+    usable = np.isfinite(product[main.name].values) & ~judged[main.name].rejected
     if main.window:
         far = _BEYOND * product[main.window[-1]].values[:, None]
         # All are shown where there is no window: it is NaN.
@@ -114,18 +118,16 @@ def _read(
     if not usable.any():
         return None
     earlier = -np.arange(len(usable))
-    clear = (usable & (flag == 0)).sum(axis=1)
+    clear = (usable & (judged[main.name].bits == 0)).sum(axis=1)
     index = int(np.lexsort((earlier, usable.sum(axis=1), clear))[-1])
     shown = slice(0, max(int(np.flatnonzero(usable[index])[-1]) + 1, 2))
     profile = product[[name for name in (*dims, *more) if name in product.variables]]
-    return (
-        profile.isel({"time": index, along: shown})
-        .load()
-        .assign(
-            rejected=(along, rejected[index, shown]),
-            with_care=(along, (flag[index, shown] != 0) & ~rejected[index, shown]),
-        )
-    )
+    verdicts = {
+        f"{name}_{verdict}": (along, getattr(one, verdict)[index, shown])
+        for name, one in judged.items()
+        for verdict in ("rejected", "with_care")
+    }
+    return profile.isel({"time": index, along: shown}).load().assign(verdicts)
 
 
 def _draw(
@@ -141,8 +143,9 @@ def _draw(
             if quantity.budget:
                 panels.append(_budget(profile, quantity, place, y))
     main = quantities[0]
-    usable = main.factor * profile[main.name].where(~profile["rejected"]).values
-    flagged = int((profile["rejected"] | profile["with_care"]).sum())
+    rejected = profile[f"{main.name}_rejected"]
+    usable = main.factor * profile[main.name].where(~rejected).values
+    flagged = int((rejected | profile[f"{main.name}_with_care"]).sum())
     title = f"{main.label[:1].upper()}{main.label[1:]}"
     words = (
         f"{title}: {span_in_words(usable, '')}; {flagged} of {place.size} values flagged;"
@@ -158,7 +161,7 @@ def _panel(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axi
         return quantity.factor * np.asarray(profile[name].values, dtype=np.float64)
 
     name, thin = quantity.name, _thin(place)
-    rejected, care = profile["rejected"].values, profile["with_care"].values
+    rejected, care = (profile[f"{name}_{verdict}"].values for verdict in ("rejected", "with_care"))
     whole = values(name)
     value = np.where(rejected, np.nan, whole)
     more = [part for part in quantity.more_errors if f"{name}_{part}" in profile]
@@ -219,12 +222,12 @@ def _clear(value: Floats, error: Floats) -> Mask:
 
 def _budget(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axis) -> Panel:
     """Return the absolute errors of a quantity by cause."""
-    good, thin = ~profile["rejected"].values, _thin(place)
+    name, thin = quantity.name, _thin(place)
+    good = ~profile[f"{name}_rejected"].values
 
-    def errors(name: str) -> Floats:
-        return np.where(good, quantity.factor * np.abs(profile[name].values), np.nan)
+    def errors(of: str) -> Floats:
+        return np.where(good, quantity.factor * np.abs(profile[of].values), np.nan)
 
-    name = quantity.name
     causes = {part.replace("_", " "): errors(f"{name}_error_{part}") for part in quantity.budget}
     total = errors(f"{name}_standard_error")
     lines = [

@@ -24,11 +24,21 @@ from lidarops.figures.time_axis import (
     profile_bounds,
 )
 from lidarops.flags import Quality
-from lidarops.netcdf.stored_flags import StoredBit, bits_of, quality_bits, rejecting_mask
+from lidarops.netcdf.stored_flags import (
+    StoredBit,
+    bits_of,
+    flags_names,
+    quality_bits,
+    rejecting_mask,
+)
+from lidarops.netcdf.variables import QUALITY_FLAG, judging
 
 Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
 """Computed in double and kept in single precision, enough for an image."""
+
+Names = tuple[str, str, str]
+"""Variables of a quantity, of its standard error and of its flags."""
 
 COLUMNS: Final = 240
 """Most columns of an image, but for those that gaps in time add."""
@@ -137,11 +147,13 @@ class Raster:
 
 def raster_variables(quantity: str, along: str = "range") -> tuple[str, ...]:
     """Return the variables that `read_raster` reads, including optional ones."""
-    return "time", along, *_along_both(quantity), TIME_BOUNDS, "cloud_base_range", "altitude"
+    flags = QUALITY_FLAG, f"{quantity}_{QUALITY_FLAG}"
+    where = "cloud_base_range", "altitude"
+    return "time", along, *_along_both(quantity), *flags, TIME_BOUNDS, *where
 
 
 def _along_both(quantity: str) -> tuple[str, ...]:
-    return quantity, f"{quantity}_standard_error", "quality_flag"
+    return quantity, f"{quantity}_standard_error"
 
 
 def read_raster(
@@ -172,7 +184,8 @@ def read_raster(
         If a variable is missing or has other dimensions, or the product is empty.
     """
     dims: dict[str, tuple[str, ...]] = {"time": ("time",), along: (along,)}
-    require(product, dims | dict.fromkeys(_along_both(quantity), ("time", along)))
+    judge = judging(quantity, flags_names(product))
+    require(product, dims | dict.fromkeys((*_along_both(quantity), judge), ("time", along)))
     if product.sizes["time"] < 1 or product.sizes[along] < 2:
         raise ProductError("holds no profile of at least 2 bins", field=quantity)
     time = product["time"].values
@@ -182,10 +195,11 @@ def read_raster(
     starts, stops = profile_bounds(product)
     columns = column_starts(starts, stops, profiles or -(-starts.size // COLUMNS))
     rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
-    known = bits_of(product)
+    known = bits_of(product, judge)
     missing = sum(bit.mask for bit in known if bit.word == Quality.INPUT_MISSING.word)
     masks = rejecting_mask(known), missing
-    sums, carried = zip(*_reduced(product, quantity, masks, columns, rows), strict=True)
+    names = quantity, f"{quantity}_standard_error", judge
+    sums, carried = zip(*_reduced(product[[*names]], names, masks, columns, rows), strict=True)
     union = int(np.bitwise_or.reduce(carried))
     start, stop = column_edges(starts, stops, columns)
     return Raster(
@@ -204,26 +218,25 @@ def read_raster(
 
 
 def _reduced(
-    product: xr.Dataset, quantity: str, masks: tuple[int, int], columns: Indices, rows: Indices
+    product: xr.Dataset, names: Names, masks: tuple[int, int], columns: Indices, rows: Indices
 ) -> Iterator[tuple[Sums, int]]:
     """Yield sums over blocks of columns, and the union of their bits."""
-    read = product[[*_along_both(quantity)]]
     edges = [*columns, product.sizes["time"]]
-    first, most = 0, _READ_BYTES // (8 * product[quantity].shape[1])
+    first, most = 0, _READ_BYTES // (8 * product[names[0]].shape[1])
     while first < columns.size:
         last = first + 1
         while last < columns.size and edges[last + 1] - edges[first] <= most:
             last += 1
-        block = read.isel(time=slice(int(edges[first]), int(edges[last])))
-        yield _sums(block, quantity, masks, columns[first:last] - edges[first], rows)
+        block = product.isel(time=slice(int(edges[first]), int(edges[last])))
+        yield _sums(block, names, masks, columns[first:last] - edges[first], rows)
         first = last
 
 
 def _sums(
-    product: xr.Dataset, quantity: str, masks: tuple[int, int], columns: Indices, rows: Indices
+    product: xr.Dataset, names: Names, masks: tuple[int, int], columns: Indices, rows: Indices
 ) -> tuple[Sums, int]:
-    signal, error = (product[name].values.astype(np.float64) for name in _along_both(quantity)[:2])
-    flag = quality_bits(product["quality_flag"])
+    signal, error = (product[name].values.astype(np.float64) for name in names[:2])
+    flag = quality_bits(product[names[2]])
     rejected, missing = ((flag & mask) != 0 for mask in masks)
     good = np.isfinite(signal) & ~rejected & ~missing
     known = np.where(good, signal, 0.0), np.where(good, error, 0.0) ** 2

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import Severity
 from lidarops.netcdf.read import opened_product, read_provenance
-from lidarops.netcdf.variables import PROVENANCE, USABLE
+from lidarops.netcdf.stored_flags import flags_names
+from lidarops.netcdf.variables import PROVENANCE, judging, summary_of
 from lidarops.records import Change, Grade, Measure, Plan
 
 MINOR: Final = 0.1
@@ -170,6 +171,7 @@ def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
         yield _Difference(name, size, lost=size)
     quantities = dict(_quantities(old))
     places = _places(old) | _places(new)
+    summaries = {summary_of(flags) for flags in flags_names(old)}
     for name in names:
         if name not in new.variables:
             continue
@@ -179,15 +181,16 @@ def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
             yield _Difference(name, size, lost=size)
             continue
         count = sum(int(_differs(before, after, part).sum()) for part in _parts(before))
-        good = int((before.to_numpy() == 0).sum()) if name == USABLE else 0
+        is_summary = name in summaries
+        good = int((before.to_numpy() == 0).sum()) if is_summary else 0
         allowed = max(MOST_STATES * (good or before.size), 1)
         many = f"other states of {name}" if count > allowed else ""
         if any(before.attrs.get(key) != after.attrs.get(key) for key in _MEANING):
             yield _Difference(name, before.size, moved=f"another meaning of {name}")
         elif name in places:
             yield _Difference(name, count, moved=f"another {name}" if count else "")
-        elif name == USABLE:
-            # What it changes is counted as lost values, or as flags of quality_flag.
+        elif is_summary:
+            # What it changes is counted as lost values, or as other flags.
             yield _Difference(name, count, moved=many)
         elif "flag_meanings" in before.attrs:
             of_states = "flag_masks" not in before.attrs
@@ -263,7 +266,7 @@ def _stated(product: xr.Dataset, name: str, part: Any) -> NDArray[np.bool_]:
     """Return which values of a part are finite, not missing and not rejected."""
     variable = product[name].variable
     stated: NDArray[np.bool_] = np.isfinite(variable[part].values)
-    usable = product.variables.get(USABLE)
+    usable = product.variables.get(summary_of(judging(name, flags_names(product))))
     if usable is None or usable.dims != variable.dims:
         return stated
     kept: NDArray[np.bool_] = usable[part].values != int(Severity.REJECT)

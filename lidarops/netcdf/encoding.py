@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.variables import FILL_VALUE, USABLE, Layout, Row, attributes
+from lidarops.netcdf.variables import FILL_VALUE, Layout, Row, attributes, summary_of
 from lidarops.records import DetectionMode
 
 Values = npt.NDArray[Any]
@@ -33,7 +33,8 @@ class CheckedInput:
 
     def __init__(self, data: xr.Dataset, layout: Layout) -> None:
         rows = (*layout.coordinates, *layout.variables)
-        known = {row.name for row in rows} - {USABLE} | {row.bounds for row in rows}
+        known = {row.name for row in rows} | {row.bounds for row in rows}
+        known -= {summary_of(row.name) for row in layout.judges}
         for name in data.data_vars:
             if name not in known:
                 raise ProductError(

@@ -106,7 +106,6 @@ class ProductWriter:
         }
         for name, values in self._fixed.items():
             self._sizes |= dict(zip(layout.row(name).dims, values.shape, strict=True))
-        self._flags = layout.flags
         self._counts = FlagCounter(layout.flags.rejecting)
         self.file: RowFile | None = None
         """None until the first profiles, which decide on optional variables."""
@@ -169,27 +168,26 @@ class ProductWriter:
         return span
 
     def _measured(self, source: CheckedInput) -> dict[str, Values]:
-        judged = self._layout.row(rows.QUALITY_FLAG)
-        flags = whole_numbers(judged, source.take(judged.name, judged.dims))
-        foreign = int(np.bitwise_or.reduce(flags & ~np.int32(sum(self._flags.bits)), axis=None))
-        if foreign:
-            raise ProductError(
-                f"holds bits that this kind of product does not have: {places(foreign)}",
-                field=judged.name,
-                remedy="add them to products/KIND/variables.py",
-            )
+        flags = {
+            row.name: _bits(row, source)
+            for row in self._layout.judges
+            if not row.optional or row.name in source
+        }
+        summaries = {rows.summary_of(name): name for name in flags}
         encoded: dict[str, Values] = {}
         for row in self._layout.variables:
-            if not _over_time(row.dims) or (row.optional and row.name not in source):
+            if row.name in summaries:
+                bits = flags[summaries[row.name]]
+                encoded[row.name] = rows.summarize_flags(bits, self._layout.flags)
                 continue
-            if row.name == rows.USABLE:
-                encoded[row.name] = rows.summarize_flags(flags, self._flags)
+            if not _over_time(row.dims) or (row.optional and row.name not in source):
                 continue
             # Bits refer to retrieved values; an optional derived or an auxiliary value may be
             # missing without one.
+            judge = self._layout.row(rows.judging(row.name, flags))
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
-            judging = row.dims == judged.dims and not spared
-            encoded[row.name] = stored(source, row, flags if judging else None)
+            judged = row.dims == judge.dims and not spared
+            encoded[row.name] = stored(source, row, flags[judge.name] if judged else None)
             self._refuse_other_sizes(row, encoded[row.name])
         return encoded
 
@@ -288,7 +286,7 @@ class ProductWriter:
             values=verdicts.values,
             flagged={
                 bit.word.upper(): carried[int(bit)]
-                for bit in sorted(self._flags.bits)
+                for bit in sorted(self._layout.flags.bits)
                 if int(bit) in carried
             },
             unflagged=verdicts.good,
@@ -296,6 +294,20 @@ class ProductWriter:
             stamp=context.stamp,
             change=change,
         )
+
+
+def _bits(row: Row, source: CheckedInput) -> Values:
+    """Return the flags of a row, refusing bits that it does not state."""
+    flags = whole_numbers(row, source.take(row.name, row.dims))
+    known = sum(row.flags.bits) if row.flags else 0
+    foreign = int(np.bitwise_or.reduce(flags & ~np.int32(known), axis=None))
+    if foreign:
+        raise ProductError(
+            f"holds bits that this kind of product does not have: {places(foreign)}",
+            field=row.name,
+            remedy="add them to products/KIND/variables.py",
+        )
+    return flags
 
 
 def _over_time(dims: tuple[Hashable, ...]) -> bool:

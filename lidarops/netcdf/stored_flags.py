@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Flags, Quality, Severity
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
+from lidarops.netcdf.variables import QUALITY_FLAG, judging, layout_of, summary_of
 from lidarops.records import Verdicts
 
 Values = NDArray[Any]
@@ -65,22 +65,22 @@ def stored_bits(attributes: Mapping[str, Any], kind: str | None) -> tuple[Stored
     return (*named, *(_bit(f"bit_{places(mask)}", mask, None) for mask in unnamed))
 
 
-def bits_of(product: xr.Dataset) -> tuple[StoredBit, ...]:
-    """Return all bits of the ``quality_flag`` of a product, as `stored_bits`.
+def bits_of(product: xr.Dataset, name: str = QUALITY_FLAG) -> tuple[StoredBit, ...]:
+    """Return all bits of a variable of flags of a product, as `stored_bits`.
 
     Of a kind that is not known, a bit that a value with another ``usable`` than the worst carries
     does not reject.
     """
     kind = product.attrs.get("lidarops_kind")
-    bits = stored_bits(product[QUALITY_FLAG].attrs, kind)
+    bits, summary = stored_bits(product[name].attrs, kind), summary_of(name)
     # A usable of other dimensions says nothing of single flags.
-    if USABLE not in product or product[USABLE].dims != product[QUALITY_FLAG].dims:
+    if summary not in product or product[summary].dims != product[name].dims:
         return bits
     if kind in set(kinds()):
         return bits
     kept = 0
     for flags, usable in zip(
-        *(blocks(product[name], READ_VALUES) for name in (QUALITY_FLAG, USABLE)), strict=True
+        *(blocks(product[one], READ_VALUES) for one in (name, summary)), strict=True
     ):
         accepted = quality_bits(flags)[usable.values < Severity.REJECT]
         kept |= int(np.bitwise_or.reduce(accepted, axis=None))
@@ -88,6 +88,38 @@ def bits_of(product: xr.Dataset) -> tuple[StoredBit, ...]:
         replace(bit, severity=Severity.CARE) if bit.severity is None and bit.mask & kept else bit
         for bit in bits
     )
+
+
+def flags_names(product: xr.Dataset) -> list[str]:
+    """Return the names of the variables of flags of a product, ``quality_flag`` first."""
+    names = [str(name) for name in product.variables if str(name).endswith(QUALITY_FLAG)]
+    return sorted(names, key=QUALITY_FLAG.__ne__)
+
+
+class Judged(NamedTuple):
+    """The bits of a quantity, and what they say of it."""
+
+    bits: NDArray[np.int64]
+    rejecting: int
+    """Union of the bits that reject a value."""
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """Whether a bit rejects the value."""
+        return np.asarray((self.bits & self.rejecting) != 0)
+
+    @property
+    def with_care(self) -> NDArray[np.bool_]:
+        """Whether the value is to be used with care."""
+        return np.asarray((self.bits != 0) & ~self.rejected)
+
+
+def judge(product: xr.Dataset, quantity: str) -> Judged:
+    """Return the flags that judge a quantity: no bits without flags of its dimensions."""
+    name = judging(quantity, flags_names(product))
+    if name not in product or product[name].dims != product[quantity].dims:
+        return Judged(np.zeros(product[quantity].shape, dtype=np.int64), 0)
+    return Judged(quality_bits(product[name]), rejecting_mask(bits_of(product, name)))
 
 
 def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
@@ -144,15 +176,19 @@ class FlagCounter:
                 self.carried[mask] += int(np.count_nonzero(values & mask))
 
 
-def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:
-    """Return what moves the bits of a file's ``quality_flag`` to their places of now.
+def recoding(
+    attributes: Mapping[str, Any], kind: object, name: str = QUALITY_FLAG
+) -> Recoding | None:
+    """Return what moves the bits of a file's flags to their places of now.
 
     Parameters
     ----------
     attributes : mapping
-        Of ``quality_flag``. Without ``flag_masks``, the places are those of now.
+        Of a variable of flags. Without ``flag_masks``, the places are those of now.
     kind : object
         Kind of product that the file states.
+    name : str
+        Name of the variable.
 
     Returns
     -------
@@ -162,7 +198,11 @@ def recoding(attributes: Mapping[str, Any], kind: object) -> Recoding | None:
     """
     flags = _flags_of_known_kind(kind)
     meanings = None if flags is None else _meanings(attributes)
-    if flags is None or meanings is None or meanings == {bit.word: int(bit) for bit in flags}:
+    if flags is None or meanings is None:
+        return None
+    layout = layout_of(str(kind))
+    own = layout.row(name).flags if layout.holds(name) else None
+    if meanings == {bit.word: int(bit) for bit in own or flags}:
         return None
     return partial(_recoded, meanings=meanings, flags=flags)
 
@@ -185,26 +225,26 @@ def _recoded(values: Values, *, meanings: Mapping[str, int], flags: Flags) -> Va
 
 
 def with_current_flags(product: xr.Dataset) -> xr.Dataset:
-    """Return a product of a known kind with the bits of ``quality_flag`` at the places of now.
+    """Return a product of a known kind with the bits of its flags at the places of now.
 
     Raises
     ------
     ProductError
         If a value carries a bit that the file does not name, or that the kind no longer has.
     """
-    if QUALITY_FLAG not in product:
-        return product
-    stored = product[QUALITY_FLAG]
-    recode = recoding(stored.attrs, product.attrs.get("lidarops_kind"))
-    if recode is None:
-        return product
-    moved = stored.copy(data=recode(stored.values))
-    flags = flags_of(product.attrs["lidarops_kind"])
-    moved.attrs |= {
-        "flag_masks": np.array(flags.bits, dtype=moved.dtype),
-        "flag_meanings": flags.words,
-    }
-    return product.assign({QUALITY_FLAG: moved})
+    for name in flags_names(product):
+        stored = product[name]
+        recode = recoding(stored.attrs, product.attrs.get("lidarops_kind"), name)
+        if recode is None:
+            continue
+        moved = stored.copy(data=recode(stored.values))
+        flags = flags_of(product.attrs["lidarops_kind"])
+        moved.attrs |= {
+            "flag_masks": np.array(flags.bits, dtype=moved.dtype),
+            "flag_meanings": flags.words,
+        }
+        product = product.assign({name: moved})
+    return product
 
 
 def places(bits: int) -> str:

@@ -10,7 +10,7 @@ name, because none is better than a wrong one (`cf111`, section 3.3).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from enum import IntFlag, StrEnum
 from functools import cache, cached_property
@@ -206,10 +206,11 @@ def completed(row: Row, coverage: Coverage = Coverage.PHYSICAL, sampled: str = "
     return replace(row, **derived)
 
 
-def _variables(row: Row) -> Iterator[Row]:
+def _variables(row: Row, flags: Collection[str]) -> Iterator[Row]:
     """Yield a row with all its ancillary variables, then the rows that follow from it.
 
-    These are its standard error, its further errors, and the summary of flags.
+    These are its standard error, its further errors, and the summary of flags. Of `flags`, the
+    variables of flags of the layout, one stands in the place of ``quality_flag``.
     """
     derived = [_error(row, error) for error in row.errors]
     if row.uncertain:
@@ -222,12 +223,13 @@ def _variables(row: Row) -> Iterator[Row]:
     certain = (error.name for error in derived if row.optional or not error.optional)
     ancillaries = (*certain, *row.ancillaries)
     if QUALITY_FLAG in ancillaries:
-        place = ancillaries.index(QUALITY_FLAG) + 1
-        ancillaries = (*ancillaries[:place], USABLE, *ancillaries[place:])
+        place, judge = ancillaries.index(QUALITY_FLAG), judging(row.name, flags)
+        named = judge, summary_of(judge)
+        ancillaries = (*ancillaries[:place], *named, *ancillaries[place + 1 :])
     yield replace(row, ancillaries=ancillaries)
     yield from derived
     if row.flags is not None:
-        yield usable(row.dims)
+        yield _usable(row)
 
 
 def _error(row: Row, error: Error) -> Row:
@@ -270,21 +272,28 @@ class Layout:
     @cached_property
     def variables(self) -> tuple[Row, ...]:
         """Data rows, each followed by the rows that follow from it: errors, summary of flags."""
-        return tuple(variable for row in self.data for variable in _variables(row))
+        flags = [row.name for row in self.judges]
+        return tuple(variable for row in self.data for variable in _variables(row, flags))
 
-    @property
+    @cached_property
+    def judges(self) -> tuple[Row, ...]:
+        """Rows of the variables of flags: ``quality_flag`` and those of single quantities."""
+        return tuple(row for row in self.data if row.flags is not None)
+
+    @cached_property
     def flags(self) -> Flags:
-        """Bits that ``quality_flag`` can carry.
+        """Bits that a variable of flags can carry.
 
         Raises
         ------
         ProductError
-            If its row states none.
+            If no row states any.
         """
-        flags = self.row(QUALITY_FLAG).flags
-        if flags is None:
+        stated = [row.flags for row in self.judges if row.flags is not None]
+        if not stated:
             raise ProductError("states no flags", field=QUALITY_FLAG, remedy="use `quality`")
-        return flags
+        first, *more = stated
+        return first.only({bit for flags in stated for bit in flags}) if more else first
 
     @cached_property
     def _rows(self) -> dict[str, Row]:
@@ -334,22 +343,42 @@ def is_retrieved(kind: str) -> bool:
     return kind not in kinds() or not layout_of(kind).processing_level.startswith("L1")
 
 
-def usable(dims: tuple[str, ...]) -> Row:
-    """Return the row of ``usable``, the severity of the worst bit of ``quality_flag``.
+def judging(quantity: str, names: Iterable[str]) -> str:
+    """Return the name of the flags that judge a quantity, or an error of it.
+
+    Its own where `names` hold such, as ``lidar_ratio_quality_flag``; else ``quality_flag``.
+    """
+    owners = (
+        name
+        for name in names
+        if name.endswith(f"_{QUALITY_FLAG}")
+        and f"{quantity}_".startswith(name.removesuffix(QUALITY_FLAG))
+    )
+    return next(owners, QUALITY_FLAG)
+
+
+def summary_of(flags: str) -> str:
+    """Return the name of the summary of a variable of flags: ``usable``, ``lidar_ratio_usable``."""
+    return f"{flags.removesuffix(QUALITY_FLAG)}{USABLE}"
+
+
+def _usable(flags: Row) -> Row:
+    """Return the row of the severity of the worst bit of flags.
 
     It is computed from the flags and never passed in, so that it cannot contradict them.
     """
     return Row(
-        USABLE,
-        "usability of the value, from the bits of quality_flag",
-        "do_not_use: quality_flag has a bit of severity reject. use_with_care: it has bits of"
-        " severity care only. good: no test failed. The comment of quality_flag states the severity"
-        " of each bit.",
-        dims=dims,
+        summary_of(flags.name),
+        f"usability of the value, from the bits of {flags.name}",
+        f"do_not_use: {flags.name} has a bit of severity reject. use_with_care: it has bits of"
+        f" severity care only. good: no test failed. The comment of {flags.name} states the"
+        " severity of each bit.",
+        dims=flags.dims,
         coverage=Coverage.QUALITY,
         dtype="i1",
         standard_name="aggregate_quality_flag",
         states=("good", "use_with_care", "do_not_use"),
+        optional=flags.optional,
     )
 
 
@@ -611,15 +640,19 @@ def station(*, profiles: bool) -> Row:
     return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION
 
 
-def quality(flags: Flags) -> Row:
-    """Return the row of the quality bits of a kind of product."""
+def quality(flags: Flags, quantity: str = "", **more: Any) -> Row:
+    """Return the row of the quality bits of a kind of product.
+
+    With `quantity` of this one alone, else of all that have none of their own.
+    """
     return Row(
-        QUALITY_FLAG,
-        "quality bits of the value, one for each failed test",
+        f"{quantity}_{QUALITY_FLAG}" if quantity else QUALITY_FLAG,
+        f"quality bits of {quantity or 'the value'}, one for each failed test",
         coverage=Coverage.QUALITY,
         dtype="i4",
         standard_name="quality_flag",
         flags=flags,
+        **more,
     )
 
 

@@ -22,7 +22,15 @@ from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import RawFormatError
 from lidarops.figures.wording import visible
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
-from lidarops.netcdf.stored_flags import FlagCounter, bits_of, blocks, quality_bits, rejecting_mask
+from lidarops.netcdf.stored_flags import (
+    FlagCounter,
+    StoredBit,
+    bits_of,
+    blocks,
+    flags_names,
+    quality_bits,
+    rejecting_mask,
+)
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
 
@@ -102,7 +110,7 @@ def tables(file: Path) -> list[Table]:
             _add_row(about, key, value)
     columns = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
     shown = [about, _table_of_rows("Variables", description["variables"], columns)]
-    flags = ("name", "severity", "values", "share", "description")
+    flags = ("flags", "name", "severity", "values", "share", "description")
     return [*shown, _table_of_rows("Quality", description["quality"], flags)]
 
 
@@ -206,10 +214,14 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
 
 def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     """Count values by verdict and by quality bit; empty for files without quality flags."""
-    if "quality_flag" not in dataset.variables:
-        return []
-    flags = dataset["quality_flag"]
-    bits = bits_of(dataset)
+    return [
+        {"flags": name, **row}
+        for name in flags_names(dataset)
+        for row in _counted_flags(dataset[name], bits_of(dataset, name))
+    ]
+
+
+def _counted_flags(flags: xr.DataArray, bits: tuple[StoredBit, ...]) -> list[dict[str, Any]]:
     counts = FlagCounter(rejecting_mask(bits))
     for block in blocks(flags, _READ_VALUES) if flags.size else ():
         counts.add(quality_bits(block))

@@ -12,7 +12,12 @@ import xarray as xr
 
 from lidarops.constants import FIXED, LEAST_SPREAD, STEEPEST
 from lidarops.flags import Quality
-from lidarops.netcdf.variables import BACKGROUND_METHOD, MOLECULAR_SOURCE, whole_error
+from lidarops.netcdf.variables import (
+    BACKGROUND_METHOD,
+    MOLECULAR_SOURCE,
+    judging,
+    whole_error,
+)
 from lidarops.raw.header import Stretches
 from lidarops.records import PlannedStep
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -106,23 +111,27 @@ def average(case: ChannelCase[Any], interval: timedelta, reason: str) -> Entry:
 def with_low_signal_to_noise(rows: xr.Dataset, names: Sequence[str], least: float) -> xr.Dataset:
     """Return rows with the bit LOW_SIGNAL_TO_NOISE where a value is small against its error.
 
+    It is that of the flags which judge the value.
+
     Parameters
     ----------
     rows : xr.Dataset
         With the variables, their standard errors, the errors by dead time and baseline beside these
-        where there are some, and ``quality_flag``, of the same dimensions.
+        where there are some, and the flags, of the same dimensions.
     names : sequence of str
-        Variables, one of which is enough.
+        Variables, of which one with the same flags is enough.
     least : float
         Least ratio of a value to its error without the bit; 0 for no bit.
     """
-    dims, flags = rows["quality_flag"].dims, rows["quality_flag"].to_numpy()
-    low = np.zeros(flags.shape, dtype=np.bool_)
+    known = [str(name) for name in rows.data_vars]
     for name in names:
-        value = rows[name].transpose(*dims).to_numpy()
-        low |= np.abs(value) < least * whole_error(rows, name).transpose(*dims).to_numpy()
-    bit = low * np.int32(Quality.LOW_SIGNAL_TO_NOISE)
-    return rows.assign(quality_flag=rows["quality_flag"].copy(data=flags | bit))
+        flags = rows[judging(name, known)]
+        value, error = (
+            part.transpose(*flags.dims).to_numpy() for part in (rows[name], whole_error(rows, name))
+        )
+        bit = (np.abs(value) < least * error) * np.int32(Quality.LOW_SIGNAL_TO_NOISE)
+        rows = rows.assign({str(flags.name): flags.copy(data=flags.to_numpy() | bit)})
+    return rows
 
 
 def _zenith_angles(case: ChannelCase[Any]) -> list[float | None]:

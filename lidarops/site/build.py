@@ -25,7 +25,7 @@ from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.time_axis import TIME_BOUNDS
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
-from lidarops.netcdf.stored_flags import with_current_flags
+from lidarops.netcdf.stored_flags import flags_names, with_current_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.site import pages, product_contents
 from lidarops.site.links import BESIDE, Links
@@ -274,7 +274,7 @@ def _decoded(stored: xr.Dataset, kind: str) -> xr.Dataset:
     Of an unknown kind, any variable may be shown. What several parts of the page need is read once,
     unless it is large.
     """
-    shown = {*_ALWAYS, *product_contents.USED}
+    shown = {*_ALWAYS, *product_contents.USED, *flags_names(stored)}
     figures = figures_of(kind)
     often = {quantity.name for quantity in figures.values} if figures is not None else set()
     often |= {f"{name}_standard_error" for name in often} | {QUALITY_FLAG}

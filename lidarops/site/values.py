@@ -13,8 +13,7 @@ from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import number, units
 from lidarops.figures.series_panels import Quantity
 from lidarops.figures.wording import percent
-from lidarops.netcdf.stored_flags import bits_of, quality_bits, rejecting_mask
-from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.netcdf.stored_flags import judge
 
 READ_BYTES: Final = 1_000_000
 """Most bytes of a variable that are read. Of a longer one, every second profile is, or fewer."""
@@ -75,18 +74,17 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
 
 
 def _row(product: xr.Dataset, quantity: Quantity, every: int) -> ValueRow:
-    whole = product[quantity.name]
+    some = product.isel(time=slice(None, None, every))
+    whole = some[quantity.name]
 
     def along(name: str) -> xr.DataArray | None:
         """Return another variable of the same dimensions; None without one."""
-        has = name in product and product[name].dims == whole.dims
-        return product[name][::every] if has else None
+        return some[name] if name in some and some[name].dims == whole.dims else None
 
-    values = quantity.factor * whole[::every].values.astype(np.float64)
+    values = quantity.factor * whole.values.astype(np.float64)
     usable = np.isfinite(values)
-    flags, error = along(QUALITY_FLAG), along(f"{quantity.name}_standard_error")
-    if flags is not None:
-        usable &= (quality_bits(flags) & rejecting_mask(bits_of(product))) == 0
+    judged, error = judge(some, quantity.name), along(f"{quantity.name}_standard_error")
+    usable &= ~judged.rejected
     errors = np.full(values.shape, np.nan)
     if error is not None:
         errors = quantity.factor * error.values.astype(np.float64)

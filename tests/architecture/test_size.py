@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_271,
-    "lines of code alone": 45_655,
+    "lines": 70_516,
+    "lines of code alone": 45_826,
     "modules": 287,
-    "dataclasses": 251,
-    "lines of dataclasses": 6_682,
+    "dataclasses": 252,
+    "lines of dataclasses": 6_701,
     "tuning numbers": 254,
     "tuning numbers that are assumed": 86,
     "copied thresholds": 0,
@@ -28,8 +28,8 @@ MOST = {
     "lines of the largest package": 6_038,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 67, "functions": 634, "changes": 216},
-    "elastic": {"modules": 76, "functions": 777, "changes": 232},
+    "homogeneous": {"modules": 67, "functions": 638, "changes": 216},
+    "elastic": {"modules": 76, "functions": 781, "changes": 233},
 }
 
 

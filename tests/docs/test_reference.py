@@ -139,10 +139,12 @@ def test_variables_and_flags_of_the_golden_products_are_listed(repository) -> No
         # These three describe the file, and are the same in all kinds.
         described -= {"station", "provenance", "quantization_info"}
         assert described <= _first_cells(section.partition("\n## ")[0]), path.name
-        (masks,) = re.findall(r"quality_flag:flag_masks = (.*) ;", text)
-        (words,) = re.findall(r'quality_flag:flag_meanings = "(.*)" ;', text)
-        for mask, word in zip(masks.split(", "), words.split(), strict=True):
-            assert f"| `{word}` | {mask} |" in bits, path.name
+        masks = re.findall(r"quality_flag:flag_masks = (.*) ;", text)
+        words = re.findall(r'quality_flag:flag_meanings = "(.*)" ;', text)
+        assert masks
+        for some, names in zip(masks, words, strict=True):
+            for mask, word in zip(some.split(", "), names.split(), strict=True):
+                assert f"| `{word}` | {mask} |" in bits, path.name
 
 
 def test_every_flag_that_rejects_values_points_to_facts_or_is_named_as_of_none(repository) -> None:

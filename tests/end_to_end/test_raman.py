@@ -17,10 +17,10 @@ from lidarops.campaign.ancillary_files import lidar_ratio_profile
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.flags import Quality, rejecting
-from lidarops.kinds import flags_of
+from lidarops.netcdf.variables import judging, summary_of
 from lidarops.records import RunRecord
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.flags import CONCERNING, RamanQuality
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 from lidarops.run.archive import Options, reprocess
 from lidarops.simulate.campaign import simulate_campaign
@@ -77,7 +77,7 @@ def particles(truth: xr.Dataset) -> dict[str, Any]:
 
 def deviations(product: xr.Dataset, name: str, true: Any) -> Any:
     """Return deviations over stated errors of values below 6 km that are not rejected."""
-    usable = (product["quality_flag"].values & flags_of("raman").rejecting) == 0
+    usable = product[summary_of(judging(name, product.variables))].values < 2
     usable &= product["range"].values < 6000.0
     z = (product[name].values - true) / product[f"{name}_standard_error"].values
     return z[usable & np.isfinite(z)]
@@ -177,19 +177,23 @@ def test_a_product_states_the_estimated_dead_time_of_its_nitrogen_channel(reposi
 def test_each_value_below_its_error_has_a_bit(night):
     campaign, _, record = night
     product = product_of(campaign, record)
-    marked = (product["quality_flag"] & Quality.LOW_SIGNAL_TO_NOISE) != 0
-    weak = xr.zeros_like(marked)
-    for name in (
-        "aerosol_extinction",
-        "aerosol_backscatter",
-        "lidar_ratio",
-        "water_vapour_mixing_ratio",
-    ):
-        weak |= np.abs(product[name]) < product[f"{name}_standard_error"]
-    water = product["water_vapour_mixing_ratio"]
-    below = np.abs(water) < product["water_vapour_mixing_ratio_standard_error"]
-    assert below.sum() > 100
-    np.testing.assert_array_equal(marked, weak)
+    for name in CONCERNING:
+        flags = product[judging(name, product.variables)]
+        weak = np.abs(product[name]) < product[f"{name}_standard_error"]
+        np.testing.assert_array_equal((flags & Quality.LOW_SIGNAL_TO_NOISE) != 0, weak)
+    assert weak.sum() > 100
+
+
+def test_a_quantity_is_not_doubted_for_another(night):
+    campaign, _, record = night
+    product = product_of(campaign, record)
+    extinction = product["aerosol_extinction"]
+    precise = extinction > 3.0 * product["aerosol_extinction_standard_error"]
+    assert precise.sum() > 80
+    # Without a lidar ratio for want of backscatter, which says nothing of extinction.
+    assert (precise & product["lidar_ratio"].isnull()).sum() > 5
+    assert (product["usable"].where(precise, 0) == 0).all()
+    assert set(np.unique(product["lidar_ratio_usable"])) > {0, 1}
 
 
 def test_water_vapour_needs_no_overlap(night):

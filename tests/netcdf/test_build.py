@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
@@ -32,10 +32,11 @@ from support.products.made_products import (
 
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
+from lidarops.flags import FlagBit
 from lidarops.kinds import flags_of
 from lidarops.netcdf.context import duration, product_path
 from lidarops.netcdf.encoding import bitround
-from lidarops.netcdf.variables import layout_of
+from lidarops.netcdf.variables import layout_of, summary_of
 from lidarops.records import DetectionMode, Stamp
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -52,10 +53,10 @@ def test_numbers_are_preserved(kind: str):
     data = MAKERS[kind]()
     product = decoded(data, kind)
     for row in layout_of(kind).variables:
+        if row.name.endswith("usable"):
+            continue
         if row.optional and row.name not in data:
             assert row.name not in product
-            continue
-        if row.name == "usable":
             continue
         bits = 23 if row.bits is None else row.bits
         np.testing.assert_allclose(
@@ -81,10 +82,15 @@ def test_attributes_name_existing_variables_only(kind: str):
 
 @each("kind", KINDS)
 def test_usable_is_the_worst_severity_of_the_bits(kind: str):
+    for row in layout_of(kind).judges:
+        check_summary(kind, row.name, row.flags or ())
+
+
+def check_summary(kind: str, name: str, bits: Iterable[FlagBit]) -> None:
     data = MAKERS[kind]()
-    flags = data["quality_flag"]
+    flags, usable = data[name], summary_of(name)
     known = flags_of(kind)
-    allowed = [0, *known]
+    allowed = [0, *bits]
     flags[...] = np.resize(np.array(allowed, np.int32), flags.shape)
     flags[0, 0] = int(allowed[1] | allowed[-1])
     # A value that is missing without a bit would be refused.
@@ -94,9 +100,9 @@ def test_usable_is_the_worst_severity_of_the_bits(kind: str):
         max((bit.severity for bit in known.raised(int(value))), default=0)
         for value in flags.values.flat
     ]
-    np.testing.assert_array_equal(product["usable"].values.ravel(), expected)
-    assert product["usable"].dims == product["quality_flag"].dims
-    assert product["usable"].dtype == np.int8
+    np.testing.assert_array_equal(product[usable].values.ravel(), expected)
+    assert product[usable].dims == product[name].dims
+    assert product[usable].dtype == np.int8
     main = next(row for row in layout_of(kind).variables if row.uncertain)
     assert "quality_flag usable" in product[main.name].attrs["ancillary_variables"]
     decoded_flags = xr.decode_cf(product)["usable"]
@@ -559,13 +565,15 @@ def test_flags_read_back_from_masks_and_meanings(case):
     kind, flags = case
     data = MAKERS[kind](3, 4)
     data = data.fillna(1.0)
-    data["quality_flag"][:] = flags
-    stored = decoded(data, kind)["quality_flag"]
-    masks = stored.attrs["flag_masks"].tolist()
-    named = dict(zip(stored.attrs["flag_meanings"].split(), masks, strict=True))
-    for value, read in zip(flags.flat, stored.values.flat, strict=True):
-        expected = {bit.word for bit in flags_of(kind).raised(int(value))}
-        assert {name for name, mask in named.items() if read & mask} == expected
+    for row in layout_of(kind).judges:
+        known = row.flags or ()
+        data[row.name][:] = flags & np.int32(sum(known))
+        stored = decoded(data, kind)[row.name]
+        masks = stored.attrs["flag_masks"].tolist()
+        named = dict(zip(stored.attrs["flag_meanings"].split(), masks, strict=True))
+        for value, read in zip(flags.flat, stored.values.flat, strict=True):
+            expected = {bit.word for bit in known if value & bit}
+            assert {name for name, mask in named.items() if read & mask} == expected
 
 
 normal = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)

@@ -16,7 +16,7 @@ from support.products.made_products import MAKERS, context
 
 from lidarops.flags import FIRST_OWN, PLACES, FlagBit, Flags, Quality, Severity
 from lidarops.kinds import flags_of
-from lidarops.netcdf.variables import layout_of, summarize_flags
+from lidarops.netcdf.variables import Row, layout_of, summarize_flags
 from lidarops.netcdf.write import write_product
 from lidarops.retrieve.multiangle import _methods
 
@@ -64,6 +64,7 @@ OWN = {
         "partly_cloudy": 21,
         "cloud": 22,
         "doubtful_water_vapour": 23,
+        "common_overlap": 24,
     },
     "multiangle": {
         "negative_optical_depth": 19,
@@ -102,7 +103,7 @@ LEFT = {
     "signal": 14,
     "homogeneous": 9,
     "elastic": 8,
-    "raman": 7,
+    "raman": 6,
     "multiangle": 2,
     "visibility": 10,
 }
@@ -161,6 +162,8 @@ SCENES = {
     "RamanQuality.CLOUD": "test_raman_clouds::test_a_cloud_in_all_profiles_is_no_partial_one",
     "RamanQuality.DOUBTFUL_WATER_VAPOUR": "test_raman_channels::"
     "test_a_broken_channel_of_water_vapour_concerns_water_vapour_alone",
+    "RamanQuality.COMMON_OVERLAP": "test_raman_channels::"
+    "test_bits_of_one_quantity_are_none_of_another",
     "MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH": "test_labeled_multiangle::"
     "test_an_optical_depth_below_zero_or_falling_is_flagged",
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
@@ -313,17 +316,21 @@ def test_usable_is_the_worst_of_any_set_of_bits(data: st.DataObject, kind: str):
 
 @pytest.mark.parametrize("kind", list(MAKERS))
 def test_any_bits_come_back_from_a_file_by_mask_and_meaning(kind: str, tmp_path: Path):
-    bits = set(flags_of(kind))
+    for row in layout_of(kind).judges:
+        check_bits(kind, row, tmp_path / "flags.nc")
+
+
+def check_bits(kind: str, row: Row, path: Path) -> None:
+    bits = set(row.flags or ())
     # No bit, all of them, each alone, and each left out.
     sets = [set(), bits, *({bit} for bit in bits), *(bits - {bit} for bit in bits)]
     results = MAKERS[kind](profiles=len(sets)).fillna(1.0)
     values = np.array([sum(each) for each in sets], np.int32)
-    shape = results["quality_flag"].shape
-    results["quality_flag"] = (results["quality_flag"].dims, np.resize(values, shape))
-    path = tmp_path / "flags.nc"
+    shape = results[row.name].shape
+    results[row.name] = (results[row.name].dims, np.resize(values, shape))
     write_product(build_product(results, context(kind)), path)
     with netCDF4.Dataset(path) as file:
-        variable = file["quality_flag"]
+        variable = file[row.name]
         stored = variable[...].ravel()
         names = dict(zip(variable.flag_meanings.split(), variable.flag_masks, strict=True))
         assert variable.flag_masks.dtype == variable.dtype

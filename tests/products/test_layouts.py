@@ -18,8 +18,10 @@ from lidarops.netcdf.variables import (
     Coverage,
     Row,
     attributes,
+    judging,
     layout_of,
     station,
+    summary_of,
 )
 from lidarops.records import DetectionMode
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
@@ -285,16 +287,30 @@ def test_ancillaries_and_standard_errors_are_consistent(layout):
 
 @pytest.mark.parametrize("layout", map(layout_of, kinds()), ids=list(kinds()))
 def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
-    row = layout.row("quality_flag")
-    found = attributes(row, mode=DetectionMode.ANALOG)
-    masks, meanings = found["flag_masks"], found["flag_meanings"].split()
-    assert masks.dtype == np.dtype(row.dtype)
-    assert len(masks) == len(meanings) == len(set(meanings))
-    assert all(mask > 0 and mask & (mask - 1) == 0 for mask in masks.tolist())
-    for mask, meaning in zip(masks.tolist(), meanings, strict=True):
-        bit = layout.flags.named(meaning)
-        assert bit == mask
-        assert f"{meaning} ({bit.severity.name.lower()}): {bit.description}" in found["comment"]
+    for row in layout.judges:
+        found = attributes(row, mode=DetectionMode.ANALOG)
+        masks, meanings = found["flag_masks"], found["flag_meanings"].split()
+        assert masks.dtype == np.dtype(row.dtype)
+        assert len(masks) == len(meanings) == len(set(meanings))
+        assert all(mask > 0 and mask & (mask - 1) == 0 for mask in masks.tolist())
+        for mask, meaning in zip(masks.tolist(), meanings, strict=True):
+            bit = layout.flags.named(meaning)
+            assert bit == mask
+            assert f"{meaning} ({bit.severity.name.lower()}): {bit.description}" in found["comment"]
+
+
+@pytest.mark.parametrize("layout", map(layout_of, kinds()), ids=list(kinds()))
+def test_quantities_name_the_flags_that_judge_them(layout):
+    names = [row.name for row in layout.judges]
+    for row in layout.variables:
+        flags = [name for name in row.ancillaries if name in names]
+        summaries = [name for name in row.ancillaries if name.endswith("usable")]
+        if flags:
+            assert flags == [judging(row.name, names)], row.name
+            assert summaries == [summary_of(flags[0])], row.name
+    raman = [row.name for row in layout_of("raman").judges]
+    assert judging("lidar_ratio_error_random", raman) == "lidar_ratio_quality_flag"
+    assert judging("aerosol_extinction_error_noise", raman) == "quality_flag"
 
 
 def test_retrieved_quantities_keep_all_their_bits_and_signals_13():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 from lidarops.flags import RAW_BITS, Flags, Quality
 from lidarops.netcdf.quantities import (
@@ -32,7 +32,7 @@ from lidarops.netcdf.variables import (
     quality,
 )
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
-from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.flags import CONCERNING, RamanQuality
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 FLAGS: Final = Flags(
@@ -47,8 +47,15 @@ FLAGS: Final = Flags(
         *RamanQuality,
     ),
 )
-"""Published places are in `tests/products/test_flags.py`."""
+"""Of all quantities. Published places are in `tests/products/test_flags.py`."""
 
+
+def _quality(quantity: str, own: str = "", **more: Any) -> Row:
+    """Return the row of the flags of a quantity; with `own` they have its name."""
+    return quality(FLAGS.only(CONCERNING[quantity]), own, **more)
+
+
+_WATER: Final = "water_vapour_mixing_ratio"
 _FACTOR: Final = math.exp(THRESHOLDS.lidar_ratio_spread)
 """Of the typical lidar ratio, within which are 68 percent of them."""
 _ONE_ERROR: Final = "error of {quantity} for one standard error of the"
@@ -102,16 +109,17 @@ LAYOUT: Final = Layout(
     ),
     comment="Profiles are means over time; range is along the beam. Extinction and lidar ratio are"
     " means over vertical_resolution, which follows from the signal; backscatter is that of the"
-    " bin. Below full overlap there is no extinction; backscatter is right there where both"
-    " channels have the same overlap. Particles in the reference window that decrease with height"
-    " nearly as molecules do look like aerosol-free air: only the error of the scattering ratio"
-    " declared in the settings covers them.",
+    " bin. Each quantity has flags of its own, which its ancillary_variables name; quality_flag is"
+    " that of extinction. Below full overlap there is no extinction; backscatter is right there"
+    " where both channels have the same overlap. Particles in the reference window that decrease"
+    " with height nearly as molecules do look like aerosol-free air: only the error of the"
+    " scattering ratio declared in the settings covers them.",
     sampled="range",
     weighed=(
         "aerosol_extinction",
         "aerosol_backscatter",
         "lidar_ratio",
-        "water_vapour_mixing_ratio",
+        _WATER,
     ),
     coordinates=ALONG_BEAM,
     data=(
@@ -156,14 +164,14 @@ LAYOUT: Final = Layout(
             bits=8,
         ),
         mean_value(
-            "water_vapour_mixing_ratio",
+            _WATER,
             "kg kg-1",
             "mass of water vapour over mass of dry air",
             "With the calibration constant of the campaign.",
             standard_name="humidity_mixing_ratio",
             errors=_BY_KIND,
             optional=True,
-            budget=divided("water_vapour_mixing_ratio", _BY_KIND, _MEANS),
+            budget=divided(_WATER, _BY_KIND, _MEANS),
         ),
         Row(
             "overlap",
@@ -184,7 +192,9 @@ LAYOUT: Final = Layout(
         *CLOUDS,
         BACKGROUND_METHOD,
         SUBTRACTED_BACKGROUND,
-        quality(FLAGS),
+        _quality("aerosol_extinction"),
+        *(_quality(name, name) for name in ("aerosol_backscatter", "lidar_ratio")),
+        _quality(_WATER, _WATER, optional=True),
         *AVERAGED,
     ),
 )

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final
 
-from lidarops.flags import FIRST_OWN, FlagBit, Severity
+import numpy as np
+
+from lidarops.flags import FIRST_OWN, FlagBit, Quality, Severity
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
+from lidarops.retrieve.common.arrays import Flags
 
 _MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
 
@@ -71,3 +76,64 @@ class RamanQuality(FlagBit):
             " too fast or has an uncertain background; other values are not concerned"
         ),
     )
+    COMMON_OVERLAP = (
+        FIRST_OWN + 7,
+        Severity.CARE,
+        (
+            "the overlap is not full: the value holds where both channels have the same overlap,"
+            " which its error does not cover"
+        ),
+    )
+
+
+_OF_SIGNALS: Final = (
+    Quality.INPUT_MISSING,
+    Quality.SATURATED,
+    Quality.PILE_UP,
+    Quality.SINGLE_RECORD,
+    Quality.LOW_SIGNAL_TO_NOISE,
+    Quality.BACKGROUND_UNCERTAIN,
+    Quality.NO_GLUING,
+    RamanQuality.WEAK_SIGNAL,
+    RamanQuality.PARTLY_CLOUDY,
+    RamanQuality.CLOUD,
+)
+_OF_SLOPE: Final = (Quality.INCOMPLETE_OVERLAP, RamanQuality.NEGATIVE_EXTINCTION)
+CONCERNING: Final[Mapping[str, tuple[FlagBit, ...]]] = MappingProxyType(
+    {
+        "aerosol_extinction": (*_OF_SIGNALS, *_OF_SLOPE),
+        "aerosol_backscatter": (
+            *_OF_SIGNALS,
+            RamanQuality.NO_REFERENCE,
+            RamanQuality.COMMON_OVERLAP,
+        ),
+        "lidar_ratio": (
+            *_OF_SIGNALS,
+            *_OF_SLOPE,
+            RamanQuality.NO_REFERENCE,
+            RamanQuality.NO_LIDAR_RATIO,
+        ),
+        "water_vapour_mixing_ratio": (
+            *_OF_SIGNALS,
+            RamanQuality.DOUBTFUL_WATER_VAPOUR,
+            RamanQuality.COMMON_OVERLAP,
+        ),
+    }
+)
+"""Quantity -> the bits that say something of it."""
+_OF_ELASTIC: Final = ("aerosol_backscatter", "lidar_ratio")
+"""Quantities that are made of the elastic signal too."""
+
+
+def concerning(quantity: str, found: Flags, of_elastic: Flags) -> Flags:
+    """Return the bits of a quantity.
+
+    Parameters
+    ----------
+    quantity : str
+        One of `CONCERNING`.
+    found, of_elastic : (...) int32
+        Bits of the Raman signal and of the retrieval; those of the elastic signal.
+    """
+    bits = found | of_elastic if quantity in _OF_ELASTIC else found
+    return bits & np.int32(sum(CONCERNING[quantity]))

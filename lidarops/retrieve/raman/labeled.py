@@ -19,7 +19,7 @@ from lidarops.retrieve.background import estimate
 from lidarops.retrieve.clouds import labeled as _clouds
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.raman.backscatter import overlap_of
-from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.flags import CONCERNING, RamanQuality, concerning
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.scattering import nitrogen_line_share
 from lidarops.retrieve.raman.settings import RamanSettings
@@ -208,8 +208,8 @@ def retrieve(
     Returns
     -------
     xr.Dataset
-        In memory, over (time, range) of cells. Where a value is NaN, a bit of ``quality_flag``
-        gives the reason.
+        In memory, over (time, range) of cells. Where a value is NaN, a bit of the flags of its
+        quantity gives the reason: ``quality_flag`` of extinction, else ``<name>_quality_flag``.
 
     Raises
     ------
@@ -237,15 +237,19 @@ def retrieve(
         channel.signal(shape, known_shape=settings.known_shape)
         for channel, shape in zip(channels[:2], shapes, strict=True)
     )
-    quality = _quality(cells, channels[:2], seen)
-    quality[elastic_uncertain | raman_uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
-    result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=quality)
+    elastic_bits, raman_bits = (
+        _quality(cells, channel, seen, uncertain)
+        for channel, uncertain in zip(channels, (elastic_uncertain, raman_uncertain), strict=False)
+    )
+    raman_bits |= elastic_bits & np.int32(Quality.INCOMPLETE_OVERLAP)
+    result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=raman_bits)
     stated = seen if overlap_is_stated or overlap is not None else np.full_like(seen, np.nan)
+    clouds, found = _cloud_variables(channels[0], result, beam, overlap_is_stated=overlap_is_stated)
     variables = {
         **_variables(result, beam),
         **_overlap(result, beam, of_raman, stated),
         **_clouds.window_variables(result.reference, beam.reference, station_altitude, climb),
-        **_cloud_variables(channels[0], result, beam, overlap_is_stated=overlap_is_stated),
+        **clouds,
         "background": ("time", of_elastic.background),
         "background_standard_error": ("time", of_elastic.background_standard_error),
         "profiles": elastic["profiles"],
@@ -254,9 +258,14 @@ def retrieve(
     }
     if water is not None:
         of_water, doubtful = _water(water, channels[2], of_raman, result, beam)
-        dims, bits = variables["quality_flag"]
-        doubt = np.where(doubtful, np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR), np.int32(0))
-        variables |= {**of_water, "quality_flag": (dims, bits | doubt)}
+        found[doubtful] |= np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR)
+        variables |= of_water
+    for quantity in CONCERNING:
+        if quantity in variables:
+            # Those of the main quantity are the flags of the product.
+            own = "" if quantity == "aerosol_extinction" else f"{quantity}_"
+            bits = concerning(quantity, found, elastic_bits)
+            variables[f"{own}quality_flag"] = (_PLANE, bits)
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
     product = xr.Dataset(variables, coords={**coords, "range": ("range", cells.range)})
     return without_analog_background(product, elastic)
@@ -329,16 +338,14 @@ def _air(
     )
 
 
-def _quality(cells: Cells, channels: list[_Channel], overlap: Array) -> Flags:
+def _quality(cells: Cells, channel: _Channel, overlap: Array, uncertain: Booleans) -> Flags:
     """Return the bits of cells: those of any bin, and INPUT_MISSING where all bins lack data."""
-    rows = len(channels[0].quality)
-    bits = np.zeros((rows, cells.range.size), dtype=np.int32)
-    for channel in channels:
-        parts = cells.split(channel.quality & np.int32(_BITS_OF_ANY_BIN))
-        bits |= np.bitwise_or.reduce(parts, axis=-1).astype(np.int32)
-        bits[~cells.split(channel.known).any(axis=-1)] |= _MISSING
+    parts = cells.split(channel.quality & np.int32(_BITS_OF_ANY_BIN))
+    bits: Flags = np.bitwise_or.reduce(parts, axis=-1).astype(np.int32)
+    bits[~cells.split(channel.known).any(axis=-1)] |= _MISSING
     unknown = np.isnan(cells.split(overlap)).any(axis=-1)
     bits[:, unknown] |= np.int32(Quality.INCOMPLETE_OVERLAP)
+    bits[uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
     return bits
 
 
@@ -367,7 +374,7 @@ def _variables(result: RamanResult, beam: _Beam) -> dict[str, Any]:
 
 def _cloud_variables(
     elastic: _Channel, result: RamanResult, beam: _Beam, *, overlap_is_stated: bool
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], Flags]:
     """Return the clouds of the elastic signal, and the quality with their bits."""
     cells, distance = beam.cells, beam.air.range
     laser = beam.air.wavelength
@@ -402,11 +409,10 @@ def _cloud_variables(
     n = cells.stop
     in_cells = _clouds.Clouds(clouds.mask[:, :n], clouds.fraction[:, :n], clouds.unknown[:, :n])
     return {
-        "quality_flag": (_PLANE, quality),
         "cloud_mask": (_PLANE, state),
         "cloud_fraction": (_PLANE, fraction),
         **_clouds.cloud_heights(in_cells, distance[:n], beam.station_altitude, beam.climb),
-    }
+    }, quality
 
 
 def _overlap(

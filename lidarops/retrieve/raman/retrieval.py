@@ -77,6 +77,7 @@ class RamanResult:
     reference: reference_window.ReferenceWindow
     """(profile,): NaN without reference."""
     quality: Flags
+    """Bits of the Raman signal and of all quantities; see `concerning`."""
 
     @property
     def extinction_standard_error(self) -> Array:
@@ -113,8 +114,9 @@ def retrieve_raman(
     cells : Cells
     settings : RamanSettings
     quality : (profile, cell) int32
-        Bits of `Quality`. Cells with INCOMPLETE_OVERLAP take no part in the fit of the Raman
-        signal; there, backscatter follows from the ratio of the signals of the cell.
+        Bits of `Quality` of the Raman signal, and INCOMPLETE_OVERLAP of either. Such cells take no
+        part in the fit of the Raman signal; there, backscatter follows from the ratio of the
+        signals of the cell.
 
     Returns
     -------
@@ -255,6 +257,7 @@ def _joined(
         return {cause: of(cause) for cause in causes}
 
     lidar_ratio = stacked(lambda one: one.lidar_ratio.value, no_slope)
+    backscatter = stacked(lambda one: one.backscatter, weak)
     return RamanResult(
         extinction=stacked(lambda one: one.profile.extinction.value, no_slope),
         extinction_budget=budget(EXTINCTION_CAUSES, lambda one: one.extinction_budget, no_slope),
@@ -264,7 +267,7 @@ def _joined(
         vertical_resolution=stacked(
             lambda one: one.profile.extinction.vertical_resolution, no_slope
         ),
-        backscatter=stacked(lambda one: one.backscatter, weak),
+        backscatter=backscatter,
         backscatter_budget=budget(BACKSCATTER_CAUSES, lambda one: one.backscatter_budget, weak),
         lidar_ratio=lidar_ratio,
         lidar_ratio_random=stacked(lambda one: one.lidar_ratio.random, no_slope),
@@ -272,7 +275,7 @@ def _joined(
         raman_depth=stacked(lambda one: one.profile.fit.depth, weak),
         raman_depth_error=stacked(lambda one: one.profile.fit.standard_error, weak),
         reference=window,
-        quality=_flags(solved, quality, weak, np.isnan(lidar_ratio), window.chosen),
+        quality=_flags(solved, quality, weak, np.isnan(lidar_ratio), np.isnan(backscatter)),
     )
 
 
@@ -281,13 +284,15 @@ def _flags(
     quality: Flags,
     weak: Booleans,
     no_ratio: Booleans,
-    chosen: Booleans,
+    no_backscatter: Booleans,
 ) -> Flags:
     """Return the quality with the bits of the retrieval."""
     flags = quality.copy()
+    partial = (quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0
+    flags[partial] |= np.int32(RamanQuality.COMMON_OVERLAP)
     flags[weak] |= np.int32(RamanQuality.WEAK_SIGNAL)
     flags[no_ratio] |= np.int32(RamanQuality.NO_LIDAR_RATIO)
-    flags[~chosen] |= np.int32(RamanQuality.NO_REFERENCE)
+    flags[no_backscatter.all(axis=1)] |= np.int32(RamanQuality.NO_REFERENCE)
     for row, one in enumerate(solved):
         if one is not None:
             flags[row, one.negative] |= np.int32(RamanQuality.NEGATIVE_EXTINCTION)

@@ -81,12 +81,21 @@ SETTINGS = RamanSettings(
 )
 
 
-def retrieved(nitrogen=None, water=None, filter_width=None, seen=1.0, **arguments: Any):
-    """Return the product of these channels; where none are given, of exact ones times `seen`."""
+FLAGS_OF_OTHERS = "quality_flag", "aerosol_backscatter_quality_flag", "lidar_ratio_quality_flag"
+
+
+def elastic_power():
     elastic = 1e18 * (AIR.backscatter(R, LASER) + extinction(R) / 50.0) / R**2
+    return elastic * transmission(LASER, R) ** 2
+
+
+def retrieved(
+    nitrogen=None, water=None, filter_width=None, seen=1.0, elastic=None, **arguments: Any
+):
+    """Return the product of these channels; where none are given, of exact ones times `seen`."""
     nitrogen = averages(seen * raman_power(RAMAN)) if nitrogen is None else nitrogen
     return retrieve(
-        averages(seen * elastic * transmission(LASER, R) ** 2),
+        averages(seen * elastic_power()) if elastic is None else elastic,
         nitrogen,
         molecules=AIR,
         station_altitude=0.0,
@@ -137,11 +146,37 @@ def test_a_broken_channel_of_water_vapour_concerns_water_vapour_alone(exact, bro
     product = retrieved(water=water)
     assert np.isnan(product["water_vapour_mixing_ratio"]).all()
     doubtful = np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR)
-    quality, of_exact = (one["quality_flag"].to_numpy() for one in (product, exact))
-    np.testing.assert_array_equal(quality & ~doubtful, of_exact & ~doubtful)
-    assert np.all(quality & doubtful)
+    assert np.all(product["water_vapour_mixing_ratio_quality_flag"] & doubtful)
     assert not between(exact, "quality_flag", 300.0, 5000.0).any()
+    for name in ("aerosol_extinction", *FLAGS_OF_OTHERS):
+        np.testing.assert_array_equal(product[name], exact[name])
+
+
+@pytest.mark.parametrize("bit", [Quality.SATURATED, Quality.PILE_UP])
+def test_extinction_is_not_doubted_for_the_elastic_signal(exact, bit):
+    elastic = averages(elastic_power())
+    elastic["quality"][:, 40:60] |= int(bit)
+    product = retrieved(elastic=elastic, water=averages(HUMIDITY * raman_power(WATER)))
+    low, high = R[42], R[58]
+    for name in ("aerosol_backscatter", "lidar_ratio"):
+        assert np.all(between(product, f"{name}_quality_flag", low, high) & int(bit)), name
     np.testing.assert_array_equal(product["aerosol_extinction"], exact["aerosol_extinction"])
+    for name in ("quality_flag", "water_vapour_mixing_ratio_quality_flag"):
+        np.testing.assert_array_equal(product[name], exact[name])
+
+
+def test_bits_of_one_quantity_are_none_of_another(exact):
+    no_ratio = np.int32(RamanQuality.NO_LIDAR_RATIO)
+    clean = between(exact, "lidar_ratio_quality_flag", 8000.0, 11_000.0)
+    assert np.all(clean & no_ratio)
+    for name in ("quality_flag", "aerosol_backscatter_quality_flag"):
+        assert not np.any(exact[name] & no_ratio), name
+    near = retrieved(overlap=np.where(R < 600.0, np.nan, 1.0))
+    partial = np.int32(Quality.INCOMPLETE_OVERLAP)
+    assert np.all(between(near, "quality_flag", 0.0, 500.0) & partial)
+    of_backscatter = between(near, "aerosol_backscatter_quality_flag", 0.0, 500.0)
+    assert np.all(of_backscatter == RamanQuality.COMMON_OVERLAP)
+    assert np.isfinite(between(near, "aerosol_backscatter", 0.0, 500.0)).all()
 
 
 @pytest.mark.parametrize("channel", ["nitrogen", "water"])
@@ -157,7 +192,8 @@ def test_analog_alone_in_a_glued_channel_has_no_scale_for_water_vapour(exact, ch
     pair = (scaled, water) if channel == "nitrogen" else (nitrogen, scaled)
     product = retrieved(*pair)
     assert np.isnan(product["water_vapour_mixing_ratio"]).all()
-    assert np.all(product["quality_flag"] & np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR))
+    doubtful = np.int32(RamanQuality.DOUBTFUL_WATER_VAPOUR)
+    assert np.all(product["water_vapour_mixing_ratio_quality_flag"] & doubtful)
     for name in ("aerosol_extinction", "aerosol_backscatter"):
         values = (between(one, name, 300.0, 5000.0) for one in (product, exact))
         np.testing.assert_allclose(*values, rtol=1e-6, atol=1e-12)

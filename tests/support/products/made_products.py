@@ -25,7 +25,7 @@ from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES
-from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.retrieve.raman.flags import CONCERNING, RamanQuality, concerning
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
 SCENE = "lidar-1_20260301T000000"
@@ -258,7 +258,9 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
     dims = ("time", "range")
     shape = (profiles, bins)
     flags = np.zeros(shape, np.int32)
-    flags[:, :3] = Quality.INCOMPLETE_OVERLAP | RamanQuality.NO_LIDAR_RATIO
+    flags[:, :3] = (
+        Quality.INCOMPLETE_OVERLAP | RamanQuality.NO_LIDAR_RATIO | RamanQuality.COMMON_OVERLAP
+    )
     flags[-1] |= np.int32(RamanQuality.WEAK_SIGNAL | RamanQuality.NO_LIDAR_RATIO)
     flags[0, 5:] |= np.int32(RamanQuality.NO_REFERENCE | RamanQuality.NO_LIDAR_RATIO)
     scales = {
@@ -284,7 +286,10 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
         "aerosol_extinction_smoothing_error": np.full(shape, 5e-6),
         "vertical_resolution": np.full(shape, 300.0),
     }
-    values = {name: np.where(flags != 0, np.nan, array) for name, array in values.items()}
+    for name in scales:
+        missing = concerning(name, flags, flags) != 0
+        for part in [part for part in values if part.startswith(name)]:
+            values[part] = np.where(missing, np.nan, values[part])
     window = np.where(np.arange(profiles) < profiles - 1, 6000.0, np.nan)
     return xr.Dataset(
         {
@@ -310,7 +315,13 @@ def raman(profiles: int = 5, bins: int = 40, **beam: Any) -> xr.Dataset:
             },
             "background": ("time", rng.uniform(0.1, 2.0, profiles)),
             "background_standard_error": ("time", rng.uniform(1e-4, 1e-3, profiles)),
-            "quality_flag": (dims, flags),
+            **{
+                f"{name.removeprefix('aerosol_extinction')}_quality_flag".strip("_"): (
+                    dims,
+                    concerning(name, flags, flags),
+                )
+                for name in CONCERNING
+            },
             "profiles": ("time", np.full(profiles, 10, np.int32)),
             "profiles_left_out": ("time", np.arange(profiles, dtype=np.int32)),
             "shots": ("time", np.full(profiles, 6000, np.int32)),
