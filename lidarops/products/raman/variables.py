@@ -147,7 +147,8 @@ LAYOUT: Final = Layout(
             "sr",
             "ratio of extinction to backscatter of aerosol particles",
             "Measured: extinction over backscatter, which is smoothed as extinction is. Missing"
-            " where backscatter exceeds zero by too few standard errors. The error allows for noise"
+            " where backscatter exceeds zero by too few standard errors, or extinction is not above"
+            " zero. The error allows for noise"
             " that made the value too small; of uncertain values, it expects most lidar ratios"
             f" within a factor of {_FACTOR:.1f} of {THRESHOLDS.typical_lidar_ratio:g} sr.",
             ("vertical_resolution",),

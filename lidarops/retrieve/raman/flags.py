@@ -38,8 +38,8 @@ class RamanQuality(FlagBit):
         FIRST_OWN + 2,
         Severity.CARE,
         (
-            "backscatter exceeds zero by too few standard errors for a lidar ratio, so that it is"
-            " missing; other values are not concerned"
+            "backscatter exceeds zero by too few standard errors for a lidar ratio, or extinction is"
+            " not above zero, so that it is missing"
         ),
     )
     NEGATIVE_EXTINCTION = (

@@ -363,7 +363,8 @@ def lidar_ratio_of(
         likely = _likely(extinction, smooth, error, complete & usable)
         # The error is in proportion to total backscatter: this is that of the likely one.
         least = THRESHOLDS.least_ratio_certainty * error * (1.0 + (likely - smooth) / total)
-    certain = complete & (smooth > 0.0) & (likely > least)
+    # Particles neither amplify light nor let it pass: noise makes a ratio that is not positive.
+    certain = complete & (smooth > 0.0) & (likely > least) & (ratio > 0.0)
     parts = (ratio, np.sqrt(scatter), np.sqrt(systematic))
     return Quotient(*(np.where(certain, part, np.nan) for part in parts))
 

@@ -179,6 +179,20 @@ def test_bits_of_one_quantity_are_none_of_another(exact):
     assert np.isfinite(between(near, "aerosol_backscatter", 0.0, 500.0)).all()
 
 
+def test_an_extinction_below_zero_gives_no_lidar_ratio():
+    # A step of 2 % over 300 m, as of a background that is slightly wrong.
+    step = 1.0 + 0.02 * np.clip((R - 1500.0) / 300.0, 0.0, 1.0)
+    product = retrieved(averages(raman_power(RAMAN) * step))
+    below = between(product, "aerosol_extinction", 300.0, 5000.0) <= 0.0
+    ratio = between(product, "lidar_ratio", 300.0, 5000.0)
+    assert below.sum() > 2
+    assert (between(product, "aerosol_backscatter", 300.0, 5000.0)[below] > 0.0).all()
+    assert np.isnan(ratio[below]).all()
+    assert np.isfinite(ratio[~below]).sum() > 20
+    bits = between(product, "lidar_ratio_quality_flag", 300.0, 5000.0)
+    assert np.all(bits[below] & np.int32(RamanQuality.NO_LIDAR_RATIO))
+
+
 @pytest.mark.parametrize("channel", ["nitrogen", "water"])
 def test_analog_alone_in_a_glued_channel_has_no_scale_for_water_vapour(exact, channel):
     nitrogen, water = averages(raman_power(RAMAN)), averages(HUMIDITY * raman_power(WATER))

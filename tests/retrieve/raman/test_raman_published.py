@@ -45,14 +45,14 @@ FIGURES = {
     "532": {
         "extinction": (2.4, 0.0),
         "backscatter": (-2.1, -1.1),
-        "lidar_ratio": (4.5, 3.8),
+        "lidar_ratio": (4.5, 5.3),
         "line": (1.1, -10.5),
     },
 }
 # With the reference and air of products by default: deviations in percent, and coverage.
 DEFAULT_AWAY = {"355": (-14.7, -31.4), "532": (-5.8, -4.8)}
 DEFAULT_COVERED = {"355": 0.9801, "532": 0.9550}
-COVERED = {"355": (0.938, 0.967, 1.0), "532": (0.961, 0.922, 0.946)}
+COVERED = {"355": (0.938, 0.967, 1.0), "532": (0.961, 0.922, 0.945)}
 
 
 def channel(counts, variance=None):
