@@ -203,6 +203,7 @@ def test_variables_without_standard_name():
             "background",
             "background_standard_error",
             "background_model_error",
+            "slope_error",
             "reduced_chi2",
             "retrieval_method",
         },

@@ -112,6 +112,7 @@ class PathSettings(SettingsModel):
         None, unit="MHz or mV", description="given one of `known_background`, and its error"
     )
     lag: int | None = quantity(None, unit=NO_UNIT, description="of `cubic`, bins")
+    slope_error: float
     visibility: VisibilitySettings | None = None
 
 
@@ -320,13 +321,21 @@ class _Sections(ProductStream):
     def results(self) -> Iterator[xr.Dataset]:
         """Yield all profiles, with visibility along the sections where it is requested."""
         sections, requested = self._joined(), self._settings.visibility
+        stated = self._settings.slope_error
+        # They are proportional to it.
+        scale = stated / THRESHOLDS.model_error
+        errors = {
+            name: scale * sections[name]
+            for name in ("total_extinction_model_error", "background_model_error")
+        }
+        sections = sections.assign({**errors, "slope_error": stated})
         if requested is not None:
             definition = VisibilityDefinition(self._signal.wavelength, **dict(requested))
             sections = _with_visibility(sections, definition)
         method = self._settings.method
-        stated = sections.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
+        product = sections.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
         paper = _PAPERS.get(method)
-        return in_one_batch(stated.assign_attrs(references=paper) if paper else stated)
+        return in_one_batch(product.assign_attrs(references=paper) if paper else product)
 
 
 def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:

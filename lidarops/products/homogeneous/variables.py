@@ -21,6 +21,7 @@ from lidarops.netcdf.variables import (
 )
 from lidarops.products.homogeneous import Method
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
 FLAGS: Final = Flags(
     kind="homogeneous",
@@ -53,8 +54,8 @@ _ALONG = (
 )
 
 _CURVED_SIGNAL = (
-    "whose logarithmic slope deviates by 5 percent of its value at mean range at one end of the"
-    " section, and by the opposite amount at the other"
+    "whose logarithmic slope deviates by the share slope_error of its value at mean range at one"
+    " end of the section, and by the opposite amount at the other"
 )
 _UNDETECTED = (
     "This is not an upper bound: departures from the model that its parameters absorb leave no"
@@ -92,8 +93,8 @@ LAYOUT: Final = Layout(
                     "model",
                     "model (systematic) uncertainty of extinction",
                     comment="Separate from the random error in {quantity}_standard_error. Root of"
-                    " the sum of squares of 5 percent of (extinction + 1 / mean range), and of the"
-                    f" extinction error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED}",
+                    " the sum of squares of slope_error times (extinction + 1 / mean range), and of"
+                    f" the extinction error caused by a signal {_CURVED_SIGNAL}. {_UNDETECTED}",
                 ),
                 Error(
                     "baseline",
@@ -131,6 +132,16 @@ LAYOUT: Final = Layout(
                     f" that is curved along the path. {_UNDETECTED}",
                 ),
             ),
+        ),
+        Row(
+            "slope_error",
+            "standard error of the logarithmic slope of the signal by air that is not homogeneous,"
+            " as a share of 2 (extinction + 1 / mean range)",
+            "On which model errors rest. Assumed, unless the campaign states another: the"
+            f" default of {THRESHOLDS.model_error:g} covers what simulated scenes violate, and"
+            " exceeds what calm air does by several times.",
+            dims=(),
+            coverage=Coverage.REFERENCE,
         ),
         Row(
             "reduced_chi2",

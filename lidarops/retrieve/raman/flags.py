@@ -38,8 +38,8 @@ class RamanQuality(FlagBit):
         FIRST_OWN + 2,
         Severity.CARE,
         (
-            "backscatter exceeds zero by too few standard errors for a lidar ratio, or extinction is"
-            " not above zero, so that it is missing"
+            "the lidar ratio is missing: backscatter exceeds zero by too few standard errors, or"
+            " extinction is not above zero"
         ),
     )
     NEGATIVE_EXTINCTION = (

@@ -134,6 +134,7 @@ def homogeneous(profiles: int = 5, sections: int = 2, **beam: Any) -> xr.Dataset
             "background": (dims, rng.uniform(0.1, 2.0, shape)),
             "background_standard_error": (dims, rng.uniform(1e-4, 1e-3, shape)),
             "background_model_error": (dims, np.full(shape, 5e-4)),
+            "slope_error": 0.05,
             "reduced_chi2": (dims, rng.uniform(0.8, 1.2, shape)),
             "retrieval_method": 0,
             "valid_bins": (dims, rng.integers(8, 500, shape)),
