@@ -21,12 +21,7 @@ Random = np.random.Generator
 
 _CALM: Final = (5e-3, 0.4)
 """Scatter of calm air, drawn uniformly in its logarithm."""
-_UNCERTAIN: Final = (
-    MultiAngleQuality.NO_RESIDUAL
-    | MultiAngleQuality.UNDERSMOOTHED
-    | MultiAngleQuality.HIGH_CORRELATION
-    | MultiAngleQuality.POOR_STRATIFICATION
-)
+_UNCERTAIN: Final = MultiAngleQuality.NO_RESIDUAL | MultiAngleQuality.POOR_STRATIFICATION
 """Bits of values whose stated uncertainty may be too small."""
 _LAYER_WIDTH: Final = (2.0, 4.0)
 """Standard deviation of a layer in altitude steps: 5 to 9 of them are its width at half maximum."""

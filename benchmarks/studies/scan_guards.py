@@ -33,14 +33,11 @@ from benchmarks.studies.ablation import (
     without,
     write_table,
 )
-from lidarops.flags import Quality
 from lidarops.retrieve.multiangle import (
-    _block,
     _calibration,
     _horizontal_variation,
+    _methods,
     _smoothing,
-    altitude_correlation,
-    robust_weights,
     smooth_profile,
 )
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
@@ -57,58 +54,21 @@ def _at(*places: Any, **changes: Any) -> Context:
     return without(*((place, "THRESHOLDS", changed) for place in places))
 
 
-def _ones(beams: Any, _: Any) -> Any:
-    return np.ones((beams.noise.shape[0], beams.noise.shape[2]))
-
-
 def _nothing(*_: Any) -> None:
     return None
 
 
-def _never(*_: Any) -> bool:
-    return False
-
-
-SCREEN: Final = (robust_weights, "screen_outliers", lambda _, information: information.copy())
-BISQUARE: Final = (robust_weights, "downweight_outliers", _nothing)
 GUARDS: Final = (
     *(
         Guard(bit.name or "", int(bit))
-        for bit in (
-            Quality.LOW_SIGNAL,
-            Quality.OUTLIER,
-            MultiAngleQuality.LOW_LEVERAGE,
-            MultiAngleQuality.NO_RESIDUAL,
-            MultiAngleQuality.PRIOR_DOMINATED,
-            MultiAngleQuality.UNDERSMOOTHED,
-            MultiAngleQuality.HIGH_CORRELATION,
-            MultiAngleQuality.INTERPOLATED,
-        )
+        for bit in (MultiAngleQuality.NO_RESIDUAL, MultiAngleQuality.INTERPOLATED)
     ),
     Guard("path variation", off=without((_horizontal_variation, "path_variation_from", _nothing))),
     Guard("gradients that residuals show", off=_at(_horizontal_variation, gradient_noise=0.0)),
-    Guard("outlying beams", off=without((_block, "_has_outliers", _never))),
-    Guard(
-        "outlying beams: moments",
-        off=without((robust_weights, "clean_moments", lambda _: (1.0, 1.0))),
-    ),
-    Guard(
-        "outlying beams: residual scale",
-        off=without((_block, "residual_scale", _ones)),
-    ),
-    Guard("outlying beams: best pair", off=without((robust_weights, "pair_residuals", _nothing))),
-    Guard("kept information", off=without((_block, "kept_information", _ones))),
     Guard(
         "few residuals: inflation",
-        off=without((smooth_profile, "_inflation", lambda *a: np.ones(a[2]))),
+        off=without((smooth_profile, "_inflation", lambda noise: np.ones(noise.freedom.size))),
     ),
-    Guard(
-        "gaps",
-        off=without((_block, "profiles_with_gaps", lambda used, *_: np.zeros(len(used), bool))),
-    ),
-    Guard("outlying estimates: screen", off=without(SCREEN)),
-    Guard("outlying estimates: bisquare", off=without(BISQUARE)),
-    Guard("outlying estimates: both", off=without(SCREEN, BISQUARE)),
     Guard("Cp beside the likelihood", off=_at(_smoothing, rougher=np.inf)),
     Guard("calibration", off=without((smooth_profile, "_calibrate", _nothing))),
     Guard(
@@ -116,17 +76,7 @@ GUARDS: Final = (
         off=without((_calibration, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
-    Guard(
-        "calibration: common altitudes", off=without((_calibration, "_common", lambda c: c >= 1))
-    ),
-    Guard(
-        "correlation",
-        off=without((altitude_correlation, "fit_correlation", lambda *_: (0.0, 1.0))),
-    ),
-    Guard(
-        "correlation: amplitude",
-        off=_at(altitude_correlation, least_amplitude=1.0, largest_amplitude=1.0),
-    ),
+    Guard("correlation", off=without((_methods, "correlation_of_air", lambda *_: 0.0))),
 )
 
 

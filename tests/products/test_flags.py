@@ -18,7 +18,6 @@ from lidarops.flags import FIRST_OWN, PLACES, FlagBit, Flags, Quality, Severity
 from lidarops.kinds import flags_of
 from lidarops.netcdf.variables import Row, layout_of, summarize_flags
 from lidarops.netcdf.write import write_product
-from lidarops.retrieve.multiangle import _methods
 
 SHARED = {
     "input_missing": 0,
@@ -73,10 +72,7 @@ OWN = {
         "prior_dominated": 22,
         "extrapolated": 23,
         "interpolated": 24,
-        "low_leverage": 26,
         "no_residual": 27,
-        "undersmoothed": 28,
-        "high_correlation": 29,
     },
     "visibility": {
         "poorly_determined": 17,
@@ -92,11 +88,12 @@ VERSION = {
     "homogeneous": 2,
     "elastic": 3,
     "raman": 1,
-    "multiangle": 3,
+    "multiangle": 4,
     "visibility": 2,
 }
-RETIRED = {"multiangle": {25, 30}}
-"""Places of bits of former versions: one_sided and horizontal_gradient."""
+RETIRED = {"multiangle": {25, 26, 28, 29, 30}}
+"""Places of bits of former versions: one_sided, low_leverage, undersmoothed, high_correlation and
+horizontal_gradient."""
 
 LEFT = {
     "shared": 0,
@@ -169,11 +166,9 @@ SCENES = {
     "MultiAngleQuality.NO_LEVERAGE": "test_labeled_multiangle::"
     "test_incomplete_cycles_are_used_as_far_as_possible",
     "MultiAngleQuality.POOR_STRATIFICATION": "test_labeled_multiangle::"
-    "test_extinction_stays_withheld_if_single_altitudes_replace_joint",
+    "test_extinction_that_varies_along_the_paths_is_withheld",
     "MultiAngleQuality.EXTRAPOLATED": "test_labeled_multiangle::"
     "test_every_missing_value_is_explained_whatever_the_method",
-    "MultiAngleQuality.HIGH_CORRELATION": "test_labeled_multiangle::"
-    "test_single_altitudes_stay_valid_if_shot_energy_jitters",
     "HomogeneousQuality.NOT_LEVEL": "test_archives::"
     "test_the_campaign_knows_the_pointing_better_than_the_header",
     "HomogeneousQuality.NOISE_UNCERTAIN": "test_homogeneous_limits::"
@@ -186,19 +181,9 @@ SCENES = {
     "test_published_claim_is_not_reproduced_at_15_degrees",
     "MultiAngleQuality.INTERPOLATED": "test_optical_depth::"
     "test_invalid_profiles_do_not_affect_others",
-    "MultiAngleQuality.LOW_LEVERAGE": "test_optical_depth::"
-    "test_tiny_leverage_is_flagged_and_has_a_correct_error",
     "MultiAngleQuality.NO_RESIDUAL": "test_optical_depth::test_two_beams_have_no_residual",
 }
 """The test of a scene that raises the bit; the bit stands in it by name."""
-
-BY_FIELD = {
-    "MultiAngleQuality.UNDERSMOOTHED": (
-        "smooth.undersmoothed",
-        "test_smooth_profile::test_profile_with_too_much_structure_for_smoothing_is_flagged",
-    ),
-}
-"""As above, where the bit is a boolean of a profile that the methods of scans turn into it."""
 
 GUARDS = {"Quality.NO_REAL_SOLUTION"}
 """Raised only where arithmetic fails; no scene is known that does it."""
@@ -297,11 +282,6 @@ def test_every_bit_is_documented_and_raised_by_some_scene(bit: FlagBit, reposito
     assert bit.severity in Severity
     if name in SCENES:
         assert name in source(repository, SCENES[name])
-    elif name in BY_FIELD:
-        field, scene = BY_FIELD[name]
-        assert f".{field.partition('.')[2]}" in source(repository, scene)
-        written = Path(str(_methods.__file__)).read_text(encoding="utf-8")
-        assert f"({name}, {field}" in written
     else:
         assert name in GUARDS, "name a scene that raises it"
 

@@ -34,8 +34,7 @@ class ScanSettings(SettingsModel):
         description="two_angle uses the shortest and the longest path; kano_hamilton a regression"
         " at each altitude; joint then one smooth profile through all altitudes; mld a regularised"
         " derivative along the path; mld_prior the same on the difference from the altitude below."
-        " auto is two_angle for two beams, joint for more, kano_hamilton where the errors of joint"
-        " would be too small",
+        " auto is two_angle for two beams, joint for more",
     )
     regularisation: float | None = quantity(
         None,

@@ -236,17 +236,6 @@ def _gradient_regressor(case: Case, directions: Beams) -> Entry:
     return case.run(name, reason, number=directions.free)
 
 
-def _robust(case: Case, directions: Beams) -> Entry:
-    """Give outlying beams less weight where there are enough beams to identify them."""
-    count = float(directions.count)
-    fewest = THRESHOLDS.fewest_beams
-    if count < fewest:
-        reason = f"fewer than {fewest} beam directions cannot identify an outlier"
-        return case.leave("robust", reason, number=count)
-    reason = "decided from the data: used where a residual is too large to be chance"
-    return case.run("robust", reason, number=count)
-
-
 def _vertical(case: Case, directions: Beams) -> Entry:
     """Regularise the profile along altitude where the method treats altitudes together."""
     settings, count = case.request, directions.count
@@ -289,7 +278,6 @@ class MultiAnglePlan(SettingsModel):
     baseline: NoSettings | None = None
     gradient: NoSettings | None = None
     gradient_regressor: NoSettings | None = None
-    robust: NoSettings | None = None
     vertical: NoSettings | None = None
     correlation: NoSettings | None = None
     layers: NoSettings | None = None
@@ -312,7 +300,6 @@ def _needs(case: Case) -> Entries:
     yield plan_baseline(case)
     yield _gradient(case, directions)
     yield _gradient_regressor(case, directions)
-    yield _robust(case, directions)
     yield _vertical(case, directions)
     yield _correlation(case, directions)
     yield _layers(case)
@@ -332,7 +319,7 @@ def _retrieved(case: Case, directions: Beams) -> Entry:
         ScanSettings.taken_from(settings),
         needs=(
             "read", "overlap", "noise", "glue", "molecular", "background", "baseline", "gradient",
-            "gradient_regressor", "robust", "vertical", "correlation", "layers",
+            "gradient_regressor", "vertical", "correlation", "layers",
         ),
         warning="; ".join(filter(None, (_single_beams(case, directions), _low_beams(directions)))),
     )  # fmt: skip

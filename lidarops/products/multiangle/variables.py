@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Final, get_args
 
-from lidarops.flags import COMPARED_BITS, SIGNAL_BITS, Flags
+from lidarops.flags import COMPARED_BITS, SIGNAL_BITS, Flags, Quality
 from lidarops.netcdf.quantities import VALUE_BITS, total_extinction
 from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
@@ -32,7 +32,12 @@ from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 FLAGS: Final = Flags(
-    kind="multiangle", version=3, bits=(*sorted(SIGNAL_BITS + COMPARED_BITS), *MultiAngleQuality)
+    kind="multiangle",
+    version=4,
+    bits=(
+        *sorted({*SIGNAL_BITS, *COMPARED_BITS} - {Quality.OUTLIER}),
+        *MultiAngleQuality,
+    ),
 )
 """Published places are in `tests/products/test_flags.py`."""
 
@@ -346,8 +351,7 @@ LAYOUT: Final = Layout(
         ),
         retrieval_method(
             tuple(name for name in get_args(Method) if name != "auto"),
-            "The method that ran: auto of the settings chooses two_angle, joint or kano_hamilton"
-            " from the data.",
+            "The method that ran: auto of the settings chooses two_angle or joint from the data.",
         ),
         BACKGROUND_METHOD,
         quality(FLAGS),

@@ -5,9 +5,9 @@ A scan passes through these modules in order:
 1. `labeled_altitudes.AltitudeCycles` takes the conditioned profiles of a scene. `scan_cycles`
    groups them into directions and cycles. The background is subtracted, and `_cell_means`
    averages each beam over altitude cells.
-2. `optical_depth.retrieve_optical_depth` solves the cycles in blocks. `_methods` carries out one
-   block. `_block` takes the logarithms and, with `_kano_hamilton`, fits them against the slant path
-   (`slant_paths`) at each altitude. `robust_weights` gives outliers less weight.
+2. `optical_depth.retrieve_optical_depth` solves the cycles as one block, with `_methods`.
+   `_samples` takes the logarithms; `_block`, with `_kano_hamilton`, fits them against the slant
+   path (`slant_paths`) at each altitude.
 3. Method "joint": `smooth_profile` combines the optical depths of single altitudes into one profile
    with smooth extinction. Methods "mld" and "mld_prior": `mld` differentiates the logarithm along
    the slant path with regularisation (the historical method), each altitude on its own.

@@ -6,12 +6,17 @@ Formula numbers are those of ``docs/algorithms/vertical.md``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.multiangle import _smoothing
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
+_COMPUTED: Final = 48
+"""Most differences that are computed, not interpolated: factors on errors change by less than 1
+percent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +28,11 @@ class Calibration:
     """
 
     bands: Array
-    """(3, altitude): precision of the typical profile."""
+    """(2, altitude): precision of the typical profile."""
     information: Array
     """(altitude,): of the typical profile, 0 where there is no estimate."""
-    share: Array
-    """(altitude,): correlated share of its variance."""
+    shared: Array
+    """(altitude - 1,): correlation of its noise at neighbouring altitudes in equal air."""
     correlation: float
     """Correlation of the correlated noise at neighbouring altitudes."""
     stiffness: Array
@@ -43,7 +48,8 @@ class Calibration:
 def sandwich(calibration: Calibration, upper: Integers, lower: Integers) -> Array:
     """Return posterior variances of differences of optical depths, and their components.
 
-    Formula 4 of ``docs/algorithms/vertical.md``.
+    Formula 3 of ``docs/algorithms/vertical.md``. Of many differences, some are computed, more at
+    low altitudes, and those between them interpolated.
 
     Parameters
     ----------
@@ -57,24 +63,31 @@ def sandwich(calibration: Calibration, upper: Integers, lower: Integers) -> Arra
         Posterior variance, variance from noise, expected square of the smoothing error, and
         variance of the smoothing error estimated from the pilot.
     """
-    bands, each = calibration.bands[:, np.newaxis], np.arange(upper.size)
-    a = np.zeros((upper.size, bands.shape[2]))
-    a[each, upper] = 1.0
-    a[each[lower >= 0], lower[lower >= 0]] = -1.0
+    every = np.arange(upper.size)
+    some = every
+    if every.size > _COMPUTED:
+        places = every[-1] * np.linspace(0.0, 1.0, _COMPUTED) ** 2
+        some = np.unique(np.rint(places).astype(np.int64))
+    bands, each = calibration.bands[:, np.newaxis], np.arange(some.size)
+    a = np.zeros((some.size, bands.shape[2]))
+    a[each, upper[some]] = 1.0
+    below = lower[some]
+    a[each[below >= 0], below[below >= 0]] = -1.0
     solved = _inverse(calibration, 1.0, a)
     x = _smoothing.multiply_rows(bands, solved)
     y = _smoothing.multiply_rows(bands, _inverse(calibration, THRESHOLDS.pilot, a - x))
     posterior = (a * solved).sum(axis=1)
     model = np.maximum(posterior - (solved * x).sum(axis=1), 0.0)
-    return np.stack([posterior, _noise(calibration, x), model, _noise(calibration, y)])
+    parts = posterior, _noise(calibration, x), model, _noise(calibration, y)
+    return np.stack([np.interp(every, some, part) for part in parts])
 
 
 def _inverse(calibration: Calibration, factor: float, rows: Array) -> Array:
     """Return rows times the inverse of the system, with a multiple of its smoothing."""
     count = len(rows)
-    out = np.empty((4, *rows.shape))
+    out = np.empty((1, *rows.shape))
     _smoothing.solve_banded(
-        np.broadcast_to(calibration.bands[:, np.newaxis], (3, *rows.shape)).copy(),
+        np.broadcast_to(calibration.bands[:, np.newaxis], (2, *rows.shape)).copy(),
         rows, calibration.stiffness, np.arange(count),
         np.full(count, factor * calibration.smoothing), out,
     )  # fmt: skip
@@ -85,41 +98,32 @@ def _noise(calibration: Calibration, y: Array) -> Array:
     """Return y'Vy of each row: a share of the noise is correlated, decaying with the distance."""
     known = calibration.information > 0.0
     error = np.where(known, 1.0 / np.sqrt(np.where(known, calibration.information, 1.0)), 0.0)
-    own = (y * error) ** 2 * (1.0 - calibration.share)
     from scipy.signal import lfilter  # noqa: PLC0415 - loads a third of a second of other modules
 
-    common = y * error * np.sqrt(calibration.share)
+    # Neighbours of the ends are as those of the altitudes beside them.
+    shared = calibration.shared if calibration.shared.size else np.zeros(1)
+    share = np.convolve(np.pad(shared, 1, mode="edge"), [0.5, 0.5], mode="valid")[: y.shape[1]]
+    own, common = (y * error) ** 2 * (1.0 - share), y * error * np.sqrt(share)
     decay = calibration.correlation
     tail = lfilter([0.0, decay], [1.0, -decay], common, axis=1)
     total: Array = (own + common * (common + 2.0 * tail)).sum(axis=1)
     return total
 
 
-def typical_profile(information: Array, share: Array) -> tuple[Array, Array]:
-    """Return mean information and correlated share of the profiles of a block.
-
-    Altitudes with estimates of few profiles (less than half of the largest number) count as
-    missing.
-    """
+def typical_profile(information: Array, shared: Array) -> tuple[Array, Array]:
+    """Return means over the profiles of a block, of information and of what neighbours share."""
     used = information > 0.0
-    count = used.sum(axis=0)
-    kept = _common(count)
-    divisor = np.maximum(count, 1)
-    mean = np.where(kept, information.sum(axis=0) / divisor, 0.0)
-    return mean, np.where(used, share, 0.0).sum(axis=0) / divisor
-
-
-def _common(count: Integers) -> Booleans:
-    """Return the altitudes with at least half of the largest number of profiles."""
-    common: Booleans = count >= max(0.5 * count.max(), 1.0)
-    return common
+    count = np.maximum(used.sum(axis=0), 1)
+    linked = used[:, 1:] & used[:, :-1]
+    mean = np.where(linked, shared, 0.0).sum(axis=0) / np.maximum(linked.sum(axis=0), 1)
+    return information.sum(axis=0) / count, mean
 
 
 def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
-    """Return the squared optical depth of each profile over the usual one, formula 6 of the page.
+    """Return the squared optical depth of each profile over the usual one, formula 5 of the page.
 
     The smoothing error of a profile is proportional to its extinction. Profiles are compared at
-    the highest altitude within the reach of each that half of the block also reaches.
+    the highest altitude within the reach of each.
 
     Parameters
     ----------
@@ -132,9 +136,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     (profile,) float64
         1 where noise exceeds the optical depth by far.
     """
-    # Above it, a profile would be compared with few others, or only with itself.
-    shared = int(np.flatnonzero(_common(within.sum(axis=0)))[-1])
-    tops, own = np.unique(np.minimum(within.sum(axis=1) - 1, shared), return_inverse=True)
+    tops, own = np.unique(within.sum(axis=1) - 1, return_inverse=True)
     reached = within[:, tops]
     square = np.where(reached, depth[:, tops] ** 2, np.nan)
     noise = np.where(reached, variance[:, tops], np.nan)
@@ -154,7 +156,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
 
 
 def _smoothing_square(bias: Array, known: Array) -> Array:
-    """Return the square of the smoothing error, formula 5 of the page, (difference,).
+    """Return the square of the smoothing error, formula 4 of the page, (difference,).
 
     Parameters
     ----------

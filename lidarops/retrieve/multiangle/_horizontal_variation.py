@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.special import polygamma, stdtrit
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
-from lidarops.retrieve.multiangle._block import BeamBlock, Regression, weights_of, windowed
+from lidarops.retrieve.multiangle._block import BeamBlock, Regression, windowed
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _UNKNOWNS: Final = 3
@@ -22,6 +22,15 @@ _LEAST_REST: Final = 1e-3
 _DEPENDENT: Final = 1e-8
 """Squared length of a column outside those before it, over its own, up to which it depends on
 them."""
+_CLIPPED: Final = 3.0
+"""Standard errors to which residuals are clipped in the test of growth."""
+_FEWEST_PROFILES: Final = 4
+"""Profiles below which growth is not tested over profiles."""
+_FEWEST_ALTITUDES: Final = 6
+"""Altitudes below which growth is not tested."""
+_THIRDS: Final = 3
+_SUMS: Final = 5
+"""Number of the sums of `_gradient_sums`."""
 
 
 def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
@@ -33,19 +42,20 @@ def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
     above the lower third.
     """
     tested = np.flatnonzero((fit.column(kh.FREEDOM) > 0).any(axis=0))
-    if tested.size < THRESHOLDS.fewest_altitudes:
+    if tested.size < _FEWEST_ALTITUDES:
         return None
-    third = tested.size // 3
-    thirds = tested[:third], tested[-third:]
-    low = float(np.mean(fit.inhomogeneity[thirds[0]]))
-    lower, upper = (_beam_means(beams, fit, altitudes, low) for altitudes in thirds)
+    third = tested.size // _THIRDS
+    label = np.full(fit.inhomogeneity.size, -1)
+    label[tested[:third]], label[tested[-third:]] = 0, 1
+    low = float(np.mean(fit.inhomogeneity[label == 0]))
+    lower, upper = _beam_means(beams, fit, label, low)
     known = (lower.freedom > 0) & (upper.freedom > 0)
     lower, upper = lower.select(known), upper.select(known)
     if not _grows(lower, upper):
         return None
-    if np.count_nonzero(known) < THRESHOLDS.fewest_profiles:
+    if np.count_nonzero(known) < _FEWEST_PROFILES:
         return 0
-    return 0 if _grows(lower.deviations(), upper.deviations()) else int(thirds[0][-1]) + 1
+    return 0 if _grows(lower.deviations(), upper.deviations()) else int(tested[third - 1]) + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,31 +91,157 @@ def _grows(lower: _Means, upper: _Means) -> bool:
     return growth > THRESHOLDS.growth and math.log(growth) > THRESHOLDS.growth_certainty * spread
 
 
+@compiled
+def _levers(
+    noise: Array, tested: Booleans, inhomogeneity: Array, limit: float, design: Array,
+    altitude: Array, lever: Array, arm: Array,
+) -> None:  # fmt: skip
+    """Fill what a residual adds to a gradient, and what a gradient adds to a residual.
+
+    Parameters
+    ----------
+    noise : (angle, altitude) float
+    tested : (altitude,) bool
+    inhomogeneity, altitude : (altitude,) float
+    limit : float
+        Noise from which a sample is left out.
+    design : (2, angle, altitude) float
+        Distance and path.
+    lever, arm : (angle, altitude) float
+        Outputs; 0 where the sample is too noisy, or constant and path explain the distance.
+    """
+    angles, altitudes = noise.shape
+    sums, least = np.zeros((6, altitudes)), np.zeros(altitudes)
+    for a in range(angles):
+        for k in range(altitudes):
+            clear = tested[k] and noise[a, k] < limit
+            w = 1.0 / (noise[a, k] + inhomogeneity[k]) if clear else 0.0
+            lever[a, k] = w
+            sums[0, k] += w
+            sums[1, k] += w * design[0, a, k]
+            sums[2, k] += w * design[1, a, k]
+            least[k] += w * design[0, a, k] * design[0, a, k]
+    for k in range(altitudes):
+        sums[1, k] /= sums[0, k]
+        sums[2, k] /= sums[0, k]
+    for a in range(angles):
+        for k in range(altitudes):
+            distance, path = design[0, a, k] - sums[1, k], design[1, a, k] - sums[2, k]
+            sums[3, k] += lever[a, k] * path * path
+            sums[4, k] += lever[a, k] * path * distance
+            sums[5, k] += lever[a, k] * distance * distance
+    for k in range(altitudes):
+        slope = sums[4, k] / sums[3, k]
+        left = sums[5, k] - slope * sums[4, k]
+        sums[4, k], sums[5, k] = slope, 1.0 if left > _DEPENDENT * least[k] else 0.0
+    for a in range(angles):
+        for k in range(altitudes):
+            distance, path = design[0, a, k] - sums[1, k], design[1, a, k] - sums[2, k]
+            own = altitude[k] * (distance - sums[4, k] * path)
+            arm[a, k] = own if sums[5, k] > 0.0 else 0.0
+            lever[a, k] *= arm[a, k]
+
+
+@compiled
+def _subtract_line(noise: Array, limit: float, path: Array, left: Array) -> None:
+    """Subtract the line over the path through samples with less noise than a limit.
+
+    The weights are those of noise and an inhomogeneity of that limit; arrays are (angle, altitude).
+    """
+    angles, altitudes = left.shape
+    weight, sums = np.empty((angles, altitudes)), np.zeros((5, altitudes))
+    for a in range(angles):
+        for k in range(altitudes):
+            w = 1.0 / (noise[a, k] + limit) if noise[a, k] < limit else 0.0
+            weight[a, k] = w
+            sums[0, k] += w
+            sums[1, k] += w * path[a, k]
+            sums[2, k] += w * left[a, k]
+    # Altitudes without such a sample become NaN, and are not used.
+    sums[1] /= sums[0]
+    sums[2] /= sums[0]
+    for a in range(angles):
+        for k in range(altitudes):
+            arm = weight[a, k] * (path[a, k] - sums[1, k])
+            sums[3, k] += arm * (path[a, k] - sums[1, k])
+            sums[4, k] += arm * left[a, k]
+    for k in range(altitudes):
+        slope = sums[4, k] / sums[3, k] if sums[3, k] > 0.0 else 0.0
+        for a in range(angles):
+            left[a, k] -= sums[2, k] + slope * (path[a, k] - sums[1, k])
+
+
+@compiled
+def _sums_of_thirds(
+    logarithm: Array, noise: Array, tested: Booleans, inhomogeneity: Array, design: Array,
+    label: Integers, sums: Array, count: Integers,
+) -> None:  # fmt: skip
+    """Add scaled residuals of samples with less noise than inhomogeneity, and count them.
+
+    They are left by a constant, the path and a gradient along each axis at each altitude.
+
+    Parameters
+    ----------
+    logarithm, noise : (profile, angle, altitude) float
+    tested : (profile, altitude) bool
+    inhomogeneity : (altitude,) float
+        The same at all.
+    design : (1 + axis, angle, altitude) float
+        Slant path, and horizontal distance along each axis over altitude.
+    label : (altitude,) int
+        Third: 0 or 1; other altitudes are not tested.
+    sums, count : (2, profile, angle) float, (2, profile, altitude) int
+        Outputs.
+    """
+    limit, path = inhomogeneity[0], design[0]
+    both = np.stack((path, path))
+    left, lever, arm = np.empty_like(path), np.empty_like(path), np.empty_like(path)
+    over, under, ones = np.empty(label.size), np.empty(label.size), np.ones(label.size)
+    for t in range(noise.shape[0]):
+        left[:] = logarithm[t]
+        _subtract_line(noise[t], limit, path, left)
+        for axis in range(1, design.shape[0]):
+            both[0] = design[axis]
+            _levers(noise[t], tested[t], inhomogeneity, limit, both, ones, lever, arm)
+            over[:], under[:] = 0.0, 0.0
+            for a in range(path.shape[0]):
+                for k in range(label.size):
+                    over[k] += lever[a, k] * left[a, k] if lever[a, k] != 0.0 else 0.0
+                    under[k] += lever[a, k] * arm[a, k]
+            for a in range(path.shape[0]):
+                for k in range(label.size):
+                    left[a, k] -= over[k] / under[k] * arm[a, k] if under[k] > 0.0 else 0.0
+        for a in range(path.shape[0]):
+            for k in range(label.size):
+                if tested[t, k] and noise[t, a, k] < limit:
+                    size = left[a, k] / math.sqrt(noise[t, a, k] + limit)
+                    sums[label[k], t, a] += min(max(size, -_CLIPPED), _CLIPPED)
+                    count[label[k], t, k] += 1
+
+
 def _beam_means(
-    beams: BeamBlock, fit: Regression, altitudes: Indices, inhomogeneity: float
-) -> _Means:
-    """Average each beam of each profile over a third."""
-    noise = beams.noise[..., altitudes]
-    kept = fit.keep[..., altitudes] if fit.keep.shape[1] > 0 else 1.0
-    used = (noise < inhomogeneity) & (kept > THRESHOLDS.least_weight)
-    weights = np.where(used, kept / (noise + inhomogeneity), 0.0)
-    left = beams.logarithm[..., altitudes]
-    known = np.zeros(weights.shape[::2], dtype=np.int64)
-    for column, square in orthogonal_columns(
-        weights, (np.ones(altitudes.size), *beams.design[..., altitudes])
-    ):
-        left = left - sum_over_beams(weights * column, left) / square * column
-        known += np.isfinite(square[:, 0])
-    freedom = np.maximum(used.sum(axis=1) - known, 0)
-    limit = np.where(freedom > 0, THRESHOLDS.clipped, 0.0)[:, np.newaxis]
-    residual = np.clip(left * np.sqrt(weights), -limit, limit)
-    filled = np.count_nonzero(freedom > 0, axis=1)
-    # With fewer altitudes the mean would not represent the third.
-    on = 2 * filled >= altitudes.size
-    # The root gives white noise variance 1, however many altitudes are missing.
-    mean = residual.sum(axis=2) / np.sqrt(np.maximum(filled, 1))[:, np.newaxis]
-    mean_freedom = freedom.sum(axis=1) / np.maximum(filled, 1)
-    return _Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, mean_freedom, 0.0))
+    beams: BeamBlock, fit: Regression, label: Integers, inhomogeneity: float
+) -> tuple[_Means, _Means]:
+    """Average each beam of each profile over the lower and the upper third."""
+    profiles, angles, altitudes = beams.noise.shape
+    sums, count = np.zeros((2, profiles, angles)), np.zeros((2, profiles, altitudes), np.int64)
+    axes = _along_axes(beams.design[:2])
+    tested = (fit.column(kh.FREEDOM) > 0.0) & (label >= 0)
+    _sums_of_thirds(
+        beams.logarithm, beams.noise, tested, np.full(altitudes, inhomogeneity),
+        np.stack([beams.path, *axes]), label, sums, count,
+    )  # fmt: skip
+    means = []
+    for third in range(2):
+        used = np.maximum(count[third] - 2 - len(axes), 0)
+        filled = np.count_nonzero(used, axis=1)
+        # With fewer altitudes the mean would not represent the third.
+        on = 2 * filled >= np.count_nonzero(label == third)
+        # The root gives white noise variance 1, however many altitudes are missing.
+        mean = sums[third] / np.sqrt(np.maximum(filled, 1))[:, np.newaxis]
+        freedom = used.sum(axis=1) / np.maximum(filled, 1)
+        means.append(_Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, freedom, 0.0)))
+    return means[0], means[1]
 
 
 def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: Array) -> Array:
@@ -151,9 +287,9 @@ def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: 
 def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
     """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
 
-    It is the largest that is shown at any altitude of the block, by all profiles within 500 m of
-    it, beyond what an error of the dead time explains; 0 if none is shown. It holds at all
-    altitudes: an optical depth is that of the air below, too.
+    It is the largest that is shown in any window of 1000 m of the block, by all profiles, beyond
+    what an error of the dead time explains; 0 if none is shown. It holds at all altitudes: an
+    optical depth is that of the air below, too.
 
     Parameters
     ----------
@@ -164,25 +300,67 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     """
     if not beams.noise.size:
         return 0.0
-    # Selection and logarithms bias noisy samples, which together would look like a gradient. The
-    # profiles decide together, lest a sample be selected by the noise around it.
-    middle = np.count_nonzero(beams.noise < np.inf, axis=0, keepdims=True) // 2
-    typical = np.take_along_axis(np.sort(beams.noise, axis=0), middle, axis=0)
-    clear = np.isfinite(fit.residual) & (typical < THRESHOLDS.gradient_noise)
-    weights = np.where(clear, weights_of(beams, fit), 0.0)
-    weights *= ((fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0))[:, np.newaxis]
-    plain = orthogonal_columns(weights, (np.ones(altitude.size), beams.path))
+    block = (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
+    tested = (fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0.0)
+    change = np.empty((0, *beams.noise.shape[1:]))
+    if beams.dead_time_change is not None:
+        expected = np.exp(beams.logarithm - np.nan_to_num(fit.residual))
+        change = beams.dead_time_change / expected
     square = 0.0
     for distance in _along_axes(beams.design[:2]):
-        left, length = orthogonal_columns(weights, (distance,), plain)[-1]
-        lever = np.where(np.isfinite(length), weights * left * altitude, 0.0)
-        square += _gradient_beyond_chance(beams, fit, lever, left, altitude) ** 2
+        sums = np.zeros((_SUMS, *beams.noise.shape[:2], int(block[-1]) + 2))
+        _gradient_sums(
+            fit.residual, fit.leverage, beams.noise, tested, fit.inhomogeneity,
+            np.stack([distance, beams.path]), altitude, block, change, sums,
+        )  # fmt: skip
+        # Windows of two blocks each, every half a window.
+        windows = sums[..., :-1] + sums[..., 1:]
+        windows = np.moveaxis(windows, -1, 1).reshape(_SUMS, block[-1] + 1, -1)
+        square += _gradient_beyond_chance(windows) ** 2
     return float(np.sqrt(square))
 
 
-def _gradient_beyond_chance(
-    beams: BeamBlock, fit: Regression, lever: Array, left: Array, altitude: Array
-) -> float:
+@compiled
+def _gradient_sums(
+    residual: Array, leverage: Array, noise: Array, tested: Booleans, inhomogeneity: Array,
+    design: Array, altitude: Array, block: Integers, change: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Add what the beams of each profile show of a gradient along an axis, in blocks of altitudes.
+
+    Parameters
+    ----------
+    residual, leverage, noise : (profile, angle, altitude) float
+    tested : (profile, altitude) bool
+    inhomogeneity, altitude : (altitude,) float
+    design : (2, angle, altitude) float
+        Horizontal distance along the axis over altitude, and slant path.
+    block : (altitude,) int
+    change : (profile or 0, angle, altitude) float
+        Of the logarithm, with one standard error of the dead time.
+    sums : (5, profile, angle, block) float
+        Output: of lever times residual and arm; of both with the lever over what a fit leaves of an
+        error, because beams of large leverage keep less; and of lever times change.
+    """
+    lever, arm = np.empty(noise.shape[1:]), np.empty(noise.shape[1:])
+    for t in range(noise.shape[0]):
+        _levers(
+            noise[t], tested[t], inhomogeneity, THRESHOLDS.gradient_noise, design, altitude,
+            lever, arm,
+        )  # fmt: skip
+        for a in range(noise.shape[1]):
+            for k in range(altitude.size):
+                if lever[a, k] != 0.0:
+                    b, own, r = block[k], lever[a, k], residual[t, a, k]
+                    whole = own / math.sqrt(max(1.0 - leverage[t, a, k], _LEAST_REST))
+                    sums[0, t, a, b] += own * r
+                    sums[1, t, a, b] += own * arm[a, k]
+                    sums[2, t, a, b] += whole * r
+                    sums[3, t, a, b] += whole * arm[a, k]
+                    if change.shape[0] > 0:
+                        sums[4, t, a, b] += own * change[t, a, k]
+
+
+def _gradient_beyond_chance(sums: Array) -> float:
     """Return the largest gradient along an axis that is beyond chance and the dead time, m-1.
 
     The error by chance follows from the scatter of the beams of all profiles about the gradient,
@@ -190,33 +368,15 @@ def _gradient_beyond_chance(
 
     Parameters
     ----------
-    beams : BeamBlock
-    fit : Regression
-    lever : (profile, angle, altitude) float
-        Weight of a residual in the sum that gives the gradient.
-    left : (profile, angle, altitude) float
-        Horizontal distance over altitude that constant and path do not explain.
-    altitude : (altitude,) float
-        m.
+    sums : (5, window, profile times angle) float
+        From `_gradient_sums`.
     """
-    residual = np.nan_to_num(fit.residual)
-    # A fit leaves beams of large leverage less than their error.
-    whole = lever / np.sqrt(np.maximum(1.0 - np.nan_to_num(fit.leverage), _LEAST_REST))
-    arm = left * altitude
-    total, weight, product, part = (
-        _sums_nearby(values, altitude)
-        for values in (lever * residual, lever * arm, whole * residual, whole * arm)
-    )
+    total, weight, product, part, shift = sums
     information = weight.sum(axis=1)
     known = np.where(information > 0.0, information, np.inf)
     gradient = total.sum(axis=1) / known
     own = np.minimum(weight / known[:, np.newaxis], 1.0 - _LEAST_REST)
     scatter = (((product - gradient[:, np.newaxis] * part) / (1.0 - own)) ** 2).sum(axis=1)
-    shift = np.zeros(altitude.size)
-    if beams.dead_time_change is not None:
-        expected = np.exp(beams.logarithm - residual)
-        change = np.where(lever != 0.0, beams.dead_time_change / expected, 0.0)
-        shift = _sums_nearby(lever * change, altitude).sum(axis=1)
     squares = (own**2).sum(axis=1)
     # Beams with little weight do not tell the scatter of those that decide.
     freedom = 1.0 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
@@ -224,15 +384,9 @@ def _gradient_beyond_chance(
     error = np.where(tested, np.sqrt(scatter) / known, np.inf)
     chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(np.count_nonzero(tested)), 1)
     limit = stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
-    explained = THRESHOLDS.gradient_dead_time * np.abs(shift) / known
     size = np.abs(gradient)
+    explained = np.abs(shift.sum(axis=1)) / known
     return float(np.max(size, where=size - explained > limit * error, initial=0.0))
-
-
-def _sums_nearby(values: Array, altitude: Array) -> Array:
-    """Return sums over the altitudes around each, (altitude, profile times angle)."""
-    inside = np.abs(altitude[:, np.newaxis] - altitude) <= 0.5 * THRESHOLDS.gradient_window
-    return np.asarray(inside @ values.reshape(-1, altitude.size).T)
 
 
 def _along_axes(distances: Array) -> list[Array]:
@@ -251,38 +405,3 @@ def _along_axes(distances: Array) -> list[Array]:
         for length, axis in zip(lengths, axes.T, strict=True)
         if length > _DEPENDENT * lengths[-1]
     ]
-
-
-def orthogonal_columns(
-    weights: Array, columns: Iterable[Array], before: Sequence[tuple[Array, Array]] = ()
-) -> list[tuple[Array, Array]]:
-    """Return columns orthogonal to those before them, and their squared lengths.
-
-    Parameters
-    ----------
-    weights : (profile, angle, altitude) float
-    columns : iterable of (angle, altitude) or (altitude,) float
-    before : sequence of (Array, Array)
-        Columns returned earlier.
-
-    Returns
-    -------
-    list of (profile, angle, altitude) float, (profile, 1, altitude) float
-        Those before and the new ones. The squared length is infinite where a column depends on
-        those before it.
-    """
-    basis = list(before)
-    for column in columns:
-        left = np.broadcast_to(column, weights.shape)
-        weighted = weights * left
-        least = _DEPENDENT * sum_over_beams(weighted, left)
-        for other, square in basis:
-            left = left - sum_over_beams(weighted, other) / square * other
-        square = sum_over_beams(weights * left, left)
-        basis.append((left, np.where(square > least, square, np.inf)))
-    return basis
-
-
-def sum_over_beams(first: Array, second: Array) -> Array:
-    """Return the sums over beams of products, (profile, 1, altitude)."""
-    return np.asarray(np.einsum("tak,tak->tk", first, second))[:, np.newaxis]

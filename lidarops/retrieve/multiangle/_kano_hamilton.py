@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import compiled
 
 TAU: Final = 0
@@ -27,18 +27,15 @@ FREEDOM: Final = 5
 TRACE: Final = 6
 """Sum over beams of weight times (1 - leverage): increase of chi2 per unit of inhomogeneity
 variance."""
-SPAN: Final = 7
-"""Largest minus smallest slant path."""
-SLOPE_EAST: Final = 8
+SLOPE_EAST: Final = 7
 """Change of the optical depth per unit of a gradient to the east that is not fitted."""
-SLOPE_NORTH: Final = 9
-SIDES: Final = 10
+SLOPE_NORTH: Final = 8
+SIDES: Final = 9
 """Number of fitted gradients: 0, 1 or 2."""
-SHARE: Final = 11
-"""Share of the variance of the optical depth per unit of inhomogeneity variance."""
-EXPECTED: Final = 12
-"""Expectation of chi2: the degrees of freedom, fewer where weights are reduced."""
-COLUMNS: Final = 13
+SHARED: Final = 10
+"""Covariance with the error of the altitude above, of errors of unit variance, if the air of each
+beam had unit variance and were the same at both."""
+COLUMNS: Final = 11
 
 _SAME_PATH: Final = 1e-20
 """Variance of slant paths up to which they count as equal."""
@@ -47,6 +44,8 @@ _DEPENDENT: Final = 1e-12
 which it depends on them."""
 _OPPOSITE: Final = 1e-6
 """radian, rounding by which the gap between opposite azimuths may exceed half a turn."""
+_PATH: Final = 2
+"""Number of the column of slant paths, after those of the distances."""
 
 
 @compiled
@@ -90,24 +89,24 @@ def _sums(weights: Array, first: Array, second: Array, out: Array) -> None:
 
 
 @compiled
-def _ratio(over: Array, under: Array) -> None:
-    """Divide in place; 0 where the divisor is not positive."""
-    for k in range(over.size):
-        over[k] = over[k] / under[k] if under[k] > 0.0 else 0.0
-
-
-@compiled
-def _subtract(values: Array, share: Array, column: Array) -> None:
+def _subtract_projection(
+    weights: Array, values: Array, column: Array, inverse: Array, share: Array
+) -> None:
+    """Subtract from values their part along a column, and fill the part of each altitude."""
+    _sums(weights, values, column, share)
+    for k in range(share.size):
+        share[k] *= inverse[k]
     for a in range(values.shape[0]):
         for k in range(share.size):
             values[a, k] -= share[k] * column[a, k]
 
 
 @compiled
-def _orthogonal_columns(
-    weights: Array, design: Array, least: Array, q: Array, norm: Array, mean: Array, c: int
-) -> None:
-    """Make a column orthogonal to a constant and to the columns before it, at every altitude.
+def _orthogonal_column(
+    weights: Array, design: Array, least: Array, q: Array, inverse: Array, mean: Array,
+    first: int, c: int,
+) -> None:  # fmt: skip
+    """Make a column orthogonal to a constant and to the columns from `first` to it.
 
     Parameters
     ----------
@@ -118,10 +117,11 @@ def _orthogonal_columns(
         Squared length up to which the column is left out.
     q : (3, angle, altitude) float
         The columns; 0 if left out.
-    norm, mean : (3, altitude) float
-        Their squared lengths, and the coordinates of path 0 and distance 0 on them.
-    c : int
-        The column: those before it are inputs, it is output.
+    inverse, mean : (3, altitude) float
+        Their reciprocal squared lengths, 0 if left out, and the coordinates of path 0 and distance
+        0 on them.
+    first, c : int
+        The first column and the output.
     """
     whole, share = np.zeros(least.size), np.zeros(least.size)
     for a in range(weights.shape[0]):
@@ -134,29 +134,28 @@ def _orthogonal_columns(
     for a in range(weights.shape[0]):
         for k in range(whole.size):
             q[c, a, k] = design[c, a, k] - share[k]
-    for b in range(c):
-        _sums(weights, q[b], q[c], share)
-        _ratio(share, norm[b])
-        _subtract(q[c], share, q[b])
+    for b in range(first, c):
+        _subtract_projection(weights, q[c], q[b], inverse[b], share)
         for k in range(whole.size):
             mean[c, k] -= share[k] * mean[b, k]
-    _sums(weights, q[c], q[c], norm[c])
-    _leave_out(norm[c] > least, q, norm, mean, c)
+    _sums(weights, q[c], q[c], share)
+    for k in range(whole.size):
+        inverse[c, k] = 1.0 / share[k] if share[k] > least[k] else 0.0
+    _leave_out(inverse[c], q[c], mean[c])
 
 
 @compiled
-def _leave_out(kept: Booleans, q: Array, norm: Array, mean: Array, c: int) -> None:
-    """Set a column to 0 where it is not kept."""
-    for k in range(kept.size):
-        if not kept[k]:
-            norm[c, k] = mean[c, k] = 0.0
-            for a in range(q.shape[1]):
-                q[c, a, k] = 0.0
+def _leave_out(inverse: Array, column: Array, mean: Array) -> None:
+    """Set a column to 0 where its reciprocal length is 0."""
+    for k in range(inverse.size):
+        if inverse[k] == 0.0:
+            mean[k] = 0.0
+            column[:, k] = 0.0
 
 
 @compiled
 def _gradients(
-    weights: Array, design: Array, beams: Array, q: Array, norm: Array, mean: Array, sides: Array
+    weights: Array, design: Array, beams: Array, q: Array, inverse: Array, mean: Array, sides: Array
 ) -> None:
     """Fill the columns of the gradients, and their number `sides` at each altitude."""
     surrounded, lever, share = np.empty(sides.size), np.empty(sides.size), np.empty(sides.size)
@@ -165,52 +164,47 @@ def _gradients(
     _sums(weights, design[1], design[1], share)
     for k in range(sides.size):
         lever[k] = _DEPENDENT * (lever[k] + share[k]) if surrounded[k] > 0.0 else np.inf
-    for c in range(2):
-        _orthogonal_columns(weights, design, lever, q, norm, mean, c)
+    for c in range(_PATH):
+        _orthogonal_column(weights, design, lever, q, inverse, mean, 0, c)
         for k in range(sides.size):
-            sides[k] += 1.0 if norm[c, k] > 0.0 else 0.0
+            sides[k] += 1.0 if inverse[c, k] > 0.0 else 0.0
     # Otherwise no residual would be left to check the optical depth.
-    spare = beams > 2.0 + sides
-    for c in range(2):
-        _leave_out(spare, q, norm, mean, c)
     for k in range(sides.size):
-        sides[k] = sides[k] if spare[k] else 0.0
+        if not beams[k] > 2.0 + sides[k]:
+            sides[k] = inverse[0, k] = inverse[1, k] = 0.0
+    for c in range(_PATH):
+        _leave_out(inverse[c], q[c], mean[c])
 
 
 @compiled
 def _fill_precision(
-    weights: Array, design: Array, whole: Array, q: Array, norm: Array, mean: Array, out: Array
+    weights: Array, design: Array, q: Array, inverse: Array, mean: Array, first: int, out: Array
 ) -> None:
     """Fill the columns of a fit that do not depend on the signal."""
     angles, altitudes = weights.shape
-    for k in range(altitudes):
-        out[INTERCEPT_VARIANCE, k] = 1.0 / whole[k]
-        out[INFORMATION, k] = 4.0 * norm[2, k]
-    for c in range(3):
+    lever, before = np.empty(altitudes), np.empty(altitudes)
+    for c in range(first, _PATH + 1):
         for k in range(altitudes):
-            if norm[c, k] > 0.0:
-                out[INTERCEPT_VARIANCE, k] += mean[c, k] * mean[c, k] / norm[c, k]
-    low, high = np.full(altitudes, np.inf), np.full(altitudes, -np.inf)
+            out[INTERCEPT_VARIANCE, k] += mean[c, k] * mean[c, k] * inverse[c, k]
+    for k in range(altitudes):
+        out[INFORMATION, k] = 4.0 / inverse[_PATH, k] if inverse[_PATH, k] > 0.0 else 0.0
+        before[k] = math.sqrt(inverse[_PATH, k])
     for a in range(angles):
         for k in range(altitudes):
-            lever = weights[a, k] * q[2, a, k]
-            out[SHARE, k] += lever * lever
-            out[SLOPE_EAST, k] += lever * design[0, a, k]
-            out[SLOPE_NORTH, k] += lever * design[1, a, k]
-            path = design[2, a, k]
-            low[k] = min(low[k], path if weights[a, k] > 0.0 else np.inf)
-            high[k] = max(high[k], path if weights[a, k] > 0.0 else -np.inf)
+            lever[k] = weights[a, k] * q[_PATH, a, k] * before[k]
+            out[SLOPE_EAST, k] += lever[k] * design[0, a, k]
+            out[SLOPE_NORTH, k] += lever[k] * design[1, a, k]
+        for k in range(altitudes - 1):
+            out[SHARED, k] += lever[k] * lever[k + 1]
     for k in range(altitudes):
-        out[SPAN, k] = high[k] - low[k]
-        out[SHARE, k] /= norm[2, k]
-        known = out[SIDES, k] == 0.0
-        out[SLOPE_EAST, k] = -0.5 * out[SLOPE_EAST, k] / norm[2, k] if known else 0.0
-        out[SLOPE_NORTH, k] = -0.5 * out[SLOPE_NORTH, k] / norm[2, k] if known else 0.0
+        scale = -0.5 * before[k] if out[SIDES, k] == 0.0 else 0.0
+        out[SLOPE_EAST, k] *= scale
+        out[SLOPE_NORTH, k] *= scale
 
 
 @compiled
 def _fill_fit(
-    y: Array, weights: Array, whole: Array, q: Array, norm: Array, mean: Array,
+    y: Array, weights: Array, q: Array, inverse: Array, mean: Array, first: int,
     residual: Array, hat: Array, out: Array,
 ) -> None:  # fmt: skip
     """Fill optical depth, intercept, residuals and leverages."""
@@ -220,47 +214,40 @@ def _fill_fit(
         for k in range(altitudes):
             slope[k] += weights[a, k] * y[a, k]
     for k in range(altitudes):
-        out[INTERCEPT, k] = slope[k] / whole[k]
+        out[INTERCEPT, k] = slope[k] * out[INTERCEPT_VARIANCE, k]
     for a in range(angles):
         for k in range(altitudes):
             residual[a, k] = y[a, k] - out[INTERCEPT, k]
-            hat[a, k] = weights[a, k] / whole[k]
-    for c in range(3):
-        _sums(weights, q[c], residual, slope)
-        _ratio(slope, norm[c])
-        _subtract(residual, slope, q[c])
+            hat[a, k] = weights[a, k] * out[INTERCEPT_VARIANCE, k]
+    for c in range(first, _PATH + 1):
+        _subtract_projection(weights, residual, q[c], inverse[c], slope)
         for k in range(altitudes):
             out[INTERCEPT, k] += slope[k] * mean[c, k]
             out[TAU, k] = -0.5 * slope[k]
         for a in range(angles):
             for k in range(altitudes):
-                lever = weights[a, k] * q[c, a, k] * q[c, a, k]
-                hat[a, k] += lever / norm[c, k] if norm[c, k] > 0.0 else 0.0
+                hat[a, k] += weights[a, k] * q[c, a, k] * q[c, a, k] * inverse[c, k]
 
 
 @compiled
-def _fill_scatter(
-    weights: Array, keep: Array, beams: Array, residual: Array, hat: Array, out: Array
-) -> None:
-    """Fill chi2 and its expectation where residuals are left."""
+def _fill_scatter(weights: Array, beams: Array, residual: Array, hat: Array, out: Array) -> None:
+    """Fill chi2 and its increase where residuals are left."""
     angles, altitudes = weights.shape
+    for a in range(angles):
+        for k in range(altitudes):
+            out[TRACE, k] += weights[a, k] * (1.0 - hat[a, k])
+            out[CHI2, k] += weights[a, k] * residual[a, k] * residual[a, k]
     for k in range(altitudes):
         out[FREEDOM, k] = beams[k] - 2.0 - out[SIDES, k]
-    for a in range(angles):
-        kept = keep[a] if keep.shape[0] > 0 else np.ones(altitudes)
-        for k in range(altitudes):
-            if out[FREEDOM, k] > 0.0:
-                free = 1.0 - hat[a, k]
-                out[TRACE, k] += weights[a, k] * free
-                out[EXPECTED, k] += kept[k] * free if weights[a, k] > 0.0 else 0.0
-                out[CHI2, k] += weights[a, k] * residual[a, k] * residual[a, k]
+        if not out[FREEDOM, k] > 0.0:
+            out[TRACE, k] = out[CHI2, k] = 0.0
 
 
 @compiled
-def _empty(fitted: Array, residual: Array, hat: Array, out: Array) -> None:
+def _empty(inverse: Array, residual: Array, hat: Array, out: Array) -> None:
     """Mark the altitudes where the slant paths do not differ."""
-    for k in range(fitted.size):
-        if not fitted[k] > 0.0:
+    for k in range(inverse.size):
+        if not inverse[k] > 0.0:
             sides = out[SIDES, k]
             out[:, k] = 0.0
             out[TAU, k] = out[INTERCEPT, k] = out[INTERCEPT_VARIANCE, k] = np.nan
@@ -271,7 +258,7 @@ def _empty(fitted: Array, residual: Array, hat: Array, out: Array) -> None:
 
 @compiled
 def _fill_weights(
-    noise: Array, keep: Array, inhomogeneity: Array, weights: Array, whole: Array, beams: Array
+    noise: Array, inhomogeneity: Array, weights: Array, whole: Array, beams: Array
 ) -> None:
     """Fill the weights, their sum over beams, and the number of beams with weight."""
     whole[:] = 0.0
@@ -279,8 +266,6 @@ def _fill_weights(
     for a in range(weights.shape[0]):
         for k in range(whole.size):
             weights[a, k] = 1.0 / (noise[a, k] + inhomogeneity[k])
-            if keep.shape[0] > 0:
-                weights[a, k] *= keep[a, k]
             whole[k] += weights[a, k]
             beams[k] += 1.0 if weights[a, k] > 0.0 else 0.0
 
@@ -289,7 +274,6 @@ def _fill_weights(
 def fit_levels(
     y: Array,
     noise: Array,
-    keep: Array,
     inhomogeneity: Array,
     design: Array,
     sides: bool,
@@ -303,8 +287,6 @@ def fit_levels(
     ----------
     y, noise : (profile, angle, altitude) float
         Logarithms and their variances; 0 and inf where there is no sample.
-    keep : (profile, angle or 0, altitude) float
-        Factors of the weights.
     inhomogeneity : (altitude,) float
         Variance of the logarithms on top of the noise.
     design : (3, angle, altitude) float
@@ -318,20 +300,22 @@ def fit_levels(
         hat matrix; not filled if they have no profile.
     """
     count, angles, altitudes = y.shape
-    weights, q = np.empty((angles, altitudes)), np.zeros((3, angles, altitudes))
+    weights, q = np.empty((angles, altitudes)), np.zeros((_PATH + 1, angles, altitudes))
     residual, hat = np.empty((angles, altitudes)), np.empty((angles, altitudes))
-    norm, mean = np.zeros((3, altitudes)), np.zeros((3, altitudes))
+    inverse, mean = np.zeros((_PATH + 1, altitudes)), np.zeros((_PATH + 1, altitudes))
     whole, beams = np.empty(altitudes), np.empty(altitudes)
+    first = 0 if sides else _PATH
     for t in range(count):
         out[t] = 0.0
-        _fill_weights(noise[t], keep[t], inhomogeneity, weights, whole, beams)
+        _fill_weights(noise[t], inhomogeneity, weights, whole, beams)
         if sides:
-            _gradients(weights, design, beams, q, norm, mean, out[t, SIDES])
-        _orthogonal_columns(weights, design, _SAME_PATH * whole, q, norm, mean, 2)
-        _fill_precision(weights, design, whole, q, norm, mean, out[t])
-        _fill_fit(y[t], weights, whole, q, norm, mean, residual, hat, out[t])
-        _fill_scatter(weights, keep[t], beams, residual, hat, out[t])
-        _empty(norm[2], residual, hat, out[t])
+            _gradients(weights, design, beams, q, inverse, mean, out[t, SIDES])
+        _orthogonal_column(weights, design, _SAME_PATH * whole, q, inverse, mean, first, _PATH)
+        out[t, INTERCEPT_VARIANCE] = 1.0 / whole
+        _fill_fit(y[t], weights, q, inverse, mean, first, residual, hat, out[t])
+        _fill_scatter(weights, beams, residual, hat, out[t])
+        _fill_precision(weights, design, q, inverse, mean, first, out[t])
+        _empty(inverse[_PATH], residual, hat, out[t])
         if residuals.shape[0] > 0:
             for a in range(angles):
                 for k in range(altitudes):

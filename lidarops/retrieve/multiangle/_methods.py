@@ -11,16 +11,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.flags import Quality
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
 from lidarops.retrieve.multiangle import _block, _horizontal_variation, mld
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
-from lidarops.retrieve.multiangle.altitude_correlation import (
-    ResidualMoments,
-    fit_correlation,
-    residual_moments,
-)
+from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, correlation_of_air
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.slant_paths import Scan
 from lidarops.retrieve.multiangle.smooth_profile import smooth_optical_depth
@@ -31,8 +26,7 @@ class MultiAngleMethod(StrEnum):
     """Method of retrieving optical depths."""
 
     AUTO = "auto"
-    """`TWO_ANGLE` for two beams, else `JOINT`; `KANO_HAMILTON` where all standard errors of `JOINT`
-    would be too small."""
+    """`TWO_ANGLE` for two beams, else `JOINT`."""
     TWO_ANGLE = "two_angle"
     """Only the shortest and the longest path."""
     KANO_HAMILTON = "kano_hamilton"
@@ -151,8 +145,6 @@ class OpticalDepthSettings:
     largest_gradient: float = LARGEST_GRADIENT
     """m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
     `extinction_gradient_error`, unless the residuals show a larger one."""
-    robust: bool = True
-    """Whether to test for outliers."""
     layers: Sequence[tuple[float, float]] = ()
     """m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
     altitudes and the station, by at most half the distance to the next one."""
@@ -185,17 +177,10 @@ def solve_cycles(
     settings : BlockSettings
     """
     beams = _block.make_beam_block(signal, variance, settings.scan, dead_time_change)
-    fit = _block.regress(beams, inhomogeneity=settings.inhomogeneity, robust=settings.robust)
+    fit = _block.regress(beams, settings.inhomogeneity)
     method, reason = _choose_method(beams, settings)
     profiles = _solve(method, beams, fit, settings)
-    steps = [*_steps(beams, fit, settings, method), StepRecord(method, ran=True, reason=reason)]
-    doubt = _doubt(profiles) if settings.method == "auto" and method == "joint" else ""
-    if doubt:
-        profiles = _solve("kano_hamilton", beams, fit, settings)
-        steps[-1:] = [
-            StepRecord("kano_hamilton", ran=True, reason="single altitudes instead of a profile"),
-            StepRecord("joint", ran=False, reason=doubt),
-        ]
+    steps = [*_steps(beams, settings, method), StepRecord(method, ran=True, reason=reason)]
     return replace(profiles, steps=tuple(steps))
 
 
@@ -209,27 +194,12 @@ def _solve(
         above = np.arange(profiles.quality.shape[1]) >= lowest
         profiles.mark(MultiAngleQuality.POOR_STRATIFICATION, above)
     _withhold_extinction(profiles, profiles.raised(MultiAngleQuality.POOR_STRATIFICATION))
-    _raise_common_flags(profiles, beams, fit)
+    valued = np.isfinite(profiles.optical_depth)
+    profiles.mark(MultiAngleQuality.NO_RESIDUAL, valued & (_block.pooled_freedom(fit) == 0))
     return profiles
 
 
-def _doubt(profiles: MultiAngleResult) -> str:
-    """Return why the standard errors of all values of "joint" would be too small; empty if not.
-
-    Errors that are common to neighbouring altitudes, such as those of the shot energy, look like
-    structure of the profile. The standard errors of single altitudes remain valid.
-    """
-    valued = np.isfinite(profiles.optical_depth)
-    causes = MultiAngleQuality.UNDERSMOOTHED, MultiAngleQuality.HIGH_CORRELATION
-    if not valued.any() or not profiles.raised(causes[0] | causes[1])[valued].all():
-        return ""
-    words = " and ".join(bit.word for bit in causes if profiles.raised(bit).any())
-    return f"its standard errors would be too small ({words})"
-
-
-def _steps(
-    beams: BeamBlock, fit: Regression, settings: BlockSettings, method: str
-) -> Iterator[StepRecord]:
+def _steps(beams: BeamBlock, settings: BlockSettings, method: str) -> Iterator[StepRecord]:
     """Yield what the data decided before the method."""
     number = int(np.count_nonzero(~settings.scan.usable))
     count = number or "no"
@@ -240,13 +210,6 @@ def _steps(
         number > 0,
         f"{count} {beam} {are} less than 3 degrees above the horizon",
     )
-    if not settings.robust:
-        why = "not requested"
-    elif fit.robust:
-        why = "a residual is too large for chance"
-    else:
-        why = "no residual is too large for chance, or fewer than 4 beams"
-    yield StepRecord("robust_passes", fit.robust, why)
     around = "beams point to all sides"
     free = "a half turn around the zenith has no beam"
     if method in WITHOUT_GRADIENT:
@@ -265,45 +228,33 @@ def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]
 
 def _kano_hamilton(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
     """Return the estimates of single altitudes."""
-    return _single_altitudes(beams, fit, settings, _moments(beams, fit))
+    return _single_altitudes(beams, fit, settings, _correlation(beams, fit))
 
 
 def _single_altitudes(
-    beams: BeamBlock, fit: Regression, settings: BlockSettings, moments: ResidualMoments
+    beams: BeamBlock, fit: Regression, settings: BlockSettings, correlation: float
 ) -> MultiAngleResult:
     """Return the estimates of single altitudes, with the correlation that residuals show."""
     profiles = _start(beams, fit, settings)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
-    correlation, amplitude = fit_correlation(moments.lag_products, moments.lag_norms)
-    share = np.clip(_correlated_share(beams, fit) * amplitude, 0.0, 1.0)
     _fill_single(
         profiles,
         settings,
         depth=profiles.optical_depth,
         error=error,
         slopes=_gradient_slopes(profiles, beams, fit, settings),
-        correlation=correlation * np.sqrt(share * _below(share)),
+        correlation=np.pad(correlation * fit.shared, ((0, 0), (1, 0))),
     )
     return profiles
 
 
-def _correlated_share(beams: BeamBlock, fit: Regression) -> Array:
-    """Return the share of the air between the beams in the variances, (profile, altitude)."""
-    return fit.column(kh.SHARE) * fit.inhomogeneity * _block.kept_information(beams, fit)
-
-
-def _moments(beams: BeamBlock, fit: Regression) -> ResidualMoments:
-    """Return what the residuals show of the correlation along altitude."""
-    within = (beams.alive >= beams.needed) & np.isfinite(fit.column(kh.TAU))
-    return residual_moments(
-        fit.residual * _block.residual_scale(beams, fit)[:, np.newaxis],
-        np.where(np.isfinite(fit.residual), _block.weights_of(beams, fit), 0.0),
-        fit.leverage,
-        fit.inhomogeneity,
-        np.where(within, _correlated_share(beams, fit), 0.0),
-        beams.gaps,
-    )
+def _correlation(beams: BeamBlock, fit: Regression) -> float:
+    """Return the correlation of the air at neighbouring altitudes, which residuals show."""
+    return correlation_of_air(
+        fit.residual, beams.noise, fit.leverage, fit.inhomogeneity, beams.path,
+        np.ascontiguousarray(fit.column(kh.SIDES)),
+    )  # fmt: skip
 
 
 def _two_angle(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiAngleResult:
@@ -313,7 +264,7 @@ def _two_angle(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Mu
     """
     ends = _block.end_beams(beams)
     of_ends = _block.refit(ends, fit.inhomogeneity, fit.freedom)
-    return _single_altitudes(ends, of_ends, settings, _moments(beams, fit))
+    return _single_altitudes(ends, of_ends, settings, _correlation(beams, fit))
 
 
 def _mld(
@@ -386,11 +337,12 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     rows = np.flatnonzero(within.any(axis=1))
     if rows.size == 0:
         return profiles
+    noise = AltitudeNoise(_correlation(beams, fit), fit.shared, _block.pooled_freedom(fit))
     smooth = smooth_optical_depth(
         profiles.optical_depth[rows],
         np.where(within, fit.column(kh.INFORMATION), 0.0)[rows],
         settings.height,
-        residuals=_moments(beams, fit).of(rows),
+        noise=noise.of(rows),
     )
     for name in (
         "optical_depth", "optical_depth_standard_error", "extinction", "extinction_standard_error",
@@ -400,23 +352,16 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     slopes = np.full((2, *within.shape), np.nan)
     of_single = _gradient_slopes(profiles, beams, fit, settings)
     for slope, single in zip(slopes, of_single, strict=True):
-        slope[rows] = smooth.respond(np.where(within, single, 0.0)[rows])
+        one = np.where(within, single, 0.0)[rows]
+        slope[rows] = smooth.respond(one) if one.any() else 0.0 * smooth.optical_depth
     _fill_gradient_errors(profiles, slopes, settings)
     for number, (bottom, top) in enumerate(settings.levels):
         depth, error = smooth.layer(bottom - 1, top - 1)
         profiles.layer_optical_depth[rows, number] = depth
         profiles.layer_optical_depth_standard_error[rows, number] = error
-    with np.errstate(invalid="ignore"):
-        deviating = np.abs(smooth.data_share - 1.0) > 1.0 - THRESHOLDS.least_share
-    for bit, raised in (
-        (MultiAngleQuality.INTERPOLATED, smooth.interpolated),
-        (Quality.OUTLIER, smooth.downweighted),
-        (MultiAngleQuality.PRIOR_DOMINATED, smooth.saturated & np.isfinite(smooth.optical_depth)),
-        (MultiAngleQuality.PRIOR_DOMINATED, deviating),
-        (MultiAngleQuality.UNDERSMOOTHED, smooth.undersmoothed[:, np.newaxis]),
-        (MultiAngleQuality.HIGH_CORRELATION, smooth.high_correlation),
-    ):
-        profiles.quality[rows] |= np.where(raised, np.int32(bit), np.int32(0))
+    profiles.quality[rows] |= np.where(
+        smooth.interpolated, np.int32(MultiAngleQuality.INTERPOLATED), np.int32(0)
+    )
     return profiles
 
 
@@ -434,7 +379,7 @@ def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     count, angles, altitudes = beams.noise.shape
     profiles = MultiAngleResult.missing(count, angles, altitudes, len(settings.levels))
     tau = fit.column(kh.TAU)
-    within = (beams.alive >= beams.needed) & np.isfinite(tau)
+    within = fit.within(beams)
     profiles.optical_depth[:] = np.where(within, tau, np.nan)
     profiles.log_intercept[:] = np.where(within, fit.column(kh.INTERCEPT), np.nan)
     factor = _block.student_factor(fit.freedom)
@@ -453,18 +398,6 @@ def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     profiles.mark(MultiAngleQuality.EXTRAPOLATED, beyond)
     profiles.mark(MultiAngleQuality.NO_LEVERAGE, ~known)
     return profiles
-
-
-def _raise_common_flags(profiles: MultiAngleResult, beams: BeamBlock, fit: Regression) -> None:
-    """Raise the flags common to all methods, wherever there is a value."""
-    valued = np.isfinite(profiles.optical_depth)
-    estimated = fit.column(kh.INFORMATION) > 0
-    short = valued & estimated & (fit.column(kh.SPAN) < THRESHOLDS.least_span)
-    profiles.mark(MultiAngleQuality.LOW_LEVERAGE, short)
-    profiles.mark(MultiAngleQuality.NO_RESIDUAL, valued & (_block.pooled_freedom(fit) == 0))
-    if fit.robust:
-        low = (fit.keep < 0.5) & (beams.noise < np.inf)
-        profiles.mark(Quality.OUTLIER, low.any(axis=1))
 
 
 def _gradient_slopes(

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Indices, Integers
+from lidarops.retrieve.common.arrays import Array, Integers
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -22,12 +22,14 @@ PAD: Final = 2
 """Rows of zeros at either end, in place of values outside the grid."""
 _LOGARITHM_EVERY: Final = 4
 """Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
-PER_DECADE: Final = 6
-GRID: Final = 10.0 ** (np.arange(11 * PER_DECADE + 1) / PER_DECADE - 10.0)
+_PER_DECADE: Final = 6
+_GRID: Final = 10.0 ** (np.arange(11 * _PER_DECADE + 1) / _PER_DECADE - 10.0)
 """Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
-_SCORED_PROFILES: Final = 64
-_SCORED_VALUES: Final = 25_600
-"""A block is scored on at most so many profiles, or profiles with so many values together."""
+_SCORED: Final = 32
+"""Most profiles of a block on which the weight is chosen: every n-th."""
+_NEGLIGIBLE: Final = 1e-6
+"""Relative likelihood below which a weight is left out of the average: less than the 12 bits of a
+stored value."""
 
 
 def penalty(altitude: Array) -> Array:
@@ -66,14 +68,13 @@ def multiply_rows(bands: Array, rows: Array) -> Array:
 
     Parameters
     ----------
-    bands : (3, profile or 1, altitude) float64
+    bands : (2, profile or 1, altitude) float64
     rows : (profile, altitude) float64
     """
     out: Array = bands[0] * rows
-    for step in (1, 2):
-        beside = bands[step][:, :-step]
-        out[:, step:] += beside * rows[:, :-step]
-        out[:, :-step] += beside * rows[:, step:]
+    beside = bands[1][:, :-1]
+    out[:, 1:] += beside * rows[:, :-1]
+    out[:, :-1] += beside * rows[:, 1:]
     return out
 
 
@@ -105,7 +106,7 @@ def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
 
     Parameters
     ----------
-    o : (3, row, lane) float64
+    o : (2, row, lane) float64
         Bands of the precision.
     b : (row, lane) float64
         Right-hand sides.
@@ -118,7 +119,7 @@ def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
     """
     edge, far, farther = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
     for i in range(PAD, b.shape[0] - PAD):
-        o0, o1, o2, right = o[0, i], o[1, i], o[2, i], b[i]
+        o0, o1, right = o[0, i], o[1, i], b[i]
         k0, k1, k2 = k[0, i - PAD], k[1, i - PAD], k[2, i - PAD]
         near_l, far_l = f[1, i - 1], f[2, i - 2]
         near_y, far_y = f[3, i - 1], f[3, i - 2]
@@ -126,7 +127,7 @@ def _sweep_down(o: Array, b: Array, k: Array, lam: Array, f: Array) -> None:
         for j in range(LANES):
             pivot = o0[j] + lam[j] * k0 - near_l[j] * edge[j] - far_l[j] * farther[j]
             across = o1[j] + lam[j] * k1 - near_l[j] * far[j]
-            beyond = o2[j] + lam[j] * k2
+            beyond = lam[j] * k2
             inverse = 1.0 / pivot
             d[j] = inverse
             l1[j] = across * inverse
@@ -164,10 +165,19 @@ def _sweep_up(f: Array, c: Array) -> None:
 
 
 @compiled
+def _substitute(f: Array) -> None:
+    """Substitute back only; the last row of `f` becomes the solution."""
+    for i in range(f.shape[1] - PAD - 1, PAD - 1, -1):
+        d, l1, l2, x, x1, x2 = f[0, i], f[1, i], f[2, i], f[3, i], f[3, i + 1], f[3, i + 2]
+        for j in range(LANES):
+            x[j] = x[j] * d[j] - l1[j] * x1[j] - l2[j] * x2[j]
+
+
+@compiled
 def _work(altitudes: int) -> tuple[Array, Array, Array, Array]:
     rows = altitudes + 2 * PAD
     return (
-        np.zeros((3, rows, LANES)),
+        np.zeros((2, rows, LANES)),
         np.zeros((rows, LANES)),
         np.zeros((4, rows, LANES)),
         np.zeros((3, rows, LANES)),
@@ -178,11 +188,11 @@ def _work(altitudes: int) -> tuple[Array, Array, Array, Array]:
 def solve_banded(
     bands: Array, right: Array, stiffness: Array, profile: Integers, lam: Array, out: Array
 ) -> None:
-    r"""Solve :math:`(\Omega + \lambda K) x = b`, with the inverse within the bands.
+    r"""Solve :math:`(\Omega + \lambda K) x = b`, and invert within the bands.
 
     Parameters
     ----------
-    bands : (3, profile, altitude) float64
+    bands : (2, profile, altitude) float64
         Precision of each profile.
     right : (profile, altitude) float64
     stiffness : (3, altitude) float64
@@ -191,18 +201,21 @@ def solve_banded(
         Profile of each system.
     lam : (system,) float64
         Weight of the penalty.
-    out : (4, system, altitude) float64
-        Output: the solution, the diagonal and the two off-diagonals of the inverse.
+    out : (1 or 3, system, altitude) float64
+        Output: the solution, then the diagonal and the first off-diagonal of the inverse.
     """
     o, b, f, c = _work(right.shape[1])
     lams = np.ones(LANES)
     for first in range(0, profile.size, LANES):
         _load_system(bands, right, profile, lam, first, o, b, lams)
         _sweep_down(o, b, stiffness, lams, f)
-        _sweep_up(f, c)
+        if out.shape[0] == 1:
+            _substitute(f)
+        else:
+            _sweep_up(f, c)
+            _store(c[0], first, out[1])
+            _store(c[1], first, out[2])
         _store(f[3], first, out[0])
-        for band in range(3):
-            _store(c[band], first, out[band + 1])
 
 
 @compiled
@@ -210,7 +223,7 @@ def _load_system(
     bands: Array, right: Array, profile: Integers, lam: Array, first: int,
     o: Array, b: Array, lams: Array,
 ) -> None:  # fmt: skip
-    for band in range(3):
+    for band in range(2):
         _load(bands[band], profile, first, o[band])
     _load(right, profile, first, b)
     for j in range(LANES):
@@ -224,14 +237,14 @@ def _misfits(o: Array, b: Array, t: Array, f: Array, c: Array, total: Array) -> 
     product = np.ones(LANES)
     likely, rss, free = total[0], total[1], total[2]
     for i in range(PAD, b.shape[0] - PAD):
-        o0, o1, o2, right = o[0, i], o[1, i], o[2, i], b[i]
-        t0, t1, t2, x0, x1, x2 = t[i], t[i + 1], t[i + 2], f[3, i], f[3, i + 1], f[3, i + 2]
-        c0, c1, c2, d = c[0, i], c[1, i], c[2, i], f[0, i]
+        o0, o1, right = o[0, i], o[1, i], b[i]
+        t0, t1, x0, x1 = t[i], t[i + 1], f[3, i], f[3, i + 1]
+        c0, c1, d = c[0, i], c[1, i], f[0, i]
         for j in range(LANES):
-            e0, e1, e2 = t0[j] - x0[j], t1[j] - x1[j], t2[j] - x2[j]
+            e0, e1 = t0[j] - x0[j], t1[j] - x1[j]
             likely[j] += right[j] * e0
-            rss[j] += o0[j] * e0 * e0 + 2.0 * (o1[j] * e0 * e1 + o2[j] * e0 * e2)
-            free[j] += o0[j] * c0[j] + 2.0 * (o1[j] * c1[j] + o2[j] * c2[j])
+            rss[j] += o0[j] * e0 * e0 + 2.0 * o1[j] * e0 * e1
+            free[j] += o0[j] * c0[j] + 2.0 * o1[j] * c1[j]
             product[j] *= d[j]
         if (i - PAD) % _LOGARITHM_EVERY == 0:
             for j in range(LANES):
@@ -290,19 +303,17 @@ class Smoothing:
     """(candidate,): one weight, or several to be averaged over."""
     share: Array
     """(candidate,): share of each in the average, 1 in total."""
-    saturated: bool
-    """Whether the best weight leaves little more than a straight line."""
-    limited: bool
-    """Whether the best weight is the largest that is allowed, but leaves more than that."""
 
     def times(self, factor: float) -> Smoothing:
         """Return weights multiplied by a factor."""
         return replace(self, weight=self.weight * factor)
 
-    def solve(self, right: Array, bands: Array, stiffness: Array) -> Array:
-        """Return solutions and the bands of the inverse, (4, profile * candidate, altitude)."""
+    def solve(
+        self, right: Array, bands: Array, stiffness: Array, *, inverse: bool = False
+    ) -> Array:
+        """Return solutions, (1, profile * candidate, altitude), or (3, ...) with the inverse."""
         profiles, count = len(right), self.share.size
-        out = np.empty((4, profiles * count, right.shape[1]))
+        out = np.empty((3 if inverse else 1, profiles * count, right.shape[1]))
         row, weight = np.repeat(np.arange(profiles), count), np.tile(self.weight, profiles)
         solve_banded(bands, right, stiffness, row, weight, out)
         return out
@@ -321,80 +332,70 @@ class Smoothing:
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """The criteria on the grid, summed over the scored profiles of a block."""
+    """The criteria for some weights, summed over the scored profiles of a block."""
 
+    weight: Array
+    """(smoothing,): rising."""
     likelihood: Array
     """(smoothing,): minus twice the restricted log-likelihood, up to a constant."""
     risk: Array
     """(smoothing,): Mallows' Cp, up to a constant."""
     freedom: Array
     """(smoothing,): mean effective degrees of freedom of a profile."""
-    profiles: int
-    """Profiles of the block, scored or not."""
 
 
-def score_smoothing(bands: Array, estimates: Array, stiffness: Array, unit: float) -> Scores:
-    """Score every weight on the grid for the profiles of one block, formula 3 of the page.
+def score_smoothing(bands: Array, estimates: Array, stiffness: Array, weight: Array) -> Scores:
+    """Score weights for the profiles of one block, formula 2 of the page.
 
     A long block is scored on every n-th profile.
 
     Parameters
     ----------
-    bands : (3, profile, altitude) float64
+    bands : (2, profile, altitude) float64
     estimates : (profile, altitude) float64
         0 where there is none.
     stiffness : (3, altitude) float64
-    unit : float
-        Factor of the dimensionless weights.
+    weight : (smoothing,) float64
     """
     profiles, altitudes = estimates.shape
-    most = max(_SCORED_PROFILES, _SCORED_VALUES // altitudes)
-    scored = np.arange(0, profiles, -(-profiles // most))
+    scored = np.arange(0, profiles, -(-profiles // _SCORED))
     right = multiply_rows(bands, estimates)
-    profile = np.repeat(scored, GRID.size)
-    lam = np.tile(GRID * unit, scored.size)
+    profile = np.repeat(scored, weight.size)
+    lam = np.tile(weight, scored.size)
     raw = banded_scores(bands, right, estimates, stiffness, profile, lam)
-    fit, misfit, freedom, logarithm = raw.reshape(4, scored.size, GRID.size)
-    likelihood = (fit + logarithm - (altitudes - 1) * np.log(GRID * unit)).sum(axis=0)
+    fit, misfit, freedom, logarithm = raw.reshape(4, scored.size, weight.size)
+    likelihood = (fit + logarithm - (altitudes - 1) * np.log(weight)).sum(axis=0)
     # Where a pivot lost all its digits, the weight is too large.
     likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)
     risk = misfit + 2.0 * freedom
-    return Scores(likelihood, risk.sum(axis=0), freedom.mean(axis=0), profiles)
+    return Scores(weight, likelihood, risk.sum(axis=0), freedom.mean(axis=0))
 
 
-def choose_smoothing(scores: Scores, largest: float) -> Smoothing:
-    """Choose the dimensionless weight of a block, or the weights to average over.
+def weights_up_to(largest: float, unit: float) -> Array:
+    """Return the weights to choose from: those of a grid in `unit`, and the largest one.
 
-    Weights above `largest` are not allowed: without a limit, smooth extinction below would deny
-    the top of a layer above, where the data are too noisy to show it.
+    Without a limit, smooth extinction below would deny the top of a layer above, where the data are
+    too noisy to show it.
+    """
+    grid = _GRID * unit
+    return grid if grid[-1] < largest else np.append(grid[grid < largest], largest)
+
+
+def choose_smoothing(scores: Scores, *, one: bool) -> Smoothing:
+    """Choose the weight of a block, or without `one` the weights to average over.
 
     Profiles of a block have similar shapes, but the likelihood treats them as independent; in
     clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
     gives 1.2 times the degrees of freedom, and lowers the weight by at most a factor of 10.
     """
-    admitted = np.flatnonzero(
-        (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
-    )
-    straight = int(admitted[-1]) if admitted.size else 0
-    last = min(straight, max(int(np.searchsorted(GRID, largest, side="right")) - 1, 0))
-    likely = int(np.argmin(scores.likelihood[: last + 1]))
-    if scores.profiles < THRESHOLDS.fewest_to_choose:
-        return _average(scores, last, straight)
-    risky = int(np.argmin(scores.risk[: last + 1]))
-    risky = max(risky, likely - PER_DECADE)
-    rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
-    best = risky if rougher else likely
-    return _smoothing(np.array([best]), np.ones(1), last, straight)
-
-
-def _average(scores: Scores, last: int, straight: int) -> Smoothing:
+    admitted = (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
+    last = int(np.flatnonzero(admitted)[-1]) if admitted.any() else 0
     likelihood = scores.likelihood[: last + 1]
-    share = np.exp(-0.5 * (likelihood - likelihood.min()))
-    kept = np.flatnonzero(share > THRESHOLDS.negligible_likelihood)
-    share = share[kept] / share[kept].sum()
-    return _smoothing(kept, share, last, straight)
-
-
-def _smoothing(kept: Indices, share: Array, last: int, straight: int) -> Smoothing:
-    best = int(kept[np.argmax(share)])
-    return Smoothing(GRID[kept], share, saturated=best == straight, limited=best == last < straight)
+    if not one:
+        share = np.exp(-0.5 * (likelihood - likelihood.min()))
+        kept = np.flatnonzero(share > _NEGLIGIBLE)
+        return Smoothing(scores.weight[kept], share[kept] / share[kept].sum())
+    likely = int(np.argmin(likelihood))
+    risky = max(int(np.argmin(scores.risk[: last + 1])), likely - _PER_DECADE)
+    rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
+    return Smoothing(scores.weight[[risky if rougher else likely]], np.ones(1))

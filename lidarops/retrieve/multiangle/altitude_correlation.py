@@ -1,9 +1,9 @@
-"""Correlation of noise along altitude, estimated from residuals, and the resulting precision."""
+"""Correlation of the air along altitude, from residuals of beams, and the resulting precision."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Final
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,246 +11,188 @@ from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
-LAGS: Final = 3
-"""Largest distance of residuals that are multiplied, in altitudes."""
-_FARTHEST: Final = 2
-"""Largest distance of linked altitudes."""
-_CANDIDATES: Final = np.arange(98) / 100.0
-"""Correlations to choose from; beyond `highest_correlation` they are flagged, and 1 is excluded
-because its noise has no finite power at low frequencies (formula 1 of the page)."""
-
 
 @dataclass(frozen=True, slots=True)
-class ResidualMoments:
-    """Sums over the residuals of beams, from which the noise of optical depths is estimated.
+class AltitudeNoise:
+    """Noise of optical depths of single altitudes beside their variance."""
 
-    The correlation along altitude and the standard errors depend on them.
-    """
+    correlation: float
+    """Of the air at neighbouring altitudes."""
+    shared: Array
+    """(profile, altitude - 1): correlation of the errors at an altitude and the next if the air
+    were the same at both; its correlation is that of the air times this."""
+    freedom: Array
+    """(altitude,): residual degrees of freedom from which the variance is known."""
 
-    lag_products: Array
-    """(profile, 3): sums over beams and altitudes of products of weighted residuals 1, 2 and 3
-    altitudes apart, weighted by the share of the inhomogeneity in them."""
-    lag_norms: Array
-    """(profile, 3): expectation of these sums if the inhomogeneity is fully correlated."""
-    inhomogeneity_share: Array
-    """(profile, altitude): share of the inhomogeneity in the variance of optical depth, 0..1."""
-    degrees_of_freedom: Array
-    """(profile, altitude): number of beams used minus 2, at least 0."""
-    gaps: Booleans
-    """(profile,): whether samples are missing between others, so that neighbouring altitudes come
-    from different beams."""
-
-    def of(self, profiles: Integers) -> ResidualMoments:
-        """Return the moments of some profiles."""
-        return ResidualMoments(*(getattr(self, field.name)[profiles] for field in fields(self)))
+    def of(self, profiles: Integers) -> AltitudeNoise:
+        """Return the noise of some profiles."""
+        return AltitudeNoise(self.correlation, self.shared[profiles], self.freedom)
 
 
 @compiled
-def _lag_sums(
-    residual: Array, weight: Array, leverage: Array, variance: Array
-) -> tuple[Array, Array, Array]:
+def _traces(sums: Array, joint: Array, sides: Array, k: int) -> float:
+    """Return the trace of the product of what the fits of an altitude and the next leave.
+
+    For beams of equal weight, of which some may be missing at one of both.
+
+    Parameters
+    ----------
+    sums : (3, altitude) float
+        Number of beams, and sums of their paths and squared paths.
+    joint : (4, altitude) float
+        The same of the beams at both, and the sum of 1 minus both leverages.
+    sides : (altitude,) float
+        Number of gradients that are fitted.
+    k : int
+    """
+    n, after, both = sums[0, k], sums[0, k + 1], joint[0, k]
+    mean, mean_after = sums[1, k] / n, sums[1, k + 1] / after
+    square = sums[2, k] - n * mean * mean
+    square_after = sums[2, k + 1] - after * mean_after * mean_after
+    line = joint[1, k] - both * mean
+    line_after = joint[1, k] - both * mean_after
+    slope = joint[2, k] - (mean + mean_after) * joint[1, k] + both * mean * mean_after
+    lost = both**2 / (n * after) + line_after**2 / (n * square_after)
+    lost += line**2 / (after * square) + slope**2 / (square * square_after)
+    return float(joint[3, k] + lost + min(sides[k], sides[k + 1]))
+
+
+@compiled
+def _neighbour_products(
+    residual: Array, noise: Array, leverage: Array, variance: Array, path: Array, sides: Array
+) -> tuple[float, float]:
+    """Return the weighted sum of products of neighbours, and its expectation for equal air."""
     profiles, beams, altitudes = residual.shape
-    products, norms = np.zeros((profiles, LAGS)), np.zeros((profiles, LAGS))
-    freedom = np.zeros((profiles, altitudes))
-    weighted, spread = np.zeros(altitudes), np.zeros(altitudes)
+    value, free, weight = np.empty(altitudes), np.empty(altitudes), np.empty(altitudes)
+    sums, joint, pairs = (
+        np.empty((3, altitudes)),
+        np.empty((4, altitudes)),
+        np.empty((3, altitudes)),
+    )
+    scatter = np.sqrt(variance)
+    product = norm = 0.0
     for t in range(profiles):
+        sums[:], joint[:], pairs[:] = 0.0, 0.0, 0.0
         for beam in range(beams):
+            x = path[beam]
             for k in range(altitudes):
-                w = weight[t, beam, k]
-                share = w * variance[k] * (1.0 - leverage[t, beam, k])
-                u = residual[t, beam, k] * np.sqrt(w)
-                used = w > 0.0 and np.isfinite(u) and share > 0.0
-                freedom[t, k] += 1.0 if w > 0.0 and np.isfinite(u) else 0.0
-                weighted[k] = u if used else 0.0
-                spread[k] = np.sqrt(share) if used else 0.0
-            for lag in range(1, LAGS + 1):
-                product = norm = 0.0
-                for k in range(altitudes - lag):
-                    joint = spread[k] * spread[k + lag]
-                    if joint > 0.0:
-                        product += joint * weighted[k] * weighted[k + lag]
-                        norm += joint * joint
-                products[t, lag - 1] += product
-                norms[t, lag - 1] += norm
-        for k in range(altitudes):
-            freedom[t, k] = max(freedom[t, k] - 2.0, 0.0)
-    return products, norms, freedom
+                used = noise[t, beam, k] < np.inf and leverage[t, beam, k] < 1.0
+                free[k] = math.sqrt(1.0 - leverage[t, beam, k]) if used else 0.0
+                weight[k] = scatter[k] * free[k] / (noise[t, beam, k] + variance[k])
+                value[k] = residual[t, beam, k] * weight[k] if weight[k] > 0.0 else 0.0
+                on = 1.0 if used else 0.0
+                sums[0, k] += on
+                sums[1, k] += on * x[k]
+                sums[2, k] += on * x[k] * x[k]
+            for k in range(altitudes - 1):
+                on = 1.0 if free[k] * free[k + 1] > 0.0 else 0.0
+                joint[0, k] += on
+                joint[1, k] += on * x[k]
+                joint[2, k] += on * x[k] * x[k]
+                joint[3, k] += on * (free[k] * free[k] + free[k + 1] * free[k + 1] - 1.0)
+                pairs[0, k] += free[k] * free[k + 1]
+                pairs[1, k] += value[k] * value[k + 1]
+                expected = weight[k] * weight[k + 1] * free[k] * free[k + 1]
+                pairs[2, k] += scatter[k] * scatter[k + 1] * expected
+        for k in range(altitudes - 1):
+            if pairs[2, k] > 0.0 and min(sums[0, k], sums[0, k + 1]) > 2.0:
+                share = _traces(sums, joint, sides[t], k) / pairs[0, k]
+                product += pairs[1, k]
+                norm += pairs[2, k] * min(max(share, 0.0), 1.0)
+    return product, norm
 
 
-def residual_moments(
-    residual: Array,
-    weight: Array,
-    leverage: Array,
-    inhomogeneity_variance: Array,
-    inhomogeneity_share: Array,
-    gaps: Booleans,
-) -> ResidualMoments:
-    r"""Return sums over the residuals of a fit over beams.
+def correlation_of_air(
+    residual: Array, noise: Array, leverage: Array, variance: Array, path: Array, sides: Array
+) -> float:
+    r"""Return the correlation of the air at neighbouring altitudes, 0 to 0.98.
 
-    Each product is weighted by the share of the inhomogeneity in it: where noise dominates, the
+    One step of scoring towards the largest restricted likelihood of a stationary autoregressive
+    process, of which the variance is known: products of neighbouring residuals, weighted by the
+    share of the air in them, over their expectation for equal air. Where noise dominates, the
     products show errors along a beam, such as those of the background, not the air.
 
     Parameters
     ----------
-    residual : (profile, beam, altitude) float64
-        Logarithm of the signal minus its fit.
-    weight : (profile, beam, altitude) float64
-        :math:`w = 1 / (v + s^2)`; zero or NaN where a beam was not used.
+    residual, noise : (profile, beam, altitude) float64
+        Logarithm of the signal minus its fit, and the variance of its noise; NaN and infinite where
+        a beam was not used.
     leverage : (profile, beam, altitude) float64
         Diagonal of the hat matrix, :math:`h = w (1 / \sum w + (x - \bar x)^2 / S_{xx})`.
-    inhomogeneity_variance : (altitude,) float64
-        :math:`s^2`.
-    inhomogeneity_share : (profile, altitude) float64
-        :math:`f = s^2 \sum w^2 (x - \bar x)^2 / S_{xx}`, the share of :math:`s^2` in the
-        variance of the optical depth.
-    gaps : (profile,) bool
-        Whether samples are missing between others, so that neighbouring altitudes come from
-        different beams.
+    variance : (altitude,) float64
+        Of the air, :math:`s^2`.
+    path : (beam, altitude) float64
+        Slant over vertical path.
+    sides : (profile, altitude) float64
+        Number of gradients that are fitted.
     """
-    products, norms, freedom = _lag_sums(residual, weight, leverage, inhomogeneity_variance)
-    share = np.clip(np.nan_to_num(inhomogeneity_share), 0.0, 1.0)
-    return ResidualMoments(products, norms, share, freedom, gaps)
-
-
-def fit_correlation(products: Array, norms: Array) -> tuple[float, float]:
-    r"""Fit :math:`\phi \rho^h` to the pooled lag ratios of a block.
-
-    Detector noise is not correlated along altitude, so :math:`\phi` may be less than 1.
-
-    Parameters
-    ----------
-    products, norms : (profile, 3) float
-        Of the profiles of one block.
-
-    Returns
-    -------
-    correlation, amplitude : float
-        :math:`\rho` within 0..0.97 and :math:`\phi` within 0.5..1.05.
-    """
-    norm = norms.sum(axis=0)
-    if not np.all(norm > 0.0):
-        return 0.0, 1.0
-    ratio = products.sum(axis=0) / norm
-    shape = _CANDIDATES[:, np.newaxis] ** np.arange(1, LAGS + 1)
-    square = np.maximum((shape**2).sum(axis=1), np.finfo(np.float64).tiny)
-    amplitude = np.clip(
-        (shape * ratio).sum(axis=1) / square,
-        THRESHOLDS.least_amplitude,
-        THRESHOLDS.largest_amplitude,
-    )
-    misfit = ((ratio - amplitude[:, np.newaxis] * shape) ** 2).sum(axis=1)
-    best = int(np.argmin(misfit))
-    return (float(_CANDIDATES[best]), float(amplitude[best])) if best > 0 else (0.0, 1.0)
+    product, norm = _neighbour_products(residual, noise, leverage, variance, path, sides)
+    return min(max(product / norm, 0.0), THRESHOLDS.most_correlated) if norm > 0.0 else 0.0
 
 
 @compiled
-def correlated_precision(information: Array, share: Array, correlation: float) -> Array:
-    """Return the precision of the estimates as an autoregressive process along altitude.
+def _mean_covariances(information: Array, shared: Array, joint: Array) -> Booleans:
+    """Fill the covariances of neighbours in equal air, and return where both are known.
 
-    Formula 1 of ``docs/algorithms/vertical.md``. An altitude whose correlated share is less than
-    half of that of one of the two on either side is not linked: most of its noise is its own and
-    does not predict that of its neighbours. It is bridged like a single missing altitude; a longer
-    gap breaks the chain.
+    They are means over 15 altitudes: where samples are missing, neighbours see the air along
+    different beams, but altitudes a few steps apart do not see less of it in common. The first and
+    the last place are those of neighbours outside the grid.
+    """
+    links, half = np.zeros(joint.size, np.bool_), THRESHOLDS.pooled // 2
+    single = np.zeros(joint.size)
+    for k in range(1, joint.size - 1):
+        both = information[k - 1] * information[k]
+        links[k] = both > 0.0
+        single[k] = shared[k - 1] / math.sqrt(both) if links[k] else 0.0
+    for k in range(joint.size):
+        total = count = 0.0
+        for j in range(max(k - half, 0), min(k + half + 1, joint.size)):
+            total += single[j]
+            count += 1.0 if links[j] else 0.0
+        joint[k] = total / count if links[k] else 0.0
+    return links
+
+
+@compiled
+def correlated_precision(information: Array, shared: Array, correlation: float) -> Array:
+    """Return the precision of the estimates as a chain along altitude.
+
+    Formula 1 of ``docs/algorithms/vertical.md``. A missing estimate breaks the chain.
 
     Parameters
     ----------
     information : (profile, altitude) float64
         0 where there is no estimate.
-    share : (profile, altitude) float64
-        Correlated share of the variance.
+    shared : (profile, altitude - 1) float64
+        See `AltitudeNoise`.
     correlation : float
-        Of that noise at neighbouring altitudes.
+        Of the air at neighbouring altitudes.
 
     Returns
     -------
-    (3, profile, altitude) float64
-        Diagonal, and the first and second off-diagonals (of an altitude with those above it).
+    (2, profile, altitude) float64
+        Diagonal, and the off-diagonal (of an altitude with the one above it).
     """
     profiles, altitudes = information.shape
-    bands = np.zeros((3, profiles, altitudes))
-    decay = 2.0 * correlation / (1.0 - correlation)
+    bands, joint = np.zeros((2, profiles, altitudes)), np.empty(altitudes + 1)
+    far = 2.0 * correlation / (1.0 - correlation)
     for t in range(profiles):
-        last, joint = -1, 0.0
+        own = information[t]
+        links = _mean_covariances(own, shared[t], joint)
+        for k in range(altitudes - 1):
+            if links[k + 1]:
+                variance = 0.5 / own[k] + 0.5 / own[k + 1]
+                both = min(joint[k + 1], variance)
+                slow = 1.0 / (variance + both * far)
+                product = 2.0 * (variance - both * correlation) * slow
+                u = 0.125 * (product + math.sqrt(product * (product + 16.0)))
+                link = 0.25 * slow * (1.0 - u * u) / (u * u)
+                bands[0, t, k] += link
+                bands[0, t, k + 1] += link
+                bands[1, t, k] = -link
         for k in range(altitudes):
-            q = share[t, k] * decay
-            joint *= q / (q + 2.0)
-            if not information[t, k] > 0.0:
-                continue
-            bands[0, t, k] = information[t, k]
-            if share[t, k] < THRESHOLDS.linked * np.max(share[t, max(k - 2, 0) : k + 3]):
-                continue
-            step = k - last
-            if last >= 0 and step <= 2 and joint > 0.0:
-                rest = 1.0 - joint * joint
-                bands[0, t, k] = information[t, k] / rest
-                bands[0, t, last] += information[t, last] * joint * joint / rest
-                across = np.sqrt(information[t, k]) * np.sqrt(information[t, last])
-                bands[step, t, last] = -joint / rest * across
-            last, joint = k, 1.0
-    return bands
-
-
-@compiled
-def _link(information: Array, share: Array, linked: Booleans) -> None:
-    """Fill which altitudes have at least half of the correlated share of those on either side."""
-    for k in range(share.size):
-        most = np.max(share[max(k - 2, 0) : k + 3])
-        enough = share[k] > THRESHOLDS.least_correlated and share[k] >= THRESHOLDS.linked * most
-        linked[k] = information[k] > 0.0 and enough
-
-
-@compiled
-def _own_noise(share: Array, linked: Booleans, k: int) -> float:
-    """Return the mean over links around an altitude of own over correlated noise."""
-    total = count = 0.0
-    for j in range(
-        max(k - THRESHOLDS.half_window, 0), min(k + THRESHOLDS.half_window + 1, share.size)
-    ):
-        if linked[j]:
-            total += (1.0 - share[j]) / share[j]
-            count += 1.0
-    return total / count if count > 0.0 else 0.0
-
-
-@compiled
-def gap_precision(information: Array, share: Array, correlation: float) -> Array:
-    """Return the precision of estimates whose neighbours come from different beams.
-
-    Formula 2 of ``docs/algorithms/vertical.md``; parameters and shape as of
-    `correlated_precision`.
-    """
-    profiles, altitudes = information.shape
-    bands = np.zeros((3, profiles, altitudes))
-    decay = 2.0 * correlation / (1.0 - correlation)
-    linked = np.zeros(altitudes, np.bool_)
-    for t in range(profiles):
-        _link(information[t], share[t], linked)
-        last, known = -1, 0.0
-        for k in range(altitudes):
-            own = information[t, k]
-            if not (own > 0.0 and share[t, k] > THRESHOLDS.least_correlated):
-                bands[0, t, k] = own
-                continue
-            usual = _own_noise(share[t], linked, k)
-            q = decay / (1.0 + usual)
-            r = q / (q + 2.0)
-            if not linked[k]:
-                left = (1.0 - r) * (1.0 - r) / (1.0 + r * r)
-                bands[0, t, k] = left * own / (1.0 + share[t, k] * decay)
-                continue
-            ratio = (1.0 - share[t, k]) / share[t, k]
-            level = 1.0 / (1.0 + usual + (1.0 - r) * (1.0 - r) * (ratio - usual))
-            own *= level / share[t, k]
-            step = k - last
-            q = level * decay
-            joint = (q / (q + 2.0)) ** step
-            bands[0, t, k] = own
-            if last >= 0 and step > _FARTHEST:
-                bands[0, t, k] = own * (1.0 - joint) / (1.0 + joint)
-            elif last >= 0:
-                rest = 1.0 - joint * joint
-                bands[0, t, k] = own / rest
-                bands[0, t, last] += known * joint * joint / rest
-                bands[step, t, last] = -joint / rest * np.sqrt(own) * np.sqrt(known)
-            last, known = k, own
+            n = (1.0 if links[k] else 0.0) + (1.0 if links[k + 1] else 0.0)
+            both = min((joint[k] + joint[k + 1]) / max(n, 1.0) * own[k], 1.0)
+            slow = own[k] / (1.0 + both * far)
+            bands[0, t, k] += slow + (1.0 - 0.5 * n) * (own[k] - slow)
     return bands

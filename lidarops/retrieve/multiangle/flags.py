@@ -44,24 +44,10 @@ class MultiAngleQuality(FlagBit):
         Severity.CARE,
         "in a gap of the data, interpolated from the altitudes above and below",
     )
-    LOW_LEVERAGE = FIRST_OWN + 9, *flags.LOW_LEVERAGE
     NO_RESIDUAL = (
         FIRST_OWN + 10,
         Severity.CARE,
         "there are as many unknowns as angles, so no residual tests the result",
-    )
-    UNDERSMOOTHED = (
-        FIRST_OWN + 11,
-        Severity.CARE,
-        "the profile has more vertical structure than its errors explain",
-    )
-    HIGH_CORRELATION = (
-        FIRST_OWN + 12,
-        Severity.CARE,
-        (
-            "errors of neighbouring altitudes are correlated by more than 0.85: confidence"
-            " intervals are too narrow"
-        ),
     )
 
 

@@ -89,7 +89,7 @@ def retrieve_optical_depth(
 
     References
     ----------
-    kano1968, hamilton1969, gobrusenko1989, dersimonian1986, siegel1982.
+    kano1968, hamilton1969, gobrusenko1989, dersimonian1986.
     """
     method = inputs.choice(settings.method, MultiAngleMethod, "method")
     station = settings.station_altitude

@@ -16,14 +16,9 @@ import numpy as np
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
-from lidarops.retrieve.multiangle import (
-    _calibration,
-    _smoothing,
-    altitude_correlation,
-    robust_weights,
-)
+from lidarops.retrieve.multiangle import _calibration, _smoothing
 from lidarops.retrieve.multiangle._smoothing import Smoothing
-from lidarops.retrieve.multiangle.altitude_correlation import ResidualMoments
+from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, correlated_precision
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _UNIFORM: Final = 1e-3
@@ -37,32 +32,26 @@ class _Block:
     altitude: Array
     """m above the lidar."""
     estimates: Array
+    """0 where there is none."""
     information: Array
-    share: Array
-    """Correlated share of the variance."""
-    correlation: float
+    noise: AltitudeNoise
+    bands: Array
+    """Precision of the estimates."""
     stiffness: Array
-    extent: float
-    """m, from the lidar to the highest estimate."""
-    gaps: Integers
-    """Rows where neighbouring altitudes come from different beams."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
     """Solution of a block."""
 
-    information: Array
-    """After the loss of weight of outlying estimates."""
-    bands: Array
     smoothing: Smoothing
     depth: Array
     variance: Array
     extinction: Array
     """Optical depth of the layer from the altitude below."""
     extinction_variance: Array
-    own: Array
-    """Weight of each estimate in its own optical depth."""
+    freedom: Array
+    """(profile,): effective degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +71,8 @@ class VerticalResult:
     where the optical depth is not larger than its standard error."""
     effective_degrees_of_freedom: Array
     """(profile,): effective number of independent values in the profile."""
-    correlation: float
-    """Of the inhomogeneity at neighbouring altitudes."""
     interpolated: Booleans
     """No estimate there; interpolated from those around, or from the lidar."""
-    downweighted: Booleans
-    """The estimate is an outlier of its profile."""
-    saturated: bool
-    """The best fit of the block is little more than a straight line."""
-    undersmoothed: Booleans
-    """(profile,): more than 10 degrees of freedom and more than 0.4 per altitude, which the data
-    prefer to a smoother profile."""
-    high_correlation: bool
-    """The correlation exceeds 0.85; standard errors may be too small."""
     block: _Block
     fit: _Fit
     factor: Callable[[Integers, Integers], Array]
@@ -110,8 +88,9 @@ class VerticalResult:
         rows : (profile, altitude) float
             Finite wherever there was an estimate.
         """
-        rows = _respond(self.block, self.fit, rows)
-        return np.where(np.isfinite(self.optical_depth), rows, np.nan)
+        known = np.where(self.block.information > 0.0, rows, 0.0)
+        smooth = _respond(self.block, self.fit.smoothing, known)
+        return np.where(np.isfinite(self.optical_depth), smooth, np.nan)
 
     def layer(self, lower: int, upper: int) -> tuple[Array, Array]:
         """Return the optical depth between two altitudes, and its standard error, (profile,).
@@ -123,20 +102,20 @@ class VerticalResult:
         lower, upper : int
             Indices of altitudes in ascending order, -1 for the lidar.
         """
-        block, fit = self.block, self.fit
+        block, smoothing = self.block, self.fit.smoothing
         right = np.zeros(block.estimates.shape)
         right[:, upper] = 1.0
         if lower >= 0:
             right[:, lower] = -1.0
-        estimates = _smoothing.multiply_rows(fit.bands, block.estimates)
+        estimates = _smoothing.multiply_rows(block.bands, block.estimates)
         inverse, solved = (
-            fit.smoothing.solve(rows, fit.bands, block.stiffness)[0] for rows in (right, estimates)
+            smoothing.solve(rows, block.bands, block.stiffness)[0] for rows in (right, estimates)
         )
         posterior, value = (
             rows[:, [upper]] - (rows[:, [lower]] if lower >= 0 else 0.0)
             for rows in (inverse, solved)
         )
-        depth, variance = fit.smoothing.mixed(value, posterior)
+        depth, variance = smoothing.mixed(value, posterior)
         variance *= self.factor(np.array([upper]), np.array([lower]))
         reached = np.isfinite(self.optical_depth[:, upper])
         return (
@@ -150,13 +129,12 @@ def smooth_optical_depth(
     information: Array,
     altitude: Array,
     *,
-    residuals: ResidualMoments | None = None,
-    robust: bool = True,
+    noise: AltitudeNoise | None = None,
 ) -> VerticalResult:
     """Return profiles with smooth extinction from optical depths of single altitudes.
 
-    The correlation, the weight of smoothness and the calibration of the standard errors are common
-    to the profiles. With fewer than 8 profiles, solutions are averaged over the weight.
+    The weight of smoothness and the calibration of the standard errors are common to the profiles.
+    With fewer than 8 profiles, solutions are averaged over the weight.
 
     Parameters
     ----------
@@ -166,13 +144,8 @@ def smooth_optical_depth(
         Reciprocal variances; NaN or 0 where there is no estimate.
     altitude : (altitude,) float
         m above the lidar, ascending and uniform.
-    residuals : ResidualMoments, optional
+    noise : AltitudeNoise, optional
         If not given, the estimates are taken as uncorrelated, with exactly known variance.
-    robust : bool
-        Whether to give outlying estimates less weight: first those more than 6 standard errors
-        from the median of 15 altitudes; then, if any is more than 4.5 standard errors from the
-        solution, all by Tukey's bisquare at 6 standard errors. Not done if `residuals` come from
-        fewer than 4 beams, nor in a profile where more than half would lose weight.
 
     Raises
     ------
@@ -182,24 +155,22 @@ def smooth_optical_depth(
     References
     ----------
     patterson1971 (likelihood), mallows1973 (Cp), wahba1983 (intervals), takahashi1973
-    (variances), beaton1974 (bisquare).
+    (variances).
     """
     _require_uniform(altitude)
     used = np.isfinite(optical_depth) & (information > 0.0)
     block = _block(
-        np.where(used, optical_depth, 0.0), np.where(used, information, 0.0), altitude, residuals
+        np.where(used, optical_depth, 0.0), np.where(used, information, 0.0), altitude, noise
     )
-    freedom = None if residuals is None else residuals.degrees_of_freedom
-    few = freedom is not None and freedom.max() < THRESHOLDS.fewest_beams - 2.0
-    fit = _solve_block(block, robust=robust and not few)
+    fit = _fit(block)
     within = np.cumsum(used[:, ::-1], axis=1)[:, ::-1] > 0
     calibrated = len(within) >= THRESHOLDS.fewest_to_choose
     factor = partial(
         _variance_factor,
         _calibrate(block, fit, within) if calibrated else None,
-        _inflation(freedom, block.correlation, altitude.size),
+        np.ones(altitude.size) if noise is None else _inflation(noise),
     )
-    return _result(block, fit, factor, within, np.diff(altitude, prepend=0.0))
+    return _result(block, fit, factor, within)
 
 
 def _require_uniform(altitude: Array) -> None:
@@ -212,55 +183,36 @@ def _require_uniform(altitude: Array) -> None:
 
 
 def _block(
-    depth: Array, information: Array, altitude: Array, moments: ResidualMoments | None
+    depth: Array, information: Array, altitude: Array, noise: AltitudeNoise | None
 ) -> _Block:
-    highest = int(np.flatnonzero((information > 0.0).any(axis=0))[-1])
-    correlation, share = 0.0, np.zeros_like(depth)
-    gaps = np.zeros(0, dtype=np.int64)
-    if moments is not None:
-        correlation, amplitude = altitude_correlation.fit_correlation(
-            moments.lag_products, moments.lag_norms
-        )
-        share = np.clip(moments.inhomogeneity_share * amplitude, 0.0, 1.0)
-        gaps = np.flatnonzero(moments.gaps)
+    if noise is None:
+        noise = AltitudeNoise(0.0, np.zeros((len(depth), altitude.size - 1)), np.zeros(0))
+    bands = correlated_precision(information, noise.shared, noise.correlation)
     stiffness = _smoothing.penalty(altitude)
-    return _Block(
-        altitude, depth, information, share, correlation, stiffness, float(altitude[highest]), gaps
-    )
+    return _Block(altitude, depth, information, noise, bands, stiffness)
 
 
-def _solve_block(block: _Block, *, robust: bool) -> _Fit:
-    if not robust:
-        return _fit(block, block.information)
-    screened = robust_weights.screen_outliers(block.estimates, block.information)
-    fit = _fit(block, robust_weights.reduce_information(block.information, screened))
-    reduced = robust_weights.downweight_outliers(
-        block.estimates, block.information, block.share, fit.depth, fit.variance
-    )
-    return fit if reduced is None else _fit(block, reduced)
-
-
-def _fit(block: _Block, information: Array) -> _Fit:
+def _fit(block: _Block) -> _Fit:
     """Choose the smoothness of a block and solve."""
-    bands = _precision(block, information)
-    unit = float(information[information > 0.0].mean()) * block.extent**3
-    scores = _smoothing.score_smoothing(bands, block.estimates, block.stiffness, unit)
-    largest = _largest_smoothing(block, information) / unit
-    smoothing = _smoothing.choose_smoothing(scores, largest).times(unit)
+    information, bands = block.information, block.bands
+    highest = int(np.flatnonzero((information > 0.0).any(axis=0))[-1])
+    unit = float(information[information > 0.0].mean()) * block.altitude[highest] ** 3
+    weights = _smoothing.weights_up_to(_largest_smoothing(block, information), unit)
+    scores = _smoothing.score_smoothing(bands, block.estimates, block.stiffness, weights)
+    one = len(information) >= THRESHOLDS.fewest_to_choose
+    smoothing = _smoothing.choose_smoothing(scores, one=one)
     right = _smoothing.multiply_rows(bands, block.estimates)
-    solved, diagonal, beside, second = smoothing.solve(right, bands, block.stiffness)
+    solved, diagonal, beside = smoothing.solve(right, bands, block.stiffness, inverse=True)
     gained = np.diff(solved, axis=1, prepend=0.0)
     uncertain = diagonal.copy()
     uncertain[:, 1:] += diagonal[:, :-1] - 2.0 * beside[:, :-1]
     repeated = np.repeat(bands, smoothing.share.size, axis=1)
-    own = _own_weights(repeated, np.array([diagonal, beside, second]))
+    own = repeated[0] * diagonal + 2.0 * repeated[1] * beside
     return _Fit(
-        information,
-        bands,
         smoothing,
         *smoothing.mixed(solved, diagonal),
         *smoothing.mixed(gained, uncertain),
-        smoothing.mean(own),
+        smoothing.mean(own).sum(axis=1),
     )
 
 
@@ -271,61 +223,24 @@ def _largest_smoothing(block: _Block, information: Array) -> float:
     return THRESHOLDS.scale_height / (mean**2 + 1.0 / known)
 
 
-def _precision(block: _Block, information: Array) -> Array:
-    share = _reduced_share(block, information)
-    bands = altitude_correlation.correlated_precision(information, share, block.correlation)
-    rows = block.gaps
-    if rows.size and block.correlation > 0.0:
-        bands[:, rows] = altitude_correlation.gap_precision(
-            information[rows], share[rows], block.correlation
-        )
-    return bands
-
-
-def _reduced_share(block: _Block, information: Array) -> Array:
-    """Return the correlated share of the variance: an estimate with less weight has more own noise.
-
-    The bisquare raises the information of good estimates slightly above the whole; a share above 1
-    would leave a negative variance.
-    """
-    whole = block.information
-    ratio = np.where(whole > 0.0, information / np.where(whole > 0.0, whole, 1.0), 1.0)
-    return np.asarray(block.share * np.minimum(ratio, 1.0))
-
-
-def _respond(block: _Block, fit: _Fit, rows: Array) -> Array:
+def _respond(block: _Block, smoothing: Smoothing, rows: Array) -> Array:
     """Apply the smoother of each profile to its row."""
-    right = _smoothing.multiply_rows(fit.bands, np.where(fit.information > 0.0, rows, 0.0))
-    return fit.smoothing.mean(fit.smoothing.solve(right, fit.bands, block.stiffness)[0])
-
-
-def _own_weights(bands: Array, inverse: Array) -> Array:
-    """Return the diagonal of the smoother of each system."""
-    own: Array = bands[0] * inverse[0]
-    for step in (1, 2):
-        both = (bands[step] * inverse[step])[:, :-step]
-        own[:, :-step] += both
-        own[:, step:] += both
-    return own
+    right = _smoothing.multiply_rows(block.bands, rows)
+    return smoothing.mean(smoothing.solve(right, block.bands, block.stiffness)[0])
 
 
 def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calibration:
-    information, share = _calibration.typical_profile(
-        fit.information, _reduced_share(block, fit.information)
-    )
-    right = _smoothing.multiply_rows(fit.bands, block.estimates)
-    pilot = fit.smoothing.times(THRESHOLDS.pilot)
-    rough = pilot.solve(right, fit.bands, block.stiffness)[0]
-    right = _smoothing.multiply_rows(fit.bands, rough)
-    smooth = fit.smoothing.solve(right, fit.bands, block.stiffness)[0]
-    bands = altitude_correlation.correlated_precision(
-        information[np.newaxis], share[np.newaxis], block.correlation
+    information, shared = _calibration.typical_profile(block.information, block.noise.shared)
+    rough = _respond(block, fit.smoothing.times(THRESHOLDS.pilot), block.estimates)
+    smooth = _respond(block, fit.smoothing, rough)
+    bands = correlated_precision(
+        information[np.newaxis], shared[np.newaxis], block.noise.correlation
     )
     return _calibration.Calibration(
         bands[:, 0],
         information,
-        share,
-        block.correlation,
+        shared,
+        block.noise.correlation,
         block.stiffness,
         float(fit.smoothing.weight[0]),
         np.where(within, rough - smooth, np.nan),
@@ -333,14 +248,10 @@ def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calib
     )
 
 
-def _inflation(freedom: Array | None, correlation: float, altitudes: int) -> Array:
+def _inflation(noise: AltitudeNoise) -> Array:
     """Return the factor on variances because noise is estimated from a window of residuals."""
-    if freedom is None:
-        return np.ones(altitudes)
-    total = np.convolve(freedom.sum(axis=0), np.ones(THRESHOLDS.pooled), mode="full")
-    start = THRESHOLDS.pooled // 2
-    square = correlation * correlation
-    known = total[start : start + altitudes] * (1.0 - square) / (1.0 + square)
+    square = noise.correlation**2
+    known = noise.freedom * (1.0 - square) / (1.0 + square)
     known = np.maximum(known, THRESHOLDS.fewest_freedom)
     factor: Array = known / (known - 2.0)
     return factor
@@ -366,36 +277,23 @@ def _variance_factor(
 
 
 def _result(
-    block: _Block,
-    fit: _Fit,
-    factor: Callable[[Integers, Integers], Array],
-    within: Booleans,
-    step: Array,
+    block: _Block, fit: _Fit, factor: Callable[[Integers, Integers], Array], within: Booleans
 ) -> VerticalResult:
+    step = np.diff(block.altitude, prepend=0.0)
     rows = np.arange(step.size)
     error = np.sqrt(fit.variance * factor(rows, np.full(step.size, -1)))
     extinction_error = np.sqrt(fit.extinction_variance * factor(rows, rows - 1)) / step
     certain = within & (np.abs(fit.depth) > error)
-    response = _respond(block, fit, fit.depth)
-    share = np.where(certain, response / np.where(certain, fit.depth, 1.0), np.nan)
-    freedom = fit.own.sum(axis=1)
-    used = fit.information > 0.0
+    known = np.where(block.information > 0.0, fit.depth, 0.0)
+    response = _respond(block, fit.smoothing, known)
     return VerticalResult(
         optical_depth=np.where(within, fit.depth, np.nan),
         optical_depth_standard_error=np.where(within, error, np.nan),
         extinction=np.where(within, fit.extinction / step, np.nan),
         extinction_standard_error=np.where(within, extinction_error, np.nan),
-        data_share=share,
-        effective_degrees_of_freedom=freedom,
-        correlation=block.correlation,
-        interpolated=within & ~used,
-        downweighted=fit.information < THRESHOLDS.majority * block.information,
-        saturated=fit.smoothing.saturated,
-        # Where the data are smoother than allowed, their noise is not mistaken for structure.
-        undersmoothed=(not fit.smoothing.limited)
-        & (freedom > THRESHOLDS.most_freedom)
-        & (freedom > THRESHOLDS.roughest * used.sum(axis=1)),
-        high_correlation=block.correlation > THRESHOLDS.highest_correlation,
+        data_share=np.where(certain, response / np.where(certain, fit.depth, 1.0), np.nan),
+        effective_degrees_of_freedom=fit.freedom,
+        interpolated=within & ~(block.information > 0.0),
         block=block,
         fit=fit,
         factor=factor,

@@ -64,71 +64,38 @@ class Thresholds(NamedTuple):
     """Share of the variance of backgrounds, by signal in the far range, that all beams have in
     common; assumed."""
 
+    # Correlation along altitude (`altitude_correlation`, `beam_backgrounds`).
     most_correlated: float = 0.98
-    """Largest correlation of residuals at neighbouring altitudes: one altitude then counts as a
-    hundredth; assumed."""
+    """Largest correlation at neighbouring altitudes: one altitude then counts as a hundredth;
+    assumed."""
 
-    # Samples (`_block`).
+    # Samples (`_samples`).
     lowest_snr: float = 3.0
     """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
     light (`test_kano_hamilton`)."""
-    around: int = 15
-    """Altitudes of that mean, so many that a sample has little influence on its own selection; by
-    the same bias."""
     swallowed_snr: float = 2.0
     """The same of the altitudes from one upwards: the wide window would accept samples behind a
     cloud that swallows the beam; by the stiff case of optical depth 20."""
     ahead: int = 5
-    """Altitudes of that mean; by the same case."""
-    least_noise: float = 1e-6
-    """Smallest noise over signal; a variance of 0 counts as this; by definition."""
-    farthest_expected: float = 3.0
-    """Standard deviations by which the expected signal may differ from the sample; assumed."""
+    """Altitudes of that mean, a third of those around; by the same case."""
 
     # Fit at single altitudes (`_block`, `_methods`).
     pooled: int = 15
     """Altitudes over which the inhomogeneity is pooled; assumed."""
-    first_guess: float = 0.03**2
-    """Variance of the inhomogeneity with which the first fit is weighted; assumed."""
     fewest_freedom: float = 4.1
     """Least degrees of freedom n in Student's variance n / (n - 2), which diverges at 2: the
     variance is at most doubled; by definition."""
     least_span: float = 0.1
-    """Span of slant paths below which LOW_LEVERAGE is raised: 0 to 25 degrees; assumed."""
+    """Span of slant paths below which a scan or a plane is not retrieved: 0 to 25 degrees;
+    assumed."""
     least_share: float = 0.9
-    """Data share below which the prior determines the extinction of "mld" and "mld_prior", by
-    definition; and the farthest from 1 at which the optical depth of "joint" is not flagged: beyond
-    it, 0.4 percent deviated by more than 4 errors, not 0.07, where beams were not averaged over
-    cells (`docs/algorithms/multiangle.md`)."""
+    """Data share below which the prior determines the extinction of "mld" and "mld_prior"; by
+    definition."""
 
     # Values (`labeled`).
     negative: float = 2.0
     """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
     alone in 2.3 percent of the altitudes where the air is clear."""
-
-    # Outlying beams (`_block`, `robust_weights`).
-    outlying_residual: float = 4.5
-    """Least limit in standard errors beyond which a residual starts the robust passes; assumed."""
-    false_alarm: float = 0.01
-    """Probability that chance starts them in a block; chosen."""
-    fewest_beams: int = 4
-    """Beams from which one outlier can be identified: two unknowns and two residuals."""
-    start_width: float = 5.0
-    """Standard errors from the start beyond which a sample has no weight; assumed."""
-    pass_width: float = 7.0
-    """Standard errors from a weighted fit beyond which a sample has no weight; assumed."""
-    closest_paths: float = 1e-3
-    """Distance of two slant paths, over their span, below which they define no slope: they would
-    amplify noise 1000 times; by the formula."""
-    kept_weight: float = 0.3
-    """Weight above which a beam counts as kept; assumed."""
-    fewest_kept: int = 3
-    """Beams that must be kept; with fewer, all keep their full weight; assumed."""
-    clear_variance: float = 0.01
-    """Variance of a logarithm up to which its noise is well known: signal 10 times its noise;
-    assumed."""
-    median_of: int = 100_000
-    """Residuals that suffice for the median of their sizes, which errs by 0.4 percent; formula."""
 
     # Horizontal gradient (`_horizontal_variation`, `_methods`).
     gradient_window: float = 1000.0
@@ -139,10 +106,6 @@ class Thresholds(NamedTuple):
     without them, 1.4 with them (`test_level_air_shows_no_gradient`)."""
     gradient_false_alarm: float = 1e-3
     """Probability that chance shows a gradient along an axis at any altitude of a block; chosen."""
-    gradient_dead_time: float = 1.0
-    """Standard errors of the dead time that may explain a gradient, as optical depths state one.
-    With 2, of simulated haze that grows by 20 percent per km to one side, 62 of 72 values without a
-    flag were false, with 1 all are rejected (`test_what_the_dead_time_explains_is_no_gradient`)."""
     largest_gradient: float = 3e-4
     """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
     no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted
@@ -155,45 +118,6 @@ class Thresholds(NamedTuple):
     growth_certainty: float = 2.5
     """Standard errors by which the logarithm of that ratio must exceed zero: with `growth`, 0.3
     percent false alarms; simulations."""
-    fewest_profiles: int = 4
-    """Profiles below which growth is not tested over profiles; assumed."""
-    fewest_altitudes: int = 6
-    """Altitudes below which growth is not tested; assumed."""
-    clipped: float = 3.0
-    """Standard errors to which the residuals of that test are clipped; assumed."""
-    least_weight: float = 1e-3
-    """Robust weight up to which a sample is left out of the test of growth; assumed."""
-
-    # Correlation along altitude (`altitude_correlation`).
-    least_amplitude: float = 0.5
-    """Least amplitude of the correlation; assumed."""
-    largest_amplitude: float = 1.05
-    """Largest amplitude of the correlation; assumed."""
-    highest_correlation: float = 0.85
-    """Correlation beyond which HIGH_CORRELATION is raised. In random scenes standard errors remain
-    right beyond it; if the laser energy varies from file to file they do not; simulations."""
-    linked: float = 0.5
-    """Correlated share, over the largest of the neighbours, from which an altitude is linked;
-    assumed."""
-    least_correlated: float = 1e-6
-    """Correlated share up to which noise counts as uncorrelated; limit of rounding."""
-
-    # Outlying estimates (`robust_weights`).
-    jump: float = 5.0
-    """Standard errors between neighbouring estimates from which a profile is screened; assumed."""
-    outlying_estimate: float = 4.5
-    """Standard errors from the solution beyond which an estimate starts the robust pass;
-    assumed."""
-    bisquare: float = 6.0
-    """Standard errors at which the bisquare ends; assumed."""
-    least_kept: float = 1e-3
-    """Share of its information that an estimate at the end of the bisquare keeps; assumed."""
-    smallest_kept: float = 1e-9
-    """The least share; a smaller one would cost the solution its digits."""
-    majority: float = 0.5
-    """Share of weight, and of estimates, that is regarded as a majority; by definition."""
-    half_window: int = 7
-    """Altitudes to either side of windows of medians and means; assumed."""
 
     # Smoothness and its errors (`smooth_profile`).
     least_smooth_freedom: float = 2.0
@@ -209,20 +133,12 @@ class Thresholds(NamedTuple):
     rougher: float = 1.2
     """Ratio of degrees of freedom from which Cp is preferred to the likelihood; by coverage in the
     same scenes."""
-    negligible_likelihood: float = 1e-6
-    """Relative likelihood below which a weight is left out of the average; below the 12 bits of a
-    stored value."""
     pilot: float = 0.01
     """Weight of smoothness of the pilot solution over that of the solution; by coverage in the same
     scenes."""
     least_scale: float = 0.7
     """Least scale of the smoothing error of a profile, because a thin haze may still have a sharp
     layer. With 1, errors would be too large where profiles differ by noise alone; simulations."""
-    most_freedom: float = 10.0
-    """Degrees of freedom from which a profile may be undersmoothed; assumed."""
-    roughest: float = 0.4
-    """Degrees of freedom per estimate beyond which smoothing has little effect. With fewer, no
-    more values are false in random scenes than among all unflagged ones; benchmark of stability."""
 
 
 THRESHOLDS: Final = Thresholds()

@@ -133,7 +133,6 @@ def test_the_line_and_its_error_equal_ours_for_known_weights():
         variance=scan.variance,
         method="kano_hamilton",
         inhomogeneity=scene.inhomogeneity,
-        robust=False,
     )
     assert np.abs(peer.optical_depth - ours.optical_depth).max() < 1e-6
     assert peer.standard_error == pytest.approx(ours.optical_depth_standard_error, rel=1e-6)

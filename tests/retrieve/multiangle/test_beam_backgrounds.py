@@ -40,7 +40,6 @@ def fit(signals, beams=slice(None), method="kano_hamilton"):
         method=method,
         inhomogeneity=0.0,
         largest_gradient=0.0,
-        robust=False,
     )
 
 

@@ -21,13 +21,13 @@ def calibration(correlation=0.6, heights=HEIGHTS):
     rng = np.random.default_rng(3)
     information = rng.uniform(20.0, 80.0, heights)
     information[7] = 0.0
-    share = rng.uniform(0.2, 1.0, heights)
-    bands = correlated_precision(information[np.newaxis], share[np.newaxis], correlation)
+    shared = rng.uniform(0.2, 1.0, heights - 1)
+    bands = correlated_precision(information[np.newaxis], shared[np.newaxis], correlation)
     stiffness = _smoothing.penalty(30.0 * np.arange(1, heights + 1))
     return _calibration.Calibration(
         bands[:, 0],
         information,
-        share,
+        shared,
         correlation,
         stiffness,
         1e7,
@@ -40,8 +40,10 @@ def noise_covariance(c):
     there = c.information > 0.0
     error = np.sqrt(np.divide(1.0, c.information, where=there, out=np.zeros(there.size)))
     apart = np.abs(np.subtract.outer(np.arange(there.size), np.arange(there.size)))
-    both = np.outer(np.sqrt(c.share) * error, np.sqrt(c.share) * error)
-    return both * c.correlation**apart + np.diag((1.0 - c.share) * error**2)
+    ends = np.concatenate([c.shared[:1], c.shared, c.shared[-1:]])
+    share = 0.5 * (ends[1:] + ends[:-1])
+    both = np.outer(np.sqrt(share) * error, np.sqrt(share) * error)
+    return both * c.correlation**apart + np.diag((1.0 - share) * error**2)
 
 
 @each("correlation", [0.0, 0.6])
@@ -98,14 +100,6 @@ def test_few_profiles_leave_the_square_of_the_model():
     assert np.mean(observed(0.0, 0.0, 3000)) < 0.25
 
 
-def test_typical_profile_leaves_out_altitudes_of_few_profiles():
-    information = np.array([[2.0, 4.0, 1.0], [4.0, 0.0, 0.0], [6.0, 8.0, 0.0]])
-    share = np.array([[0.2, 0.4, 0.5], [0.4, 9.0, 9.0], [0.6, 0.8, 9.0]])
-    mean, mean_share = _calibration.typical_profile(information, share)
-    np.testing.assert_allclose(mean, [4.0, 6.0, 0.0])
-    np.testing.assert_allclose(mean_share, [0.4, 0.6, 0.5])
-
-
 # In proportion to the optical depth ------------------------------------------------------------
 
 
@@ -157,20 +151,6 @@ def test_profiles_are_compared_at_the_reach_of_each():
     depth[3, 5:] = variance[3, 5:] = np.nan
     scale = _calibration.relative_squares(depth, variance, within)
     np.testing.assert_allclose(scale, [1.0, 1.0, 1.0, 16.0 / 4.75], rtol=1e-6)
-
-
-@pytest.mark.parametrize("farther", [1, 2])
-def test_profiles_that_reach_farther_are_not_compared_with_themselves(farther):
-    """One more altitude reached only by thick hazes does not change their scale."""
-    amounts = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 2.0])
-    depth, variance, within = hazes(amounts)
-    equal = _calibration.relative_squares(depth[:, :-1], variance[:, :-1], within[:, :-1])
-    few = slice(0, amounts.size - farther)
-    within[few, -1] = False
-    depth[few, -1] = variance[few, -1] = np.nan
-    scale = _calibration.relative_squares(depth, variance, within)
-    np.testing.assert_allclose(scale, equal, rtol=1e-9)
-    np.testing.assert_allclose(scale[5], 9.0 / np.mean(amounts**2), rtol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-6])

@@ -6,18 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import erfc
 from support.cases import each
 from support.oracles.multiangle import (
     Scan,
-    ScanScene,
     clear_scene,
     cloud_scene,
     random_scene,
 )
 from support.scan_arguments import retrieve_optical_depth
 
-from lidarops.retrieve.multiangle import _block
 from lidarops.retrieve.multiangle._horizontal_variation import path_variation_from
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
@@ -96,22 +93,6 @@ def test_extinction_is_withheld_whatever_the_method():
         assert np.isfinite(result.optical_depth).any()
         assert np.isnan(result.extinction).all()
         assert np.isnan(result.extinction_standard_error).all()
-
-
-def test_robust_passes_run_by_chance_in_few_clean_blocks_and_wherever_outliers_are():
-    """With a probability of 1 percent, however many residuals a block has."""
-    assert _block.outlier_limit(100) == THRESHOLDS.outlying_residual
-    counts = 10 ** np.arange(4, 9)
-    limits = np.array([_block.outlier_limit(int(count)) for count in counts])
-    np.testing.assert_allclose(counts * erfc(limits / np.sqrt(2.0)), 0.01, rtol=1e-6)
-
-    def ran(scene: ScanScene, profiles: int, seed: int) -> bool:
-        steps = scene.draw(profiles, seed).retrieve("kano_hamilton").steps
-        return any(step.ran for step in steps if step.step == "robust_passes")
-
-    clean = [ran(clear_scene(ratio), 60, seed) for ratio in (3000.0, 300.0) for seed in range(8)]
-    assert np.mean(clean) <= 0.1
-    assert all(ran(clear_scene(3000.0, outliers=0.01), 8, seed) for seed in range(4))
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.005])

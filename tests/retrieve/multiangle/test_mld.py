@@ -43,7 +43,6 @@ def retrieve(signal, angles, method, **options):
         variance=0.0,
         method=method,
         inhomogeneity=SCATTER,
-        robust=False,
         **options,
     )
 

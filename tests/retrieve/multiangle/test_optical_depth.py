@@ -73,7 +73,7 @@ def test_clear_air_to_six_kilometres():
     signal, variance, tau = signals(
         np.random.default_rng(2), 150, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
     )
-    options = {"variance": variance, "robust": False}
+    options = {"variance": variance}
     joint = retrieve_optical_depth(signal, ANGLES, atmosphere[0], **options)
     single = retrieve_optical_depth(
         signal, ANGLES, atmosphere[0], method="kano_hamilton", **options
@@ -242,7 +242,7 @@ def test_one_path_gives_no_optical_depth(small, method):
         assert np.all(result.quality == MultiAngleQuality.NO_LEVERAGE)
 
 
-def test_tiny_leverage_is_flagged_and_has_a_correct_error():
+def test_tiny_leverage_has_a_correct_error():
     path = 1 + np.linspace(0, 0.001, 12)
     height, extinction, _ = clear(60)
     tau = depth(height, extinction)
@@ -250,7 +250,6 @@ def test_tiny_leverage_is_flagged_and_has_a_correct_error():
     signal = np.exp(-2 * path[:, np.newaxis] * tau + 0.03 * rng.normal(size=(100, 12, 60)))
     angles = np.degrees(np.arccos(1 / path))
     result = retrieve_optical_depth(signal, angles, height, variance=1e-12, method="kano_hamilton")
-    assert result.raised(MultiAngleQuality.LOW_LEVERAGE).all()
     assert np.median(result.optical_depth_standard_error) == pytest.approx(14.4, rel=0.05)
     assert rms(result.optical_depth - tau) == pytest.approx(14.4, rel=0.05)
 
@@ -376,8 +375,6 @@ def test_constant_extinction_is_within_its_errors():
     signal, variance, _ = signals(rng, 20, STEEP, atmosphere, ratio=1e9, inhomogeneity=1e-4)
     result = retrieve_optical_depth(signal, STEEP, height, variance=variance)
     assert result.optical_depth[:, -1] == pytest.approx(0.24, abs=0.002)
-    doubts = MultiAngleQuality.PRIOR_DOMINATED | MultiAngleQuality.UNDERSMOOTHED
-    assert not result.raised(doubts).any()
     score = (result.optical_depth - atmosphere[1] * height) / result.optical_depth_standard_error
     assert np.abs(score).max() < 4.5
 

@@ -7,9 +7,6 @@ import pytest
 from support.oracles.multiangle import ANGLES, clear, cloud, rms, signals
 from support.scan_arguments import retrieve_optical_depth
 
-from lidarops.retrieve.multiangle import _block
-from lidarops.retrieve.multiangle import altitude_correlation as correlation_of_air
-
 STEEP = np.linspace(0.0, 30.0, 6)
 
 
@@ -78,64 +75,3 @@ def test_all_values_of_highly_correlated_scans_have_a_standard_error(hole):
                 ((result.extinction - atmosphere[1]) / result.extinction_standard_error)[valued]
             )
     assert np.mean(np.abs(np.concatenate(deviations)) > 4.0) < 5e-4
-
-
-def noise_with_gaps(rng, correlation, beams=8, altitudes=60):
-    """Return information, share and true covariance of means over beams, a third missing.
-
-    The noise of each beam is fully correlated along altitude, with variance 1.
-    """
-    present = rng.random((altitudes, beams)) > 1.0 / 3.0
-    present[:, 0] |= ~present.any(axis=1)
-    weight = present / present.sum(axis=1, keepdims=True)
-    apart = np.abs(np.subtract.outer(np.arange(altitudes), np.arange(altitudes)))
-    covariance = (weight @ weight.T) * correlation**apart
-    information = present.sum(axis=1).astype(np.float64)
-    return information, information / beams, covariance
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.7, 0.9, 0.95])
-def test_precision_with_gaps_gives_the_variance_of_a_mean(correlation):
-    """The variance of a constant by the precision is that of the mean with its weights."""
-    rng, ratios = np.random.default_rng(3), []
-    for _ in range(100):
-        information, share, covariance = noise_with_gaps(rng, correlation)
-        bands = correlation_of_air.gap_precision(information[None], share[None], correlation)[:, 0]
-        dense = np.diag(bands[0])
-        for step in (1, 2):
-            dense += np.diag(bands[step, :-step], step) + np.diag(bands[step, :-step], -step)
-        assert np.linalg.eigvalsh(dense).min() > 0.0
-        weight = dense.sum(axis=0)
-        stated = 1.0 / weight.sum()
-        ratios.append((weight @ covariance @ weight) * stated**2 / stated)
-    assert np.sqrt(np.mean(ratios)) == pytest.approx(1.0, abs=0.1)
-
-
-def test_precision_of_uniform_noise_is_that_without_gaps():
-    information, share = np.full((2, 30), 5.0), np.full((2, 30), 0.8)
-    plain = correlation_of_air.correlated_precision(information, share, 0.9)
-    bands = correlation_of_air.gap_precision(information, share, 0.9)
-    np.testing.assert_allclose(bands, plain, rtol=1e-12)
-
-
-def test_altitudes_without_correlated_noise_stay_independent():
-    information = np.tile([4.0, 0.0, 9.0], (1, 5))
-    share = np.where(np.arange(15) % 2 == 0, 0.0, 1e-300)[np.newaxis]
-    bands = correlation_of_air.gap_precision(information, share, 0.9)
-    np.testing.assert_array_equal(bands[0], information)
-    assert not bands[1:].any()
-
-
-def test_only_samples_missing_between_others_are_gaps():
-    signal = np.ones((6, 2, 5))
-    signal[1, 0, 2] = np.nan
-    signal[2, 1, :2] = np.nan
-    signal[3, 1, 3:] = np.nan
-    signal[4, 1] = np.nan
-    signal[5, 0, 2] = -1.0
-    variance = np.full(signal.shape, 0.1)
-    present = signal > 0.0
-    gappy = _block.profiles_with_gaps(present, signal, variance)
-    np.testing.assert_array_equal(gappy, [False, True, False, False, False, False])
-    variance[0, 1, 3], present[0, 1, 3] = np.nan, False
-    assert _block.profiles_with_gaps(present, signal, variance)[0]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erf
 
 from lidarops.retrieve.multiangle import labeled
-from lidarops.retrieve.multiangle.altitude_correlation import ResidualMoments, residual_moments
+from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, correlation_of_air
 from lidarops.retrieve.multiangle.optical_depth import OpticalDepthSettings
 from support.scan_arguments import altitude_cycles
 
@@ -35,11 +35,11 @@ class Scene:
 
 @dataclass(frozen=True)
 class Estimates:
-    """Optical depths of single altitudes, and their residual moments."""
+    """Optical depths of single altitudes, and their noise."""
 
     optical_depth: np.ndarray
     information: np.ndarray
-    residuals: ResidualMoments
+    noise: AltitudeNoise
     slope: np.ndarray
     """(profile, altitude): of the weighted regression of tan(zenith angle) on the secant."""
 
@@ -148,12 +148,19 @@ def kano_hamilton(scene, logarithm, variance):
     w = _weights(variance, between)
     slope, residual, leverage, centred, square = _regress(y, x, w)
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = between * ((w * centred) ** 2).sum(axis=1) / square[:, 0]
         tangent = np.tan(np.arccos(1.0 / x))
         slant = (w * centred * tangent).sum(axis=1) / square[:, 0]
-    gaps = np.zeros(len(share), dtype=np.bool_)
-    moments = residual_moments(residual, w, leverage, between, share, gaps)
-    return Estimates(-0.5 * slope[:, 0], 4.0 * square[:, 0], moments, slant)
+        lever = w * centred / np.sqrt(square)
+    shared = np.nan_to_num((lever[..., 1:] * lever[..., :-1]).sum(axis=1))
+    shared = np.clip(shared * np.sqrt(between[1:] * between[:-1]), 0.0, 1.0)
+    used = w > 0.0
+    residual, noise = np.where(used, residual, np.nan), np.where(used, variance, np.inf)
+    path = np.repeat(scene.secant[:, np.newaxis], between.size, axis=1)
+    leverage, sides = np.nan_to_num(leverage, nan=1.0), np.zeros((len(w), between.size))
+    correlation = correlation_of_air(residual, noise, leverage, between, path, sides)
+    freedom = _pooled(np.maximum(used.sum(axis=1, keepdims=True) - 2.0, 0.0))
+    noise_of_depth = AltitudeNoise(correlation, shared, freedom)
+    return Estimates(-0.5 * slope[:, 0], 4.0 * square[:, 0], noise_of_depth, slant)
 
 
 def retrieve_scan(conditioned, *, station_altitude, **arguments):

@@ -6,9 +6,9 @@ import numpy as np
 
 
 def dense(bands):
-    """Return the symmetric matrix of its diagonal and two upper off-diagonals."""
+    """Return the symmetric matrix of its diagonal and upper off-diagonals, one or two."""
     matrix = np.diag(bands[0])
-    for step in range(1, min(3, bands.shape[1])):
+    for step in range(1, min(len(bands), bands.shape[1])):
         above = np.diag(bands[step][: bands.shape[1] - step], step)
         matrix = matrix + above + above.T
     return matrix

@@ -185,10 +185,10 @@ class Scan:
         )
 
     def regress(self):
-        """Return the block of beams and its robust regression."""
+        """Return the block of beams and its regression."""
         geometry = slant_paths.make_scan(self.scene.zenith_angle, self.scene.altitude)
         beams = _block.make_beam_block(self.signal, self.variance, geometry)
-        return beams, _block.regress(beams, inhomogeneity=None, robust=True)
+        return beams, _block.regress(beams, None)
 
 
 def hazy_air(height, aerosol, layer):

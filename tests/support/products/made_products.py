@@ -344,7 +344,7 @@ def multiangle(
     angles = np.atleast_1d(np.float64(zenith))
     dims = ("time", "altitude")
     shape = (profiles, levels)
-    flags = np.full(shape, np.int32(MultiAngleQuality.LOW_LEVERAGE))
+    flags = np.full(shape, np.int32(MultiAngleQuality.NO_RESIDUAL))
     flags[0, 2 * levels // 3 :] = MultiAngleQuality.EXTRAPOLATED
     flags[-1, 0] |= np.int32(MultiAngleQuality.INTERPOLATED | MultiAngleQuality.POOR_STRATIFICATION)
     scales = {
