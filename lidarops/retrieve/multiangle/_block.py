@@ -78,7 +78,7 @@ class Regression:
         """
         scatter = np.sqrt(self.inhomogeneity)
         both = self.column(kh.SHARED)[:, :-1] * scatter[:-1] * scatter[1:]
-        return np.asarray(np.clip(both, 0.0, 1.0))
+        return np.asarray(np.clip(both, -1.0, 1.0))
 
 
 def make_beam_block(

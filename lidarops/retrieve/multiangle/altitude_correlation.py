@@ -134,23 +134,41 @@ def correlation_of_air(
 def _mean_covariances(information: Array, shared: Array, joint: Array) -> Booleans:
     """Fill the covariances of neighbours in equal air, and return where both are known.
 
-    They are means over 15 altitudes: where samples are missing, neighbours see the air along
-    different beams, but altitudes a few steps apart do not see less of it in common. The first and
-    the last place are those of neighbours outside the grid.
+    They are means over 15 altitudes, weighted by information: where samples are missing, neighbours
+    see the air along different beams, but altitudes a few steps apart do not see less of it in
+    common. The first and the last place are those of neighbours outside the grid.
     """
     links, half = np.zeros(joint.size, np.bool_), THRESHOLDS.pooled // 2
-    single = np.zeros(joint.size)
+    both = np.zeros(joint.size)
     for k in range(1, joint.size - 1):
-        both = information[k - 1] * information[k]
-        links[k] = both > 0.0
-        single[k] = shared[k - 1] / math.sqrt(both) if links[k] else 0.0
+        both[k] = information[k - 1] * information[k]
+        links[k] = both[k] > 0.0
     for k in range(joint.size):
-        total = count = 0.0
-        for j in range(max(k - half, 0), min(k + half + 1, joint.size)):
-            total += single[j]
-            count += 1.0 if links[j] else 0.0
-        joint[k] = total / count if links[k] else 0.0
+        total = weight = 0.0
+        for j in range(max(k - half, 1), min(k + half + 1, joint.size - 1)):
+            total += shared[j - 1] * math.sqrt(both[j])
+            weight += both[j]
+        joint[k] = max(total / weight, 0.0) if links[k] else 0.0
     return links
+
+
+@compiled
+def _covariance_sums(
+    information: Array, joint: Array, links: Booleans, correlation: float, sums: Array
+) -> None:
+    """Fill the sums over the covariances of each error with itself and all that it is linked to."""
+    air, along = np.zeros(sums.size), 0.0
+    for k in range(sums.size):
+        n = (1.0 if links[k] else 0.0) + (1.0 if links[k + 1] else 0.0)
+        sums[k] = 1.0 / information[k] if information[k] > 0.0 else 0.0
+        air[k] = math.sqrt(min((joint[k] + joint[k + 1]) / max(n, 1.0), sums[k]))
+    for k in range(1, sums.size):
+        along = correlation * (along + air[k - 1]) if links[k] else 0.0
+        sums[k] += air[k] * along
+    along = 0.0
+    for k in range(sums.size - 2, -1, -1):
+        along = correlation * (along + air[k + 1]) if links[k + 1] else 0.0
+        sums[k] += air[k] * along
 
 
 @compiled
@@ -175,10 +193,13 @@ def correlated_precision(information: Array, shared: Array, correlation: float) 
     """
     profiles, altitudes = information.shape
     bands, joint = np.zeros((2, profiles, altitudes)), np.empty(altitudes + 1)
-    far = 2.0 * correlation / (1.0 - correlation)
+    sums, far = np.empty(altitudes), 2.0 * correlation / (1.0 - correlation)
     for t in range(profiles):
         own = information[t]
         links = _mean_covariances(own, shared[t], joint)
+        _covariance_sums(own, joint, links, correlation, sums)
+        for k in range(altitudes):
+            bands[0, t, k] = 1.0 if own[k] > 0.0 else 0.0
         for k in range(altitudes - 1):
             if links[k + 1]:
                 variance = 0.5 / own[k] + 0.5 / own[k + 1]
@@ -187,12 +208,9 @@ def correlated_precision(information: Array, shared: Array, correlation: float) 
                 product = 2.0 * (variance - both * correlation) * slow
                 u = 0.125 * (product + math.sqrt(product * (product + 16.0)))
                 link = 0.25 * slow * (1.0 - u * u) / (u * u)
-                bands[0, t, k] += link
-                bands[0, t, k + 1] += link
+                bands[0, t, k] += link * sums[k + 1]
+                bands[0, t, k + 1] += link * sums[k]
                 bands[1, t, k] = -link
         for k in range(altitudes):
-            n = (1.0 if links[k] else 0.0) + (1.0 if links[k + 1] else 0.0)
-            both = min((joint[k] + joint[k + 1]) / max(n, 1.0) * own[k], 1.0)
-            slow = own[k] / (1.0 + both * far)
-            bands[0, t, k] += slow + (1.0 - 0.5 * n) * (own[k] - slow)
+            bands[0, t, k] /= sums[k] if own[k] > 0.0 else 1.0
     return bands
