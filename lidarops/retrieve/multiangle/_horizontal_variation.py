@@ -287,9 +287,9 @@ def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: 
 def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
     """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
 
-    It is the largest that is shown in any window of 1000 m of the block, by all profiles, beyond
-    what an error of the dead time explains; 0 if none is shown. It holds at all altitudes: an
-    optical depth is that of the air below, too.
+    It is the largest that is shown in any window of 1000 m of the block, or of 500 m at its ends,
+    by all profiles, beyond what an error of the dead time explains; 0 if none is shown. It holds at
+    all altitudes: an optical depth is that of the air below, too.
 
     Parameters
     ----------
@@ -300,7 +300,8 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     """
     if not beams.noise.size:
         return 0.0
-    block = (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
+    # Empty blocks at both ends make windows of half the length there: near ranges are distorted.
+    block = 1 + (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
     tested = (fit.column(kh.SIDES) == 0.0) & (fit.column(kh.FREEDOM) > 0.0)
     change = np.empty((0, *beams.noise.shape[1:]))
     if beams.dead_time_change is not None:
