@@ -92,10 +92,12 @@ class CommonQuantity:
     errors_of_air: tuple[str, ...] = ()
     """Variables of systematic errors with one cause in all channels, of which only the difference
     remains in the difference of two channels."""
+    parts_of_air: tuple[str, ...] = ()
+    """Variables of parts of the standard error that the air makes, which all channels see."""
 
     @property
     def errors(self) -> tuple[str, ...]:
-        """Variables of all errors."""
+        """Variables of all errors, without their parts."""
         own = (f"{self.variable}_standard_error", *self.errors_of_channel)
         return own + self.errors_of_air
 

@@ -132,22 +132,29 @@ def _wrong_one(pair: tuple[str, str], deviations: Mapping[tuple[str, str], float
 def _error_of_difference(
     first: xr.Dataset, second: xr.Dataset, common: CommonQuantity
 ) -> xr.DataArray:
-    """Return the standard error of the difference of two channels, of all stated errors."""
+    """Return the standard error of the difference of two channels, of all stated errors.
+
+    Both see the same air. A channel with less noise weighs beams otherwise, and polarisations
+    differ: the smaller part of the air remains. The larger one may be a distorted signal.
+    """
     variance = xr.zeros_like(first["value"])
     for name in common.errors:
         if name in common.errors_of_air:
             variance = variance + (first[name] - second[name]) ** 2
         else:
             variance = variance + first[name] ** 2 + second[name] ** 2
+    for name in common.parts_of_air:
+        variance = variance - np.maximum(first[name], second[name]) ** 2
     return variance**0.5
 
 
 def _usable_values(product: Retrieved) -> xr.Dataset:
     """Return the usable values, with errors; those that a channel does not state are 0."""
     common, batches = product.common, product.batches
-    needed = {common.variable, *common.errors, "quality_flag"} & set(batches[0])
+    errors = (*common.errors, *common.parts_of_air)
+    needed = {common.variable, *errors, "quality_flag"} & set(batches[0])
     rows = xr.concat([batch[sorted(needed)] for batch in batches], "time")
     usable = (rows["quality_flag"] & flags_of(product.context.kind).rejecting) == 0
     value = rows[common.variable].where(usable)
-    errors = {name: rows.get(name, xr.zeros_like(value)) for name in common.errors}
-    return xr.Dataset({"value": value, **errors})
+    known = {name: rows.get(name, xr.zeros_like(value)) for name in errors}
+    return xr.Dataset({"value": value, **known})

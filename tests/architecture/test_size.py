@@ -16,16 +16,16 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_516,
-    "lines of code alone": 45_826,
+    "lines": 69_603,
+    "lines of code alone": 45_258,
     "modules": 287,
-    "dataclasses": 252,
-    "lines of dataclasses": 6_701,
-    "tuning numbers": 254,
-    "tuning numbers that are assumed": 86,
+    "dataclasses": 251,
+    "lines of dataclasses": 6_659,
+    "tuning numbers": 220,
+    "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 6_038,
+    "lines of the largest package": 5_592,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 67, "functions": 638, "changes": 216},

@@ -164,6 +164,7 @@ def test_variables_without_standard_name():
             "residual",
             "beam_signal",
             "beam_obstruction",
+            "vertical_optical_depth_error_air",
             "vertical_optical_depth_dead_time_error",
             "total_extinction_dead_time_error",
             "vertical_optical_depth_baseline_error",

@@ -24,11 +24,13 @@ def retrieved(
     gradient: float = 0.0,
     dead_time: float = 0.0,
     wavelength: float = 532e-9,
+    air: float = 0.0,
 ) -> Retrieved:
     """Return a product of an optical depth (level,) with errors."""
     product = multiangle(profiles=2, levels=LEVELS).isel(time=[1])
     product["vertical_optical_depth"][:] = depth
-    product["vertical_optical_depth_standard_error"][:] = ERROR
+    product["vertical_optical_depth_standard_error"][:] = np.hypot(ERROR, air)
+    product["vertical_optical_depth_error_air"][:] = air
     product["vertical_optical_depth_gradient_error"][:] = gradient
     product["vertical_optical_depth_dead_time_error"][:] = dead_time
     product["quality_flag"][:] = 0
@@ -92,6 +94,26 @@ def test_errors_explain_a_difference_if_they_differ_between_the_channels(
     analog = retrieved("analog_532o", depth, gradients[0])
     photon = retrieved("photon_532o", depth + SHIFT, gradients[1], dead_time)
     assert len(compared(analog, photon)) == pairs
+
+
+@pytest.mark.parametrize(
+    ("airs", "pairs"),
+    [
+        ((0.0, 0.0), 1),
+        # Air that both see, with other weights.
+        ((SHIFT / 3, SHIFT / 3), 0),
+        # A distorted signal looks like air that one channel alone sees.
+        ((0.0, SHIFT), 1),
+        ((SHIFT, ERROR), 1),
+    ],
+)
+def test_air_explains_a_difference_if_both_channels_see_it(
+    airs: tuple[float, float], pairs: int
+) -> None:
+    depth = np.full(LEVELS, 0.3)
+    first = retrieved("photon_532p", depth, air=airs[0])
+    second = retrieved("photon_532s", depth + SHIFT, air=airs[1])
+    assert len(compared(first, second)) == pairs
 
 
 @pytest.mark.parametrize(

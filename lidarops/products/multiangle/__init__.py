@@ -105,6 +105,7 @@ KIND: Final = Kind(
             "vertical_optical_depth_baseline_error",
         ),
         errors_of_air=("vertical_optical_depth_gradient_error",),
+        parts_of_air=("vertical_optical_depth_error_air",),
     ),
     draft=_section,
 )

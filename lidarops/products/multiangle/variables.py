@@ -183,7 +183,17 @@ _OPTICAL_DEPTH: Final = Row(
     "optical depth of molecules and particles from the station to the altitude",
     "Along the vertical, at the wavelength of the channel.",
     cell_methods=_POINT,
-    errors=_errors("optical depth"),
+    errors=(
+        Error(
+            "air",
+            "part of the standard error of optical depth from inhomogeneity of the air",
+            ErrorKind.BOTH,
+            "All channels of the beams have it in common. Missing for mld and mld_prior.",
+            part=True,
+            optional=True,
+        ),
+        *_errors("optical depth"),
+    ),
     **_RETRIEVED,
 )
 _EXTINCTION: Final = total_extinction(

@@ -20,17 +20,13 @@ percent."""
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
-    """Inputs of the calibration of one block.
-
-    The typical profile represents all profiles of the block in quantities that depend on weights
-    only.
-    """
+class Typical:
+    """A profile that represents all of a block in quantities that depend on weights only."""
 
     bands: Array
-    """(2, altitude): precision of the typical profile."""
+    """(2, altitude): its precision."""
     information: Array
-    """(altitude,): of the typical profile, 0 where there is no estimate."""
+    """(altitude,): 0 where there is no estimate."""
     shared: Array
     """(altitude - 1,): correlation of its noise at neighbouring altitudes in equal air."""
     correlation: float
@@ -39,13 +35,9 @@ class Calibration:
     """(3, altitude): bands of the penalty on roughness."""
     smoothing: float
     """Weight of the penalty, in the unit of the system."""
-    bias: Array
-    """(profile, altitude): pilot solution minus its smoothed form; NaN beyond the reach."""
-    scale: Array
-    """(profile,): from `relative_squares`."""
 
 
-def sandwich(calibration: Calibration, upper: Integers, lower: Integers) -> Array:
+def sandwich(typical: Typical, upper: Integers, lower: Integers) -> Array:
     """Return posterior variances of differences of optical depths, and their components.
 
     Formula 3 of ``docs/algorithms/vertical.md``. Of many differences, some are computed, more at
@@ -53,70 +45,69 @@ def sandwich(calibration: Calibration, upper: Integers, lower: Integers) -> Arra
 
     Parameters
     ----------
-    calibration : Calibration
+    typical : Typical
     upper, lower : (difference,) int64
         Altitudes in ascending order; -1 for the lidar.
 
     Returns
     -------
-    (4, difference) float64
-        Posterior variance, variance from noise, expected square of the smoothing error, and
-        variance of the smoothing error estimated from the pilot.
+    (5, difference) float64
+        Posterior variance, variance from noise and air, expected square of the smoothing error,
+        variance of the smoothing error estimated from the pilot, and variance from air alone.
     """
     every = np.arange(upper.size)
     some = every
     if every.size > _COMPUTED:
         places = every[-1] * np.linspace(0.0, 1.0, _COMPUTED) ** 2
         some = np.unique(np.rint(places).astype(np.int64))
-    bands, each = calibration.bands[:, np.newaxis], np.arange(some.size)
+    bands, each = typical.bands[:, np.newaxis], np.arange(some.size)
     a = np.zeros((some.size, bands.shape[2]))
     a[each, upper[some]] = 1.0
     below = lower[some]
     a[each[below >= 0], below[below >= 0]] = -1.0
-    solved = _inverse(calibration, 1.0, a)
+    solved = _inverse(typical, 1.0, a)
     x = _smoothing.multiply_rows(bands, solved)
-    y = _smoothing.multiply_rows(bands, _inverse(calibration, THRESHOLDS.pilot, a - x))
+    y = _smoothing.multiply_rows(bands, _inverse(typical, THRESHOLDS.pilot, a - x))
     posterior = (a * solved).sum(axis=1)
     model = np.maximum(posterior - (solved * x).sum(axis=1), 0.0)
-    parts = posterior, _noise(calibration, x), model, _noise(calibration, y)
+    (noise, air), of_pilot = _noise_and_air(typical, x), _noise_and_air(typical, y)
+    parts = posterior, noise + air, model, sum(of_pilot), air
     return np.stack([np.interp(every, some, part) for part in parts])
 
 
-def _inverse(calibration: Calibration, factor: float, rows: Array) -> Array:
+def _inverse(typical: Typical, factor: float, rows: Array) -> Array:
     """Return rows times the inverse of the system, with a multiple of its smoothing."""
     count = len(rows)
     out = np.empty((1, *rows.shape))
     _smoothing.solve_banded(
-        np.broadcast_to(calibration.bands[:, np.newaxis], (2, *rows.shape)).copy(),
-        rows, calibration.stiffness, np.arange(count),
-        np.full(count, factor * calibration.smoothing), out,
+        np.broadcast_to(typical.bands[:, np.newaxis], (2, *rows.shape)).copy(),
+        rows, typical.stiffness, np.arange(count),
+        np.full(count, factor * typical.smoothing), out,
     )  # fmt: skip
     return np.asarray(out[0])
 
 
-def _noise(calibration: Calibration, y: Array) -> Array:
-    """Return y'Vy of each row: a share of the noise is correlated, decaying with the distance."""
-    known = calibration.information > 0.0
-    error = np.where(known, 1.0 / np.sqrt(np.where(known, calibration.information, 1.0)), 0.0)
+def _noise_and_air(typical: Typical, y: Array) -> tuple[Array, Array]:
+    """Return the parts of y'Vy of each row: the share of the air decays with the distance."""
+    known = typical.information > 0.0
+    error = np.where(known, 1.0 / np.sqrt(np.where(known, typical.information, 1.0)), 0.0)
     from scipy.signal import lfilter  # noqa: PLC0415 - loads a third of a second of other modules
 
     # Neighbours of the ends are as those of the altitudes beside them.
-    shared = calibration.shared if calibration.shared.size else np.zeros(1)
+    shared = typical.shared if typical.shared.size else np.zeros(1)
     share = np.convolve(np.pad(shared, 1, mode="edge"), [0.5, 0.5], mode="valid")[: y.shape[1]]
     own, common = (y * error) ** 2 * (1.0 - share), y * error * np.sqrt(share)
-    decay = calibration.correlation
+    decay = typical.correlation
     tail = lfilter([0.0, decay], [1.0, -decay], common, axis=1)
-    total: Array = (own + common * (common + 2.0 * tail)).sum(axis=1)
-    return total
+    return own.sum(axis=1), (common * (common + 2.0 * tail)).sum(axis=1)
 
 
 def typical_profile(information: Array, shared: Array) -> tuple[Array, Array]:
     """Return means over the profiles of a block, of information and of what neighbours share."""
     used = information > 0.0
-    count = np.maximum(used.sum(axis=0), 1)
     linked = used[:, 1:] & used[:, :-1]
     mean = np.where(linked, shared, 0.0).sum(axis=0) / np.maximum(linked.sum(axis=0), 1)
-    return information.sum(axis=0) / count, mean
+    return information.sum(axis=0) / np.maximum(used.sum(axis=0), 1), np.maximum(mean, 0.0)
 
 
 def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
@@ -162,10 +153,10 @@ def _smoothing_square(bias: Array, known: Array) -> Array:
     ----------
     bias : (profile, difference) float64
         NaN beyond the reach.
-    known : (4, difference) float64
+    known : (5, difference) float64
         From `sandwich`.
     """
-    _, _, model, noise = known
+    _, _, model, noise, _ = known
     present = np.isfinite(bias)
     count = np.maximum(present.sum(axis=0), 1)
     mean = np.where(present, bias, 0.0).sum(axis=0) / count
@@ -186,21 +177,22 @@ def _trust(signal: Array, variance: Array) -> Array:
     return share
 
 
-def variance_ratio(calibration: Calibration, upper: Integers, lower: Integers) -> Array:
+def variance_ratio(known: Array, bias: Array, scale: Array) -> Array:
     """Return calibrated over posterior variance of differences of optical depths.
 
     Parameters
     ----------
-    calibration : Calibration
-    upper, lower : (difference,) int64
-        Altitudes in ascending order; -1 for the lidar.
+    known : (5, difference) float64
+        From `sandwich`.
+    bias : (profile, difference) float64
+        Pilot solution minus its smoothed form; NaN beyond the reach.
+    scale : (profile,) float64
+        From `relative_squares`.
 
     Returns
     -------
     (profile, difference) float64
     """
-    known = sandwich(calibration, upper, lower)
-    below = np.where(lower >= 0, calibration.bias[:, np.maximum(lower, 0)], 0.0)
-    square = _smoothing_square(calibration.bias[:, upper] - below, known)
-    factor: Array = (known[1] + calibration.scale[:, np.newaxis] * square) / known[0]
+    square = scale[:, np.newaxis] * _smoothing_square(bias, known)
+    factor: Array = (known[1] + square) / known[0]
     return factor

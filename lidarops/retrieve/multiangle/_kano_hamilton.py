@@ -35,7 +35,9 @@ SIDES: Final = 9
 SHARED: Final = 10
 """Covariance with the error of the altitude above, of errors of unit variance, if the air of each
 beam had unit variance and were the same at both."""
-COLUMNS: Final = 11
+AIR: Final = 11
+"""The same with the error at the altitude itself: its variance by air of unit variance."""
+COLUMNS: Final = 12
 
 _SAME_PATH: Final = 1e-20
 """Variance of slant paths up to which they count as equal."""
@@ -194,6 +196,7 @@ def _fill_precision(
             lever[k] = weights[a, k] * q[_PATH, a, k] * before[k]
             out[SLOPE_EAST, k] += lever[k] * design[0, a, k]
             out[SLOPE_NORTH, k] += lever[k] * design[1, a, k]
+            out[AIR, k] += lever[k] * lever[k]
         for k in range(altitudes - 1):
             out[SHARED, k] += lever[k] * lever[k + 1]
     for k in range(altitudes):

@@ -66,6 +66,9 @@ class MultiAngleResult:
     """From the lidar to the altitude."""
     optical_depth_standard_error: Array
     """Error from noise and smoothing, without `optical_depth_gradient_error`."""
+    optical_depth_error_air: Array
+    """Part of the standard error that the inhomogeneity of the air makes; NaN for the methods with
+    a penalty."""
     optical_depth_gradient_error: Array
     """Systematic: largest error caused by the declared horizontal gradient of backscatter."""
     extinction: Array
@@ -246,6 +249,8 @@ def _single_altitudes(
         slopes=_gradient_slopes(profiles, beams, fit, settings),
         correlation=np.pad(correlation * fit.shared, ((0, 0), (1, 0))),
     )
+    share = np.sqrt(fit.column(kh.AIR) * fit.inhomogeneity)
+    profiles.optical_depth_error_air[:] = profiles.optical_depth_standard_error * share
     return profiles
 
 
@@ -345,8 +350,8 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
         noise=noise.of(rows),
     )
     for name in (
-        "optical_depth", "optical_depth_standard_error", "extinction", "extinction_standard_error",
-        "effective_degrees_of_freedom", "data_share",
+        "optical_depth", "optical_depth_standard_error", "optical_depth_error_air", "extinction",
+        "extinction_standard_error", "effective_degrees_of_freedom", "data_share",
     ):  # fmt: skip
         getattr(profiles, name)[rows] = getattr(smooth, name)
     slopes = np.full((2, *within.shape), np.nan)

@@ -37,6 +37,8 @@ _PER_ALTITUDE: Final = (
 )
 _OF_PENALTY: Final = ("regularisation", "prior_optical_depth")
 """Of the methods with a penalty."""
+_WITHOUT_PENALTY: Final = ("optical_depth_error_air",)
+"""Of the others."""
 _SEVERAL: Final = 2
 """Planes of a volume."""
 _FEWEST_OF_PLANE: Final = 3
@@ -80,7 +82,7 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
     penalised = settings.method in optical_depth.REGULARISED
     values = {
         _variable(name): (("time", "altitude"), getattr(retrieval, name))
-        for name in (*_PER_ALTITUDE, *(_OF_PENALTY if penalised else ()))
+        for name in (*_PER_ALTITUDE, *(_OF_PENALTY if penalised else _WITHOUT_PENALTY))
     }
     depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)

@@ -62,6 +62,8 @@ class VerticalResult:
     """From the lidar to the altitude."""
     optical_depth_standard_error: Array
     """Random error and smoothing error."""
+    optical_depth_error_air: Array
+    """Part of the standard error that the air makes."""
     extinction: Array
     """m-1, mean of the layer between the altitude and the next lower one (or the lidar)."""
     extinction_standard_error: Array
@@ -75,8 +77,8 @@ class VerticalResult:
     """No estimate there; interpolated from those around, or from the lidar."""
     block: _Block
     fit: _Fit
-    factor: Callable[[Integers, Integers], Array]
-    """Of the variances of differences of optical depths; see `_variance_factor`."""
+    factor: Callable[[Integers, Integers], tuple[Array, Array]]
+    """Of the variances of differences of optical depths; see `_variance_factors`."""
 
     def respond(self, rows: Array) -> Array:
         """Return the solution for other estimates with the same weights, NaN beyond the reach.
@@ -116,7 +118,7 @@ class VerticalResult:
             for rows in (inverse, solved)
         )
         depth, variance = smoothing.mixed(value, posterior)
-        variance *= self.factor(np.array([upper]), np.array([lower]))
+        variance *= self.factor(np.array([upper]), np.array([lower]))[0]
         reached = np.isfinite(self.optical_depth[:, upper])
         return (
             np.where(reached, depth[:, 0], np.nan),
@@ -164,12 +166,12 @@ def smooth_optical_depth(
     )
     fit = _fit(block)
     within = np.cumsum(used[:, ::-1], axis=1)[:, ::-1] > 0
-    calibrated = len(within) >= THRESHOLDS.fewest_to_choose
-    factor = partial(
-        _variance_factor,
-        _calibrate(block, fit, within) if calibrated else None,
-        np.ones(altitude.size) if noise is None else _inflation(noise),
-    )
+    calibration = None
+    if len(within) >= THRESHOLDS.fewest_to_choose:
+        scale = _calibration.relative_squares(fit.depth, fit.variance, within)
+        calibration = _pilot_change(block, fit, within), scale
+    inflation = np.ones(altitude.size) if noise is None else _inflation(noise)
+    factor = partial(_variance_factors, _typical(block, fit.smoothing), inflation, calibration)
     return _result(block, fit, factor, within)
 
 
@@ -229,23 +231,26 @@ def _respond(block: _Block, smoothing: Smoothing, rows: Array) -> Array:
     return smoothing.mean(smoothing.solve(right, block.bands, block.stiffness)[0])
 
 
-def _calibrate(block: _Block, fit: _Fit, within: Booleans) -> _calibration.Calibration:
+def _typical(block: _Block, smoothing: Smoothing) -> _calibration.Typical:
     information, shared = _calibration.typical_profile(block.information, block.noise.shared)
-    rough = _respond(block, fit.smoothing.times(THRESHOLDS.pilot), block.estimates)
-    smooth = _respond(block, fit.smoothing, rough)
     bands = correlated_precision(
         information[np.newaxis], shared[np.newaxis], block.noise.correlation
     )
-    return _calibration.Calibration(
+    return _calibration.Typical(
         bands[:, 0],
         information,
         shared,
         block.noise.correlation,
         block.stiffness,
-        float(fit.smoothing.weight[0]),
-        np.where(within, rough - smooth, np.nan),
-        _calibration.relative_squares(fit.depth, fit.variance, within),
+        float(smoothing.weight[smoothing.share.argmax()]),
     )
+
+
+def _pilot_change(block: _Block, fit: _Fit, within: Booleans) -> Array:
+    """Return the pilot solution minus its smoothed form, (profile, altitude)."""
+    rough = _respond(block, fit.smoothing.times(THRESHOLDS.pilot), block.estimates)
+    smooth = _respond(block, fit.smoothing, rough)
+    return np.where(within, rough - smooth, np.nan)
 
 
 def _inflation(noise: AltitudeNoise) -> Array:
@@ -257,38 +262,47 @@ def _inflation(noise: AltitudeNoise) -> Array:
     return factor
 
 
-def _variance_factor(
-    calibration: _calibration.Calibration | None,
+def _variance_factors(
+    typical: _calibration.Typical,
     inflation: Array,
+    calibration: tuple[Array, Array] | None,
     upper: Integers,
     lower: Integers,
-) -> Array:
-    """Return the factor on the posterior variance of differences of optical depths.
+) -> tuple[Array, Array]:
+    """Return variances of differences of optical depths over posterior ones: of all, of the air.
 
-    The shape is (profile, difference), or (difference,) if common to all profiles: without a
-    calibration, where the block is too small.
+    The shape is (profile, difference), or (difference,) if common to all profiles, as all are
+    without a calibration, where the block is too small. A calibration is the change of the pilot
+    solution, (profile, altitude), and the scale of its square, (profile,).
     """
-    below = np.where(lower >= 0, inflation[np.maximum(lower, 0)], 1.0)
-    few: Array = np.maximum(inflation[upper], below)
+    known = _calibration.sandwich(typical, upper, lower)
+    below = lower >= 0
+    few = np.maximum(inflation[upper], np.where(below, inflation[np.maximum(lower, 0)], 1.0))
+    air = few * known[-1] / known[0]
     if calibration is None:
-        return few
-    factor: Array = few * _calibration.variance_ratio(calibration, upper, lower)
-    return factor
+        return few * (known[1] + known[2]) / known[0], air
+    change, scale = calibration
+    bias = change[:, upper] - np.where(below, change[:, np.maximum(lower, 0)], 0.0)
+    return few * _calibration.variance_ratio(known, bias, scale), air
 
 
 def _result(
-    block: _Block, fit: _Fit, factor: Callable[[Integers, Integers], Array], within: Booleans
+    block: _Block,
+    fit: _Fit,
+    factor: Callable[[Integers, Integers], tuple[Array, Array]],
+    within: Booleans,
 ) -> VerticalResult:
     step = np.diff(block.altitude, prepend=0.0)
     rows = np.arange(step.size)
-    error = np.sqrt(fit.variance * factor(rows, np.full(step.size, -1)))
-    extinction_error = np.sqrt(fit.extinction_variance * factor(rows, rows - 1)) / step
+    error, air = (np.sqrt(fit.variance * of) for of in factor(rows, np.full(step.size, -1)))
+    extinction_error = np.sqrt(fit.extinction_variance * factor(rows, rows - 1)[0]) / step
     certain = within & (np.abs(fit.depth) > error)
     known = np.where(block.information > 0.0, fit.depth, 0.0)
     response = _respond(block, fit.smoothing, known)
     return VerticalResult(
         optical_depth=np.where(within, fit.depth, np.nan),
         optical_depth_standard_error=np.where(within, error, np.nan),
+        optical_depth_error_air=np.where(within, air, np.nan),
         extinction=np.where(within, fit.extinction / step, np.nan),
         extinction_standard_error=np.where(within, extinction_error, np.nan),
         data_share=np.where(certain, response / np.where(certain, fit.depth, 1.0), np.nan),

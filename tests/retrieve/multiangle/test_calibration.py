@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.cases import each
@@ -17,41 +15,33 @@ HEIGHTS = 30
 ROWS = np.arange(HEIGHTS)
 
 
-def calibration(correlation=0.6, heights=HEIGHTS):
+def typical(correlation=0.6, heights=HEIGHTS):
     rng = np.random.default_rng(3)
     information = rng.uniform(20.0, 80.0, heights)
     information[7] = 0.0
     shared = rng.uniform(0.2, 1.0, heights - 1)
     bands = correlated_precision(information[np.newaxis], shared[np.newaxis], correlation)
     stiffness = _smoothing.penalty(30.0 * np.arange(1, heights + 1))
-    return _calibration.Calibration(
-        bands[:, 0],
-        information,
-        shared,
-        correlation,
-        stiffness,
-        1e7,
-        np.zeros((1, heights)),
-        np.ones(1),
-    )
+    return _calibration.Typical(bands[:, 0], information, shared, correlation, stiffness, 1e7)
 
 
-def noise_covariance(c):
+def air_and_noise_covariances(c):
     there = c.information > 0.0
     error = np.sqrt(np.divide(1.0, c.information, where=there, out=np.zeros(there.size)))
     apart = np.abs(np.subtract.outer(np.arange(there.size), np.arange(there.size)))
     ends = np.concatenate([c.shared[:1], c.shared, c.shared[-1:]])
     share = 0.5 * (ends[1:] + ends[:-1])
     both = np.outer(np.sqrt(share) * error, np.sqrt(share) * error)
-    return both * c.correlation**apart + np.diag((1.0 - share) * error**2)
+    return both * c.correlation**apart, np.diag((1.0 - share) * error**2)
 
 
 @each("correlation", [0.0, 0.6])
 @each("lower", [np.full(HEIGHTS, -1), ROWS - 1, np.maximum(ROWS - 5, -1)])
 def test_sandwich_equals_dense_algebra(correlation, lower):
-    c = calibration(correlation)
+    c = typical(correlation)
     components = _calibration.sandwich(c, ROWS, lower)
-    weight, covariance = dense(c.bands), noise_covariance(c)
+    air, noise = air_and_noise_covariances(c)
+    weight, covariance = dense(c.bands), air + noise
     inverse = np.linalg.inv(weight + c.smoothing * dense(c.stiffness))
     pilot = np.linalg.inv(weight + THRESHOLDS.pilot * c.smoothing * dense(c.stiffness))
     for k in ROWS:
@@ -59,14 +49,15 @@ def test_sandwich_equals_dense_algebra(correlation, lower):
         x = weight @ inverse @ a
         y = weight @ pilot @ (a - x)
         model = a @ inverse @ a - (inverse @ a) @ weight @ (inverse @ a)
-        expected = (a @ inverse @ a, x @ covariance @ x, model, y @ covariance @ y)
+        expected = (a @ inverse @ a, x @ covariance @ x, model, y @ covariance @ y, x @ air @ x)
         np.testing.assert_allclose(components[:, k], expected, rtol=1e-7)
 
 
 def test_pilot_variance_is_that_of_simulated_noise():
-    c = calibration()
+    c = typical()
     rng = np.random.default_rng(0)
-    noise = rng.multivariate_normal(np.zeros(HEIGHTS), noise_covariance(c), size=4000)
+    covariance = np.add(*air_and_noise_covariances(c))
+    noise = rng.multivariate_normal(np.zeros(HEIGHTS), covariance, size=4000)
     weight = dense(c.bands)
     smoother = np.linalg.solve(weight + c.smoothing * dense(c.stiffness), weight)
     rough = np.linalg.solve(weight + THRESHOLDS.pilot * c.smoothing * dense(c.stiffness), weight)
@@ -82,7 +73,7 @@ def observed(shared, own, profiles, model=1.0, noise=4.0):
     rng = np.random.default_rng(7)
     shape = (profiles, 400)
     bias = shared + own * rng.normal(size=shape) + np.sqrt(noise) * rng.normal(size=shape)
-    known = np.array([2.0, 1.0, model, noise])[:, np.newaxis] * np.ones((4, 400))
+    known = np.array([2.0, 1.0, model, noise, 0.5])[:, np.newaxis] * np.ones((5, 400))
     return _calibration._smoothing_square(bias, known)
 
 
@@ -123,9 +114,9 @@ def test_small_optical_depth_does_not_make_the_smoothing_error_small():
 
 
 def test_smoothing_error_is_scaled_and_noise_is_not():
-    c = replace(calibration(), scale=np.array([1.0, 4.0]), bias=np.full((2, HEIGHTS), 5.0))
-    unscaled, fourfold = _calibration.variance_ratio(c, ROWS, np.full(HEIGHTS, -1))
-    known = _calibration.sandwich(c, ROWS, np.full(HEIGHTS, -1))
+    known = _calibration.sandwich(typical(), ROWS, np.full(HEIGHTS, -1))
+    bias, scale = np.full((2, HEIGHTS), 5.0), np.array([1.0, 4.0])
+    unscaled, fourfold = _calibration.variance_ratio(known, bias, scale)
     noise = known[1] / known[0]
     np.testing.assert_allclose(fourfold - noise, 4.0 * (unscaled - noise), rtol=1e-9)
 

@@ -350,6 +350,7 @@ def multiangle(
     scales = {
         "vertical_optical_depth": 0.3,
         "vertical_optical_depth_standard_error": 0.01,
+        "vertical_optical_depth_error_air": 0.003,
         "vertical_optical_depth_gradient_error": 0.005,
         "vertical_optical_depth_dead_time_error": 0.004,
         "total_extinction": 1e-4,
