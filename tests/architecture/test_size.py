@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_603,
-    "lines of code alone": 45_258,
+    "lines": 69_884,
+    "lines of code alone": 45_461,
     "modules": 287,
-    "dataclasses": 251,
-    "lines of dataclasses": 6_659,
+    "dataclasses": 252,
+    "lines of dataclasses": 6_679,
     "tuning numbers": 220,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
