@@ -217,15 +217,17 @@ class _Work(ABC):
         bins = {channel.name: channel.bins for channel in scene.layout if channel.name in read}
         profiles = chunk_profiles(max(bins.values()), job.profiles_per_chunk)
         open_files = (job.campaign, scene)
+        together = max(1, profiles // READ_TOGETHER)
+        opened = partial(
+            open_granules,
+            *open_files,
+            scene.granules,
+            self.root,
+            profiles_per_chunk=together,
+        )
         source = Source(
-            archive=open_granules(
-                *open_files,
-                scene.granules,
-                self.root,
-                list(bins),
-                profiles_per_chunk=max(1, profiles // READ_TOGETHER),
-                stretches=stretches,
-            ),
+            archive=opened(list(bins), stretches=stretches),
+            opened_whole=partial(opened, [channel.name for channel in scene.layout]),
             dark=(
                 open_granules(*open_files, scene.dark, self.root, subtracted)
                 if subtracted and scene.dark

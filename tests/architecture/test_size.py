@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_884,
-    "lines of code alone": 45_461,
-    "modules": 287,
+    "lines": 70_114,
+    "lines of code alone": 45_601,
+    "modules": 288,
     "dataclasses": 252,
-    "lines of dataclasses": 6_679,
-    "tuning numbers": 220,
+    "lines of dataclasses": 6_724,
+    "tuning numbers": 224,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
     "lines of the largest package": 5_592,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 67, "functions": 638, "changes": 216},
-    "elastic": {"modules": 76, "functions": 781, "changes": 233},
+    "homogeneous": {"modules": 67, "functions": 639, "changes": 217},
+    "elastic": {"modules": 76, "functions": 783, "changes": 234},
 }
 
 
