@@ -12,7 +12,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.arrays import Array, Booleans, frozen
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _FAR: Final = 10
@@ -39,13 +40,30 @@ def variation(counts: npt.NDArray[Any], shots: npt.NDArray[Any]) -> Variation:
     shots : (time,) int
     """
     split = counts.shape[1] - max(counts.shape[1] // _FAR, 1)
-    scaled = counts / np.maximum(shots, 1)[:, np.newaxis]
-    far = scaled[:, split:]
-    away = np.ascontiguousarray(scaled[:, :split] - far.mean(axis=1, keepdims=True))
-    # A count more, as no counts in the far range say little of the noise.
-    one = np.maximum(shots, 1.0) ** -2.0 / far.shape[1]
-    measured = (shots > 0) & counts.any(axis=1)
-    return Variation((away * away).mean(axis=1), far.var(axis=1) + one, measured)
+    squares = np.empty((2, len(counts)))
+    _fill_squares(frozen(counts), split, *squares)
+    square, noise = squares / np.maximum(shots, 1.0) ** 2
+    return Variation(square, noise, (shots > 0) & counts.any(axis=1))
+
+
+@compiled
+def _fill_squares(counts: npt.NDArray[Any], split: int, near: Array, far: Array) -> None:
+    """Fill in the mean square deviations of near and far bins from the mean of the far ones."""
+    bins = counts.shape[1]
+    for t in range(counts.shape[0]):
+        row = counts[t]
+        total = square = 0.0
+        for i in range(split, bins):
+            total += row[i]
+        mean = total / (bins - split)
+        for i in range(split):
+            square += (row[i] - mean) ** 2
+        near[t] = square / split
+        # A count more, as no counts in the far range say little of the noise.
+        square = 1.0
+        for i in range(split, bins):
+            square += (row[i] - mean) ** 2
+        far[t] = square / (bins - split)
 
 
 class Teller(NamedTuple):
