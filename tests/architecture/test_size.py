@@ -16,15 +16,15 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_132,
-    "lines of code alone": 45_616,
-    "modules": 288,
-    "dataclasses": 252,
-    "lines of dataclasses": 6_724,
-    "tuning numbers": 224,
-    "tuning numbers that are assumed": 65,
+    "lines": 69_884,
+    "lines of code alone": 45_461,
+    "modules": 287,
+    "dataclasses": 251,
+    "lines of dataclasses": 6_674,
+    "tuning numbers": 218,
+    "tuning numbers that are assumed": 59,
     "copied thresholds": 0,
-    "most parameters": 14,
+    "most parameters": 10,
     "lines of the largest package": 5_592,
 }
 MOST_OF_ONE_FILE = {
