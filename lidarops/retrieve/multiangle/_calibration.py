@@ -142,8 +142,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     usual_square = (np.where(total > 0.0, mean, square) + noise)[at_top]
     known = np.isfinite(own_square) & np.isfinite(usual_square) & (usual_square > 0.0)
     relative = np.where(known, own_square, 1.0) / np.where(known, usual_square, 1.0)
-    scale: Array = np.maximum(relative, THRESHOLDS.least_scale)
-    return scale
+    return np.asarray(np.maximum(relative, THRESHOLDS.least_scale))
 
 
 def _smoothing_square(bias: Array, known: Array) -> Array:
@@ -173,8 +172,7 @@ def _smoothing_square(bias: Array, known: Array) -> Array:
 
 
 def _trust(signal: Array, variance: Array) -> Array:
-    share: Array = signal**2 / np.maximum(signal**2 + variance, np.finfo(np.float64).tiny)
-    return share
+    return np.asarray(signal**2 / np.maximum(signal**2 + variance, np.finfo(np.float64).tiny))
 
 
 def variance_ratio(known: Array, bias: Array, scale: Array) -> Array:
@@ -194,5 +192,4 @@ def variance_ratio(known: Array, bias: Array, scale: Array) -> Array:
     (profile, difference) float64
     """
     square = scale[:, np.newaxis] * _smoothing_square(bias, known)
-    factor: Array = (known[1] + square) / known[0]
-    return factor
+    return np.asarray((known[1] + square) / known[0])

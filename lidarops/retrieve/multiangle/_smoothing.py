@@ -371,14 +371,17 @@ def score_smoothing(bands: Array, estimates: Array, stiffness: Array, weight: Ar
     return Scores(weight, likelihood, risk.sum(axis=0), freedom.mean(axis=0))
 
 
-def weights_up_to(largest: float, unit: float) -> Array:
+def weights_up_to(largest: float, unit: float, *, one: bool = True) -> Array:
     """Return the weights to choose from: those of a grid in `unit`, and the largest one.
 
     Without a limit, smooth extinction below would deny the top of a layer above, where the data are
-    too noisy to show it.
+    too noisy to show it. An average, without `one`, is over the grid alone: the limit beside its
+    last weight would count twice (`test_bench_false_values`).
     """
     grid = _GRID * unit
-    return grid if grid[-1] < largest else np.append(grid[grid < largest], largest)
+    if one and largest <= grid[-1]:
+        return np.append(grid[grid < largest], largest)
+    return grid[: max(int(np.searchsorted(grid, largest, side="right")), 1)]
 
 
 def choose_smoothing(scores: Scores, *, one: bool) -> Smoothing:

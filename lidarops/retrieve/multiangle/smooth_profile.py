@@ -199,9 +199,9 @@ def _fit(block: _Block) -> _Fit:
     information, bands = block.information, block.bands
     highest = int(np.flatnonzero((information > 0.0).any(axis=0))[-1])
     unit = float(information[information > 0.0].mean()) * block.altitude[highest] ** 3
-    weights = _smoothing.weights_up_to(_largest_smoothing(block, information), unit)
-    scores = _smoothing.score_smoothing(bands, block.estimates, block.stiffness, weights)
     one = len(information) >= THRESHOLDS.fewest_to_choose
+    weights = _smoothing.weights_up_to(_largest_smoothing(block, information), unit, one=one)
+    scores = _smoothing.score_smoothing(bands, block.estimates, block.stiffness, weights)
     smoothing = _smoothing.choose_smoothing(scores, one=one)
     right = _smoothing.multiply_rows(bands, block.estimates)
     solved, diagonal, beside = smoothing.solve(right, bands, block.stiffness, inverse=True)

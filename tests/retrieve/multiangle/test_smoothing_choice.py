@@ -116,6 +116,12 @@ def test_the_largest_weight_is_one_of_those_to_choose_from():
     np.testing.assert_array_equal(weights_up_to(1e-12, 1.0), [1e-12])
 
 
+def test_an_average_is_over_the_grid_alone():
+    """The limit beside the last weight of the grid would count twice."""
+    np.testing.assert_array_equal(weights_up_to(1.2 * GRID[15], 1.0, one=False), GRID[:16])
+    np.testing.assert_array_equal(weights_up_to(1e-12, 1.0, one=False), GRID[:1])
+
+
 def test_small_block_is_averaged_by_likelihood():
     choice = choose_smoothing(scores(30, 5), one=False)
     assert choice.share.sum() == pytest.approx(1.0)
