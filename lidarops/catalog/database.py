@@ -61,7 +61,15 @@ class Database:
             # Check first, because opening would create the file.
             if not create and not Path(self._url.database).exists():
                 raise self._absent()
-            _make_folder(Path(self._url.database).parent)
+            folder = Path(self._url.database).parent
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise CatalogError(
+                    f"the folder of the catalog cannot be made: {error.strerror}",
+                    file=folder,
+                    remedy="choose another folder with --out",
+                ) from error
         self._copied = ExitStack()
         self._upserts: dict[tuple[str, bool], sa.TextClause] = {}
         self._engine = _engine(self._url if create else self._readable())
@@ -340,17 +348,6 @@ def _engine(url: sa.URL) -> sa.Engine:
             f"cannot be opened: {error}",
             file=_without_passwords(url),
             remedy="install its driver: pip install lidarops[postgresql]",
-        ) from error
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CatalogError(
-            f"the folder of the catalog cannot be made: {error.strerror}",
-            file=folder,
-            remedy="choose another folder with --out",
         ) from error
 
 

@@ -138,10 +138,16 @@ class Granules(Database):
         )
         return statement, [{"file": path, "digest": digest} for path, digest in digests.items()]
 
-    def granules(self, *, status: Status | None = None) -> list[Granule]:
+    def granules(
+        self, *conditions: sa.ColumnElement[bool], status: Status | None = None
+    ) -> list[Granule]:
         """Return the granules of the campaign, ordered by instrument, start time and path."""
-        conditions = [] if status is None else [_C.status == status.value]
-        return self._granules(*conditions)
+        conditions += () if status is None else (_C.status == status.value,)
+        query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
+        query = query.order_by(_C.instrument, _C.start, _C.path)
+        layouts = dict(self.read(sa.select(LAYOUT), lambda row: (row.hash, _layout_from(row[1]))))
+        with self.stream(query) as rows:
+            return list(self.decoded(_granule_from(row, layouts) for row in rows))
 
     def granules_of(self, first: int, last: int, *, dark_days: int) -> list[Granule]:
         """Return good granules that start on days `first` to `last`, and dark ones around them.
@@ -156,14 +162,7 @@ class Granules(Database):
         near = _C.day.between(first - dark_days, last + dark_days)
         on_days = _C.day.between(first, last)
         role = sa.or_(on_days, _C.role == Role.DARK.value)
-        return self._granules(near, role, _C.status == Status.GOOD.value)
-
-    def _granules(self, *conditions: sa.ColumnElement[bool]) -> list[Granule]:
-        query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
-        query = query.order_by(_C.instrument, _C.start, _C.path)
-        layouts = dict(self.read(sa.select(LAYOUT), lambda row: (row.hash, _layout_from(row[1]))))
-        with self.stream(query) as rows:
-            return list(self.decoded(_granule_from(row, layouts) for row in rows))
+        return self.granules(near, role, status=Status.GOOD)
 
     def refused(self) -> list[Granule]:
         """Return the granules that the catalog refuses."""

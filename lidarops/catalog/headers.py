@@ -23,6 +23,7 @@ from lidarops.records import (
     UNREADABLE,
     ChannelLayout,
     Granule,
+    Header,
     Role,
     Status,
     day_of,
@@ -37,6 +38,7 @@ NO_NOTES: Final = "[]"
 """Stored notes of a file that has none."""
 
 _FIELDS: Final = tuple(item.name for item in fields(Granule))
+_STATED: Final = tuple(item.name for item in fields(Header))
 _HALF: Final = (1 << 31) - 1
 _TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
 """Starts of the reason if a refused file may be readable another time, or its format be added."""
@@ -79,24 +81,6 @@ class UnreadFile(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class _Lidar:
-    """What the campaign states of an instrument that headers state too."""
-
-    instrument: Instrument
-    station: Station
-
-    def is_near(self, latitude: float, longitude: float) -> bool:
-        """Return whether a position is that of the station, within the tolerance."""
-        eastward = (longitude - self.station.longitude + 180.0) % 360.0 - 180.0
-        northward = latitude - self.station.latitude
-        return max(abs(northward), abs(eastward)) <= self.instrument.position_tolerance
-
-    def is_level(self, altitude: float) -> bool:
-        """Return whether an altitude is that of the station, within the tolerance."""
-        return abs(altitude - self.station.altitude) <= self.instrument.altitude_tolerance
-
-
-@dataclass(frozen=True, slots=True)
 class Headers:
     """The source of raw files and the campaign with which their headers are read."""
 
@@ -104,11 +88,6 @@ class Headers:
     campaign: Campaign
     entered_as: str
     """Name by which the catalog knows the campaign."""
-
-    def lidar(self, name: str) -> _Lidar:
-        """Return what the campaign states of an instrument."""
-        instrument = self.campaign.instruments[name]
-        return _Lidar(instrument, self.campaign.stations[instrument.station])
 
 
 def read_row(headers: Headers, due: UnreadFile) -> GranuleRow:
@@ -131,24 +110,24 @@ def read_header(headers: Headers, due: UnreadFile) -> Granule:
     if due.rivals:
         claimants = f"{due.instrument} and {', '.join(due.rivals)}"
         return _refused(due, f"claimed by instruments {claimants} (make their patterns disjoint)")
-    head = b""
+    head, instrument = b"", headers.campaign.instruments[due.instrument]
     try:
         head = headers.source.head(file.path, HEADER_BYTES)
         header = parse_raw_header(head, file=file.path, size=file.size)
-        return _accepted(due, header, headers.lidar(due.instrument))
+        return _accepted(due, header, instrument, headers.campaign.stations[instrument.station])
     except RawFormatError as error:
         reason = str(error).removeprefix(f"{file.path}: ")
-        return _refused(due, reason, _start(head, headers.lidar(due.instrument)))
+        return _refused(due, reason, _start(head, instrument))
     except OSError as error:
         return _refused(due, f"{UNREADABLE}: {error.strerror or error}")
 
 
-def _start(head: bytes, lidar: _Lidar) -> datetime | None:
+def _start(head: bytes, instrument: Instrument) -> datetime | None:
     """Return the start of a file that is refused, by which it belongs to a scene."""
     start = read_start(head)
     if start is None:
         return None
-    return start - timedelta(seconds=lidar.instrument.facts_at(start, by_clock=True).clock_offset)
+    return start - timedelta(seconds=instrument.facts_at(start, by_clock=True).clock_offset)
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
@@ -164,8 +143,9 @@ def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Gra
     )
 
 
-def _accepted(due: UnreadFile, header: RawHeader, lidar: _Lidar) -> Granule:
-    instrument, station = lidar.instrument, lidar.station
+def _accepted(
+    due: UnreadFile, header: RawHeader, instrument: Instrument, station: Station
+) -> Granule:
     facts = instrument.facts_at(header.start, by_clock=True)
     header = header.read_as(instrument.header_pointing)
     if header.doubt and facts.zenith_angle is None:
@@ -187,7 +167,7 @@ def _accepted(due: UnreadFile, header: RawHeader, lidar: _Lidar) -> Granule:
         "azimuth": header.azimuth if facts.azimuth is None else facts.azimuth,
         "latitude": latitude,
         "longitude": longitude,
-        "notes": (*header.notes, *_overridden(header, facts, lidar)),
+        "notes": (*header.notes, *_overridden(header, facts, instrument, station)),
     }
     return Granule(
         path=due.file.path,
@@ -196,20 +176,32 @@ def _accepted(due: UnreadFile, header: RawHeader, lidar: _Lidar) -> Granule:
         instrument=due.instrument,
         role=due.role,
         status=Status.GOOD,
-        contradictions=() if order == "ignore" else tuple(_contradictions(header, position, lidar)),
-        **header.stated | of_campaign,
+        contradictions=tuple(_contradictions(header, position, instrument, station)),
+        **{name: getattr(header, name) for name in _STATED} | of_campaign,
     )
 
 
+def _is_near(instrument: Instrument, station: Station, latitude: float, longitude: float) -> bool:
+    """Return whether a position is that of the station, within the tolerance."""
+    eastward = (longitude - station.longitude + 180.0) % 360.0 - 180.0
+    northward = latitude - station.latitude
+    return max(abs(northward), abs(eastward)) <= instrument.position_tolerance
+
+
 def _contradictions(
-    header: RawHeader, position: tuple[float, float] | None, lidar: _Lidar
+    header: RawHeader,
+    position: tuple[float, float] | None,
+    instrument: Instrument,
+    station: Station,
 ) -> Iterator[str]:
     """Yield what the header states otherwise than the station of the campaign."""
-    station, altitude = lidar.station, header.altitude
-    if position is not None and not lidar.is_near(*position):
+    if instrument.header_position == "ignore":
+        return
+    altitude, tolerance = header.altitude, instrument.altitude_tolerance
+    if position is not None and not _is_near(instrument, station, *position):
         latitude, longitude = position
         remedy = "correct the station, or set header_position: ignore or position_tolerance"
-        if lidar.is_near(longitude, latitude):
+        if _is_near(instrument, station, longitude, latitude):
             remedy = (
                 "they look swapped: correct the station, or set header_position if the header has"
                 " them in another order"
@@ -218,9 +210,9 @@ def _contradictions(
             f"the header states the position {latitude:.1f} N {longitude:.1f} E, the station of the"
             f" campaign {station.latitude:.1f} N {station.longitude:.1f} E ({remedy})"
         )
-    if altitude is not None and not lidar.is_level(altitude):
+    if altitude is not None and abs(altitude - station.altitude) > tolerance:
         remedy = "correct the station, or set header_position: ignore or altitude_tolerance"
-        if abs(altitude - 1e3 * station.altitude) <= lidar.instrument.altitude_tolerance:
+        if abs(altitude - 1e3 * station.altitude) <= tolerance:
             remedy = "that of the station looks like km: give m"
         yield (
             f"the header states the altitude {altitude:.0f} m, the station of the campaign"
@@ -228,7 +220,9 @@ def _contradictions(
         )
 
 
-def _overridden(header: RawHeader, facts: InstrumentFacts, lidar: _Lidar) -> Iterator[str]:
+def _overridden(
+    header: RawHeader, facts: InstrumentFacts, instrument: Instrument, station: Station
+) -> Iterator[str]:
     """Yield what of the campaign overrides what the header states otherwise."""
     for name in ("zenith_angle", "azimuth"):
         stated, given = getattr(header, name), getattr(facts, name)
@@ -238,11 +232,15 @@ def _overridden(header: RawHeader, facts: InstrumentFacts, lidar: _Lidar) -> Ite
             yield f"{name} {given:g} degree of the campaign overrides {stated:g} of the header"
     if header.doubt:
         yield f"zenith_angle {facts.zenith_angle:g} of the facts overrides header: {header.doubt}"
-    if lidar.instrument.header_position == "ignore":
+    if instrument.header_position == "ignore":
         pair, altitude = header.coordinates, header.altitude
-        if pair is not None and not (lidar.is_near(*pair) or lidar.is_near(*pair[::-1])):
+        orders = (pair, pair[::-1]) if pair else ()
+        if pair and not any(_is_near(instrument, station, *order) for order in orders):
             yield f"header_position: ignore overrides {pair[0]:g}, {pair[1]:g} of the header"
-        if altitude is not None and not lidar.is_level(altitude):
+        if (
+            altitude is not None
+            and abs(altitude - station.altitude) > instrument.altitude_tolerance
+        ):
             yield f"header_position: ignore overrides the altitude {altitude:g} m of the header"
 
 

@@ -135,10 +135,9 @@ class Lock(AbstractContextManager["Lock"]):
         """
         self._wait_for(lambda: not self.is_taken())
 
-    def is_taken(self) -> bool:
-        """Return whether a living process holds the lock."""
-        holder = self.holder()
-        return holder is not None and not holder.dead
+    def is_taken(self, *, by_others: bool = False) -> bool:
+        """Return whether a living process holds the lock, or that of another campaign."""
+        return not all(holder.dead for holder in self._holders(others=by_others))
 
     def _wait_for(self, attempt: Callable[[], bool]) -> bool:
         """Repeat an attempt until it succeeds; return whether it failed at first."""
@@ -169,19 +168,13 @@ class Lock(AbstractContextManager["Lock"]):
 
     def holder(self) -> Holder | None:
         """Return the present holder of the lock."""
-        own = self._holders(_L.campaign == self._database.campaign)
-        return own[0] if own else None
+        return next(iter(self._holders()), None)
 
-    def others_at_work(self) -> bool:
-        """Return whether a living process holds the lock of another campaign of the database."""
-        others = self._holders(_L.campaign != self._database.campaign)
-        return not all(holder.dead for holder in others)
-
-    def _holders(self, condition: sa.ColumnElement[bool]) -> list[Holder]:
-        clock = self._database.clock()
-        query = sa.select(LOCK, (clock - _L.heartbeat).label("silent")).where(condition)
-        with self._database.transaction() as connection:
-            rows = connection.execute(query).all()
+    def _holders(self, *, others: bool = False) -> list[Holder]:
+        """Return the holder, or those of the locks of other campaigns of the database."""
+        silent = (self._database.clock() - _L.heartbeat).label("silent")
+        query = sa.select(LOCK, silent).where((_L.campaign != self._database.campaign) == others)
+        rows = self._database.read(query, tuple)
         return [Holder(*(*known, silent)) for _campaign, *known, _heartbeat, silent in rows]
 
     def _try(self) -> bool:

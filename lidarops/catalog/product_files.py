@@ -125,7 +125,7 @@ def sweep(output: Path, store: Store) -> bool:
     failures: list[OSError] = []
     paths = list(temporary_files(output, failures))
     # Once the files are listed: those of a run that begins later are not among them.
-    if Lock(store).others_at_work():
+    if Lock(store).is_taken(by_others=True):
         return False
     for path in paths:
         try:
@@ -229,7 +229,7 @@ def verify_archive(
 def _is_written(store: Store) -> bool:
     """Return whether a run may write products: campaigns of a catalog may share a folder."""
     lock = Lock(store)
-    return lock.is_taken() or lock.others_at_work()
+    return lock.is_taken() or lock.is_taken(by_others=True)
 
 
 def _check_inputs(campaign: Campaign, store: Store) -> Iterator[CheckedFile]:

@@ -44,21 +44,6 @@ def literal_pattern(path: str) -> str:
     return re.sub(r"[*?\[{]", r"[\g<0>]", path)
 
 
-def _rank(entry: os.DirEntry[str]) -> str:
-    """Return the sort key that orders entries like the paths of their files."""
-    name = printable(entry.name)
-    return f"{name}/" if entry.is_dir(follow_symlinks=False) else name
-
-
-def _raw_file(entry: os.DirEntry[str], path: str) -> RawFile:
-    try:
-        status = entry.stat()
-    except OSError:
-        # A broken link is listed too, so that it is reported as unreadable.
-        return RawFile(path, 0, 0)
-    return RawFile(path, status.st_size, status.st_mtime_ns)
-
-
 class Source:
     """An archive in a local folder."""
 
@@ -95,17 +80,25 @@ class Source:
     def _files_below(self, folder: str, prefix: str) -> Iterator[RawFile]:
         try:
             with os.scandir(folder) as listing:
-                entries = sorted(listing, key=_rank)
+                entries = [(entry, entry.is_dir(follow_symlinks=False)) for entry in listing]
         except OSError as error:
             raise CatalogError(
                 f"cannot be listed: {error.strerror}", file=folder, remedy="check its permissions"
             ) from error
-        for entry in entries:
+        # In the order of the paths of their files.
+        entries.sort(key=lambda item: printable(item[0].name) + "/" * item[1])
+        for entry, is_folder in entries:
             path = f"{prefix}{entry.name}"
-            if entry.is_dir(follow_symlinks=False):
+            if is_folder:
                 yield from self._files_below(entry.path, f"{path}/")
+                continue
+            try:
+                status = entry.stat()
+            except OSError:
+                # A broken link is listed too, so that it is reported as unreadable.
+                yield RawFile(path, 0, 0)
             else:
-                yield _raw_file(entry, path)
+                yield RawFile(path, status.st_size, status.st_mtime_ns)
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""

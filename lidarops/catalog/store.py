@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -39,6 +38,7 @@ from lidarops.records import (
     Role,
     SceneOutcome,
     Stamp,
+    digest,
 )
 
 
@@ -196,28 +196,27 @@ class Store(Granules):
 
     def begin_run(self, run: Run, token: str, *, swept: bool = True) -> None:
         """Enter a starting run; close runs whose process died, if what they left is swept."""
+        if swept:
+            self.close_runs(token)
         with self._writing(token) as connection:
-            if swept:
-                connection.execute(self._closing())
             values = asdict(run) | {"campaign": self.campaign, "started": naive(run.started)}
             del values["seconds"]
             connection.execute(sa.insert(RUN), values)
 
-    def _closing(self) -> sa.Update:
-        return sa.update(RUN).where(*self._open_runs()).values(status=RunStatus.DIED.value)
-
-    def _open_runs(self) -> tuple[sa.ColumnElement[bool], ...]:
-        return RUN.c.campaign == self.campaign, RUN.c.status == RunStatus.RUNNING.value
-
     def has_dead_run(self) -> bool:
         """Return whether the process of a run that did not end has died."""
-        query = sa.select(RUN.c.id).where(*self._open_runs()).limit(1)
+        running = RUN.c.status == RunStatus.RUNNING.value
+        query = sa.select(RUN.c.id).where(RUN.c.campaign == self.campaign, running).limit(1)
         return bool(self.read(query, tuple)) and not Lock(self).is_taken()
 
     def close_runs(self, token: str) -> None:
         """Close runs whose process died."""
         with self._writing(token) as connection:
-            connection.execute(self._closing())
+            connection.execute(
+                sa.update(RUN)
+                .where(RUN.c.campaign == self.campaign, RUN.c.status == RunStatus.RUNNING.value)
+                .values(status=RunStatus.DIED.value)
+            )
 
     def end_run(self, run: str, status: RunStatus, *, refused: int, token: str) -> None:
         """Enter the end of a run."""
@@ -271,7 +270,16 @@ class Store(Granules):
         outcome = entry.outcome
         with self._writing(token) as connection:
             self._enter_products(connection, entry, run)
-            self._enter_scene(connection, entry, run)
+            row = {
+                "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
+                "key": entry.key, "run": run, "error": outcome.error,
+                "internal": outcome.internal, "final": entry.final, "crashes": 0,
+            }  # fmt: skip
+            connection.execute(self.upsert(SCENE), row)
+            place = {"run": run, "scene": outcome.scene}
+            stages = [{**place, "stage": name, "seconds": s} for name, s in outcome.seconds.items()]
+            if stages:
+                connection.execute(self.upsert(STAGE, replacing=False), stages)
             if outcome.error:
                 day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == entry.day
                 connection.execute(sa.delete(VERDICT).where(*day))
@@ -303,7 +311,7 @@ class Store(Granules):
             by_role = sorted(new.inputs, key=attrgetter("role", "path"))
             for role, files in groupby(by_role, key=attrgetter("role")):
                 members = list(files)
-                name = _set_id(members)
+                name = digest([[used.path, used.sha256] for used in members])[:32]
                 sets[name] = members
                 links.append({**ours, "product": path, "role": role.value, "file_set": name})
         known = set(
@@ -319,19 +327,6 @@ class Store(Granules):
             connection.execute(self.upsert(FILE_SET, replacing=False), files_of_sets)
         if links:
             connection.execute(sa.insert(PRODUCT_INPUT), links)
-
-    def _enter_scene(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
-        outcome = entry.outcome
-        row = {
-            "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
-            "key": entry.key, "run": run, "error": outcome.error, "internal": outcome.internal,
-            "final": entry.final, "crashes": 0,
-        }  # fmt: skip
-        connection.execute(self.upsert(SCENE), row)
-        ours = {"run": run, "scene": outcome.scene}
-        stages = [{**ours, "stage": name, "seconds": s} for name, s in outcome.seconds.items()]
-        if stages:
-            connection.execute(self.upsert(STAGE, replacing=False), stages)
 
     def _refuse(self, connection: sa.Connection, refused: Iterable[Granule]) -> None:
         """Enter granules that cannot be used; the next scan tries what was not read again."""
@@ -521,15 +516,9 @@ class Store(Granules):
             for (scene,) in self.read(scenes.where(SCENE.c.day == day), tuple)
         ]
 
-    def failures(self) -> dict[str, str]:
-        """Return scene -> error of the scenes whose last try failed."""
-        return self._errors_of_scenes(SCENE.c.error)
-
-    def internal_errors(self) -> dict[str, str]:
-        """Return scene -> traceback of the scenes whose last try ended with an internal error."""
-        return self._errors_of_scenes(SCENE.c.internal)
-
-    def _errors_of_scenes(self, column: sa.Column[str]) -> dict[str, str]:
+    def failures(self, *, internal: bool = False) -> dict[str, str]:
+        """Return scene -> error of the scenes whose last try failed, or traceback of a bug."""
+        column = SCENE.c.internal if internal else SCENE.c.error
         query = sa.select(SCENE.c.scene, column)
         own = SCENE.c.campaign == self.campaign
         return dict(self.read(query.where(own, column != ""), tuple))
@@ -577,13 +566,6 @@ class Store(Granules):
             row = {"campaign": self.campaign, "day": day, "signature": facts.pop("signature")}
             rows.append({**row, "facts": json.dumps(facts)})
         self.execute(self.upsert(VERDICT), rows)
-
-
-def _set_id(files: Sequence[InputRecord]) -> str:
-    digest = hashlib.sha256()
-    for used in files:
-        digest.update(f"{used.path}\0{used.sha256}\0".encode("utf-8", "surrogateescape"))
-    return digest.hexdigest()[:32]
 
 
 def _product_row(new: NewProduct) -> dict[str, Any]:

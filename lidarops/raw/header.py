@@ -141,11 +141,6 @@ class RawHeader(Header):
         object.__setattr__(self, "layout", _layout(self.channels))
         object.__setattr__(self, "setup", _setup(self.site, self.channels))
 
-    @property
-    def stated(self) -> dict[str, Any]:
-        """The fields of `records.Header`, by name."""
-        return {name: getattr(self, name) for name in _STATED}
-
     def read_as(self, pointing: HeaderPointing) -> Self:
         """Return the header with its written angle read as what the campaign says that it is.
 
@@ -194,9 +189,6 @@ class RawHeader(Header):
                 " in the campaign",
             )
         return latitude, longitude
-
-
-_STATED: Final = tuple(item.name for item in fields(Header))
 
 
 @lru_cache(maxsize=128)

@@ -264,7 +264,7 @@ def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None
         status=RunStatus.FINISHED,
         summary=summary,
         failures=store.failures(),
-        internal=store.internal_errors(),
+        internal=store.failures(internal=True),
         unusable=tuple(store.unusable_scenes()),
         empty_scenes=empty_scenes,
         set_aside=set_aside,

@@ -133,7 +133,7 @@ class Pass:
             summary=self.summary,
             orphans=tuple(told.orphans.values()),
             failures=self.store.failures(),
-            internal=self.store.internal_errors(),
+            internal=self.store.failures(internal=True),
             # Orphans are never made again, so they would be reported for ever.
             unusable=tuple(self.store.unusable_scenes(without=told.orphans.keys())),
             empty_scenes=told.empty_scenes | clean[0],

@@ -273,7 +273,7 @@ class Sources:
                     f"the source of {start} is missing",
                     remedy="install its package with its sources",
                 )
-            waiting += self._run_by(start)
+            waiting += accumulate(start.split("."), "{}.{}".format)
         while waiting:
             name = waiting.pop()
             path = self.path(name)
@@ -289,14 +289,12 @@ class Sources:
         for target in imported_modules(self._content(path)[0]):
             # A text that only reads like an import may have too many dots.
             with suppress(ImportError):
-                names |= dict.fromkeys(self._run_by(resolve_name(target, package)))
+                # The packages around it and, unless it is a function, the target itself.
+                parts = resolve_name(target, package).split(".")
+                around = list(accumulate(parts, "{}.{}".format))
+                if parts[0] in self._roots and self._apart.isdisjoint(around):
+                    names |= dict.fromkeys(filter(self.path, around))
         return tuple(names)
-
-    def _run_by(self, target: str) -> Iterator[str]:
-        """Yield the packages around a target of an import and, unless it is a function, itself."""
-        names = list(accumulate(target.split("."), "{}.{}".format))
-        if names[0] in self._roots and self._apart.isdisjoint(names):
-            yield from filter(self.path, names)
 
     def _find(self, module: str) -> Path | None:
         root, *names = module.split(".")

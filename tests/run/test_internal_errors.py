@@ -62,7 +62,7 @@ def test_a_bug_ends_its_scene_only_and_its_traceback_is_kept(
     assert "ERROR" in log.read_text()
     assert found["traceback"].strip() in log.read_text()
     with Store(archive.write().catalog_url, "small") as store:
-        assert store.internal_errors() == {SCENE: found["traceback"]}
+        assert store.failures(internal=True) == {SCENE: found["traceback"]}
         # Products of other channels were complete before the bug.
         assert {row["scene"] for row in store.products()} == {*OTHERS, SCENE}
         assert not [file for file in verify_archive(archive.write(), store) if file.problem]
@@ -108,7 +108,7 @@ def test_a_bug_in_planning_ends_its_scene_only(
         assert "in decide_with_a_bug" in first.internal[SCENE]
         assert first.internal[SCENE] in caplog.text
         with Store(campaign.catalog_url, "small") as store:
-            assert store.internal_errors() == first.internal
+            assert store.failures(internal=True) == first.internal
         again = bring_up_to_date(campaign)
         assert again.record is None
         assert again.internal == first.internal
