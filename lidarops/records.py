@@ -350,10 +350,14 @@ class Plan:
         return digest(self.as_dict())
 
 
+def canonical(value: Any) -> str:
+    """Return JSON with sorted keys, without spaces."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
 def digest(value: Any) -> str:
     """Return the sha256 of plain JSON types."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(canonical(value).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

@@ -199,7 +199,7 @@ def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
 
 def _clouds(product: xr.Dataset, layout: Layout, usable: NDArray[np.bool_]) -> Sample | None:
     """Return the share of cloudy profiles: 1 also where only the mean shows a cloud."""
-    if not layout.holds(CLOUD_FRACTION):
+    if CLOUD_FRACTION not in layout.rows:
         return None
     exact = np.zeros(usable.shape)
     fraction = np.full(usable.shape, np.nan)

@@ -26,10 +26,16 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.means_variables import Period, Weights, layout
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
-from lidarops.netcdf.context import UNUSED_INPUTS, iso
+from lidarops.netcdf.context import (
+    UNUSED_INPUTS,
+    identifier,
+    iso,
+    package_versions,
+    prov_document,
+    prov_type,
+)
 from lidarops.netcdf.coordinates import auxiliary_names
 from lidarops.netcdf.encoding import as_stored, as_text
-from lidarops.netcdf.provenance import identifier, package_versions, prov_document, prov_type
 from lidarops.netcdf.variables import QUANTIZATION, Layout, attributes, layout_of
 from lidarops.netcdf.write import write_product
 from lidarops.system.code_version import code_version

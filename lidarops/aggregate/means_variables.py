@@ -156,7 +156,7 @@ _CLOUD_COMMENT: Final = (
 
 def _rows(source: Layout, weights: Weights) -> Iterator[Row]:
     judges = {row.name: row for row in source.judges}
-    cloudy = (CLOUD_FRACTION,) if source.holds(CLOUD_FRACTION) else ()
+    cloudy = (CLOUD_FRACTION,) if CLOUD_FRACTION in source.rows else ()
     for row in averaged(source):
         names = systematic(row)
         flags = judges[judging(row.name, judges)]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.dialects import sqlite
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.schema import METADATA, SCHEMA, SCHEMA_VERSION
@@ -152,7 +152,11 @@ class Database:
 
     def insert(self, table: sa.Table) -> Any:
         """Return an insert statement that can handle rows that already exist."""
-        return sqlite.insert(table) if self._sqlite else postgresql.insert(table)
+        if self._sqlite:
+            return sqlite.insert(table)
+        from sqlalchemy.dialects import postgresql  # noqa: PLC0415 - few catalogs need it
+
+        return postgresql.insert(table)
 
     def upsert(self, table: sa.Table, *, replacing: bool = True) -> sa.TextClause:
         """Return an insert of complete rows that replaces existing rows, or leaves them.
@@ -169,7 +173,8 @@ class Database:
                 statement = statement.on_conflict_do_update(index_elements=keys, set_=others)
             else:
                 statement = statement.on_conflict_do_nothing()
-            dialect = (sqlite if self._sqlite else postgresql).dialect(paramstyle="named")
+            # Dialects take it, their interface does not state it.
+            dialect = self._url.get_dialect()(paramstyle="named")  # type: ignore[call-arg]
             # Types are needed because a text statement does not know how times are stored.
             typed = [sa.bindparam(column.name, type_=column.type) for column in table.columns]
             text = str(statement.compile(dialect=dialect))

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import Database
-from lidarops.catalog.headers import NO_NOTES, GranuleRow, aware, naive
+from lidarops.catalog.headers import NO_NOTES, GranuleRow
 from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
@@ -49,7 +49,6 @@ class Fingerprint(NamedTuple):
     stamp_high: int
     sha256: str | None
     start: datetime | None
-    """UTC, without a zone."""
     status: str
 
     @property
@@ -175,7 +174,7 @@ class Granules(Database):
         begin = f"{folder}/" if folder else ""
         with self.stream(query) as rows:
             return [
-                DatedFile(path, instrument, _ROLES[role], start.replace(tzinfo=UTC))
+                DatedFile(path, instrument, _ROLES[role], start)
                 for path, instrument, role, start in self.decoded(rows)
                 if "/" not in path[len(begin) :]
             ]
@@ -191,7 +190,7 @@ class Granules(Database):
             )
             .group_by(_C.day)
         )
-        return sorted(self.read(query, lambda row: row[0].replace(tzinfo=UTC)))
+        return sorted(start for (start,) in self.read(query, tuple))
 
     def _good_below(self, folder: str) -> list[sa.ColumnElement[bool]]:
         conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
@@ -237,7 +236,7 @@ class Granules(Database):
             One per instrument, period and layout of channels.
         """
         begins = [datetime.min.replace(tzinfo=UTC), *edges]
-        later = [(_C.start >= naive(edge), k) for k, edge in enumerate(edges, 1)]
+        later = [(_C.start >= edge, k) for k, edge in enumerate(edges, 1)]
         period = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
         signal = (
             sa.select(_C.instrument, period.label("period"), _C.layout, _C.start)
@@ -258,7 +257,7 @@ class Granules(Database):
 
         def holding(row: Any) -> Holding:
             name, k, _, files, first, text = row
-            return Holding(name, begins[k], _layout_from(text), files, first.replace(tzinfo=UTC))
+            return Holding(name, begins[k], _layout_from(text), files, first)
 
         return self.read(query, holding)
 
@@ -382,8 +381,6 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
             "status": _STATUSES[stored["status"]],
             "notes": _sentences(stored["notes"]),
             "contradictions": _sentences(stored["contradictions"]),
-            "start": aware(stored["start"]),
-            "stop": aware(stored["stop"]),
             "layout": layouts[stored["layout"]],
         }
     )

@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -56,16 +56,6 @@ class GranuleRow(NamedTuple):
     """By column."""
     layout: str
     """JSON text of its layout of channels."""
-
-
-def naive(moment: datetime | None) -> datetime | None:
-    """Return a time as stored in the tables: UTC, without a zone."""
-    return None if moment is None else moment.astimezone(UTC).replace(tzinfo=None)
-
-
-def aware(moment: datetime | None) -> datetime | None:
-    """Return a stored time with its zone, UTC."""
-    return None if moment is None else moment.replace(tzinfo=UTC)
 
 
 class UnreadFile(NamedTuple):
@@ -265,8 +255,6 @@ def row_of(granule: Granule, campaign: str, scan_key: str) -> GranuleRow:
         "status": granule.status.value,
         "notes": json.dumps(granule.notes),
         "contradictions": json.dumps(granule.contradictions),
-        "start": naive(granule.start),
-        "stop": naive(granule.stop),
         "layout": layout,
         "day": None if granule.start is None else day_of(granule.start),
         "stamp_low": low,

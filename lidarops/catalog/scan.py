@@ -216,22 +216,22 @@ class _Scan:
     def _owners(self, path: str) -> list[_Claim]:
         # The index of a web server encodes names: "+45" is "%2B45".
         encoded = "%" in path and self._archive.startswith(("http://", "https://"))
-        return self._matching(path) or (self._matching(unquote(path)) if encoded else [])
-
-    def _matching(self, path: str) -> list[_Claim]:
-        folder, slash, name = path.rpartition("/")
-        if folder + slash != self._folder:
-            self._folder = folder + slash
-            self._near = [
+        owners: list[_Claim] = []
+        for plain in (path, unquote(path)) if encoded else (path,):
+            folder, slash, name = plain.rpartition("/")
+            if folder + slash != self._folder:
+                self._folder = folder + slash
+                self._near = [
+                    claim
+                    for claim in self._claims
+                    if claim.folder is None or claim.folder.match(self._folder)
+                ]
+            owners = owners or [
                 claim
-                for claim in self._claims
-                if claim.folder is None or claim.folder.match(self._folder)
+                for claim in self._near
+                if claim.name.match(plain if claim.folder is None else name)
             ]
-        return [
-            claim
-            for claim in self._near
-            if claim.name.match(path if claim.folder is None else name)
-        ]
+        return owners
 
     def enter(self, row: GranuleRow) -> None:
         """Enter the row of the next file in `due`, unless it is unchanged."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from datetime import UTC, datetime
+from typing import Any, Final
 
 import sqlalchemy as sa
 
@@ -10,6 +11,22 @@ SCHEMA_VERSION: Final = 12
 """Raised with every change of a table; a database of another version is refused."""
 
 METADATA: Final = sa.MetaData()
+
+
+class Moment(sa.TypeDecorator[datetime]):
+    """A time, stored in UTC without a zone."""
+
+    impl = sa.DateTime
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Any) -> datetime | None:  # noqa: ARG002
+        """Return a time as it is stored."""
+        return None if value is None else value.astimezone(UTC).replace(tzinfo=None)
+
+    def process_result_value(self, value: datetime | None, dialect: Any) -> datetime | None:  # noqa: ARG002
+        """Return a stored time with its zone."""
+        return None if value is None else value.replace(tzinfo=UTC)
+
 
 # Paths are listed by code point; PostgreSQL would sort them by the locale of the server.
 _PATH = sa.String(1024).with_variant(sa.String(1024, collation="C"), "postgresql")
@@ -41,8 +58,8 @@ GRANULE = sa.Table(
     # JSON lists of sentences.
     sa.Column("notes", sa.Text, nullable=False),
     sa.Column("contradictions", sa.Text, nullable=False),
-    sa.Column("start", sa.DateTime),
-    sa.Column("stop", sa.DateTime),
+    sa.Column("start", Moment),
+    sa.Column("stop", Moment),
     *(
         sa.Column(name, sa.Float)
         for name in ("zenith_angle", "azimuth", "latitude", "longitude", "altitude")
@@ -80,8 +97,8 @@ RUN = sa.Table(
     METADATA,
     sa.Column("id", _NAME, primary_key=True),
     sa.Column("campaign", _NAME, nullable=False),
-    sa.Column("started", sa.DateTime, nullable=False),
-    sa.Column("finished", sa.DateTime),
+    sa.Column("started", Moment, nullable=False),
+    sa.Column("finished", Moment),
     sa.Column("status", sa.String(12), nullable=False),
     sa.Column("holder", sa.Text, nullable=False),
     sa.Column("version", _NAME, nullable=False),
@@ -114,7 +131,7 @@ PRODUCT = sa.Table(
     sa.Column("usable", sa.BigInteger),
     # Number of the version of the content, and when its file was written.
     sa.Column("version", sa.Integer, nullable=False),
-    sa.Column("written", sa.DateTime),
+    sa.Column("written", Moment),
     # How it differs from the product that it replaced, as JSON; empty for a new one.
     sa.Column("change", sa.Text, nullable=False),
     sa.Index("product_by_day", "campaign", "day"),

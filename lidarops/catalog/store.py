@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.granules import Granules
-from lidarops.catalog.headers import RETRY, aware, naive, row_of
+from lidarops.catalog.headers import RETRY, row_of
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.schema import (
     FILE_SET,
@@ -199,7 +199,7 @@ class Store(Granules):
         if swept:
             self.close_runs(token)
         with self._writing(token) as connection:
-            values = asdict(run) | {"campaign": self.campaign, "started": naive(run.started)}
+            values = asdict(run) | {"campaign": self.campaign}
             del values["seconds"]
             connection.execute(sa.insert(RUN), values)
 
@@ -224,7 +224,7 @@ class Store(Granules):
             connection.execute(
                 sa.update(RUN)
                 .where(RUN.c.id == run)
-                .values(status=status.value, refused=refused, finished=naive(datetime.now(UTC)))
+                .values(status=status.value, refused=refused, finished=datetime.now(UTC))
             )
 
     def runs(self, *, limit: int | None = None) -> list[Run]:
@@ -577,18 +577,17 @@ def _product_row(new: NewProduct) -> dict[str, Any]:
         "mtime_ns": new.mtime_ns,
         "usable": record.usable,
         "version": record.stamp.version,
-        "written": naive(record.stamp.written),
+        "written": record.stamp.written,
         "change": "" if change is None else json.dumps(change.as_dict()),
     }
 
 
 def _made_from(row: Any) -> RecordedProduct:
     # In the order of `_MADE`.
-    stamp = Stamp(row.version, None if row.written is None else aware(row.written))
+    stamp = Stamp(row.version, row.written)
     return RecordedProduct(*(*row[:8], Dependence(*row[8:12]), row.run, stamp))
 
 
 def _run_from(row: Any) -> Run:
-    values = {name: getattr(row, name) for name in (field.name for field in fields(Run)[:-1])}
-    times = {name: aware(values[name]) for name in ("started", "finished")}
-    return Run(**values | times | {"status": RunStatus(row.status)})
+    values = {item.name: getattr(row, item.name) for item in fields(Run)[:-1]}
+    return Run(**values | {"status": RunStatus(row.status)})

@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import os
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -232,6 +233,9 @@ def progress_bar(name: str, total: int | None, unit: str = "") -> Iterator[Bar]:
     unit : str, optional
         What is counted, to show throughput and remaining time.
     """
+    if not sys.stderr.isatty():
+        yield Bar(lambda _: None, lambda _: None)
+        return
     from rich import progress
     from rich.console import Console
     from rich.text import Text
@@ -250,8 +254,7 @@ def progress_bar(name: str, total: int | None, unit: str = "") -> Iterator[Bar]:
     if unit:
         columns += [progress.TextColumn("remaining"), progress.TimeRemainingColumn()]
     console = Console(stderr=True)
-    hidden = not console.is_terminal
-    with progress.Progress(*columns, console=console, transient=True, disable=hidden) as bar:
+    with progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=total)
 
         def grow(number: int) -> None:

@@ -1,27 +1,45 @@
-"""The context of a product: its path, and all that its file states besides numbers.
+"""The context of a product: its path, its provenance, and all that its file states besides numbers.
 
-The global attributes follow from it, after ACDD-1.3 (`acdd13`).
+The global attributes follow from it, after ACDD-1.3 (`acdd13`); the provenance is W3C PROV-JSON.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any, Final, cast
+from functools import cache
+from importlib.metadata import version
+from itertools import groupby
+from operator import attrgetter
+from typing import Any, Final
+from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 
 from lidarops import __version__
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
-from lidarops.netcdf.provenance import product_id, writing_time
 from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
 from lidarops.raw.header import POLARISATIONS, label_of
-from lidarops.records import DetectionMode, Provenance, Role, Stamp, UnusedFile, is_glued
+from lidarops.records import (
+    DetectionMode,
+    Provenance,
+    Role,
+    Stamp,
+    UnusedFile,
+    canonical,
+    is_glued,
+)
 
+EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
+NAMESPACE: Final = "urn:lidarops:"
+
+_PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
 RECORDERS: Final = "lidarops_recorder"
 UNUSED_INPUTS: Final = "lidarops_unused_inputs"
 MOST_UNUSED: Final = 20
@@ -30,8 +48,8 @@ _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 @dataclass(frozen=True, slots=True)
-class Context:
-    """Station, instrument and provenance of a product, and texts of its campaign."""
+class Context(Provenance):
+    """Origin of a product, its station and instrument, and texts of its campaign."""
 
     mode: DetectionMode
     wavelength: float
@@ -48,29 +66,24 @@ class Context:
     stop: datetime
     notes: tuple[str, ...]
     """Notes on its raw files."""
-    provenance: Provenance
     raw_format: str
     """Raw format of its files, in words; empty where it is made of other products."""
     unused: tuple[UnusedFile, ...] = ()
     """Raw files of its scene from which it is not made."""
     stamp: Stamp = field(default_factory=Stamp)
     """Version of its content, and when it is written; now, where it has no time."""
-    kind: str = field(init=False)
-    """That of the provenance, as the two that follow."""
-    channel: str = field(init=False)
-    scene: str = field(init=False)
+    path: str = field(init=False)
+    """Of the product; see `product_path`."""
+    written: datetime = field(init=False)
+    """When the product is written, UTC; several attributes state it."""
 
     def __post_init__(self) -> None:
-        """Take what the provenance states; and the time once: several attributes state it."""
-        for name in ("kind", "channel", "scene"):
-            object.__setattr__(self, name, getattr(self.provenance, name))
-        if self.stamp.written is None:
-            object.__setattr__(self, "stamp", replace(self.stamp, written=writing_time()))
-
-    @property
-    def written(self) -> datetime:
-        """When the product is written, UTC."""
-        return cast("datetime", self.stamp.written)
+        """Add the path, and the time of writing if the stamp has none."""
+        names = (self.station_key, self.instrument_key, self.kind, self.channel)
+        written = self.stamp.written or writing_time()
+        object.__setattr__(self, "path", product_path(names, self.scene, self.start))
+        object.__setattr__(self, "written", written)
+        object.__setattr__(self, "stamp", replace(self.stamp, written=written))
 
     @property
     def detection(self) -> str:
@@ -78,8 +91,17 @@ class Context:
         return "glued" if is_glued(self.channel) else self.mode.value
 
 
-def product_path(context: Context) -> str:
+def product_path(names: tuple[str, str, str, str], scene: str, start: datetime) -> str:
     """Return the path of a product's file.
+
+    Parameters
+    ----------
+    names : (str, str, str, str)
+        Keys of station and instrument, kind and channel.
+    scene : str
+        Id of its scene.
+    start : datetime
+        Start of the scene.
 
     Returns
     -------
@@ -92,22 +114,6 @@ def product_path(context: Context) -> str:
     ------
     ProductError
         If a name cannot be part of a file name.
-    """
-    names = (context.station_key, context.instrument_key, context.kind, context.channel)
-    return path_of_product(names, context.scene, context.start)
-
-
-def path_of_product(names: tuple[str, str, str, str], scene: str, start: datetime) -> str:
-    """Return the path of a product's file; see `product_path`.
-
-    Parameters
-    ----------
-    names : (str, str, str, str)
-        Keys of station and instrument, kind and channel.
-    scene : str
-        Id of its scene.
-    start : datetime
-        Start of the scene.
     """
     # The id of a scene without its instrument: start time, and key of the grid where there are two.
     parts = (*names, scene.removeprefix(f"{names[1]}_"))
@@ -123,7 +129,7 @@ def path_of_product(names: tuple[str, str, str, str], scene: str, start: datetim
 
 
 def product_of_path(path: str) -> tuple[str, str]:
-    """Return kind and channel of a product from a path by `path_of_product`."""
+    """Return kind and channel of a product from a path by `product_path`."""
     *names, _, file = path.split("/")
     return names[2], file.removeprefix(f"{'_'.join(names)}_").rpartition("_")[0]
 
@@ -186,10 +192,10 @@ def _description(context: Context, layout: Layout) -> dict[str, Any]:
     references = (metadata.references, *layout.references)
     return {
         "title": f"{context.title}: {layout.title}, channel {context.channel}, {station}",
-        "summary": _sentences(context.summary, summary),
+        "summary": f"{context.summary.strip()} {summary}".strip(),
         "keywords": ", ".join(layout.keywords),
         "keywords_vocabulary": "GCMD Science Keywords",
-        "id": product_id(context.provenance),
+        "id": product_id(context),
         "naming_authority": metadata.naming_authority,
         "source": f"surface observation: {files} of the lidar {context.instrument_name}",
         "processing_level": layout.processing_level,
@@ -198,22 +204,18 @@ def _description(context: Context, layout: Layout) -> dict[str, Any]:
         "product_version": str(context.stamp.version),
         "history": _history(context),
         "references": "\n".join(text for text in references if text),
-        "comment": _sentences(metadata.comment, layout.comment),
+        "comment": f"{metadata.comment.strip()} {layout.comment.strip()}".strip(),
         "acknowledgement": metadata.acknowledgement,
         "license": metadata.license,
         "standard_name_vocabulary": STANDARD_NAME_TABLE,
     }
 
 
-def _sentences(*texts: str) -> str:
-    return " ".join(text.strip() for text in texts if text.strip())
-
-
 def _history(context: Context) -> str:
     """Return one line for each step, as CF requires: date, step, program."""
-    program = f"lidarops {__version__} ({context.provenance.code_version})"
+    program = f"lidarops {__version__} ({context.code_version})"
     # The plan of a product holds what it depends on, such as the corrections of glued channels.
-    lines = [*context.provenance.plan.lines(context.channel), f"wrote the {context.kind} product"]
+    lines = [*context.plan.lines(context.channel), f"wrote the {context.kind} product"]
     return "\n".join(
         f"{iso(context.written)} {' '.join(line.split())} [{program}]" for line in lines
     )
@@ -223,19 +225,20 @@ def _people(context: Context) -> dict[str, str]:
     metadata = context.metadata
     institution = metadata.institution
     publisher = metadata.publisher_name or metadata.creator_name
+    types = {institution: "institution", "": ""}
     return {
         "institution": institution,
         "project": metadata.project,
         "program": metadata.program or metadata.project,
         "creator_name": metadata.creator_name,
-        "creator_type": _kind_of(metadata.creator_name, institution),
+        "creator_type": types.get(metadata.creator_name, "person"),
         "creator_institution": institution,
         "creator_email": metadata.creator_email,
         "creator_url": metadata.creator_url,
         # As in files of EARLINET.
         "PI": metadata.principal_investigator,
         "publisher_name": publisher,
-        "publisher_type": _kind_of(publisher, institution),
+        "publisher_type": types.get(publisher, "person"),
         "publisher_institution": institution,
         "publisher_email": metadata.publisher_email or metadata.creator_email,
         "publisher_url": metadata.publisher_url or metadata.creator_url,
@@ -245,15 +248,8 @@ def _people(context: Context) -> dict[str, str]:
     }
 
 
-def _kind_of(name: str, institution: str) -> str:
-    if not name:
-        return ""
-    return "institution" if name == institution else "person"
-
-
 def _processing(context: Context) -> dict[str, Any]:
     """Return the attributes that lidarops itself reads."""
-    provenance = context.provenance
     unused = [
         f"{'dark file ' if role is Role.DARK else ''}{path}: {reason}"
         for path, role, reason in context.unused[:MOST_UNUSED]
@@ -261,7 +257,7 @@ def _processing(context: Context) -> dict[str, Any]:
     if len(context.unused) > MOST_UNUSED:
         unused.append(f"{len(context.unused) - MOST_UNUSED} other raw files")
     return {
-        "lidarops_campaign": provenance.campaign,
+        "lidarops_campaign": context.campaign,
         "lidarops_scene": context.scene,
         "lidarops_window_start": iso(context.start),
         "lidarops_window_end": iso(context.stop),
@@ -272,13 +268,13 @@ def _processing(context: Context) -> dict[str, Any]:
         "lidarops_detection_mode": context.detection,
         RECORDERS: ", ".join(
             step.settings["recorder"]
-            for step in provenance.plan.steps
+            for step in context.plan.steps
             if step.settings.get("recorder") and not is_glued(step.channel)
         ),
         "lidarops_polarisation": POLARISATIONS.get(label_of(context.channel)[-1:], ""),
-        "lidarops_plan_sha256": provenance.plan.hash,
-        "lidarops_code_version": provenance.code_version,
-        "lidarops_input_count": np.int32(len(provenance.inputs)),
+        "lidarops_plan_sha256": context.plan.hash,
+        "lidarops_code_version": context.code_version,
+        "lidarops_input_count": np.int32(len(context.inputs)),
         "lidarops_input_notes": "\n".join(context.notes),
         UNUSED_INPUTS: "\n".join(unused),
     }
@@ -302,3 +298,165 @@ def duration(seconds: float) -> str:
     if not date and not clock:
         clock = "0S"
     return f"P{date}{'T' + clock if clock else ''}"
+
+
+def prov_json(provenance: Provenance) -> str:
+    """Return the provenance of a product as W3C PROV-JSON (`provo2013`).
+
+    Inputs with equal content are one entity, because a product depends on content only.
+
+    Returns
+    -------
+    str
+        ASCII, with sorted keys; independent of the order of the inputs.
+    """
+    inputs = sorted(provenance.inputs, key=attrgetter("sha256", "path", "role"))
+    files = {}
+    for digest, group in groupby(inputs, key=attrgetter("sha256")):
+        records = list(group)
+        paths = [record.path for record in records]
+        sort = "Product" if records[0].role is Role.PRODUCT else "RawFile"
+        files[f"sha256:{digest}"] = {
+            "prov:type": prov_type(f"lidarops:{sort}"),
+            "lidarops:path": paths[0] if len(paths) == 1 else paths,
+            "lidarops:sha256": digest,
+        }
+    return prov_document(
+        "lidarops:product",
+        ("lidarops:processing", {"lidarops:scene": provenance.scene}),
+        {
+            "lidarops:product": {
+                "prov:type": prov_type("lidarops:Product"),
+                "lidarops:id": product_id(provenance),
+                "lidarops:campaign": provenance.campaign,
+                "lidarops:scene": provenance.scene,
+                "lidarops:kind": provenance.kind,
+                "lidarops:channel": provenance.channel,
+                "lidarops:settings": canonical(dict(provenance.settings)),
+            },
+            "lidarops:plan": _plan(provenance),
+            **files,
+        },
+        ({"prov:entity": f"sha256:{record.sha256}", "prov:role": record.role} for record in inputs),
+        (provenance.code_version, provenance.versions),
+        {"prov:plan": "lidarops:plan"},
+    )
+
+
+def prov_document(
+    result: str,
+    activity: tuple[str, Mapping[str, str]],
+    entities: Mapping[str, Any],
+    uses: Iterable[Mapping[str, str]],
+    software: tuple[str, Mapping[str, str]],
+    association: Mapping[str, str],
+) -> str:
+    """Return how a file was made as W3C PROV-JSON: ASCII, with sorted keys.
+
+    Parameters
+    ----------
+    result : str
+        Name of the entity that was made.
+    activity : (str, mapping of str to str)
+        Name of what made it, and what is stated of that.
+    entities : mapping of str to dict
+    uses : iterable of mapping of str to str
+        What was used, besides the activity.
+    software : (str, mapping of str to str)
+        Code version, and the versions of packages.
+    association : mapping of str to str
+        What is stated of how the software did it.
+    """
+    name, stated = activity
+    code_version, versions = software
+    of_activity = {"prov:activity": name}
+    document = {
+        "prefix": {"lidarops": NAMESPACE, "sha256": "urn:sha256:"},
+        "entity": entities,
+        "activity": {name: stated},
+        "agent": {
+            "lidarops:software": {
+                "prov:type": prov_type("prov:SoftwareAgent"),
+                "lidarops:code_version": code_version,
+                "lidarops:versions": [f"{key} {versions[key]}" for key in sorted(versions)],
+            }
+        },
+        "wasGeneratedBy": {"_:generation": {"prov:entity": result, **of_activity}},
+        "wasAssociatedWith": {
+            "_:association": {"prov:agent": "lidarops:software", **of_activity, **association}
+        },
+        "used": {f"_:use{number}": {**of_activity, **use} for number, use in enumerate(uses, 1)},
+    }
+    return canonical(document)
+
+
+def prov_type(name: str) -> dict[str, str]:
+    """Return the type of an entity or agent."""
+    return {"$": name, "type": "prov:QUALIFIED_NAME"}
+
+
+def _plan(provenance: Provenance) -> dict[str, Any]:
+    plan, omissions = provenance.plan, []
+    for omission in plan.left_out:
+        number = "" if omission.number is None else f", {omission.number:g}"
+        rule = f" [{omission.rule}{number}]" if omission.rule else ""
+        omissions.append(f"{omission.name} of {omission.channel}: {omission.reason}{rule}")
+    return {
+        "prov:type": prov_type("prov:Plan"),
+        "lidarops:sha256": plan.hash,
+        # The text of this digest.
+        "lidarops:json": canonical(plan.as_dict()),
+        "lidarops:left_out": omissions,
+    }
+
+
+def product_id(provenance: Provenance) -> str:
+    """Return the identifier of a product: equal for equal inputs, plan, settings and code.
+
+    Returns
+    -------
+    str
+        UUID version 5 of kind, channel, inputs' sha256, plan hash, settings and code version.
+    """
+    return identifier(
+        {
+            "kind": provenance.kind,
+            "channel": provenance.channel,
+            "inputs": sorted([record.role, record.sha256] for record in provenance.inputs),
+            "plan": provenance.plan.hash,
+            "settings": dict(provenance.settings),
+            "code_version": provenance.code_version,
+        }
+    )
+
+
+def identifier(content: Mapping[str, Any]) -> str:
+    """Return the UUID version 5 of plain JSON types."""
+    return str(uuid5(NAMESPACE_URL, NAMESPACE + canonical(content)))
+
+
+@cache
+def package_versions() -> Mapping[str, str]:
+    """Return the versions of Python and of the packages that can change a product."""
+    return {name: version(name) for name in _PACKAGES} | {"python": platform.python_version()}
+
+
+def writing_time() -> datetime:
+    """Return the time now in UTC to the second, or that of ``SOURCE_DATE_EPOCH`` if it is set.
+
+    Raises
+    ------
+    ProductError
+        If ``SOURCE_DATE_EPOCH`` is not a number of seconds.
+    """
+    epoch = os.environ.get(EPOCH_VARIABLE, "")
+    if not epoch:
+        return datetime.now(UTC).replace(microsecond=0)
+    try:
+        return datetime.fromtimestamp(int(epoch), UTC)
+    except (ValueError, OverflowError, OSError) as error:
+        raise ProductError(
+            f"is {epoch!r}, not a number of seconds",
+            field=EPOCH_VARIABLE,
+            remedy="set it to whole seconds since 1970-01-01, or unset it",
+        ) from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.netcdf.context import Context, duration, iso
-from lidarops.netcdf.encoding import CheckedInput, Values, check_range, whole_numbers
+from lidarops.netcdf.encoding import Values, check_range, taken, whole_numbers
 from lidarops.netcdf.variables import BOUNDS_DIM, SOUNDED, Layout, Row, attributes, deployment
 
 NEAR_VERTICAL: Final = 10.0
@@ -56,7 +56,7 @@ class Located(NamedTuple):
     """Whether the beam is fixed and near the vertical, as CF profiles require."""
 
 
-def locate_product(source: CheckedInput, layout: Layout, context: Context) -> Located:
+def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Located:
     """Return the coordinates of a product in the order of its layout, and what follows from them.
 
     Raises
@@ -79,7 +79,7 @@ def locate_product(source: CheckedInput, layout: Layout, context: Context) -> Lo
         "wavelength": round(context.wavelength * 1e9, 6),
     }
     for name, value in fixed.items():
-        if name not in by_name and layout.holds(name) and np.isfinite(value):
+        if name not in by_name and name in layout.rows and np.isfinite(value):
             row = layout.row(name)
             row = deployment(row) if f"bin_{name}" in bins else row
             by_name[name] = Coordinate(row, (), np.asarray(value, np.float64))
@@ -136,7 +136,7 @@ class _Vertical(NamedTuple):
 _Place = tuple[dict[str, Coordinate], _Vertical]
 
 
-def _beam_place(source: CheckedInput, layout: Layout, station: float, profiles: int) -> _Place:
+def _beam_place(source: xr.Dataset, layout: Layout, station: float, profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie along the beam."""
     names = _names_along(layout)
     by_name = {name: _along(source, layout.row(name)) for name in names}
@@ -152,7 +152,7 @@ def _air_positions(
     by_name: Mapping[str, Coordinate], layout: Layout, context: Context
 ) -> dict[str, Coordinate]:
     """Return latitude and longitude of the air along a fixed slant beam of known azimuth."""
-    if not layout.holds("bin_latitude") or "azimuth" not in by_name:
+    if "bin_latitude" not in layout.rows or "azimuth" not in by_name:
         return {}
     # No tool reads positions that also change over time: CDO reads garbage.
     if by_name["zenith_angle"].dims or by_name["azimuth"].dims:
@@ -172,7 +172,7 @@ def _air_positions(
     }
 
 
-def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles: int) -> _Place:
+def _scan_place(source: xr.Dataset, layout: Layout, station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes of a scan."""
     names = ["beam", "beam_zenith_angle"]
     # Layers, planes and the baseline are optional, and so are their coordinates.
@@ -190,7 +190,7 @@ def _scan_place(source: CheckedInput, layout: Layout, station: float, _profiles:
     return by_name, _Vertical(values, _common_step(values, np.ones(1)), profiles=False)
 
 
-def _network_place(source: CheckedInput, layout: Layout, _station: float, _profiles: int) -> _Place:
+def _network_place(source: xr.Dataset, layout: Layout, _station: float, _profiles: int) -> _Place:
     """Return the coordinates of a kind whose values lie at crossings of beams."""
     angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
     beams = (f"beam_{name}" for name in angles)
@@ -224,15 +224,15 @@ def _time(row: Row, moments: Values, bounds: Values) -> Coordinate:
     return _with_bounds(row, *seconds)
 
 
-def _moments(source: CheckedInput, name: str) -> Values:
-    times = source.take(name, ("time",) if name == "time" else ("time", BOUNDS_DIM))
+def _moments(source: xr.Dataset, name: str) -> Values:
+    times = taken(source, name, ("time",) if name == "time" else ("time", BOUNDS_DIM))
     if times.dtype.kind != "M":
         raise ProductError(f"has data of type {times.dtype}, not datetime64", field=name)
     return times.astype("datetime64[ns]")
 
 
-def _along(source: CheckedInput, row: Row) -> Coordinate:
-    values = source.take(row.name, row.dims)
+def _along(source: xr.Dataset, row: Row) -> Coordinate:
+    values = taken(source, row.name, row.dims)
     values = whole_numbers(row, values) if row.dtype.startswith("i") else _finite(row.name, values)
     # Sections may overlap, so their midpoints may come in any order.
     if row.dims == (row.name,) and (np.diff(values) <= 0).any():
@@ -240,7 +240,7 @@ def _along(source: CheckedInput, row: Row) -> Coordinate:
     if row.bounds is None:
         return Coordinate(row, row.dims, values)
     if row.bounds in source:
-        bounds = _finite(row.bounds, source.take(row.bounds, (*row.dims, BOUNDS_DIM)))
+        bounds = _finite(row.bounds, taken(source, row.bounds, (*row.dims, BOUNDS_DIM)))
     elif row.dims == (row.name,):
         bounds = _midpoints(row, values)
     else:
@@ -276,10 +276,10 @@ def _with_bounds(row: Row, values: Values, bounds: Values) -> Coordinate:
     return Coordinate(row, row.dims, values, bounds)
 
 
-def _beam(source: CheckedInput, row: Row, profiles: int) -> Coordinate:
+def _beam(source: xr.Dataset, row: Row, profiles: int) -> Coordinate:
     """Return an angle of the beam: one number for a fixed beam, else over time."""
-    dims = ("time",) if row.name in source and source.dims(row.name) else ()
-    values = _finite(row.name, source.take(row.name, dims))
+    dims = ("time",) if row.name in source and source[row.name].dims else ()
+    values = _finite(row.name, taken(source, row.name, dims))
     if dims and values.shape != (profiles,):
         raise ProductError(f"has {values.size} values for {profiles} profiles", field=row.name)
     if (values == values.flat[0]).all():
@@ -379,7 +379,8 @@ def _vertical_extent(vertical: _Vertical) -> dict[str, Any]:
 
 
 def _time_extent(moments: Values, bounds: Values) -> dict[str, str]:
-    start, stop = _datetime(bounds[:, 0].min()), _datetime(bounds[:, 1].max())
+    ends = bounds[:, 0].min(), bounds[:, 1].max()
+    start, stop = (end.astype("datetime64[us]").item().replace(tzinfo=UTC) for end in ends)
     intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
     return {
         "time_coverage_start": iso(start),
@@ -387,11 +388,6 @@ def _time_extent(moments: Values, bounds: Values) -> dict[str, str]:
         "time_coverage_duration": duration((stop - start).total_seconds()),
         "time_coverage_resolution": duration(float(np.median(intervals / np.timedelta64(1, "s")))),
     }
-
-
-def _datetime(moment: np.datetime64) -> datetime:
-    plain: datetime = moment.astype("datetime64[us]").item()
-    return plain.replace(tzinfo=UTC)
 
 
 def beam_positions(

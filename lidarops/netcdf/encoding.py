@@ -16,72 +16,56 @@ Values = npt.NDArray[Any]
 _MANTISSA_BITS: Final = 23
 
 
-class CheckedInput:
-    """A dataset from which variables are taken one by one, each checked against its row.
+def refuse_unknown(data: xr.Dataset, layout: Layout) -> None:
+    """Refuse a dataset that holds a data variable that is not in the layout.
+
+    Raises
+    ------
+    ProductError
+    """
+    known = {*layout.rows, *(row.bounds for row in layout.rows.values())}
+    known -= {summary_of(row.name) for row in layout.judges}
+    for name in data.data_vars:
+        if name not in known:
+            raise ProductError(
+                "is not a variable of this kind of product",
+                field=str(name),
+                remedy="add a row to lidarops/products/KIND/variables.py, or drop the variable",
+            )
+
+
+def taken(data: xr.Dataset, name: str, dims: tuple[str, ...]) -> Values:
+    """Return the numbers of a variable with its dimensions in the given order.
+
+    Raises
+    ------
+    ProductError
+        If the variable is missing, empty, lazy, not numeric, or has other dimensions.
+    """
+    if name not in data.variables:
+        raise ProductError("is missing", field=name, remedy=f"its dimensions are {dims}")
+    variable = data.variables[name]
+    if variable.chunks is not None:
+        raise ProductError(
+            "is a dask array", field=name, remedy="load the dataset before it is built"
+        )
+    if set(variable.dims) != set(dims) or variable.ndim != len(dims):
+        raise ProductError(f"has dimensions {variable.dims}, not {dims}", field=name)
+    values = np.asarray(variable.transpose(*dims).values)
+    if values.dtype.kind not in "iufM":
+        raise ProductError(f"has data of type {values.dtype}, not numbers", field=name)
+    if values.size == 0:
+        raise ProductError("is empty", field=name)
+    return values
+
+
+def stored(data: xr.Dataset, row: Row, flags: Values | None = None) -> Values:
+    """Return a variable as it is stored: in the type of its row, with fill values.
 
     Parameters
     ----------
     data : xr.Dataset
         In memory.
-    layout : Layout
-
-    Raises
-    ------
-    ProductError
-        If the dataset holds a data variable that is not in the layout.
-    """
-
-    def __init__(self, data: xr.Dataset, layout: Layout) -> None:
-        rows = (*layout.coordinates, *layout.variables)
-        known = {row.name for row in rows} | {row.bounds for row in rows}
-        known -= {summary_of(row.name) for row in layout.judges}
-        for name in data.data_vars:
-            if name not in known:
-                raise ProductError(
-                    "is not a variable of this kind of product",
-                    field=str(name),
-                    remedy="add a row to lidarops/products/KIND/variables.py, or drop the variable",
-                )
-        self._data = data
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._data.variables
-
-    def take(self, name: str, dims: tuple[str, ...]) -> Values:
-        """Return the numbers of a variable with its dimensions in the given order.
-
-        Raises
-        ------
-        ProductError
-            If the variable is missing, empty, lazy, not numeric, or has other dimensions.
-        """
-        if name not in self:
-            raise ProductError("is missing", field=name, remedy=f"its dimensions are {dims}")
-        variable = self._data.variables[name]
-        if variable.chunks is not None:
-            raise ProductError(
-                "is a dask array", field=name, remedy="load the dataset before it is built"
-            )
-        if set(variable.dims) != set(dims) or variable.ndim != len(dims):
-            raise ProductError(f"has dimensions {variable.dims}, not {dims}", field=name)
-        values = np.asarray(variable.transpose(*dims).values)
-        if values.dtype.kind not in "iufM":
-            raise ProductError(f"has data of type {values.dtype}, not numbers", field=name)
-        if values.size == 0:
-            raise ProductError("is empty", field=name)
-        return values
-
-    def dims(self, name: str) -> tuple[str, ...]:
-        """Return the dimensions of a variable."""
-        return tuple(str(dim) for dim in self._data.variables[name].dims)
-
-
-def stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Values:
-    """Return a variable as it is stored: in the type of its row, with fill values.
-
-    Parameters
-    ----------
-    source : CheckedInput
     row : Row
     flags : ndarray of int32, optional
         Of the same shape: every missing value must carry a quality bit that states why.
@@ -91,7 +75,7 @@ def stored(source: CheckedInput, row: Row, flags: Values | None = None) -> Value
     ProductError
         If it is missing, of other dimensions or type, or holds values that its row does not allow.
     """
-    values = source.take(row.name, row.dims)
+    values = taken(data, row.name, row.dims)
     check_range(row, values)
     if row.dtype.startswith("i"):
         return whole_numbers(row, values)

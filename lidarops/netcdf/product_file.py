@@ -6,7 +6,7 @@ Data that do not match the layout of the kind are refused.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -17,10 +17,16 @@ import xarray as xr
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
-from lidarops.netcdf.context import Context, global_attributes, product_path
+from lidarops.netcdf.context import Context, global_attributes, prov_json
 from lidarops.netcdf.coordinates import auxiliary_names, locate_product
-from lidarops.netcdf.encoding import CheckedInput, Values, as_text, stored, whole_numbers
-from lidarops.netcdf.provenance import prov_json
+from lidarops.netcdf.encoding import (
+    Values,
+    as_text,
+    refuse_unknown,
+    stored,
+    taken,
+    whole_numbers,
+)
 from lidarops.netcdf.stored_flags import FlagCounter, places
 from lidarops.netcdf.variables import Row, attributes, layout_of
 from lidarops.netcdf.write import RowFile, Skeleton, Written, create_file
@@ -82,22 +88,22 @@ class ProductWriter:
         former: str = "",
     ) -> None:
         layout = layout_of(context.kind)
-        source = CheckedInput(frame, layout)
+        refuse_unknown(frame, layout)
         self._layout = layout
         self._context = context
         self._path = path
         self._until_complete = until_complete
         self._former = former
         self._change: Change | None = None
-        self._located = locate_product(source, layout, context)
+        self._located = locate_product(frame, layout, context)
         self._frame_texts = frame.attrs
         self._times = frame.variables[_TIME].values
         self._profiles = 0
         self._names: frozenset[str] = frozenset()
         self._fixed = {
-            row.name: stored(source, row)
+            row.name: stored(frame, row)
             for row in layout.variables
-            if not _over_time(row.dims) and not (row.optional and row.name not in source)
+            if _TIME not in row.dims and not (row.optional and row.name not in frame)
         }
         self._sizes = {
             str(dim): size
@@ -137,21 +143,6 @@ class ProductWriter:
 
     def encode(self, profiles: xr.Dataset) -> dict[str, Values]:
         """Return the next profiles as they are stored, with their coordinates; see `add`."""
-        span = self._span(profiles)
-        measured = self._measured(CheckedInput(profiles, self._layout))
-        self._names = self._names or frozenset(measured)
-        for name in sorted(self._names ^ measured.keys()):
-            raise ProductError("is in some profiles, but not in others", field=name)
-        self._profiles = span.stop
-        moving = {name: values(span) for name, values in self._located.moving.items()}
-        located = {
-            name: variable.values[span]
-            for name, variable in self._located.variables.items()
-            if _over_time(variable.dims) and name not in moving
-        }
-        return {**located, **moving, **measured}
-
-    def _span(self, profiles: xr.Dataset) -> slice:
         first = self._profiles
         span = slice(first, first + profiles.sizes.get(_TIME, 0))
         if span.stop > self._times.size:
@@ -165,13 +156,25 @@ class ProductWriter:
                 field=_TIME,
                 remedy="add all profiles in the order of time",
             )
-        return span
+        measured = self._measured(profiles)
+        self._names = self._names or frozenset(measured)
+        for name in sorted(self._names ^ measured.keys()):
+            raise ProductError("is in some profiles, but not in others", field=name)
+        self._profiles = span.stop
+        moving = {name: values(span) for name, values in self._located.moving.items()}
+        located = {
+            name: variable.values[span]
+            for name, variable in self._located.variables.items()
+            if _TIME in variable.dims and name not in moving
+        }
+        return {**located, **moving, **measured}
 
-    def _measured(self, source: CheckedInput) -> dict[str, Values]:
+    def _measured(self, profiles: xr.Dataset) -> dict[str, Values]:
+        refuse_unknown(profiles, self._layout)
         flags = {
-            row.name: _bits(row, source)
+            row.name: _bits(row, profiles)
             for row in self._layout.judges
-            if not row.optional or row.name in source
+            if not row.optional or row.name in profiles
         }
         summaries = {rows.summary_of(name): name for name in flags}
         encoded: dict[str, Values] = {}
@@ -180,14 +183,14 @@ class ProductWriter:
                 bits = flags[summaries[row.name]]
                 encoded[row.name] = rows.summarize_flags(bits, self._layout.flags)
                 continue
-            if not _over_time(row.dims) or (row.optional and row.name not in source):
+            if _TIME not in row.dims or (row.optional and row.name not in profiles):
                 continue
             # Bits refer to retrieved values; an optional derived or an auxiliary value may be
             # missing without one.
             judge = self._layout.row(rows.judging(row.name, flags))
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
             judged = row.dims == judge.dims and not spared
-            encoded[row.name] = stored(source, row, flags[judge.name] if judged else None)
+            encoded[row.name] = stored(profiles, row, flags[judge.name] if judged else None)
             self._refuse_other_sizes(row, encoded[row.name])
         return encoded
 
@@ -247,7 +250,7 @@ class ProductWriter:
         station = rows.station(profiles=self._located.vertical)
         name = self._context.station.name or self._context.station_key
         yield station.name, as_text(station, name, mode)
-        provenance = prov_json(self._context.provenance)
+        provenance = prov_json(self._context)
         yield rows.PROVENANCE.name, as_text(rows.PROVENANCE, provenance, mode)
         if any(row.bits for row in self._layout.variables):
             row = rows.QUANTIZATION
@@ -270,15 +273,14 @@ class ProductWriter:
             If it is not written.
         """
         context, change = self._context, self._change
-        if self.file is None:
-            raise ProductError("is not written", file=self._path)
-        if change is not None and change.grade is Grade.NONE:
+        file = self.file.written if self.file else None
+        if self.file and change is not None and change.grade is Grade.NONE:
             file = Written(self._former, self._path.stat().st_size)
-        else:
-            file = self.file.written
+        if file is None:
+            raise ProductError("is not written", file=self._path)
         carried, verdicts = self._counts.carried, self._counts.verdicts
         return ProductRecord(
-            product_path(context),
+            context.path,
             context.kind,
             context.channel,
             file.sha256,
@@ -296,9 +298,9 @@ class ProductWriter:
         )
 
 
-def _bits(row: Row, source: CheckedInput) -> Values:
+def _bits(row: Row, profiles: xr.Dataset) -> Values:
     """Return the flags of a row, refusing bits that it does not state."""
-    flags = whole_numbers(row, source.take(row.name, row.dims))
+    flags = whole_numbers(row, taken(profiles, row.name, row.dims))
     known = sum(row.flags.bits) if row.flags else 0
     foreign = int(np.bitwise_or.reduce(flags & ~np.int32(known), axis=None))
     if foreign:
@@ -308,7 +310,3 @@ def _bits(row: Row, source: CheckedInput) -> Values:
             remedy="add them to products/KIND/variables.py",
         )
     return flags
-
-
-def _over_time(dims: tuple[Hashable, ...]) -> bool:
-    return dims[:1] == (_TIME,)

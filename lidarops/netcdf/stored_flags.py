@@ -167,8 +167,9 @@ class FlagCounter:
         unflagged, usable = (
             values.size - int(np.count_nonzero(bits)) for bits in (values, values & self._rejecting)
         )
-        more = Verdicts.of(values.size, unflagged=unflagged, usable=usable)
-        self.verdicts = Verdicts.total([self.verdicts, more])
+        good, care, reject = self.verdicts
+        care += usable - unflagged
+        self.verdicts = Verdicts(good + unflagged, care, reject + values.size - usable)
         # Few bits occur in a product: count only these.
         union = int(np.bitwise_or.reduce(values, axis=None))
         for mask in (1 << place for place in range(PLACES)):
@@ -201,7 +202,7 @@ def recoding(
     if flags is None or meanings is None:
         return None
     layout = layout_of(str(kind))
-    own = layout.row(name).flags if layout.holds(name) else None
+    own = layout.row(name).flags if name in layout.rows else None
     if meanings == {bit.word: int(bit) for bit in own or flags}:
         return None
     return partial(_recoded, meanings=meanings, flags=flags)

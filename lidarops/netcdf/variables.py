@@ -296,12 +296,9 @@ class Layout:
         return first.only({bit for flags in stated for bit in flags}) if more else first
 
     @cached_property
-    def _rows(self) -> dict[str, Row]:
+    def rows(self) -> dict[str, Row]:
+        """Variables and coordinates by name."""
         return {row.name: row for row in (*self.coordinates, *self.variables)}
-
-    def holds(self, name: str) -> bool:
-        """Return whether the layout has a variable or coordinate of this name."""
-        return name in self._rows
 
     def row(self, name: str) -> Row:
         """Return the row of a variable or coordinate.
@@ -311,13 +308,13 @@ class Layout:
         ProductError
             If the layout has no such variable.
         """
-        if name not in self._rows:
+        if name not in self.rows:
             raise ProductError(
                 "is not a variable of this kind of product",
                 field=name,
-                remedy=f"its variables are {', '.join(self._rows)}",
+                remedy=f"its variables are {', '.join(self.rows)}",
             )
-        return self._rows[name]
+        return self.rows[name]
 
 
 @cache

@@ -2,31 +2,40 @@
 
 The chunks of a file are deflated and written as soon as their rows are there, so memory does not
 grow with the file. Their order depends on the data only, not on how many rows came at a time.
+
+Chunks are shuffled and deflated here, faster than HDF5 does, in the format of its filters `shuffle`
+and `deflate`, so any NetCDF reader can read them. The whole writing of a `signal` product of one
+real day, from values in memory to the digest of the file, is about 3.4 times faster than with
+HDF5's own filters at level 4 of zlib (files are 4 to 7 % larger), and about 2.4 times faster than
+at level 1 (files are 3 to 4 % smaller). Measured on one channel of Pilar (8.5 MB of values) and one
+of Manaus (8.1 MB), as medians of five paired repeats; CPU times have the same ratios.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import os
 import secrets
 import unicodedata
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import h5py
 import netCDF4
 import numpy as np
 import xarray as xr
+from isal import isal_zlib
 from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.netcdf._chunks import RowBlocks, deflate_chunks
 from lidarops.system.files import sha256_of
 
 if TYPE_CHECKING:
@@ -44,6 +53,16 @@ _OTHER_DIMENSION: Final = "_nc4_non_coord_"
 """Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 _Array = NDArray[Any]
 _Format = Literal["NETCDF4", "NETCDF4_CLASSIC"]
+
+_LEVEL: Final = 2
+"""Compression level of ISA-L, 0 to 3. Level 1 is hardly faster and compresses less; 3 is slow."""
+
+_SMALL_LEVEL: Final = 4
+"""Compression level of zlib for small chunks, as netCDF would deflate them."""
+_SMALL: Final = 1 << 13
+"""Bytes up to which zlib is faster than ISA-L, which takes longer to begin."""
+
+Offset = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +176,7 @@ def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Forma
         rows = {name: variable.values for name, variable in skeleton.with_rows.items()}
         if rows:
             file.add(rows)
-    return file.written
+    return cast("Written", file.written)
 
 
 class Skeleton:
@@ -212,17 +231,17 @@ class QuietFile(io.FileIO):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "r+")
-        self._error: OSError | None = None
+        self.error: OSError | None = None
 
     def write(self, data: ReadableBuffer, /) -> int:
         """Write all of `data`, and return its length even where it was dropped."""
         rest = memoryview(data)
         size = rest.nbytes
         try:
-            while rest and self._error is None:
+            while rest and self.error is None:
                 rest = rest[self._write_some(rest) :]
         except OSError as error:
-            self._error = error
+            self.error = error
         return size
 
     def _write_some(self, data: memoryview) -> int:
@@ -232,14 +251,10 @@ class QuietFile(io.FileIO):
     def truncate(self, size: int | None = None, /) -> int:
         """Set the size of the file, unless it failed before."""
         try:
-            return super().truncate(size) if self._error is None else 0
+            return super().truncate(size) if self.error is None else 0
         except OSError as error:
-            self._error = error
+            self.error = error
             return 0
-
-    def discard(self) -> None:
-        """Drop all that is written from now on: the file will be removed."""
-        self._error = self._error or OSError("the file is discarded")
 
     def check(self) -> None:
         """Raise the first error.
@@ -249,8 +264,8 @@ class QuietFile(io.FileIO):
         OSError
             If the file is not as it was written.
         """
-        if self._error is not None:
-            raise self._error
+        if self.error is not None:
+            raise self.error
 
 
 @contextmanager
@@ -291,7 +306,9 @@ def create_file(
         with stream:
             file = RowFile(skeleton, path, stream)
             try:
-                file.write_fixed()
+                for name, variable in skeleton.variables.items():
+                    if name in skeleton.chunks and name not in skeleton.with_rows:
+                        file.write(name, 0, variable.values)
                 yield file
                 file.complete()
             finally:
@@ -303,7 +320,7 @@ def create_file(
         with _disk_errors(path):
             temporary.replace(path)
             _sync(path.parent)
-        file.settled = written
+        file.written = written
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -312,12 +329,14 @@ def create_file(
 class RowFile:
     """A file that is being written; see `create_file`."""
 
+    written: Written | None = None
+    """The file, once it is complete and has its name."""
+
     def __init__(self, skeleton: Skeleton, path: Path, stream: QuietFile) -> None:
         self._variables = skeleton.variables
         self._path = path
         self._stream = stream
         self._rows = 0
-        self.settled: Written | None = None
         self._chunks = skeleton.chunks
         self._columns = {
             name: RowBlocks(variable.shape[0], self._chunks[name][0])
@@ -334,25 +353,6 @@ class RowFile:
                 self._targets[name] = h5py.h5d.open(self._file.id, inside.encode())
                 # Its final length.
                 self._targets[name].set_extent(variable.shape)
-
-    @property
-    def written(self) -> Written:
-        """The file, when it is complete and has its name.
-
-        Raises
-        ------
-        ProductError
-            If it is not.
-        """
-        if self.settled is None:
-            raise ProductError("is not written", file=self._path)
-        return self.settled
-
-    def write_fixed(self) -> None:
-        """Write the variables that have no rows."""
-        for name in self._chunks:
-            if name not in self._columns:
-                self._write(name, 0, self._variables[name].values)
 
     def add(self, rows: Mapping[str, _Array]) -> None:
         """Write the next rows.
@@ -376,10 +376,10 @@ class RowFile:
         # Among blocks with the same last row, the order of variables stays.
         blocks.sort(key=itemgetter(0))
         for _, name, first, values in blocks:
-            self._write(name, first, values)
+            self.write(name, first, values)
         self._rows += len(next(iter(rows.values())))
 
-    def _write(self, name: str, begin: int, values: _Array) -> None:
+    def write(self, name: str, begin: int, values: _Array) -> None:
         """Write whole chunks of a variable, from a row on."""
         variable = self._variables[name]
         native = variable.dtype.newbyteorder("=")
@@ -403,7 +403,7 @@ class RowFile:
 
     def close(self) -> None:
         """Close the file; where it is not complete, write nothing more."""
-        self._stream.discard()
+        self._stream.error = self._stream.error or OSError("the file is discarded")
         with NETCDF4_PYTHON_LOCK:
             self._file.close()
 
@@ -491,3 +491,109 @@ def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
         for name, target in targets.items():
             if name not in skeleton.chunks:
                 target[...] = skeleton.variables[name].values
+
+
+class RowBlocks:
+    """The rows of one variable, cut into the blocks that its chunks hold.
+
+    Parameters
+    ----------
+    total : int
+        Number of rows that will come.
+    step : int
+        Rows of a block; the last block may have fewer.
+    """
+
+    def __init__(self, total: int, step: int) -> None:
+        self._total = total
+        self._step = step
+        self._first = 0
+        self._held: list[NDArray[Any]] = []
+
+    def take(self, rows: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
+        """Take the next rows, and yield the blocks that are complete with them.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n, ...)
+            No more than are still to come. A copy is kept of rows whose block is incomplete.
+
+        Yields
+        ------
+        (int, ndarray)
+            Number of the first row, and the rows.
+        """
+        while len(rows):
+            size = min(self._step, self._total - self._first)
+            missing = size - sum(map(len, self._held))
+            if len(rows) < missing:
+                self._held.append(rows.copy())
+                return
+            pieces = [*self._held, rows[:missing]]
+            rows = rows[missing:]
+            yield self._first, pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+            self._held = []
+            self._first += size
+
+
+def deflate_chunks(
+    values: NDArray[Any], chunk: tuple[int, ...], fill_value: Any
+) -> Iterator[tuple[Offset, bytes]]:
+    """Cut an array into chunks, and shuffle and deflate each.
+
+    Equal values give equal bytes, with one version of ISA-L and zlib and one architecture of
+    processor.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n_0, ..., n_k)
+        In the byte order of the file, with any memory layout.
+    chunk : tuple of int, length k + 1
+        Elements of a chunk along each axis, each at least 1.
+    fill_value : scalar
+        Fills the part of a last chunk beyond the array, as HDF5 does.
+
+    Yields
+    ------
+    offset : tuple of int
+        Index of the chunk's first element.
+    data : bytes
+        A zlib stream.
+    """
+    corners = (range(0, size, step) for size, step in zip(values.shape, chunk, strict=True))
+    for offset in itertools.product(*corners):
+        part = values[tuple(slice(at, at + step) for at, step in zip(offset, chunk, strict=True))]
+        if part.shape != chunk:
+            whole = np.full(chunk, fill_value, dtype=values.dtype)
+            whole[tuple(slice(size) for size in part.shape)] = part
+            part = whole
+        yield offset, _deflate(part)
+
+
+def _deflate(part: NDArray[Any]) -> bytes:
+    if part.nbytes <= _SMALL:
+        return zlib.compress(b"".join(map(bytes, _planes(part))), _SMALL_LEVEL)
+    compressor = isal_zlib.compressobj(_LEVEL)
+    pieces: list[bytes] = []
+    for plane in _planes(part):
+        # Byte planes have different statistics and share no repeated strings.
+        pieces += compressor.compress(plane), compressor.flush(isal_zlib.Z_FULL_FLUSH)
+    return b"".join((*pieces, compressor.flush()))
+
+
+def _planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:
+    """Yield the first bytes of all elements, then the second bytes: the order of HDF5's `shuffle`.
+
+    Parameters
+    ----------
+    part : ndarray
+        Elements have 1, 2, 4 or 8 bytes.
+
+    Yields
+    ------
+    ndarray of uint8, shape (size,)
+    """
+    plain = np.ascontiguousarray(part).reshape(-1)
+    words = plain.view(f"<u{plain.itemsize}")
+    for shift in range(0, 8 * plain.itemsize, 8):
+        yield (words >> words.dtype.type(shift)).astype(np.uint8)

@@ -57,6 +57,8 @@ Position = Literal["longitude_first", "latitude_first", "ignore"]
 Signal = Callable[[int, RawChannel], Any]
 """Number of a channel, the channel in the first file -> array (time, range), lazy or not."""
 
+Grid = tuple[Stretches, float]
+"""Stretches of bins, and their width in m."""
 _Variable = tuple[str | tuple[str, ...], Any, Mapping[str, Any]]
 """Dimensions, values and attributes."""
 
@@ -346,8 +348,13 @@ class RawFiles:
         self.position_order = position_order
         self.kept = _kept(stretches or {}, found)
         """Stretches of the channels of which some bins are left out."""
+        self.grids: list[Grid] = [
+            (self.kept.get(c.name, ((0, c.bins),)), c.bin_width) for c in found
+        ]
+        """Range grid of each selected channel."""
         self.selected = tuple(
-            replace(c, bins=sum(past - first for first, past in self.stretches(c))) for c in found
+            replace(c, bins=sum(past - first for first, past in stretches))
+            for c, (stretches, _) in zip(found, self.grids, strict=True)
         )
         """Selected channels of the first file, with the bins to keep."""
         self.files = sorted(files, key=lambda file: (file.interval[0], file.path))
@@ -359,10 +366,6 @@ class RawFiles:
     def values(self, channel: int, name: str) -> NDArray[Any]:
         """Return a property of selected channel number `channel`, one value per file."""
         return np.array([getattr(selected[channel], name) for selected in self.channels])
-
-    def stretches(self, channel: RawChannel) -> Stretches:
-        """Return the kept stretches of bins of a channel."""
-        return self.kept.get(channel.name, ((0, channel.bins),))
 
 
 def _alike(
@@ -471,7 +474,7 @@ def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Da
         Whether `signal` returns physical values or counts.
     """
     # The most common grid is "range"; the others follow in file order.
-    uses = Counter((files.stretches(c), c.bin_width) for c in files.selected)
+    uses = Counter(files.grids)
     ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
     grids = {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
     stated = [file.stated for file in files.files]
@@ -479,7 +482,7 @@ def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Da
     notes |= {header.doubt for header in stated if isinstance(header, RawHeader)} - {""}
     variables: dict[str, _Variable] = {}
     for index, channel in enumerate(files.selected):
-        dims = ("time", grids[files.stretches(channel), channel.bin_width])
+        dims = ("time", grids[files.grids[index]])
         attributes, varying = _properties(files, index, scaled=scaled)
         variables[channel.name] = dims, signal(index, channel), attributes
         variables |= varying
@@ -548,7 +551,7 @@ def _is_constant(values: NDArray[Any]) -> bool:
     return bool((values == values[0]).all())
 
 
-def _axes(files: RawFiles, grids: Mapping[tuple[Stretches, float], str]) -> dict[str, _Variable]:
+def _axes(files: RawFiles, grids: Mapping[Grid, str]) -> dict[str, _Variable]:
     bounds = files.times
     middle = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     about = {

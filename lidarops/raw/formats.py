@@ -12,29 +12,29 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from types import MappingProxyType
-from typing import Final, Self, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from lidarops.errors import RawFormatError, UnreadableFileError
 from lidarops.kinds import RAW_FORMATS, Registry, registered
 from lidarops.raw.header import IncompleteHeaderError, RawHeader, Stretches, holds_text
 from lidarops.records import UNKNOWN_FORMAT
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 _Header = TypeVar("_Header")
 
-_INT32: Final = np.iinfo(np.int32)
 _PREFIX: Final = 8 * 1024
 _HEADER_LIMIT: Final = 512 * 1024
 
 
-class RawFile:
+class RawFile(AbstractContextManager["RawFile"]):
     """An open local raw file; all raw files are opened here.
 
     Raises
@@ -64,9 +64,6 @@ class RawFile:
         if not stat.S_ISREG(status.st_mode):
             os.close(self._descriptor)
             raise RawFormatError("is not a regular file", file=self.path)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         # What was read is right, whether the file can be closed or not.
@@ -147,12 +144,15 @@ class RawFormat:
         self.read_counts(file, places[0], stretches, row)
         if len(places) == 1:
             return
+        import numpy as np  # noqa: PLC0415 - a run with nothing to do needs no numerics
+
         total, further = row.astype(np.int64), np.empty_like(row)
         for place in places[1:]:
             self.read_counts(file, place, stretches, further)
             total += further
         # A sum beyond 32 bits stays above full scale.
-        row[:] = np.clip(total, _INT32.min, _INT32.max)
+        limits = np.iinfo(np.int32)
+        row[:] = np.clip(total, limits.min, limits.max)
 
 
 @cache
@@ -233,6 +233,8 @@ def read_all_counts(file: RawFile, header: RawHeader) -> None:
     RawFormatError
         If one cannot.
     """
+    import numpy as np  # noqa: PLC0415 - a run with nothing to do needs no numerics
+
     raw = raw_formats()[header.format]
     for channel in header.channels:
         raw.read_channel(file, channel.places, None, np.empty(channel.bins, np.dtype("<i4")))

@@ -1,13 +1,13 @@
 """Bring the archive of a campaign up to date.
 
-- `scenes` cuts granules into scenes, without what `outlying_headers` finds; `unused_files` names
-  refused files of a scene, and `channels` the channels of all files.
+- `scenes` cuts granules into scenes, without what `outlying_headers` finds, and names the refused
+  files of each; `channels` names the channels of all files.
 - `archive`: catalog, plan, process and report; what the command line and the flows call.
 - `options`: how to run and which part of the campaign, and what a run returns.
 - `staleness`: decides which products are stale, and why; `leftovers`: scenes without product, and
   products that the campaign no longer requests.
 - `executor`: processes scenes, in this process or on dask workers; `clusters` starts or reaches
   such workers on this machine, Slurm or Kubernetes.
-- `session`: enters one run in the ledger, scene by scene.
+- `ledger_run`: enters one run in the ledger, scene by scene.
 - `reproduction`: makes one product again from its provenance, which `recipe` reads.
 """

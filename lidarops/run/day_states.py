@@ -22,7 +22,7 @@ from lidarops.records import Role, UnusedFile, day_of, digest, first_of_month
 from lidarops.run.channels import ChannelNames
 from lidarops.run.options import Selection, requested_kinds
 from lidarops.run.outlying_headers import NEAR_DAYS
-from lidarops.run.unused_files import RefusedFile, dated
+from lidarops.run.scenes import RefusedFile, dated
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import sha256_of
 
@@ -35,7 +35,6 @@ _PLANNING: Final = (
     "lidarops.run.outlying_headers",
     "lidarops.scene.plan",
     "lidarops.run.scenes",
-    "lidarops.run.unused_files",
 )
 """Modules that decide which scenes and plans a day has. A product records its own scene and plan,
 so that a change of these modules makes it stale only if they changed."""

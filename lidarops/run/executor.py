@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from lidarops.errors import SceneError
 from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.run.clusters import WORKER_TIMEOUT
-from lidarops.scene.guard import Failure, guarded
-from lidarops.scene.job import Job
+from lidarops.scene.job import Failure, Job, guarded
 from lidarops.scene.memory import scene_memory
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.processes import keep_memory
@@ -125,11 +124,6 @@ class StopRequest:
             _LOG.warning("%s: no scene is running", self.reason)
             raise KeyboardInterrupt
         _LOG.warning("%s: running scenes may end; signal again to abandon them", self.reason)
-
-
-def read_bytes(job: Job) -> int:
-    """Return the bytes that a job reads."""
-    return sum(granule.size for granule in job.scene.granules)
 
 
 def process_jobs(

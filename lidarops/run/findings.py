@@ -12,7 +12,7 @@ from lidarops.kinds import Scope, kinds
 from lidarops.records import FactsNote, Findings, IdlePattern, Role, Unmade, UnusableFile
 from lidarops.run import channels
 from lidarops.run.day_states import DayStates
-from lidarops.run.options import requested_products, station_of
+from lidarops.run.options import requested_products
 
 if TYPE_CHECKING:
     from lidarops.run.leftovers import Lost
@@ -53,7 +53,7 @@ def find(
     owners = [
         name
         for name in (*campaign.instruments, *campaign.networks)
-        if selection.owner(name, station_of(campaign, name))
+        if selection.owner(name, campaign)
     ]
     instruments = {member for name in owners for member in _members(campaign, name)}
     usable = {name for verdict in settled.values() for name in verdict.files}

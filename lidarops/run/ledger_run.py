@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import secrets
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import islice
@@ -21,9 +22,7 @@ from lidarops.records import (
     Findings,
     Granule,
     LeftOut,
-    ProductRecord,
     RunRecord,
-    Scene,
     SceneOutcome,
 )
 from lidarops.reports.run_record import Journal, save_run_record
@@ -148,13 +147,16 @@ class LedgerRun:
         """
         run, reported = self.begin(), len(outcome.products)
         new, outcome = self._new_products(judge, judged, outcome)
+        raw = (*judged.scene.granules, *judged.scene.dark)
+        known = {granule.path: granule.sha256 for granule in raw}
+        read = {used.path: used.sha256 for used in outcome.inputs if used.path in known}
         entry = SceneEntry(
             outcome=outcome,
             day=judged.day,
             key=judge.key(judged, internal=True) if outcome.internal else judged.key,
             final=final and len(new) == reported,
             products=tuple(new),
-            digests=_unknown_digests(judged.scene, outcome),
+            digests=dict(read.items() - known.items()),
         )
         outcome = replace(outcome, left_out=self._left_out_of_request(judged, outcome))
         self._named += outcome.granules
@@ -166,7 +168,7 @@ class LedgerRun:
         if self._journal:
             self._journal.write(brief)
         self._store.record(entry, run.id, self._lock.token)
-        if _went_as_planned(judged, outcome):
+        if _went_as_planned(judged, outcome, known):
             self.fresh.add(judged.scene.id)
         self._drop_unreplaced(judged, outcome)
         _log(outcome)
@@ -185,21 +187,17 @@ class LedgerRun:
     ) -> tuple[list[NewProduct], SceneOutcome]:
         new = []
         for record in outcome.products:
-            mtime_ns = self._written(record)
-            if mtime_ns is None:
+            try:
+                status = (self._campaign.products_root / record.path).stat()
+            except OSError:
+                status = None
+            if status is None or status.st_size != record.size:
                 error = f"{record.path}: vanished or changed after it was written"
                 return [], replace(outcome, products=(), error=error)
             product = record.kind, record.channel
             depends_on, used = judge.depends_on(judged.scene, judged.plan, product, outcome.inputs)
-            new.append(NewProduct(record, mtime_ns, depends_on, used))
+            new.append(NewProduct(record, status.st_mtime_ns, depends_on, used))
         return new, outcome
-
-    def _written(self, record: ProductRecord) -> int | None:
-        try:
-            status = (self._campaign.products_root / record.path).stat()
-        except OSError:
-            return None
-        return status.st_mtime_ns if status.st_size == record.size else None
 
     def _drop_unreplaced(self, judged: Judgement, outcome: SceneOutcome) -> None:
         """Drop kept versions that were not replaced."""
@@ -302,27 +300,17 @@ def _joined(before: SceneOutcome, after: SceneOutcome) -> SceneOutcome:
     )
 
 
-def _known_digests(scene: Scene) -> dict[str, str | None]:
-    """Return path -> SHA-256 of the raw files of a scene, as the catalog knows it."""
-    return {granule.path: granule.sha256 for granule in (*scene.granules, *scene.dark)}
+def _went_as_planned(
+    judged: Judgement, outcome: SceneOutcome, raw: Mapping[str, str | None]
+) -> bool:
+    """Return whether every product that was stale was made from the files that were judged.
 
-
-def _went_as_planned(judged: Judgement, outcome: SceneOutcome) -> bool:
-    """Return whether every product that was stale was made from the files that were judged."""
+    `raw` gives the SHA-256 of raw files by path, as the catalog knew them.
+    """
     # A refused file no longer belongs to the scene.
     if outcome.error or outcome.refused:
         return False
     made = {(product.kind, product.channel) for product in outcome.products}
-    known = _known_digests(judged.scene) | {used.path: used.sha256 for used in judged.ancillaries}
+    known = {**raw, **{used.path: used.sha256 for used in judged.ancillaries}}
     same = all(known.get(used.path) in (None, "", used.sha256) for used in outcome.inputs)
     return same and made.issuperset(stale.product for stale in judged.stale)
-
-
-def _unknown_digests(scene: Scene, outcome: SceneOutcome) -> dict[str, str]:
-    """Return path -> SHA-256 of the files of a scene whose digest differs from the catalog's."""
-    known = _known_digests(scene)
-    return {
-        used.path: used.sha256
-        for used in outcome.inputs
-        if used.path in known and used.sha256 != known[used.path]
-    }

@@ -17,7 +17,7 @@ from typing import Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.sources import path_pattern
 from lidarops.catalog.store import RecordedProduct, Store
-from lidarops.netcdf.context import path_of_product
+from lidarops.netcdf.context import product_path
 from lidarops.records import (
     FactsNote,
     Granule,
@@ -239,7 +239,7 @@ class Leftovers:
 
 def product_file(scene: Scene, product: ProductKey) -> str:
     """Return the path of a product, by which it is known, below the folder of products."""
-    return path_of_product((scene.station, scene.instrument, *product), scene.id, scene.start)
+    return product_path((scene.station, scene.instrument, *product), scene.id, scene.start)
 
 
 def _requests(campaign: Campaign, product: RecordedProduct) -> bool:

@@ -64,13 +64,15 @@ class Selection:
         """Return whether the scene of an id is selected; it may no longer exist."""
         owner, start = parse_scene_id(scene)
         return (
-            self.owner(owner, station_of(campaign, owner))
+            self.owner(owner, campaign)
             and (self.since is None or scene_stop(scene, campaign) > self.since)
             and (self.until is None or start < self.until)
         )
 
-    def owner(self, name: str, station: str) -> bool:
-        """Return whether an instrument or network, and its station, are selected."""
+    def owner(self, name: str, campaign: Campaign) -> bool:
+        """Return whether an instrument, and its station, or a network are selected."""
+        instrument = campaign.instruments.get(name)
+        station = instrument.station if instrument else name
         return (not self.instruments or name in self.instruments) and (
             not self.stations or station in self.stations
         )
@@ -298,9 +300,3 @@ def selects_no_scene(campaign: Campaign, selection: Selection) -> bool:
             for day in days
             for scene in cut_scenes(campaign, store.granules_of(day, day, dark_days=0)).scenes
         )
-
-
-def station_of(campaign: Campaign, name: str) -> str:
-    """Return the station of an instrument; of a network, its name."""
-    owner = campaign.instruments.get(name)
-    return owner.station if owner else name

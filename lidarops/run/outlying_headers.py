@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 from typing import Any, Final, NamedTuple
 
 from lidarops.raw.header import RawChannel, RawHeader
-from lidarops.records import FEWEST_ALIKE, FileNote, Granule, Role, Status, day_of
+from lidarops.records import FEWEST_ALIKE, Granule, Role, Status, day_of
 
 NEAR_DAYS: Final = 1
 """Days before and after that of a file whose files are compared with it."""
@@ -47,13 +47,14 @@ class Outlying(NamedTuple):
 
 def without_outlying(
     granules: Sequence[Granule], days: Collection[int], read: ReadHeader
-) -> tuple[list[Granule], list[Granule]]:
-    """Return granules without those whose headers cannot be used, and these as refused ones.
+) -> tuple[list[Granule], list[Granule], list[tuple[Granule, str]]]:
+    """Return granules without those whose headers cannot be used, these as refused ones, and notes.
 
-    Headers that differ in what changes no value become notes. Parameters as `outlying_headers`.
+    Headers that differ in what changes no value become notes, each given with its granule.
+    Parameters as `outlying_headers`.
     """
     outlying = outlying_headers(granules, days, read)
-    kept, refused = [], []
+    kept, refused, noted = [], [], []
     for granule in granules:
         stated = outlying.get(granule.path)
         if stated is None:
@@ -64,26 +65,8 @@ def without_outlying(
         else:
             note = f"the header states {stated.note}"
             kept.append(replace(granule, notes=(*granule.notes, note)))
-    return kept, refused
-
-
-def new_notes(
-    before: Sequence[Granule], after: Sequence[Granule], days: Collection[int]
-) -> Iterator[FileNote]:
-    """Yield a note for each one that `without_outlying` added to a file of some days.
-
-    Parameters
-    ----------
-    before, after : sequence of Granule
-        What it was given, and the granules that it kept.
-    days : collection of int
-        Days since 1970-01-01.
-    """
-    known = {granule.path: len(granule.notes) for granule in before}
-    for granule in after:
-        for text in granule.notes[known[granule.path] :]:
-            if granule.start and day_of(granule.start) in days:
-                yield FileNote(granule.instrument, text, contradicts=False, files=1)
+            noted.append((granule, note))
+    return kept, refused, noted
 
 
 def outlying_headers(
@@ -115,6 +98,8 @@ def outlying_headers(
     for instrument, role, day in [key for key in by_day if key[2] in days]:
         near = range(day - NEAR_DAYS, day + NEAR_DAYS + 1)
         around = [g for other in near for g in by_day.get((instrument, role, other), ())]
+        if len(around) <= FEWEST_ALIKE:
+            continue
         statements = [*_setups(around, day, read), *_intervals(around, day, read)]
         if role is Role.SIGNAL:
             statements += _pointings(around, day)

@@ -16,7 +16,7 @@ from lidarops.catalog.store import RunStatus, Verdict
 from lidarops.records import FileNote
 from lidarops.run.clusters import local_client
 from lidarops.run.day_states import REACH, DayStates, Signature
-from lidarops.run.executor import EndedScene, StopRequest, process_jobs, read_bytes
+from lidarops.run.executor import EndedScene, StopRequest, process_jobs
 from lidarops.run.findings import find
 from lidarops.run.ledger_run import JudgedDays, LedgerRun
 from lidarops.run.options import Options, Result, unused
@@ -260,7 +260,8 @@ class Pass:
                 if scene.stale
             ]
             # A large scene at the end would keep one worker busy while the others idle.
-            for job in sorted(jobs, key=read_bytes, reverse=True):
+            jobs.sort(key=lambda job: -sum(granule.size for granule in job.scene.granules))
+            for job in jobs:
                 if self.judgements[job.scene.id].suspect:
                     self.suspects.append(job)
                 else:

@@ -16,7 +16,7 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Dependence, NewProduct, RunStatus, SceneEntry, Store
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.kinds import kinds
-from lidarops.netcdf.context import path_of_product
+from lidarops.netcdf.context import product_path
 from lidarops.netcdf.read import opened_product, reading
 from lidarops.netcdf.stored_flags import FlagCounter, blocks, rejecting_mask, stored_bits
 from lidarops.netcdf.variables import QUALITY_FLAG
@@ -146,7 +146,7 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
             raise ProductError(f"is of the unknown kind {kind!r}", file=file)
         names = (keys["station"], keys["instrument"], kind, channel)
         start = datetime.fromisoformat(recipe.settings["window"][0])
-        name = path_of_product(names, recipe.plan.scene, start)
+        name = product_path(names, recipe.plan.scene, start)
         if path != name:
             raise ProductError(f"should have the name {name}", file=file)
         status = file.stat()

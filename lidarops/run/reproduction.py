@@ -18,7 +18,7 @@ import xarray as xr
 from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, ProductError
-from lidarops.netcdf.provenance import package_versions
+from lidarops.netcdf.context import package_versions
 from lidarops.netcdf.read import opened_product
 from lidarops.records import InputRecord, Role
 from lidarops.run.recipe import RAW, Recipe, stays_inside

@@ -21,7 +21,7 @@ from lidarops.catalog.store import Dependence, LastTry, RecordedProduct, Store, 
 from lidarops.errors import ProductError, RawFormatError
 from lidarops.kinds import kinds
 from lidarops.netcdf.comparison import planned_changes
-from lidarops.netcdf.provenance import package_versions
+from lidarops.netcdf.context import package_versions
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import RawHeader
 from lidarops.records import (
@@ -47,13 +47,18 @@ from lidarops.run.leftovers import (
     unmade_products,
 )
 from lidarops.run.options import Selection
-from lidarops.run.outlying_headers import NEAR_DAYS, new_notes, without_outlying
-from lidarops.run.scenes import Cut, as_recorded, cut_scenes, months_of_products
-from lidarops.run.unused_files import RefusedFile, name_unused
+from lidarops.run.outlying_headers import NEAR_DAYS, without_outlying
+from lidarops.run.scenes import (
+    Cut,
+    RefusedFile,
+    as_recorded,
+    cut_scenes,
+    months_of_products,
+    name_unused,
+)
 from lidarops.scene import dependence
 from lidarops.scene.dependence import ProductKey, ancillary_files
-from lidarops.scene.guard import Failure, guarded
-from lidarops.scene.job import Job, Place, recorded_settings
+from lidarops.scene.job import Failure, Job, Place, guarded, recorded_settings
 from lidarops.scene.plan import plan_scene
 from lidarops.system.code_version import code_version, joint_code_version, source_version
 from lidarops.system.files import sha256_of
@@ -333,7 +338,7 @@ class Judge(DayStates):
         stored = self.store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
-        kept, refused = without_outlying(granules, used, self._header)
+        kept, refused, noted = without_outlying(granules, used, self._header)
         aside = [granule for granule in refused if day_of(_moment(granule)) in days]
         cut = cut_scenes(
             self.campaign,
@@ -356,7 +361,11 @@ class Judge(DayStates):
             cut,
             scenes=(*name_unused(known, unused, lost), *self._months(days)),
             set_aside=(*cut.set_aside, *aside),
-            file_notes=tuple(new_notes(granules, kept, days)),
+            file_notes=tuple(
+                FileNote(granule.instrument, note, contradicts=False, files=1)
+                for granule, note in noted
+                if day_of(_moment(granule)) in days
+            ),
         )
 
     def _months(self, days: set[int]) -> Iterator[Scene]:

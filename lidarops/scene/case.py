@@ -8,10 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Final, Generic, TypeVar
-
-import numpy as np
-import numpy.typing as npt
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
 from lidarops.errors import SceneError
@@ -28,6 +25,10 @@ from lidarops.records import (
     is_glued,
 )
 from lidarops.settings import ChannelProduct, SettingsModel
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 R_co = TypeVar("R_co", covariant=True)
 
@@ -244,6 +245,8 @@ def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:
 
 def channel_ranges(channel: ChannelLayout, facts: ChannelFacts) -> npt.NDArray[np.float64]:
     """Return the ranges of the bin centres of a channel, m."""
+    import numpy as np  # noqa: PLC0415 - a run with nothing to do needs no numerics
+
     middles = (np.arange(channel.bins) + 0.5) * channel.bin_width
     return np.asarray(middles + range_offset(channel, facts))
 

@@ -1,23 +1,33 @@
-"""A job: everything that a worker needs to process one scene."""
+"""A job: everything that a worker needs to process one scene, and how its work fails.
+
+Whatever fails ends that scene only.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import traceback
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Self, TypeVar
 
 from lidarops.campaign.model import Campaign, InstrumentFacts, Station
+from lidarops.errors import (
+    CatalogError,
+    LidarOpsError,
+    ProductError,
+    SceneError,
+    UnreadableFileError,
+)
 from lidarops.kinds import Scope, kinds_of
-from lidarops.netcdf import provenance
-from lidarops.netcdf.context import Context
+from lidarops.netcdf.context import Context, package_versions
 from lidarops.raw.formats import raw_formats
 from lidarops.records import (
     ChannelLayout,
     DetectionMode,
     InputRecord,
     Plan,
-    Provenance,
     Scene,
+    SceneOutcome,
     Stamp,
     products_of,
 )
@@ -25,6 +35,9 @@ from lidarops.scene import dependence
 from lidarops.scene.case import REQUEST
 from lidarops.scene.dependence import ProductKey
 from lidarops.system.code_version import code_version
+from lidarops.system.stores import without_keys
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +115,15 @@ def product_context(
     settings = recorded_settings(job, scene, closure, (kind, channel.name))
     station, instrument = _owner(campaign, scene)
     return Context(
+        campaign=campaign.name,
+        scene=scene.id,
+        kind=kind,
+        channel=channel.name,
+        inputs=dependence.product_inputs(closure, inputs),
+        plan=closure,
+        settings=settings,
+        versions=package_versions(),
+        code_version=code_version(kind),
         mode=DetectionMode(channel.mode),
         wavelength=wavelength,
         station_key=scene.station,
@@ -115,17 +137,6 @@ def product_context(
         stop=scene.stop,
         notes=tuple(settings["notes"]),
         unused=dependence.product_unused(scene, closure),
-        provenance=Provenance(
-            campaign=campaign.name,
-            scene=scene.id,
-            kind=kind,
-            channel=channel.name,
-            inputs=dependence.product_inputs(closure, inputs),
-            plan=closure,
-            settings=settings,
-            versions=provenance.package_versions(),
-            code_version=code_version(kind),
-        ),
         raw_format=" and ".join(
             sorted(
                 {raw_formats()[granule.format].title for granule in (*scene.granules, *scene.dark)}
@@ -224,3 +235,65 @@ def _owner(campaign: Campaign, scene: Scene) -> tuple[Station, str]:
         for member, place in zip(scene.members, places, strict=True)
     )
     return Station(name=name, **mean), f"network of {', '.join(members)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why the work of a scene failed."""
+
+    error: str
+    internal: str = ""
+    """Traceback of a bug of lidarops; else empty."""
+    final: bool = True
+    """Whether a retry would fail in the same way: no disk, network or memory was at fault."""
+
+    @classmethod
+    def of_bug(cls, error: BaseException, *, final: bool = True) -> Self:
+        """Return the internal error that an exception means."""
+        words = _storable("".join(traceback.format_exception_only(error)).strip())
+        return cls(
+            f"internal error: {words} (a bug of lidarops, not of the data)",
+            _storable("".join(traceback.format_exception(error))),
+            final,
+        )
+
+    def outcome(self, scene: Scene, plan: Plan | None) -> SceneOutcome:
+        """Return the outcome of a scene that gave no product."""
+        return SceneOutcome(
+            scene=scene.id,
+            station=scene.station,
+            instrument=scene.instrument,
+            start=scene.start,
+            granules=len(scene.granules),
+            plan=plan,
+            error=self.error,
+            internal=self.internal,
+        )
+
+
+def guarded(work: Callable[[], T]) -> T | Failure:
+    """Return the result of some work on a scene, or why it failed: by bad data or by a bug."""
+    try:
+        return work()
+    except LidarOpsError as error:
+        passing = isinstance(error, CatalogError | ProductError | UnreadableFileError)
+        may_pass = passing and not error.wrong_use
+        return Failure(str(error), final=not may_pass)
+    except MemoryError as error:
+        return Failure(str(_too_large(error)), final=False)
+    except Exception as error:  # noqa: BLE001 - a bug in one scene must not stop the others
+        # A disk may have failed where its error is not expected.
+        return Failure.of_bug(error, final=not isinstance(error, OSError))
+
+
+def _storable(text: str) -> str:
+    """Return a text without keys, and with escapes for what a database cannot hold."""
+    return without_keys(text).encode("utf-8", "backslashreplace").decode().replace("\0", r"\0")
+
+
+def _too_large(error: MemoryError) -> SceneError:
+    return SceneError(
+        f"the scene does not fit in memory: {error or 'no memory left'}",
+        remedy="process fewer profiles at a time with a smaller --profiles-per-chunk, or give each"
+        " process more memory",
+    )

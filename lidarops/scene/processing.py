@@ -23,7 +23,7 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import channel_facts
 from lidarops.errors import ProductError, RawFormatError
 from lidarops.kinds import kinds
-from lidarops.netcdf.context import Context, path_of_product, product_of_path, product_path
+from lidarops.netcdf.context import Context, product_of_path, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.netcdf.read import opened_product
 from lidarops.raw.archive import count_bytes_read
@@ -55,9 +55,15 @@ from lidarops.scene.dependence import (
     read_products,
     scene_facts,
 )
-from lidarops.scene.guard import Failure, guarded
 from lidarops.scene.input_files import check_files, local_files, open_granules
-from lidarops.scene.job import NO_PLACE, Job, nothing_to_do, product_context
+from lidarops.scene.job import (
+    NO_PLACE,
+    Failure,
+    Job,
+    guarded,
+    nothing_to_do,
+    product_context,
+)
 from lidarops.scene.pipe import channel_signal
 from lidarops.scene.profiles import (
     READ_TOGETHER,
@@ -242,7 +248,7 @@ class _Work(ABC):
     @contextmanager
     def _writer(self, frame: xr.Dataset, context: Context) -> Iterator[ProductWriter]:
         """Yield a writer of a product, which is complete at the end."""
-        target = self.job.campaign.products_root / product_path(context)
+        target = self.job.campaign.products_root / context.path
         place = self.job.places.get((context.kind, context.channel), NO_PLACE)
         with create_product(frame, context, target, place.sha256) as writer:
             yield writer
@@ -308,7 +314,7 @@ class _Instrument(_Work):
         scene, keys = self.scene, read_products(step)
         if scene.granules:
             owner = (scene.station, scene.instrument)
-            return sorted(path_of_product((*owner, *key), scene.id, scene.start) for key in keys)
+            return sorted(product_path((*owner, *key), scene.id, scene.start) for key in keys)
         paths = (product.path for product in scene.products)
         return sorted(path for path in paths if product_of_path(path) in keys)
 
@@ -370,7 +376,7 @@ class _Instrument(_Work):
 
 def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> xr.Dataset:
     """Return the frame of a product that states what steps decided from the data."""
-    parts = counted_channels(context.provenance.plan.steps, signal.channel)
+    parts = counted_channels(context.plan.steps, signal.channel)
     words = [words for part in parts for words in signal.channels[part].statements]
     stated = [frame.attrs["steps"]] if frame.attrs.get("steps") else []
     return frame.assign_attrs(steps="; ".join([*words, *stated])) if words else frame

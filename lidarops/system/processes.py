@@ -20,13 +20,13 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from itertools import chain, islice
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from lidarops.system import ONE_THREAD
 
@@ -122,7 +122,7 @@ def prefetch_one(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-class Processes(Generic[Kept]):
+class Processes(AbstractContextManager["Processes[Kept]"], Generic[Kept]):
     """A context manager of some processes, which start one by one when there is work.
 
     Parameters
@@ -142,9 +142,6 @@ class Processes(Generic[Kept]):
         self._alone = number < 2 or bool(multiprocessing.current_process().daemon)
         self._careful = False
         """Whether a process was lost, and one does each task by itself."""
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:

@@ -221,7 +221,7 @@ def test_other_software_is_reported_where_bytes_differ(
 ):
     for module in ("lidarops.run.reproduction", "lidarops.scene.job"):
         monkeypatch.setattr(f"{module}.code_version", lambda _kind: "0" * 16)
-    for module in ("lidarops.run.reproduction", "lidarops.netcdf.provenance"):
+    for module in ("lidarops.run.reproduction", "lidarops.scene.job"):
         monkeypatch.setattr(f"{module}.package_versions", lambda: {"numpy": "0.1"})
     result = reproduce_product(of_kind(campaign, "homogeneous"))
     assert not result.identical

@@ -57,8 +57,7 @@ from lidarops.records import SceneOutcome
 from lidarops.run import executor
 from lidarops.run.archive import Result, Selection, bring_up_to_date, update_catalog
 from lidarops.run.clusters import Local
-from lidarops.scene.guard import Failure
-from lidarops.scene.job import Job
+from lidarops.scene.job import Failure, Job
 
 pytestmark = pytest.mark.slow
 

@@ -34,7 +34,7 @@ from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
 from lidarops.flags import FlagBit
 from lidarops.kinds import flags_of
-from lidarops.netcdf.context import duration, product_path
+from lidarops.netcdf.context import duration
 from lidarops.netcdf.encoding import bitround
 from lidarops.netcdf.variables import layout_of, summary_of
 from lidarops.records import DetectionMode, Stamp
@@ -272,7 +272,7 @@ def test_history_has_one_line_for_each_step_of_the_plan():
     assert all(line.startswith("2026-") and "lidarops" in line for line in lines)
     *done, omitted, last = lines
     assert [line.split()[1].rstrip(":") for line in done] == [
-        step.name for step in about.provenance.plan.steps
+        step.name for step in about.plan.steps
     ]
     assert "left out dark: photon counting has no dark signal" in omitted
     assert "wrote the elastic product" in last
@@ -280,13 +280,10 @@ def test_history_has_one_line_for_each_step_of_the_plan():
 
 def test_the_history_of_a_glued_channel_names_the_steps_of_its_parts():
     about = context("elastic")
-    plan = about.provenance.plan
+    plan = about.plan
     own = tuple(replace(step, channel="glued_532o") for step in plan.steps)
     part = replace(plan.steps[0], name="dead_time", channel="photon_532o")
-    of_glued = replace(
-        about.provenance, channel="glued_532o", plan=replace(plan, steps=(part, *own))
-    )
-    about = replace(about, provenance=of_glued)
+    about = replace(about, channel="glued_532o", plan=replace(plan, steps=(part, *own)))
     history = build_product(MAKERS["elastic"](), about).attrs["history"]
     assert f"dead_time of photon_532o: {part.reason}" in history
     assert "left out dark of photon_532o: photon counting has no dark signal" in history
@@ -298,7 +295,7 @@ def test_the_summary_states_the_detection():
         ("glued_532o", "analog detection glued to photon counting) of"),
     ):
         about = context("elastic")
-        about = replace(about, provenance=replace(about.provenance, channel=channel))
+        about = replace(about, channel=channel)
         attrs = build_product(MAKERS["elastic"](), about).attrs
         assert words in attrs["summary"]
 
@@ -344,24 +341,22 @@ def test_no_attribute_is_empty():
 
 
 def test_paths():
-    path = product_path(context("signal"))
+    path = context("signal").path
     assert path == ("odesa/lidar-1/signal/2026/odesa_lidar-1_signal_photon_532o_20260301T000000.nc")
     local = context(start=datetime.fromisoformat("2026-01-01T01:00:00+03:00"))
-    assert product_path(local).startswith("odesa/lidar-1/homogeneous/2025/")
+    assert local.path.startswith("odesa/lidar-1/homogeneous/2025/")
 
 
 def test_scenes_of_two_range_grids_have_two_files():
     start = "lidar-1_20260301T000000"
-    paths = {
-        product_path(context(scene=scene)) for scene in (f"{start}-4096x75", f"{start}-100x30")
-    }
+    paths = {context(scene=scene).path for scene in (f"{start}-4096x75", f"{start}-100x30")}
     assert len(paths) == 2
 
 
 @each("channel", ["../x", "", "a/b", ".hidden", "a b"])
 def test_paths_stay_in_their_folder(channel: str):
     with pytest.raises(ProductError, match="file name"):
-        product_path(context(channel=channel))
+        context(channel=channel)
 
 
 # Refused input

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from support.cases import each
 
-from lidarops.netcdf._chunks import _planes, deflate_chunks
+from lidarops.netcdf.write import _planes, deflate_chunks
 
 DTYPES = ["i1", "u1", "i2", "i4", "i8", "f4", "f8"]
 

@@ -16,7 +16,7 @@ from support.products.encoded_products import build_product
 from support.products.made_products import context, homogeneous, provenance
 
 from lidarops.errors import ProductError
-from lidarops.netcdf.provenance import package_versions, product_id, prov_json
+from lidarops.netcdf.context import package_versions, product_id, prov_json
 from lidarops.netcdf.read import read_provenance
 from lidarops.netcdf.write import write_plain, write_product
 from lidarops.records import InputRecord, LeftOut, Role

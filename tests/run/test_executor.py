@@ -30,8 +30,7 @@ from lidarops.run.executor import (
     process_jobs,
 )
 from lidarops.run.staleness import Judge
-from lidarops.scene.guard import Failure
-from lidarops.scene.job import Job
+from lidarops.scene.job import Failure, Job
 
 
 @pytest.fixture(scope="module")

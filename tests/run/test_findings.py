@@ -14,8 +14,7 @@ from lidarops.cli import app
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports.run_record import load_run_record
 from lidarops.run import executor
-from lidarops.scene.guard import Failure
-from lidarops.scene.job import Job
+from lidarops.scene.job import Failure, Job
 
 pytestmark = pytest.mark.usefixtures("quickly")
 

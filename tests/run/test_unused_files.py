@@ -23,7 +23,7 @@ from lidarops.reports import run_tables
 from lidarops.reports.inspection import describe
 from lidarops.run.archive import bring_up_to_date, reprocess
 from lidarops.run.reproduction import reproduce_product
-from lidarops.run.unused_files import MOST_IN_DOUBT, dated
+from lidarops.run.scenes import MOST_IN_DOUBT, dated
 from lidarops.system.stores import RemoteStore
 
 Fault = Callable[[Path, pytest.MonkeyPatch], None]

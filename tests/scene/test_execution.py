@@ -19,7 +19,7 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import Campaign, Metadata
 from lidarops.flags import Quality
 from lidarops.netcdf.context import Context
-from lidarops.records import DetectionMode, Plan, Provenance, Role
+from lidarops.records import DetectionMode, Plan, Role
 from lidarops.retrieve.air.molecular import MolecularProfile, us_standard
 from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence, pipe
@@ -297,7 +297,15 @@ def test_results_can_be_built_into_products(channel: str) -> None:
         "summary": "",
         "start": datetime(2026, 3, 1, tzinfo=UTC),
         "stop": datetime(2026, 3, 1, tzinfo=UTC) + timedelta(days=1),
-        "provenance": Provenance("test", plan.scene, "elastic", channel, (), plan, {}, {}, "0"),
+        "campaign": "test",
+        "scene": plan.scene,
+        "kind": "elastic",
+        "channel": channel,
+        "inputs": (),
+        "plan": plan,
+        "settings": {},
+        "versions": {},
+        "code_version": "0",
         "raw_format": "Licel",
         "notes": (),
     }

@@ -13,9 +13,8 @@ from lidarops.records import ProductRecord, SceneOutcome
 from lidarops.run.leftovers import product_file
 from lidarops.run.staleness import settings_digest
 from lidarops.scene import dependence
-from lidarops.scene.guard import Failure
 from lidarops.scene.input_files import check_files
-from lidarops.scene.job import Job, recorded_settings
+from lidarops.scene.job import Failure, Job, recorded_settings
 
 REFUSED = "\n# The stand-in refuses this file.\n"
 """End of an ancillary file that can be read, but ends the scenes that use it."""

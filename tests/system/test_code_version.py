@@ -126,7 +126,7 @@ def test_neighbours_of_what_makes_products_change_no_version(growing: Copy, modu
 
 @pytest.mark.parametrize(
     "module",
-    ["scene/processing.py", "netcdf/product_file.py", "netcdf/write.py", "netcdf/_chunks.py",
+    ["scene/processing.py", "netcdf/product_file.py", "netcdf/write.py",
      "netcdf/read.py", "netcdf/__init__.py", "raw/licel_format.py", "raw/licel_header.py",
      "records.py", "flags.py", "__init__.py"],
 )  # fmt: skip

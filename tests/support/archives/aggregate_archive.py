@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 
 from lidarops.aggregate.facts import Facts, list_products, read_product_facts
-from lidarops.netcdf.context import product_path
 from lidarops.netcdf.write import write_product
 from lidarops.records import Stamp
 from support.products.encoded_products import build_product
@@ -50,7 +49,7 @@ def add_day(
         stamp=Stamp(version, start + timedelta(days=2)),
         **(of or {}),
     )
-    path = f"{folder}/{product_path(about)}".removeprefix("/")
+    path = f"{folder}/{about.path}".removeprefix("/")
     write_product(build_product(data, about), root / path)
     return path
 

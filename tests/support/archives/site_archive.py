@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lidarops.netcdf.context import product_path
 from lidarops.netcdf.write import write_product
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, START, context, provenance
@@ -40,7 +39,7 @@ def add(output: Path, kind: str, days: int = 0, **changes: Any) -> Path:
     shift = np.timedelta64(days, "D")
     data = data.assign_coords(time=data["time"] + shift)
     data["time_bnds"] = (("time", "nv"), data["time_bnds"].values + shift)
-    path = output / "products" / product_path(whole)
+    path = output / "products" / whole.path
     write_product(build_product(data, whole), path)
     return path
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -79,7 +80,9 @@ def provenance(kind: str = "homogeneous", **changes: Any) -> Provenance:
 
 def context(kind: str = "homogeneous", **changes: Any) -> Context:
     about = {name: changes.pop(name) for name in ("channel", "scene") if name in changes}
-    fields = {
+    origin = changes.pop("provenance", None) or provenance(kind, **about)
+    given = {
+        **{item.name: getattr(origin, item.name) for item in fields(origin)},
         "mode": DetectionMode.PHOTON,
         "wavelength": 532e-9,
         "station_key": "odesa",
@@ -91,12 +94,11 @@ def context(kind: str = "homogeneous", **changes: Any) -> Context:
         "summary": "What the campaign is about.",
         "start": START,
         "stop": START + timedelta(days=1),
-        "provenance": provenance(kind, **about),
         "raw_format": "Licel",
         "notes": (),
         "stamp": Stamp(1, START + timedelta(days=2)),
     }
-    return Context(**(fields | changes))
+    return Context(**(given | changes))
 
 
 def clock(profiles: int, zenith: Any = 90.0, azimuth: Any = None) -> dict[str, Any]:
