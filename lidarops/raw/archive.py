@@ -1,4 +1,4 @@
-"""Many raw files of one format and layout as one dask-backed Dataset.
+"""Many raw files of one format and layout as one lazy Dataset.
 
 Every channel is a variable ``<channel>(time, range)`` in mV (analog) or MHz (photon counting), or
 in raw counts, with ``<channel>_shots(time)`` and, for analog channels,
@@ -12,7 +12,9 @@ Nothing is masked: a value at or above the attribute ``full_scale`` (in the unit
 present if it is the same in all files) is saturated or a glitch, and the processing flags it.
 
 Headers are read when the archive is opened; of files whose headers the catalog knows to be equal,
-one header is read. A task of the graph reads the bytes of one channel in the files of one chunk.
+one header is read. Counts are read as a channel is indexed: those of one channel in the files of
+the selected profiles. `open_archive` gives dask arrays of them, and processing takes them as they
+are.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import glob
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -32,11 +34,11 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-import dask.array as da
 import numpy as np
 import xarray as xr
-from dask.base import tokenize
 from numpy.typing import NDArray
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
@@ -54,9 +56,6 @@ from lidarops.records import Granule, Header
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
 Position = Literal["longitude_first", "latitude_first", "ignore"]
-Signal = Callable[[int, RawChannel], Any]
-"""Number of a channel, the channel in the first file -> array (time, range), lazy or not."""
-
 Grid = tuple[Stretches, float]
 """Stretches of bins, and their width in m."""
 _Variable = tuple[str | tuple[str, ...], Any, Mapping[str, Any]]
@@ -152,29 +151,57 @@ def open_archive(
     RawFormatError
         If a file cannot be read or is of another format or layout; the error names the file.
     """
-    stated = _read_headers(_files(source, root), header_position)
-    files = RawFiles(stated, channels, header_position, stretches)
-    chunks = _chunks(files, profiles_per_chunk)
+    files = _raw_files(source, root, channels, header_position, stretches)
+    profiles = profiles_per_chunk
+    if profiles is None:
+        largest = max(channel.bins for channel in files.selected)
+        profiles = max(1, _CHUNK_BYTES // (4 * largest))
+    if profiles < 1:
+        raise RawFormatError(
+            f"{profiles} is not a possible number of profiles",
+            field="profiles_per_chunk",
+            remedy="give at least 1",
+        )
+    # The processing needs no dask.
+    from dask.base import tokenize  # noqa: PLC0415
+
+    archive = build_raw_dataset(files, scaled=mask_and_scale)
     # Hashing one text is faster than dask's walk over a list of numbers.
-    stamps = [(file.path, file.size, file.mtime_ns) for file in stated]
-    token = tokenize(repr(stamps), files.kept)
-
-    def signal(index: int, channel: RawChannel) -> da.Array:
-        places = tuple(selected[index].places for selected in files.channels)
+    token = repr([(file.path, file.size, file.mtime_ns) for file in files.files])
+    for index, channel in enumerate(files.selected):
         scales = files.values(index, "scale") if mask_and_scale else None
-        lengths = tuple(len(chunk) for _, chunk in chunks)
-        kept = files.kept.get(channel.name)
-        name = f"{files.format}-{channel.name}-{tokenize(token, places, scales, lengths)}"
-        graph = {}
-        for number, (rows, chunk) in enumerate(chunks):
-            scale = None if scales is None else scales[rows]
-            task = Chunk(files.format, chunk, places[rows], channel.bins, kept, scale)
-            graph[name, number, 0] = (task,)
-        shape = (lengths, (channel.bins,))
-        dtype = np.int32 if scales is None else np.float32
-        return da.Array(graph, name, chunks=shape, dtype=dtype)  # type: ignore[no-untyped-call]
+        about = tokenize(token, files.kept, files.places(index), scales, profiles)
+        name = f"{files.format}-{channel.name}-{about}"
+        chunked = archive[channel.name].variable.chunk({"time": profiles}, name=name)
+        archive[channel.name] = chunked
+    return archive
 
-    return build_raw_dataset(files, signal, scaled=mask_and_scale)
+
+def open_counts(
+    granules: Iterable[Granule],
+    *,
+    root: Path,
+    channels: Iterable[str],
+    stretches: Mapping[str, Stretches] | None = None,
+) -> xr.Dataset:
+    """Return the raw counts of some channels of granules as one Dataset.
+
+    As `open_archive`, but lazy without dask, with what the granules state in place of headers.
+    """
+    return build_raw_dataset(
+        _raw_files(granules, root, channels, "ignore", stretches), scaled=False
+    )
+
+
+def _raw_files(
+    source: Source,
+    root: str | os.PathLike[str] | None,
+    channels: Iterable[str] | None,
+    position_order: Position,
+    stretches: Mapping[str, Stretches] | None,
+) -> RawFiles:
+    stated = _read_headers(_files(source, root), position_order)
+    return RawFiles(stated, channels, position_order, stretches)
 
 
 def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Granule | None]:
@@ -362,6 +389,12 @@ class RawFiles:
         """Start and stop in ns since 1970, shape (files, 2)."""
         self.channels = [of_layout[file.header.channels] for file in self.files]
         """Selected channels of each file."""
+        self.stamps = tuple((file.path, file.size) for file in self.files)
+        """Path and size of each file, shared by all channels."""
+
+    def places(self, channel: int) -> tuple[tuple[int, ...], ...]:
+        """Return where each file holds the counts of selected channel number `channel`."""
+        return tuple(selected[channel].places for selected in self.channels)
 
     def values(self, channel: int, name: str) -> NDArray[Any]:
         """Return a property of selected channel number `channel`, one value per file."""
@@ -409,70 +442,57 @@ def _kept(
     return {name: held for name, held in kept.items() if held != ((0, stored[name]),)}
 
 
-def _chunks(
-    files: RawFiles, profiles: int | None
-) -> list[tuple[slice, tuple[tuple[str, int], ...]]]:
-    """Return the rows of each chunk, with path and size of its files."""
-    if profiles is None:
-        largest = max(channel.bins for channel in files.selected)
-        profiles = max(1, _CHUNK_BYTES // (4 * largest))
-    if profiles < 1:
-        raise RawFormatError(
-            f"{profiles} is not a possible number of profiles",
-            field="profiles_per_chunk",
-            remedy="give at least 1",
-        )
-    stamps = tuple((file.path, file.size) for file in files.files)
-    slices = [slice(i, i + profiles) for i in range(0, len(stamps), profiles)]
-    return [(rows, stamps[rows]) for rows in slices]
+class LazyChannel(BackendArray):
+    """One channel of some files as an array (files, bins), which reads what is indexed.
 
+    It can be pickled, because it holds paths and no open file. Of a channel without stretches, only
+    the bins from the lowest to the highest one are read.
+    """
 
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Task that reads one channel of the files of one chunk; small, and can be pickled."""
+    def __init__(self, files: RawFiles, index: int, *, scaled: bool) -> None:
+        channel = files.selected[index]
+        self._format = files.format
+        self._files = files.stamps
+        self._places = files.places(index)
+        self._kept = files.kept.get(channel.name)
+        self._scales = files.values(index, "scale") if scaled else None
+        self.shape = (len(self._files), channel.bins)
+        self.dtype = np.dtype(np.float32 if scaled else np.int32)
 
-    format: str
-    """Name of their raw format."""
-    files: tuple[tuple[str, int], ...]
-    """Path and size of each, shared by the tasks of all channels."""
-    places: tuple[tuple[int, ...], ...]
-    """Of the channel, for each file."""
-    bins: int
-    kept: Stretches | None
-    """Stretches of bins to read; None for all bins."""
-    scales: NDArray[np.float64] | None
-    """None for counts."""
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
+        support = indexing.IndexingSupport.OUTER
+        values = indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
+        return np.asarray(values)
 
-    def __call__(self) -> NDArray[Any]:
-        """Return the values, shape (files, bins)."""
-        dtype = np.int32 if self.scales is None else np.float32
-        values = np.empty((len(self.places), self.bins), dtype)
-        row = np.empty(self.bins, np.dtype("<i4"))
-        read_channel = raw_formats()[self.format].read_channel
-        for index, ((path, size), places) in enumerate(zip(self.files, self.places, strict=True)):
+    def _read(self, key: tuple[Any, ...]) -> NDArray[Any]:
+        files, bins = (np.arange(size)[part] for size, part in zip(self.shape, key, strict=True))
+        if not (files.size and bins.size):
+            return np.empty(files.shape + bins.shape, self.dtype)
+        low, past, kept = 0, self.shape[1], self._kept
+        if kept is None and (bins.min() > 0 or bins.max() + 1 < past):
+            low, past = int(bins.min()), int(bins.max()) + 1
+            kept = ((low, past),)
+        values = np.empty((files.size, past - low), self.dtype)
+        row = np.empty(past - low, np.dtype("<i4"))
+        read_channel = raw_formats()[self._format].read_channel
+        for index, place in enumerate(np.atleast_1d(files)):
+            path, size = self._files[place]
             with RawFile(path) as file:
                 file.expect(size)
-                read_channel(file, places, self.kept, row)
-            scale = 1 if self.scales is None else self.scales[index]
+                read_channel(file, self._places[place], kept, row)
+            scale = 1 if self._scales is None else self._scales[place]
             # In double precision.
             np.multiply(row, scale, out=values[index], casting="same_kind")
         count = _COUNT.get()
         if count is not None:
-            count.bytes += sum(map(len, self.places)) * row.nbytes
-        return values
+            count.bytes += sum(len(self._places[n]) for n in np.atleast_1d(files)) * row.nbytes
+        if not np.array_equal(bins, np.arange(low, past)):
+            values = values[:, bins - low]
+        return values if files.ndim else np.asarray(values[0])
 
 
-def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Dataset:
-    """Return the Dataset of some files.
-
-    Parameters
-    ----------
-    files : RawFiles
-    signal : callable
-        Returns the array of a channel.
-    scaled : bool
-        Whether `signal` returns physical values or counts.
-    """
+def build_raw_dataset(files: RawFiles, *, scaled: bool) -> xr.Dataset:
+    """Return the lazy Dataset of some files, of physical values if `scaled`, else of counts."""
     # The most common grid is "range"; the others follow in file order.
     uses = Counter(files.grids)
     ordered = sorted(uses, key=lambda grid: grid != uses.most_common(1)[0][0])
@@ -484,7 +504,8 @@ def build_raw_dataset(files: RawFiles, signal: Signal, *, scaled: bool) -> xr.Da
     for index, channel in enumerate(files.selected):
         dims = ("time", grids[files.grids[index]])
         attributes, varying = _properties(files, index, scaled=scaled)
-        variables[channel.name] = dims, signal(index, channel), attributes
+        lazy = indexing.LazilyIndexedArray(LazyChannel(files, index, scaled=scaled))
+        variables[channel.name] = dims, lazy, attributes
         variables |= varying
     return xr.Dataset(
         variables,

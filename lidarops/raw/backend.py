@@ -1,27 +1,22 @@
 """The xarray engine ``licel``: ``xr.open_dataset(path, engine="licel")``.
 
 The Dataset (`lidarops.raw.archive`) is lazy: indexing a channel reads the bytes of the selected
-bins only. It can be pickled, because it holds the path and no open file.
+bins only.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
-from xarray.backends import BackendArray, BackendEntrypoint
-from xarray.core import indexing
+from xarray.backends import BackendEntrypoint
 
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
-from lidarops.raw.archive import Chunk, Position, RawFiles, StatedFile, build_raw_dataset
+from lidarops.raw.archive import Position, RawFiles, StatedFile, build_raw_dataset
 from lidarops.raw.formats import RawFile
-from lidarops.raw.header import RawChannel
 from lidarops.raw.licel_format import FORMAT
 
 
@@ -67,13 +62,7 @@ class LicelBackendEntrypoint(BackendEntrypoint):
         file = StatedFile(header.path, header.size, 0, header, header)
         files = RawFiles([file], channels, header_position)
 
-        def signal(_: int, channel: RawChannel) -> Any:
-            scales = np.array([channel.scale]) if mask_and_scale else None
-            stamp = (header.path, header.size)
-            chunk = Chunk(FORMAT.name, (stamp,), (channel.places,), channel.bins, None, scales)
-            return indexing.LazilyIndexedArray(_LazyChannel(chunk))
-
-        opened = build_raw_dataset(files, signal, scaled=mask_and_scale)
+        opened = build_raw_dataset(files, scaled=mask_and_scale)
         dropped = [drop_variables] if isinstance(drop_variables, str) else drop_variables or ()
         opened = opened.drop_vars(list(dropped), errors="ignore")
         opened.encoding["engine"] = "licel"
@@ -88,28 +77,3 @@ class LicelBackendEntrypoint(BackendEntrypoint):
                 return FORMAT.recognises(file.read(0, 2048))
         except RawFormatError:
             return False
-
-
-class _LazyChannel(BackendArray):
-    """One channel of one file as an array (1, bins); reads from the lowest to the highest bin."""
-
-    def __init__(self, chunk: Chunk) -> None:
-        self._chunk = chunk
-        self.shape = (1, chunk.bins)
-        self.dtype = np.dtype(np.int32 if chunk.scales is None else np.float32)
-
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
-        support = indexing.IndexingSupport.BASIC
-        values = indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
-        return np.asarray(values)
-
-    def _read(self, key: tuple[int | slice, int | slice]) -> NDArray[Any]:
-        time, bins = key
-        selected = np.asarray(np.arange(self.shape[1])[bins])
-        if not selected.size:
-            return np.empty((1, *selected.shape), self.dtype)[time]
-        low, past = int(selected.min()), int(selected.max()) + 1
-        chunk = self._chunk
-        if past - low < chunk.bins:
-            chunk = replace(chunk, bins=past - low, kept=((low, past),))
-        return chunk()[:, selected - low][time]

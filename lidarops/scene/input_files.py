@@ -15,7 +15,7 @@ import xarray as xr
 
 from lidarops.campaign.model import Campaign
 from lidarops.errors import CatalogError, LidarOpsError, SceneError, UnreadableFileError
-from lidarops.raw.archive import open_archive
+from lidarops.raw.archive import open_counts
 from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
@@ -144,7 +144,6 @@ def open_granules(
     root: Path,
     channels: list[str],
     *,
-    profiles_per_chunk: int | None = None,
     stretches: Mapping[str, Stretches] | None = None,
 ) -> xr.Dataset:
     """Return the raw counts of some granules of a scene, lazy, with the pointing of the campaign.
@@ -157,7 +156,7 @@ def open_granules(
     granules : sequence of Granule
     root : Path
         Folder of the granules.
-    channels, profiles_per_chunk, stretches
+    channels, stretches
         As for `lidarops.raw.archive.open_archive`.
 
     Raises
@@ -165,15 +164,7 @@ def open_granules(
     RawFormatError
         If a file cannot be read.
     """
-    archive = open_archive(
-        list(granules),
-        root=root,
-        channels=channels,
-        mask_and_scale=False,
-        profiles_per_chunk=profiles_per_chunk,
-        header_position="ignore",
-        stretches=stretches,
-    )
+    archive = open_counts(granules, root=root, channels=channels, stretches=stretches)
     # Facts of the campaign override the pointing in the headers.
     facts = scene_facts(campaign, scene)
     fixed = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}

@@ -15,8 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import dask.config
-import dask.local
 import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
@@ -66,10 +64,8 @@ from lidarops.scene.job import (
 )
 from lidarops.scene.pipe import channel_signal
 from lidarops.scene.profiles import (
-    READ_TOGETHER,
     ChannelSignal,
     Source,
-    chunk_profiles,
     chunks,
     in_one_batch,
     profiles_together,
@@ -139,8 +135,7 @@ def _process(job: Job) -> tuple[SceneOutcome, bool]:
             return replace(failure, error=lost), not lost
         process = _Network if usable.members else _Instrument
         work = process(job, usable, inputs, root, laps)
-        # Of a scheduler by its name, dask loads `distributed`, which takes 0.3 s.
-        with dask.config.set(scheduler=dask.local.get_sync), count_bytes_read() as tally:
+        with count_bytes_read() as tally:
             failed = guarded(work.all_products)
     outcome = replace(
         failure,
@@ -220,19 +215,11 @@ class _Work(ABC):
         job = self.job
         read = {step.channel for step in steps if step.name == READ_STEP}
         subtracted = [step.channel for step in steps if step.name == "dark"]
-        bins = {channel.name: channel.bins for channel in scene.layout if channel.name in read}
-        profiles = chunk_profiles(max(bins.values()), job.profiles_per_chunk)
+        held = [channel.name for channel in scene.layout if channel.name in read]
         open_files = (job.campaign, scene)
-        together = max(1, profiles // READ_TOGETHER)
-        opened = partial(
-            open_granules,
-            *open_files,
-            scene.granules,
-            self.root,
-            profiles_per_chunk=together,
-        )
+        opened = partial(open_granules, *open_files, scene.granules, self.root)
         source = Source(
-            archive=opened(list(bins), stretches=stretches),
+            archive=opened(held, stretches=stretches),
             opened_whole=partial(opened, [channel.name for channel in scene.layout]),
             dark=(
                 open_granules(*open_files, scene.dark, self.root, subtracted)

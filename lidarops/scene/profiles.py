@@ -258,8 +258,6 @@ _COMPARED: Final = 64
 """Profiles from all over a scene by which those without light are told."""
 _FEWEST_COMPARED: Final = 5
 """Profiles of a scene; fewer are not compared."""
-READ_TOGETHER: Final = 8
-"""Chunks of dask in a chunk, so that few profiles are read twice where it ends within one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,17 +396,13 @@ def in_one_batch(product: xr.Dataset) -> Iterator[xr.Dataset]:
     yield product
 
 
-def chunk_profiles(bins: int, requested: int | None) -> int:
-    """Return the number of profiles that are processed together, of channels with `bins` bins."""
-    return max(1, requested or CHUNK_BYTES // (4 * max(bins, 1)))
-
-
 def profiles_together(source: Source, channels: Iterable[str], requested: int | None) -> int:
     """Return the number of profiles of channels of the files that are processed together."""
     counts = [source.archive[name] for name in channels]
     if requested is None and sum(array.nbytes for array in counts) <= IN_MEMORY:
         return int(source.archive.sizes["time"])
-    return chunk_profiles(sum(int(array.shape[1]) for array in counts), requested)
+    bins = sum(int(array.shape[1]) for array in counts)
+    return max(1, requested or CHUNK_BYTES // (4 * max(bins, 1)))
 
 
 def chunks(
