@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
-import json
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -21,7 +19,7 @@ from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row, 
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
-from lidarops.records import UNREADABLE, IdlePattern, Role, Status
+from lidarops.records import UNREADABLE, IdlePattern, Role, Status, digest
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import CRASHED, Processes
 from lidarops.system.stores import without_keys
@@ -194,7 +192,9 @@ class _Scan:
             self._files += 1
             if self._files % _BATCH == 0:
                 self._progress(_BATCH)
-            key = _key(owners)
+            key, *others = [owner.scan_key for owner in owners]
+            if others:
+                key = digest([key, *others])[:16]
             if before is None or not self._is_known(before, file, key):
                 self._judged.append(before)
                 first = owners[0].instrument
@@ -416,9 +416,9 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                     for fact in instrument.facts
                 ],
             ]
-            digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:16]
+            scan_key = digest(settings)[:16]
             claims.extend(
-                _Claim(key, role, *_split(pattern), pattern, digest) for pattern in patterns
+                _Claim(key, role, *_split(pattern), pattern, scan_key) for pattern in patterns
             )
     return claims
 
@@ -430,9 +430,3 @@ def _split(pattern: str) -> tuple[re.Pattern[str] | None, re.Pattern[str]]:
         # Such a name also matches files in subfolders.
         return None, path_pattern(pattern)
     return path_pattern(folder + slash), path_pattern(name)
-
-
-def _key(owners: list[_Claim]) -> str:
-    if len(owners) == 1:
-        return owners[0].scan_key
-    return hashlib.sha256("+".join(owner.scan_key for owner in owners).encode()).hexdigest()[:16]
