@@ -345,9 +345,14 @@ class Plan:
         ]
 
     @cached_property
+    def text(self) -> str:
+        """The canonical JSON form."""
+        return canonical(self.as_dict())
+
+    @cached_property
     def hash(self) -> str:
         """sha256 of the canonical JSON form."""
-        return digest(self.as_dict())
+        return hashlib.sha256(self.text.encode()).hexdigest()
 
 
 def canonical(value: Any) -> str:

@@ -405,7 +405,7 @@ def _plan(provenance: Provenance) -> dict[str, Any]:
         "prov:type": prov_type("prov:Plan"),
         "lidarops:sha256": plan.hash,
         # The text of this digest.
-        "lidarops:json": canonical(plan.as_dict()),
+        "lidarops:json": plan.text,
         "lidarops:left_out": omissions,
     }
 

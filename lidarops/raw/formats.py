@@ -223,3 +223,18 @@ def read_raw_header(file: RawFile, known: str = "") -> RawHeader:
     return file.read_header(
         lambda head: parse_raw_header(head, file=file.path, size=file.size, known=known)
     )
+
+
+def read_all_counts(file: RawFile, header: RawHeader) -> None:
+    """Read the counts of all channels of a file, to find out whether they can be read.
+
+    Raises
+    ------
+    RawFormatError
+        If one cannot.
+    """
+    import numpy as np  # noqa: PLC0415 - a run with nothing to do needs no numerics
+
+    raw = raw_formats()[header.format]
+    for channel in header.channels:
+        raw.read_channel(file, channel.places, None, np.empty(channel.bins, np.dtype("<i4")))

@@ -11,13 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import xarray as xr
 
 from lidarops.campaign.model import Campaign
 from lidarops.errors import CatalogError, LidarOpsError, SceneError, UnreadableFileError
 from lidarops.raw.archive import open_counts
-from lidarops.raw.formats import RawFile, parse_raw_header, raw_formats
+from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
 from lidarops.scene.dependence import scene_facts
@@ -124,10 +123,8 @@ def _check(content: bytes, granule: Granule, root: Path) -> None:
             remedy="run lidarops catalog again",
         )
     header = parse_raw_header(content, file=granule.path, size=granule.size, known=granule.format)
-    read_channel = raw_formats()[header.format].read_channel
     with RawFile(root / granule.path) as file:
-        for channel in header.channels:
-            read_channel(file, channel.places, None, np.empty(channel.bins, np.dtype("<i4")))
+        read_all_counts(file, header)
 
 
 def _without(scene: Scene, usable: Mapping[str, Granule]) -> Scene:
