@@ -560,8 +560,6 @@ class SceneOutcome:
     """Why the scene gave no product; empty where it gave one."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time by stage."""
-    bytes_read: int = 0
-    """Bytes of raw files, without headers."""
     cpu_seconds: float = 0.0
     """CPU time of the thread that processed the scene; 0 where not measured."""
     left_out: tuple[LeftOut, ...] = ()

@@ -24,8 +24,6 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import lru_cache
@@ -84,27 +82,6 @@ _PROPERTIES: Mapping[str, _Property] = {
     "discriminator": _Property("discriminator level", "V", np.float64),
     "bin_shift": _Property("bin shift", "1", np.float64),
 }
-
-
-@dataclass(slots=True)
-class ByteCount:
-    """Number of signal bytes read."""
-
-    bytes: int = 0
-
-
-_COUNT: ContextVar[ByteCount | None] = ContextVar("byte_count", default=None)
-
-
-@contextmanager
-def count_bytes_read() -> Iterator[ByteCount]:
-    """Count the signal bytes that this thread reads; headers do not count."""
-    count = ByteCount()
-    token = _COUNT.set(count)
-    try:
-        yield count
-    finally:
-        _COUNT.reset(token)
 
 
 def open_archive(
@@ -483,9 +460,6 @@ class LazyChannel(BackendArray):
             scale = 1 if self._scales is None else self._scales[place]
             # In double precision.
             np.multiply(row, scale, out=values[index], casting="same_kind")
-        count = _COUNT.get()
-        if count is not None:
-            count.bytes += sum(len(self._places[n]) for n in np.atleast_1d(files)) * row.nbytes
         if not np.array_equal(bins, np.arange(low, past)):
             values = values[:, bins - low]
         return values if files.ndim else np.asarray(values[0])

@@ -53,7 +53,7 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
 
 def check_files(
     scene: Scene, root: Path, *, read_all: bool, denied: Mapping[str, str] | None = None
-) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...], int]:
+) -> tuple[Scene, tuple[InputRecord, ...], tuple[Granule, ...]]:
     """Check every file against the catalog, and take its digest.
 
     A file of unchanged size and modification time keeps the digest in the catalog, if there is
@@ -75,13 +75,10 @@ def check_files(
         With usable granules only.
     inputs : tuple of InputRecord
     refused : tuple of Granule
-    read : int
-        Number of bytes read.
     """
     usable: dict[str, Granule] = {}
     inputs: list[InputRecord] = []
     refused: list[Granule] = []
-    read = 0
     for granule in (*scene.granules, *scene.dark):
         sha256 = None
         try:
@@ -90,7 +87,6 @@ def check_files(
             same = stated and not read_all
             sha256 = granule.sha256 if same else None
             if sha256 is None:
-                read += granule.size
                 content = (root / granule.path).read_bytes()
                 sha256 = hashlib.sha256(content).hexdigest()
                 _check(content, granule, root)
@@ -107,7 +103,7 @@ def check_files(
         else:
             usable[granule.path] = granule if same else replace(granule, header_digest=None)
             inputs.append(InputRecord(granule.path, granule.role, sha256))
-    return _without(scene, usable), tuple(inputs), tuple(refused), read
+    return _without(scene, usable), tuple(inputs), tuple(refused)
 
 
 def _refused(granule: Granule, reason: str, sha256: str | None = None) -> Granule:

@@ -24,7 +24,6 @@ from lidarops.kinds import kinds
 from lidarops.netcdf.context import Context, product_of_path, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.netcdf.read import opened_product
-from lidarops.raw.archive import count_bytes_read
 from lidarops.raw.header import Stretches
 from lidarops.records import (
     Disagreement,
@@ -124,19 +123,16 @@ def _process(job: Job) -> tuple[SceneOutcome, bool]:
         return replace(failure, error=nothing_to_do(job.plan)), True
     with local_files(job.campaign.archive, job.scene) as (root, denied):
         read_all = job.campaign.all_steps
-        usable, inputs, refused, read = check_files(
-            job.scene, root, read_all=read_all, denied=denied
-        )
+        usable, inputs, refused = check_files(job.scene, root, read_all=read_all, denied=denied)
         laps.end("digest")
-        failure = replace(failure, refused=refused, inputs=inputs, bytes_read=read)
+        failure = replace(failure, refused=refused, inputs=inputs)
         if refused:
             # Without them the scene is another one, of another plan.
             lost = "" if usable.granules else "no granule of the scene can be read"
             return replace(failure, error=lost), not lost
         process = _Network if usable.members else _Instrument
         work = process(job, usable, inputs, root, laps)
-        with count_bytes_read() as tally:
-            failed = guarded(work.all_products)
+        failed = guarded(work.all_products)
     outcome = replace(
         failure,
         inputs=work.inputs,
@@ -144,7 +140,6 @@ def _process(job: Job) -> tuple[SceneOutcome, bool]:
         seconds=laps.seconds,
         notes=tuple(work.notes),
         disagreements=work.disagreements,
-        bytes_read=read + tally.bytes,
         # Also those before a failure: they are on the disk, so that the ledger must know them.
         products=tuple(sorted(work.made, key=lambda made: order.index((made.kind, made.channel)))),
     )

@@ -22,7 +22,7 @@ REFUSED = "\n# The stand-in refuses this file.\n"
 
 def attempt(job: Job) -> tuple[SceneOutcome, bool]:
     """Stand in for `lidarops.scene.processing.attempt`."""
-    scene, inputs, refused, _ = check_files(
+    scene, inputs, refused = check_files(
         job.scene, Path(job.campaign.archive), read_all=job.campaign.all_steps
     )
     if refused:

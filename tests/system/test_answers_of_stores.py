@@ -146,7 +146,7 @@ def test_a_file_that_is_denied_while_its_scene_is_processed_costs_this_file_alon
         (scene,) = cut_scenes(campaign, store.granules()).scenes
     stand_in.statuses["h1"] = status
     with local_files(campaign.archive, scene) as (root, denied):
-        usable, _, refused, _ = check_files(scene, root, read_all=True, denied=denied)
+        usable, _, refused = check_files(scene, root, read_all=True, denied=denied)
     assert [granule.path for granule in usable.granules] == ["coast/h0", "coast/h2", "coast/h3"]
     assert [(granule.path, granule.reason[: len(reason)]) for granule in refused] == [
         ("coast/h1", reason)
