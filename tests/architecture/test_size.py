@@ -18,18 +18,18 @@ from lidarops.cli import app
 MOST = {
     "lines": 69_884,
     "lines of code alone": 45_461,
-    "modules": 287,
-    "dataclasses": 251,
-    "lines of dataclasses": 6_674,
+    "modules": 284,
+    "dataclasses": 248,
+    "lines of dataclasses": 6_658,
     "tuning numbers": 218,
     "tuning numbers that are assumed": 59,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_592,
+    "lines of the largest package": 5_548,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 67, "functions": 639, "changes": 217},
-    "elastic": {"modules": 76, "functions": 783, "changes": 234},
+    "homogeneous": {"modules": 64, "functions": 595, "changes": 215},
+    "elastic": {"modules": 73, "functions": 740, "changes": 232},
 }
 
 
