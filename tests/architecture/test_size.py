@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_884,
-    "lines of code alone": 45_461,
+    "lines": 70_218,
+    "lines of code alone": 45_702,
     "modules": 284,
     "dataclasses": 248,
     "lines of dataclasses": 6_658,
-    "tuning numbers": 218,
+    "tuning numbers": 222,
     "tuning numbers that are assumed": 59,
     "copied thresholds": 0,
     "most parameters": 10,
