@@ -212,10 +212,10 @@ class _Work(ABC):
         subtracted = [step.channel for step in steps if step.name == "dark"]
         held = [channel.name for channel in scene.layout if channel.name in read]
         open_files = (job.campaign, scene)
-        opened = partial(open_granules, *open_files, scene.granules, self.root)
         source = Source(
-            archive=opened(held, stretches=stretches),
-            opened_whole=partial(opened, [channel.name for channel in scene.layout]),
+            archive=open_granules(
+                *open_files, scene.granules, self.root, held, stretches=stretches
+            ),
             dark=(
                 open_granules(*open_files, scene.dark, self.root, subtracted)
                 if subtracted and scene.dark

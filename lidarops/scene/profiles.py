@@ -15,9 +15,8 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.constants import DEAD_TIME_UNCERTAINTY
-from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.signal import labeled_gluing, light
+from lidarops.retrieve.signal import labeled_gluing
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.lag import ChannelLag
@@ -89,12 +88,8 @@ class FileProfiles:
         return counts[f"{self._channel}_shots"]
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
-        """Return power, variance and quality of profiles; of those without light, no power."""
-        conditioned = self._condition(counts, self._channel)
-        if LIGHTLESS in counts and (dark := counts[LIGHTLESS].to_numpy()).any():
-            conditioned["power"][dark] = np.nan
-            conditioned["quality"][dark] |= np.int32(Quality.NO_SIGNAL)
-        return conditioned
+        """Return power, variance and quality of profiles."""
+        return self._condition(counts, self._channel)
 
     def sums(
         self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
@@ -252,12 +247,6 @@ def gluing(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
 
 IN_MEMORY: Final = 2_000_000
 """Bytes of counts up to which a scene is one chunk: below, chunks cost more than they save."""
-LIGHTLESS: Final = "lightless"
-"""Variable of counts that tells which profiles hold no light of the laser."""
-_COMPARED: Final = 64
-"""Profiles from all over a scene by which those without light are told."""
-_FEWEST_COMPARED: Final = 5
-"""Profiles of a scene; fewer are not compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,47 +260,8 @@ class Source:
     ancillaries: Ancillaries
     station_altitude: float
     """m above mean sea level."""
-    opened_whole: Callable[[], xr.Dataset] | None = None
-    """Opens the raw counts of all channels and bins of all profiles, lazy; None where `archive`
-    holds them."""
     shared: dict[Any, Any] = field(default_factory=dict)
     """What one channel computed and others need too."""
-
-    @property
-    def whole(self) -> xr.Dataset:
-        """Raw counts of all channels and bins of all profiles, lazy."""
-        if "whole" not in self.shared:
-            self.shared["whole"] = self.opened_whole() if self.opened_whole else self.archive
-        opened: xr.Dataset = self.shared["whole"]
-        return opened
-
-    def teller(self, channels: Sequence[str]) -> light.Teller | None:
-        """Return what tells profiles without light; None where nothing does.
-
-        A fact of the scene, from profiles all over it: one of some channels if it can, else one of
-        any channel. Where no channel shows light, no profile has any.
-        """
-        number = self.archive.sizes["time"]
-        if number < _FEWEST_COMPARED:
-            return None
-        rows = np.unique(np.linspace(0, number - 1, _COMPARED).astype(int))
-        key = "teller", *channels
-        if key not in self.shared:
-            own = light.brightest(_variations(self.archive, channels, rows))
-            self.shared[key] = own or self._teller_of_any(rows)
-        found: light.Teller | None = self.shared[key]
-        return found
-
-    def _teller_of_any(self, rows: Indices) -> light.Teller | None:
-        if "teller" not in self.shared:
-            names = [str(name) for name in self.whole if f"{name}_shots" in self.whole]
-            best = light.brightest(_variations(self.whole, names, rows))
-            totals = (self.whole[n][rows].to_numpy().sum(axis=0, dtype=np.float64) for n in names)
-            if best is None and light.all_dark(totals):
-                best = light.Teller(names[0], np.inf)
-            self.shared["teller"] = best
-        found: light.Teller | None = self.shared["teller"]
-        return found
 
     @property
     def geometry(self) -> xr.Dataset:
@@ -424,7 +374,6 @@ def chunks(
     allowed = functools.reduce(np.intersect1d, limiting, np.arange(count + 1))
     if not allowed.size or allowed[-1] < count:
         allowed = np.append(allowed, count)
-    teller = source.teller(channels)
     known = tuple(f"{name}_" for name in (*GEOMETRY, *channels))
     archive = archive[[name for name in archive.variables if f"{name}_".startswith(known)]]
     first = 0
@@ -435,22 +384,5 @@ def chunks(
         if past <= first:
             past = int(allowed[np.searchsorted(allowed, first, side="right")])
         chunk = slice(first, past)
-        counts = archive.isel(time=chunk).load()
-        if teller is not None:
-            seen = counts if teller.channel in counts else source.whole.isel(time=chunk)
-            found = _variations(seen, [teller.channel], slice(None))[teller.channel]
-            counts = counts.assign({LIGHTLESS: ("time", teller.lightless(found))})
-        yield Chunk(counts, chunk)
+        yield Chunk(archive.isel(time=chunk).load(), chunk)
         first = past
-
-
-def _variations(
-    archive: xr.Dataset, channels: Iterable[str], rows: Indices | slice
-) -> dict[str, light.Variation]:
-    """Return how counts of channels vary along range in some profiles."""
-    return {
-        name: light.variation(
-            archive[name][rows].to_numpy(), archive[f"{name}_shots"][rows].to_numpy()
-        )
-        for name in channels
-    }

@@ -27,7 +27,9 @@ FLAGS: Final = Flags(
     kind="homogeneous",
     version=2,
     bits=(
-        *sorted((*RAW_BITS, Quality.TOO_FEW_BINS)),
+        *RAW_BITS,
+        Quality.TOO_FEW_BINS,
+        Quality.NO_SIGNAL,
         Quality.LOW_SIGNAL,
         Quality.NEGATIVE_AMPLITUDE,
         Quality.NOT_HOMOGENEOUS,

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import WITHHELD, Quality
+from lidarops.flags import Quality
 from lidarops.retrieve.background.estimate import Background, from_bounded_tail
 from lidarops.retrieve.common.arrays import Array, Block, Flags
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
@@ -17,9 +17,9 @@ from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
-EXCLUDED: Final = WITHHELD & ~int(Quality.NO_GLUING)
+EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
 """Bits that exclude a bin from a fit."""
-CARRIED: Final = EXCLUDED & ~int(Quality.INPUT_MISSING) | int(Quality.PILE_UP)
+CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
 """Bits that a section takes over from its bins."""
 _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
 _UNITS: Final = {
@@ -249,9 +249,6 @@ def _solve(
     bits = fit.quality | doubt
     if "quality" in inside:
         bits = bits | np.bitwise_or.reduce(inside["quality"] & CARRIED, axis=-1).astype(np.int32)
-    # A profile without light is no gap.
-    dark = (bits & np.int32(Quality.NO_SIGNAL)) != 0
-    bits = np.where(dark, bits & ~np.int32(Quality.INPUT_MISSING), bits)
     values = (getattr(fit, name.removeprefix("total_")) for name in _UNITS)
     return (*values, fit.valid_bins, bits)
 

@@ -212,10 +212,6 @@ class PartCells:
     quantum: Array
     """(...): the power of a cell with a single count; 0 where nothing is counted."""
 
-    def only(self, parts: Booleans) -> PartCells:
-        """Return the cells of some parts."""
-        return PartCells(self.power[parts], self.variance[parts], self.quantum[parts])
-
 
 def cloud_contrast(wavelength: float) -> float:
     """Return the least contrast of a cloud, that of the same aerosol at each wavelength.

@@ -15,7 +15,6 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
-from lidarops.flags import Quality
 from lidarops.records import DetectionMode
 from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
 from lidarops.retrieve.common import inputs
@@ -304,9 +303,6 @@ def correct_for_range(
     sky = _BACKGROUNDS[method][0](power, distance, of_means, background_range)
     level, level_error = sky.background[..., np.newaxis], sky.standard_error[..., np.newaxis]
     square = distance**2
-    bits = conditioned["quality"].to_numpy()
-    # A profile without light has no background either, but is no gap.
-    dark = (bits[..., :1] & np.int32(Quality.NO_SIGNAL)) != 0
     # Negative values are kept: clipping would bias every mean.
     signal = ((power - level) * square).astype(np.float32)
     error = np.sqrt(((noise.variance + level_error**2) * (square * square)).astype(np.float32))
@@ -315,7 +311,10 @@ def correct_for_range(
         {
             "signal": (plane, signal),
             "signal_standard_error": (plane, error),
-            "quality_flag": (plane, bits | np.where(dark, 0, sky.quality[..., np.newaxis])),
+            "quality_flag": (
+                plane,
+                conditioned["quality"].to_numpy() | sky.quality[..., np.newaxis],
+            ),
             "background": (plane[:-1], sky.background),
             "background_standard_error": (plane[:-1], sky.standard_error),
             CORRELATION_LENGTH: (

@@ -34,7 +34,6 @@ _PROFILES_IN_CACHE: Final = 32
 MEANS_TOGETHER: Final = 16
 """Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
-_DARK: Final = np.int32(Quality.NO_SIGNAL)
 
 Shared = Callable[[npt.NDArray[np.datetime64]], Array]
 Units = dict[str, dict[str, Any]]
@@ -47,12 +46,10 @@ class PartSums:
     sums: RunningMean
     lengths: RunningMean
     quality: Flags
-    """(part, range), without INPUT_MISSING, and NO_SIGNAL only where no profile holds light."""
+    """(part, range), without INPUT_MISSING."""
     profiles: Flags
     """(part,), their numbers."""
     shots: Flags
-    dark: Flags
-    """(part,), numbers of further profiles, which hold no light of the laser."""
     units: Units
     """Attributes of power, variance and range."""
 
@@ -120,7 +117,6 @@ class IntervalSums:
         begins = np.flatnonzero(np.diff(self._group, prepend=-1))
         self._profiles = np.diff(begins, append=interval.size).astype(np.int32)
         self._shots = np.add.reduceat(shots.to_numpy(), begins).astype(np.int32)
-        self._dark = np.zeros_like(self._profiles)
         self._shared_variance = shared_variance
         self.range, self.lag = distance, lag
         self._added = 0
@@ -165,8 +161,7 @@ class IntervalSums:
             self._add(*(array[first:past] for array in arrays))
             if past - first == left:
                 groups = slice(self._first_group, self._first_group + len(self._bits))
-                numbers = self._profiles[groups], self._shots[groups], self._dark[groups]
-                self._bits[numbers[0] == 0] |= _DARK
+                numbers = self._profiles[groups], self._shots[groups]
                 self._complete.append(
                     PartSums(self._sums, self._lengths, self._bits, *numbers, units)
                 )
@@ -178,13 +173,6 @@ class IntervalSums:
     ) -> None:
         profiles = slice(self._added, self._added + len(power))
         group, weights = self._group[profiles] - self._first_group, self._weights[profiles]
-        dark = (quality[:, 0] & _DARK) != 0
-        if dark.any():
-            weights = np.where(dark, 0.0, weights)
-            of_dark = self._group[profiles][dark]
-            np.add.at(self._dark, of_dark, 1)
-            np.subtract.at(self._profiles, of_dark, 1)
-            np.subtract.at(self._shots, of_dark, self._weights[profiles][dark].astype(np.int32))
         # Parts share the variance of their mean.
         common = self._shared
         self._sums.add(
@@ -195,7 +183,7 @@ class IntervalSums:
             shared_variance=0.0 if common is None else common,
         )
         self._lengths.add(length[:, np.newaxis], 0.0, groups=group, weights=weights)
-        join_bits(frozen(quality), frozen(group), int(~(_MISSING | _DARK)), self._bits)
+        join_bits(frozen(quality), frozen(group), int(~_MISSING), self._bits)
         self._added += len(power)
 
     def completed(self) -> Iterator[PartSums]:
@@ -277,7 +265,7 @@ class ClockAverage:
             time. ``time`` is the middle of
             ``time_bnds``, which span the profiles of the interval. Intervals without a profile are
             omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
-            profile has data. Profiles without light (NO_SIGNAL) are left out, unless all are.
+            profile has data.
 
             With a screening also ``part_power`` (background subtracted) and ``part_variance`` over
             (time, part, cell) of parts that are in the mean, means over cells of ``bins``
@@ -299,14 +287,8 @@ class ClockAverage:
             ]
             compared = slice(int(self._screening.highest / (self._bins * self._step)))
             contrast = self._screening.contrast
-            lit = parts[0].profiles > 0
-            kept = lit | ~lit.any()
-            outlying = [
-                outlying_parts(one.only(lit), compared, contrast=contrast)
-                for one in cells
-                if lit.any()
-            ]
-            kept[lit] = ~np.logical_or.reduce(outlying)
+            outlying = [outlying_parts(one, compared, contrast=contrast) for one in cells]
+            kept = ~np.logical_or.reduce(outlying)
             means = (
                 _mean(sums, kept) | _parts(sums, of_cells, kept)
                 for sums, of_cells in zip(parts, cells, strict=True)
@@ -346,8 +328,7 @@ class ClockAverage:
     ) -> xr.Dataset:
         """Return means of a record with their coordinates, as `completed` yields them."""
         of = {name: np.stack([mean[name] for mean in means]) for name in means[0]}
-        told = np.isfinite(of["power"]) | ((of["quality"] & _DARK) != 0)
-        missing = np.where(told, np.int32(0), _MISSING)
+        missing = np.where(np.isfinite(of["power"]), np.int32(0), _MISSING)
         plane, cells = ("time", "range"), ("time", "part", "cell")
         labeled = xr.Dataset(
             {
@@ -378,9 +359,6 @@ def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:
     """Return the mean of the parts that are kept."""
     averages = sums.sums.joined(kept)
     quality = sums.quality if kept.all() else sums.quality[kept]
-    # Of a mean with light, parts without any have no say.
-    if sums.profiles[kept].any():
-        quality = quality[sums.profiles[kept] > 0]
     return {
         "power": averages.values[0],
         "variance": (averages.variance + averages.shared_variance)[0],
@@ -401,7 +379,7 @@ def _parts(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
     power[places], variance[places] = cells.power[places], cells.variance[places]
     quantum[places], of_parts[places] = cells.quantum[places], sums.profiles[places]
     return {
-        "left_out": np.int32(sums.profiles[~kept].sum() + sums.dark.sum()),
+        "left_out": np.int32(sums.profiles[~kept].sum()),
         "part_power": power,
         "part_variance": variance,
         "part_quantum": quantum,

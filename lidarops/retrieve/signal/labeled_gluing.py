@@ -257,7 +257,6 @@ def _glue(
     quality |= np.where(distance >= bottom, photon_quality, 0)
     quality |= np.where(alone, int(Quality.SINGLE_RECORD), 0)[..., np.newaxis]
     quality |= np.where(alone | line, 0, int(Quality.NO_GLUING))[..., np.newaxis]
-    quality |= analog_quality & photon_quality & int(Quality.NO_SIGNAL)
     quality |= np.where(distance <= 0.0, _MISSING, 0)
     power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
     variance[np.isnan(power)] = np.nan

@@ -156,17 +156,5 @@ class Thresholds(NamedTuple):
     dead_time_block: int = 2
     """Bins that are averaged; few, because the rate is no linear function of the light; assumed."""
 
-    # Profiles without light (`light`).
-    least_light: float = 0.03
-    """Amplitude over that of bright profiles, below which there may be none. Assumed."""
-    noise_like: float = 10.0
-    """Mean square deviation of near bins over the noise of the far range, below which a profile is
-    not told from noise: of 12 real dark files 0.7 to 1.9 in analog detection and up to 5.2 in
-    photon counting, of profiles by day from 2e5 (`tests/scene/test_laser_off.py`)."""
-    bright_share: float = 0.9
-    """Share of the profiles of a scene that bright ones exceed. Assumed."""
-    sees_light: float = 5.0
-    """Standard errors by which light exceeds zero. Assumed."""
-
 
 THRESHOLDS: Final = Thresholds()
