@@ -21,8 +21,8 @@ from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import RECORDERS
 from lidarops.netcdf.read import changed, opened_product
-from lidarops.netcdf.stored_flags import FlagCounter, rejecting_mask, stored_bits
-from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
+from lidarops.netcdf.stored_flags import FlagCounter, all_bits, flags_names, rejecting_mask
+from lidarops.netcdf.variables import PROVENANCE, layout_of
 from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
 
@@ -245,9 +245,10 @@ def read_header(product: xr.Dataset, path: str, selection: ProductSelection) -> 
 
 
 def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
-    bits = stored_bits(product[QUALITY_FLAG].attrs, header.kind)
+    bits = all_bits(product)
     counts = FlagCounter(rejecting_mask(bits))
-    counts.add(product[QUALITY_FLAG].values)
+    for name in flags_names(product):
+        counts.add(product[name].values)
     height = "station_altitude" if "station_altitude" in product else "altitude"
     return Facts(
         **{stated.name: getattr(header, stated.name) for stated in fields(header)},

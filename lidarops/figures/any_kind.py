@@ -15,7 +15,7 @@ from lidarops.figures.series_data import SeriesEstimate, TimeSeries, join
 from lidarops.figures.series_panels import SERIES, Quantity, series_figures
 from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import judge
-from lidarops.netcdf.variables import QUALITY_FLAG, USABLE, layout_of
+from lidarops.netcdf.variables import layout_of, possible_judges, summary_of
 
 _BULK: Final = 64_000_000
 """Bytes of a variable above which only some profiles are read."""
@@ -48,8 +48,9 @@ def view_of(kind: str, name: str | None = None) -> View[Content]:
     uncertain = [row.name for row in data if row.uncertain]
     names = [name] if name else dict.fromkeys([*uncertain, *preferred_variables()])
     errors = (f"{name}_standard_error" for name in names)
-    own = (f"{name}_{end}" for name in names for end in (QUALITY_FLAG, USABLE))
-    variables = "time", QUALITY_FLAG, USABLE, *names, *errors, *own
+    judges = dict.fromkeys(flags for name in names for flags in possible_judges(name))
+    summaries = (summary_of(flags) for flags in judges)
+    variables = "time", *names, *errors, *judges, *summaries
     return View(kind, variables, partial(_read, name), _draw)
 
 

@@ -31,7 +31,7 @@ from lidarops.netcdf.stored_flags import (
     quality_bits,
     rejecting_mask,
 )
-from lidarops.netcdf.variables import QUALITY_FLAG, judging
+from lidarops.netcdf.variables import judging, possible_judges
 
 Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
@@ -147,8 +147,7 @@ class Raster:
 
 def raster_variables(quantity: str, along: str = "range") -> tuple[str, ...]:
     """Return the variables that `read_raster` reads, including optional ones."""
-    flags = QUALITY_FLAG, f"{quantity}_{QUALITY_FLAG}"
-    where = "cloud_base_range", "altitude"
+    flags, where = possible_judges(quantity), ("cloud_base_range", "altitude")
     return "time", along, *_along_both(quantity), *flags, TIME_BOUNDS, *where
 
 

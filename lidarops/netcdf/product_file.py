@@ -139,7 +139,9 @@ class ProductWriter:
                 create_file(self.skeleton(encoded), self._path, replaces=self._replaces)
             )
         self.file.add(encoded)
-        self._counts.add(encoded[rows.QUALITY_FLAG])
+        for row in self._layout.judges:
+            if row.name in encoded:
+                self._counts.add(encoded[row.name])
 
     def encode(self, profiles: xr.Dataset) -> dict[str, Values]:
         """Return the next profiles as they are stored, with their coordinates; see `add`."""
@@ -265,7 +267,7 @@ class ProductWriter:
 
     @property
     def record(self) -> ProductRecord:
-        """What was written, after the ``with`` block, with counts of ``quality_flag``.
+        """What was written, after the ``with`` block, with counts of all its flags.
 
         Raises
         ------

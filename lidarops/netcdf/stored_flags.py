@@ -96,6 +96,12 @@ def flags_names(product: xr.Dataset) -> list[str]:
     return sorted(names, key=QUALITY_FLAG.__ne__)
 
 
+def all_bits(product: xr.Dataset) -> tuple[StoredBit, ...]:
+    """Return the bits of all variables of flags of a product, rising."""
+    found = {bit.mask: bit for name in flags_names(product) for bit in bits_of(product, name)}
+    return tuple(bit for _, bit in sorted(found.items()))
+
+
 class Judged(NamedTuple):
     """The bits of a quantity, and what they say of it."""
 
@@ -148,7 +154,7 @@ def rejecting_mask(bits: Iterable[StoredBit]) -> int:
 
 
 class FlagCounter:
-    """Counts values of ``quality_flag`` by bit, and by what their bits say of them.
+    """Counts values of variables of flags by bit, and by what their bits say of them.
 
     Parameters
     ----------

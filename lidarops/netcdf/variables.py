@@ -354,6 +354,13 @@ def judging(quantity: str, names: Iterable[str]) -> str:
     return next(owners, QUALITY_FLAG)
 
 
+def possible_judges(quantity: str) -> list[str]:
+    """Return the names of all flags that might judge a quantity, or an error of it."""
+    words = quantity.split("_")
+    owners = ("_".join(words[:count]) for count in range(1, len(words) + 1))
+    return [QUALITY_FLAG, *(f"{owner}_{QUALITY_FLAG}" for owner in owners)]
+
+
 def summary_of(flags: str) -> str:
     """Return the name of the summary of a variable of flags: ``usable``, ``lidar_ratio_usable``."""
     return f"{flags.removesuffix(QUALITY_FLAG)}{USABLE}"

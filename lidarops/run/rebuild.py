@@ -18,8 +18,13 @@ from lidarops.errors import LidarOpsError, ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import product_path
 from lidarops.netcdf.read import opened_product, reading
-from lidarops.netcdf.stored_flags import FlagCounter, blocks, rejecting_mask, stored_bits
-from lidarops.netcdf.variables import QUALITY_FLAG
+from lidarops.netcdf.stored_flags import (
+    FlagCounter,
+    all_bits,
+    blocks,
+    flags_names,
+    rejecting_mask,
+)
 from lidarops.records import Findings, ProductRecord, Role, SceneOutcome, Verdicts, day_of
 from lidarops.run.ledger_run import JudgedDays, LedgerRun
 from lidarops.run.recipe import Recipe
@@ -168,10 +173,10 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
 def _verdicts(file: Path, kind: str) -> Verdicts:
     """Return the numbers of values of a product, which may be larger than memory."""
     with opened_product(file, in_parts=True, decode_cf=False) as product:
-        flags = product[QUALITY_FLAG]
-        counts = FlagCounter(rejecting_mask(stored_bits(flags.attrs, kind)))
-        for block in blocks(flags, _BLOCK):
-            counts.add(block.to_numpy())
+        counts = FlagCounter(rejecting_mask(all_bits(product)))
+        for name in flags_names(product):
+            for block in blocks(product[name], _BLOCK):
+                counts.add(block.to_numpy())
     return counts.verdicts
 
 

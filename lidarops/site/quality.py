@@ -17,8 +17,9 @@ from lidarops.netcdf.stored_flags import (
     READ_VALUES,
     FlagCounter,
     StoredBit,
-    bits_of,
+    all_bits,
     blocks,
+    flags_names,
     quality_bits,
     rejecting_mask,
 )
@@ -68,7 +69,7 @@ def read_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Quality
     """
     if QUALITY_FLAG not in product or not product[QUALITY_FLAG].size:
         return Quality()
-    flags, bits = product[QUALITY_FLAG], bits_of(product)
+    flags, bits = product[QUALITY_FLAG], all_bits(product)
     rejecting = rejecting_mask(bits)
     counts = FlagCounter(rejecting)
     available, shares, low = 0, [], _low(product, below)
@@ -80,6 +81,9 @@ def read_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Quality
         available += int(np.count_nonzero(seen.reshape(len(values), -1).any(axis=1)))
         parts = (part.reshape(len(values), -1) for part in (values == 0, rejected))
         shares.append([part.mean(axis=1) for part in parts])
+    for name in flags_names(product)[1:]:
+        for block in blocks(product[name], READ_VALUES):
+            counts.add(quality_bits(block))
     over_time = np.concatenate(shares, axis=1)
     has_times = flags.dims[:1] == ("time",) and product["time"].dtype.kind == "M"
     return Quality(
