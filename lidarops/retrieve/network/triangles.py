@@ -25,8 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.network import _block_errors
 from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
-from lidarops.retrieve.network._condensed_signals import FitLayout, curvature_variance
+from lidarops.retrieve.network._condensed_signals import FitLayout
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 
@@ -110,10 +111,10 @@ def solve_triangles(beams: BeamSignals, multiplier: Array | None) -> Estimates:
                 _solve_block(rows.take(members), triangle, given, out, carried, place)
     for block in np.unique(beams.block):
         members = np.flatnonzero(beams.block == block)
-        out.variance[members] += curvature_variance(
-            beams.data.curvature_error[members], beams.usable[members], carried[members]
-        )
+        signals = beams.data.take(members)
+        out.variance[members] += _block_errors.curvature_variance(signals, carried[members])
     out.variance[:] *= out.extinction**2
+    out.prior_true_variance[:] = out.variance
     return out
 
 
