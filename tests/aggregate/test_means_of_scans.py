@@ -31,7 +31,7 @@ def test_means_stay_within_their_errors(name: str):
             depths.optical_depth,
             depths.information,
             scene.altitude,
-            residuals=depths.residuals,
+            noise=depths.noise,
         )
         short = name.removeprefix("vertical_").removeprefix("total_")
         errors = getattr(smooth, f"{short}_standard_error")

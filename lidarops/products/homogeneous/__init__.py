@@ -8,7 +8,6 @@ from pydantic import Field, model_validator
 
 from lidarops.constants import FIXED
 from lidarops.kinds import Kind
-from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.settings import (
     NO_UNIT,
     BackgroundRange,
@@ -76,15 +75,15 @@ class HomogeneousSettings(ChannelProduct):
         description="bins between those of a triple of the method cubic; by default 0.4 of the bins"
         " of the section, at 1 the published cubic",
     )
-    slope_error: float = quantity(
-        THRESHOLDS.model_error,
+    slope_error: float | None = quantity(
+        None,
         unit=NO_UNIT,
         ge=0,
         le=1,
         description="standard error of the logarithmic slope of the signal by air that is not"
         " homogeneous, as a share of 2 (extinction + 1 / mean range); model errors are in"
-        " proportion to it. The default covers what simulated scenes violate: state less where air"
-        " is known to be calm",
+        " proportion to it. Without one, the product states what covers the violations of simulated"
+        " scenes: state less where air is known to be calm",
     )
     visibility: VisibilitySettings | None = Field(
         default=None, description="if given, adds visibility along the sections"

@@ -112,7 +112,7 @@ class PathSettings(SettingsModel):
         None, unit="MHz or mV", description="given one of `known_background`, and its error"
     )
     lag: int | None = quantity(None, unit=NO_UNIT, description="of `cubic`, bins")
-    slope_error: float
+    slope_error: float | None = None
     visibility: VisibilitySettings | None = None
 
 
@@ -322,6 +322,7 @@ class _Sections(ProductStream):
         """Yield all profiles, with visibility along the sections where it is requested."""
         sections, requested = self._joined(), self._settings.visibility
         stated = self._settings.slope_error
+        stated = THRESHOLDS.model_error if stated is None else stated
         # They are proportional to it.
         scale = stated / THRESHOLDS.model_error
         errors = {

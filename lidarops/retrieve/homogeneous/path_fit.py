@@ -135,7 +135,8 @@ def fit_homogeneous_path(
     -----
     direct
         The least-squares solution by Newton steps over the bins, with background and amplitude
-        eliminated (variable projection, golub1973), from the best of 24 extinctions.
+        eliminated (variable projection, golub1973), from the best of every third of 24 extinctions
+        and its neighbours.
     cubic
         The background of `lidarops.retrieve.background.cubic` (bobrovsky2024, equations (8) and
         (12) to (16), corrected there),

@@ -15,8 +15,8 @@ from lidarops.retrieve.multiangle import _smoothing
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _COMPUTED: Final = 48
-"""Most differences that are computed, not interpolated: factors on errors change by less than 1
-percent."""
+"""Most differences that are computed, not interpolated: factors on errors become up to 2 percent
+smaller, beside a gap up to 14."""
 
 
 @dataclass(frozen=True, slots=True)
