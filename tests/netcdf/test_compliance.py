@@ -29,9 +29,10 @@ SHAPES: dict[str, dict[str, Any]] = {
 
 def missing(kind: str) -> xr.Dataset:
     data = MAKERS[kind](zenith=90.0)
-    data["quality_flag"][:] = int(Quality.INPUT_MISSING)
-    for variable in data.data_vars.values():
-        if variable.dtype.kind == "f":
+    for name, variable in data.data_vars.items():
+        if str(name).endswith("quality_flag"):
+            variable[...] = int(Quality.INPUT_MISSING)
+        elif variable.dtype.kind == "f":
             variable[...] = np.nan
     return data
 

@@ -94,16 +94,17 @@ def test_cf_xarray_finds_axes_bounds_and_flags(product: Path):
         assert opened.cf.axes["T"] == ["time"]
         # Only one latitude is that of the values.
         assert len(opened.cf.standard_names["latitude"]) == 1
-        flags = opened.cf["quality_flag"]
-        known = flags.attrs["flag_meanings"].split()
-        for bit in known:
-            expected = (
-                flags.to_numpy() & int(flags_of(opened.attrs["lidarops_kind"]).named(bit))
-            ) != 0
-            np.testing.assert_array_equal((flags.cf == bit).to_numpy(), expected)
-        usable = opened.cf["aggregate_quality_flag"]
-        np.testing.assert_array_equal(usable.cf == "do_not_use", usable == 2)
-        np.testing.assert_array_equal(usable.cf <= "use_with_care", usable <= 1)
+        # One variable of flags, and one of what they say, for each quantity that has its own.
+        for name in opened.cf.standard_names["quality_flag"]:
+            flags = opened[name]
+            for bit in flags.attrs["flag_meanings"].split():
+                place = int(flags_of(opened.attrs["lidarops_kind"]).named(bit))
+                expected = (flags.to_numpy() & place) != 0
+                np.testing.assert_array_equal((flags.cf == bit).to_numpy(), expected)
+        for name in opened.cf.standard_names["aggregate_quality_flag"]:
+            usable = opened[name]
+            np.testing.assert_array_equal(usable.cf == "do_not_use", usable == 2)
+            np.testing.assert_array_equal(usable.cf <= "use_with_care", usable <= 1)
 
 
 def test_xarray_opens_many_days_at_once(product: Path, tmp_path: Path):
