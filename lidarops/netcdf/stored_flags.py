@@ -98,7 +98,9 @@ def flags_names(product: xr.Dataset) -> list[str]:
 
 def all_bits(product: xr.Dataset) -> tuple[StoredBit, ...]:
     """Return the bits of all variables of flags of a product, rising."""
-    found = {bit.mask: bit for name in flags_names(product) for bit in bits_of(product, name)}
+    every = [bit for name in flags_names(product) for bit in bits_of(product, name)]
+    # A bit that one variable does not name may be of another.
+    found = {bit.mask: bit for bit in sorted(every, key=lambda bit: bit.severity is not None)}
     return tuple(bit for _, bit in sorted(found.items()))
 
 
