@@ -27,7 +27,7 @@ from lidarops.figures.panels import (
 from lidarops.figures.series_data import require
 from lidarops.figures.wording import counted, utc
 from lidarops.netcdf.stored_flags import flags_names, judge
-from lidarops.netcdf.variables import QUALITY_FLAG, judging
+from lidarops.netcdf.variables import judging, possible_judges
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -76,7 +76,7 @@ def profile_view(name: str, quantities: Sequence[ProfileQuantity], along: str) -
     """Return the view of the clearest profile of a product; the first quantity is the main one."""
     dims = _dims(quantities, along)
     more = tuple(f"{one.name}_{part}" for one in quantities for part in one.more_errors)
-    flags = QUALITY_FLAG, *(f"{one.name}_{QUALITY_FLAG}" for one in quantities)
+    flags = dict.fromkeys(flags for one in quantities for flags in possible_judges(one.name))
     read = partial(_read, quantities, along, dims, more)
     return View(name, (*dims, *more, *flags), read, partial(_draw, quantities, along), first=True)
 
