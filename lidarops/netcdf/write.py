@@ -5,10 +5,10 @@ grow with the file. Their order depends on the data only, not on how many rows c
 
 Chunks are shuffled and deflated here, faster than HDF5 does, in the format of its filters `shuffle`
 and `deflate`, so any NetCDF reader can read them. The whole writing of a `signal` product of one
-real day, from values in memory to the digest of the file, is about 3.4 times faster than with
-HDF5's own filters at level 4 of zlib (files are 4 to 7 % larger), and about 2.4 times faster than
-at level 1 (files are 3 to 4 % smaller). Measured on one channel of Pilar (8.5 MB of values) and one
-of Manaus (8.1 MB), as medians of five paired repeats; CPU times have the same ratios.
+real day, from values in memory to the digest of the file, takes 2.4 times less CPU than with HDF5's
+own filters at level 4 of zlib (files are 5 % larger), and 2 times less than at level 1 (files are
+5 % smaller): one channel of Pilar (8.5 MB of values), medians of five paired repeats. ISA-L is
+faster, but rarely gives other bytes for the same data.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import math
 import os
 import secrets
 import unicodedata
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ import h5py
 import netCDF4
 import numpy as np
 import xarray as xr
-from isal import isal_zlib
+from deflate import zlib_compress
 from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
@@ -54,13 +53,8 @@ _OTHER_DIMENSION: Final = "_nc4_non_coord_"
 _Array = NDArray[Any]
 _Format = Literal["NETCDF4", "NETCDF4_CLASSIC"]
 
-_LEVEL: Final = 2
-"""Compression level of ISA-L, 0 to 3. Level 1 is hardly faster and compresses less; 3 is slow."""
-
-_SMALL_LEVEL: Final = 4
-"""Compression level of zlib for small chunks, as netCDF would deflate them."""
-_SMALL: Final = 1 << 13
-"""Bytes up to which zlib is faster than ISA-L, which takes longer to begin."""
+_LEVEL: Final = 1
+"""Compression level of libdeflate, 1 to 12; level 2 takes a sixth longer for 5 % smaller files."""
 
 Offset = tuple[int, ...]
 
@@ -77,8 +71,8 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     """Write an encoded dataset that is in memory.
 
     The file appears under its name when it is complete and on disk, or not at all; a former file
-    stays until then. Equal datasets give equal bytes with equal versions of netCDF4, h5py, isal
-    and zlib on one processor architecture. Thread-safe, unlike netCDF4.
+    stays until then. Equal datasets give equal bytes with equal versions of netCDF4, h5py and
+    libdeflate on one processor architecture. Thread-safe, unlike netCDF4.
 
     Parameters
     ----------
@@ -541,8 +535,7 @@ def deflate_chunks(
 ) -> Iterator[tuple[Offset, bytes]]:
     """Cut an array into chunks, and shuffle and deflate each.
 
-    Equal values give equal bytes, with one version of ISA-L and zlib and one architecture of
-    processor.
+    Equal values give equal bytes, with one version of libdeflate.
 
     Parameters
     ----------
@@ -571,14 +564,7 @@ def deflate_chunks(
 
 
 def _deflate(part: NDArray[Any]) -> bytes:
-    if part.nbytes <= _SMALL:
-        return zlib.compress(b"".join(map(bytes, _planes(part))), _SMALL_LEVEL)
-    compressor = isal_zlib.compressobj(_LEVEL)
-    pieces: list[bytes] = []
-    for plane in _planes(part):
-        # Byte planes have different statistics and share no repeated strings.
-        pieces += compressor.compress(plane), compressor.flush(isal_zlib.Z_FULL_FLUSH)
-    return b"".join((*pieces, compressor.flush()))
+    return bytes(zlib_compress(b"".join(map(bytes, _planes(part))), _LEVEL))
 
 
 def _planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:
