@@ -2,19 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 # First of all, it sets the number of threads.
 from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_rows
 
-from benchmarks.harness.results import Effort  # isort: skip
-from benchmarks.registry import run_benchmark  # isort: skip
+# isort: split
+from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle, network
+from benchmarks.harness.results import Effort, Study
+from benchmarks.harness.timing import cpu_seconds
+from benchmarks.stability import study
+from benchmarks.throughput import campaigns, memory, raman_night, readers, retrievals
+from lidarops.errors import CampaignError
 
 app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
+BENCHMARKS: Final[dict[str, dict[str, Callable[[Effort], Study]]]] = {
+    "accuracy": {
+        "all": all_retrievals.measure_all,
+        "elastic": elastic.measure_elastic_accuracy,
+        "homogeneous": homogeneous.measure_homogeneous,
+        "multiangle": multiangle.measure_multiangle,
+        "network": network.measure_network,
+    },
+    "throughput": {
+        "homogeneous": retrievals.measure_solvers,
+        "campaigns": campaigns.measure_campaigns,
+        "memory": memory.measure_memory,
+        "raman": raman_night.measure_raman,
+        "reader": readers.measure_readers,
+    },
+    "stability": study.CASES,
+}
+"""Benchmarks by what they measure and case; the first case is the default."""
+_OPTIONS: Final = {
+    "data": {"accuracy elastic", "accuracy all"},
+    "files": {"throughput reader"},
+    "repeats": {"throughput homogeneous", "throughput raman", "throughput reader"},
+}
+"""Options of a few benchmarks only."""
 
 
 @command(program=app)
@@ -26,8 +57,8 @@ def main(
     case: Annotated[
         str | None,
         typer.Option(
-            help="all, archive, campaigns, elastic, homogeneous, memory, multiangle, network, "
-            "raman or reader."
+            help="all, campaigns, elastic, homogeneous, memory, multiangle, network, raman or "
+            "reader."
         ),
     ] = None,
     data: Annotated[
@@ -62,24 +93,50 @@ def main(
     """
     today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as bar:
-        effort = Effort(quick=quick, repeats=repeats, date=today, progress=bar.advance)
-        study = run_benchmark(what, case, files or [], effort, data=data)
-    page = None if out is None else study.write(Path(out))
+        effort = Effort(quick, repeats, today, bar.advance, data, files or [])
+        measured = measure(what, case, effort)
+    page = None if out is None else measured.write(Path(out))
     if as_json:
-        typer.echo(study.json())
+        typer.echo(measured.json())
     else:
-        for results in study.results:
+        for results in measured.results:
             if not results.folded:
                 table = results.table
                 show_rows(results.title, table.columns, table.itertuples(index=False, name=None))
         if page is not None:
             typer.echo(f"report: {page}")
-    for target in study.missed:
+    for target in measured.missed:
         typer.echo(f"missed: {target}", err=True)
-    for target in study.unnamed:
+    for target in measured.unnamed:
         typer.echo(f"missed, and not named in reasons.json: {target}", err=True)
-    if study.missed:
+    if measured.missed:
         raise typer.Exit(1)
+
+
+def measure(what: str, case: str | None, effort: Effort) -> Study:
+    """Run a benchmark, and measure its CPU time.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such benchmark, or it has no such option.
+    RawFormatError
+        If the reader gets no file, or one that cannot be read.
+    """
+    if what not in BENCHMARKS:
+        raise CampaignError(f"no benchmark {what!r}", remedy=f"choose: {' or '.join(BENCHMARKS)}")
+    cases = BENCHMARKS[what]
+    case = case or ("reader" if effort.files else next(iter(cases)))
+    if case not in cases:
+        raise CampaignError(f"no case {case!r} of {what}", remedy=f"choose: {' or '.join(cases)}")
+    for option, places in _OPTIONS.items():
+        if getattr(effort, option) and f"{what} {case}" not in places:
+            raise CampaignError(
+                f"is no option of {what} {case}", field=option,
+                remedy=f"leave it out, or choose: {' or '.join(sorted(places))}",
+            )  # fmt: skip
+    begin = cpu_seconds()
+    return replace(cases[case](effort), cpu_seconds=cpu_seconds() - begin)
 
 
 if __name__ == "__main__":

@@ -39,8 +39,8 @@ _BIN_WIDTH: Final = 15.0
 RANGE: Final = bin_centres(1005, _BIN_WIDTH)
 _CELLS: Final = 9
 """Cells of a bin, over which the optical depth is summed."""
-LEVELS: Final = tuple(10.0**power for power in range(9))
-"""Backgrounds in counts per bin and shot."""
+DECADES: Final = (2, 5)
+"""Compared backgrounds: powers of 10, in counts per bin and shot."""
 CLEAN_FROM: Final = 6000.0
 """m; no particles above."""
 OVERLAP: Final = 400.0
@@ -90,16 +90,7 @@ class SimulatedSky:
     def counts(self, level: float, draws: int, *seed: int) -> Array:
         """Return noisy profiles, mean counts of `SHOTS` shots; equal seeds give equal noise.
 
-        Parameters
-        ----------
-        level : float
-            Background in counts per shot.
-        draws : int
-        *seed : int
-
-        Returns
-        -------
-        (draw, range) float
+        (draw, range), of a signal above a background of `level` counts per shot.
         """
         rng = np.random.default_rng([_SEED, *seed])
         mean = np.broadcast_to(SHOTS * (self.signal + level), (draws, self.range.size))
@@ -147,10 +138,7 @@ def clean_signal(
     """
     cells = bin_centres(_CELLS * RANGE.size, _BIN_WIDTH / _CELLS)
     signal = backscatter_signal(
-        cells,
-        extinction=extinction(cells),
-        backscatter=backscatter(cells),
-        system_constant=1.0,
+        cells, extinction=extinction(cells), backscatter=backscatter(cells), system_constant=1.0
     )
     return signal[_CELLS // 2 :: _CELLS]
 
@@ -199,8 +187,8 @@ def background_methods() -> dict[str, BackgroundMethod]:
         KNOWN_SHAPE: _known_shape,
         KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
         TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
-        HOMOGENEOUS: _homogeneous,
-        "cubic": _cubic,
+        HOMOGENEOUS: partial(_above_aerosol, path_fit.fit_homogeneous_path),
+        "cubic": partial(_above_aerosol, cubic_and_tail.cubic),
     }
 
 
@@ -212,32 +200,19 @@ def _known_shape(
     )
 
 
-def _homogeneous(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+def _above_aerosol(
+    fit: Callable[..., HomogeneousResult | BackgroundResult], counts: Array, sky: SimulatedSky
+) -> BackgroundEstimates:
     far = sky.range >= CLEAN_FROM
     variance = 1.0 / count_weight(counts[:, far])
-    fit = path_fit.fit_homogeneous_path(counts[:, far], sky.range[far], variance=variance)
-    return _estimates(fit)
-
-
-def _cubic(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
-    far = sky.range >= CLEAN_FROM
-    return _estimates(
-        cubic_and_tail.cubic(
-            counts[:, far],
-            sky.range[far],
-            variance=1.0 / count_weight(counts[:, far]),
-        )
-    )
+    return _estimates(fit(counts[:, far], sky.range[far], variance=variance))
 
 
 def _estimates(
     result: KnownShapeResult | HomogeneousResult | BackgroundResult,
 ) -> BackgroundEstimates:
-    return BackgroundEstimates(
-        result.background,
-        result.background_standard_error,
-        (result.quality & rejecting(Quality)) != 0,
-    )
+    rejected = (result.quality & rejecting(Quality)) != 0
+    return BackgroundEstimates(result.background, result.background_standard_error, rejected)
 
 
 def least_error(sky: SimulatedSky, level: float) -> float:
@@ -269,9 +244,9 @@ def count_variance(counts: Array) -> Array:
     return np.maximum(counts, 1.0 / SHOTS) / SHOTS
 
 
-def subtract_background(counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates) -> Array:
+def subtract_background(counts: Array, sky: SimulatedSky, background: Array) -> Array:
     """Return counts without background; NaN in bins that the inversion does not use."""
-    return np.where(sky.inverted, counts - estimates.background[:, np.newaxis], np.nan)
+    return np.where(sky.inverted, counts - background[:, np.newaxis], np.nan)
 
 
 def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> Mask:
@@ -290,14 +265,9 @@ def choose_window(
 ) -> reference_window.ReferenceWindow:
     """Return the reference windows chosen from the candidates."""
     return reference_window.choose_reference(
-        power,
-        sky.range,
-        noise,
-        molecular_attenuated=sky.shape,
-        candidates=candidates,
-        background_standard_error=np.nan_to_num(background_error),
-        exclude=exclude,
-    )
+        power, sky.range, noise, molecular_attenuated=sky.shape, candidates=candidates,
+        background_standard_error=np.nan_to_num(background_error), exclude=exclude,
+    )  # fmt: skip
 
 
 def invert_particles(
@@ -308,17 +278,17 @@ def invert_particles(
     noise: Array | None = None,
     background_error: npt.ArrayLike = 0.0,
     reference_error: npt.ArrayLike = 0.0,
+    assumed_errors: tuple[float, float] = (0.0, 0.0),
 ) -> inversion.ElasticResult:
-    """Invert with the true lidar ratio and air."""
+    """Invert with the lidar ratio and air of the simulation, and their stated relative errors."""
+    ratio_error, air_error = assumed_errors
     return inversion.invert_elastic(
-        power,
-        sky.range,
-        air=inversion.Air(sky.molecular_backscatter, sky.molecular_extinction),
-        lidar_ratio=inversion.LidarRatio(LIDAR_RATIO),
+        power, sky.range,
+        air=inversion.Air(sky.molecular_backscatter, sky.molecular_extinction, air_error),
+        lidar_ratio=inversion.LidarRatio(LIDAR_RATIO, ratio_error * LIDAR_RATIO),
         reference=inversion.Reference(edges, relative_error=reference_error),
-        variance=noise,
-        background_standard_error=background_error,
-    )
+        variance=noise, background_standard_error=background_error,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,44 +303,29 @@ class Chain:
     """Whether particles that noise hides in a window are stated as error of the reference."""
 
 
-def chains() -> dict[str, Chain]:
-    """Return the chains by name."""
-    return {
-        "window given": Chain(KNOWN_SHAPE),
-        "window chosen": Chain(KNOWN_SHAPE, choose=True),
-        "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=True),
-        "tail_mean, given": Chain(TAIL_MEAN),
-    }
+CHAINS: Final = {
+    "window given": Chain(KNOWN_SHAPE),
+    "window chosen": Chain(KNOWN_SHAPE, choose=True),
+    "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=True),
+    "tail_mean, given": Chain(TAIL_MEAN),
+}
 
 
 def invert(
     counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates, chain: Chain
 ) -> inversion.ElasticResult:
-    """Return the particles of profiles.
-
-    Parameters
-    ----------
-    counts : (profile, range) float
-    sky : SimulatedSky
-    estimates : BackgroundEstimates
-        From the method of the chain.
-    chain : Chain
-    """
-    power, noise = subtract_background(counts, sky, estimates), count_variance(counts)
+    """Return the particles of (profile, range) counts, given backgrounds by the chain's method."""
+    power = subtract_background(counts, sky, estimates.background)
+    noise, error = count_variance(counts), estimates.standard_error
     edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
     hidden: npt.ArrayLike = 0.0
     if chain.choose:
         clouds = find_clouds(power, noise, sky)
-        window = choose_window(power, noise, sky, clouds, background_error=estimates.standard_error)
+        window = choose_window(power, noise, sky, clouds, background_error=error)
         edges = window.edges
         hidden = window.undetected_particles if chain.carried else 0.0
     return invert_particles(
-        power,
-        sky,
-        edges,
-        noise=noise,
-        background_error=estimates.standard_error,
-        reference_error=hidden,
+        power, sky, edges, noise=noise, background_error=error, reference_error=hidden
     )
 
 
@@ -418,11 +373,9 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
     files = sorted(Path(folder).glob("background_1e*.licel"))
     if not files:
         raise CampaignError(
-            "holds no files background_1e*.licel",
-            file=folder,
-            field="data",
+            "holds no files background_1e*.licel", file=folder, field="data",
             remedy="give the folder of the intercomparison, or leave it out",
-        )
+        )  # fmt: skip
     published = []
     table = folder / "molecular_profile_hPa.csv"
     try:
@@ -441,12 +394,9 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
     for level, file in sorted(zip(levels, files, strict=True)):
         counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
         truth = known_shape.fit_known_shape(
-            counts,
-            sky.range,
-            sky.signal,
-            variance=(sky.signal + level) / SHOTS,
+            counts, sky.range, sky.signal, variance=(sky.signal + level) / SHOTS,
             start=sky.range[_FIRST_TRUE_BIN],
-        )
+        )  # fmt: skip
         values = (float(truth.background), float(truth.background_standard_error))
         published.append(Published(level, counts[np.newaxis], *values))
     return sky, published
@@ -456,9 +406,7 @@ def _raw_counts(file: Path) -> Array:
     counts = licel.read_counts(file, [_CHANNEL])[1][_CHANNEL].astype(np.float64)
     if counts.size != RANGE.size or not counts.max() > 0:
         raise RawFormatError(
-            f"holds {counts.size} bins with a maximum of {counts.max():g}",
-            file=file,
-            field=_CHANNEL,
-            remedy=f"give a file of the intercomparison, of {RANGE.size} bins",
-        )
+            f"holds {counts.size} bins with a maximum of {counts.max():g}", file=file,
+            field=_CHANNEL, remedy=f"give a file of the intercomparison, of {RANGE.size} bins",
+        )  # fmt: skip
     return counts

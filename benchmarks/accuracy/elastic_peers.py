@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from benchmarks.accuracy.elastic_cases import (
     CLEAN_FROM,
@@ -18,6 +19,7 @@ from benchmarks.harness.figure import Array
 
 LINEAR: Final = "least squares {1, shape}"
 """The range from 6 km is given, and the weights are those of the mean profile."""
+KLETT: Final = "Klett, numpy"
 
 
 def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
@@ -32,25 +34,23 @@ def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     return BackgroundEstimates(background, error, np.zeros(len(counts), dtype=np.bool_))
 
 
-def klett_numpy(power: Array, sky: SimulatedSky) -> Array:
-    """Return the backscatter of particles profile by profile, without errors.
+def klett_numpy(counts: Array, sky: SimulatedSky) -> Array:
+    """Return the backscatter of particles without errors, by the background of the peer.
 
     fernald1984, backward and forward from the middle of `GIVEN_WINDOW`, by trapezoids.
     """
+    power = counts - linear_backgrounds(counts, sky).background[:, np.newaxis]
     inside = np.flatnonzero((sky.range >= GIVEN_WINDOW[0]) & (sky.range <= GIVEN_WINDOW[1]))
     start = inside[inside.size // 2]
-    excess = sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter
-    backscatter = np.empty(power.shape)
-    for row, profile in enumerate(power):
-        depth = _cumulated(excess, sky.range)
-        corrected = profile * sky.range**2 * np.exp(2.0 * (depth - depth[start]))
-        integral = _cumulated(LIDAR_RATIO * corrected, sky.range)
-        ratio = np.mean(corrected[inside] / sky.molecular_backscatter[inside])
-        total = corrected / (ratio - 2.0 * (integral - integral[start]))
-        backscatter[row] = total - sky.molecular_backscatter
-    return backscatter
+    depth = _from(start, sky.molecular_extinction - LIDAR_RATIO * sky.molecular_backscatter, sky)
+    corrected = power * sky.range**2 * np.exp(2.0 * depth)
+    integral = _from(start, LIDAR_RATIO * corrected, sky)
+    ratio = np.mean(corrected[:, inside] / sky.molecular_backscatter[inside], axis=1)
+    total = corrected / (ratio[:, np.newaxis] - 2.0 * integral)
+    return np.asarray(total - sky.molecular_backscatter)
 
 
-def _cumulated(values: Array, distance: Array) -> Array:
-    slices = 0.5 * (values[1:] + values[:-1]) * np.diff(distance)
-    return np.concatenate([[0.0], np.cumsum(slices)])
+def _from(start: int, values: Array, sky: SimulatedSky) -> Array:
+    """Return the integral over range from a bin."""
+    integral = cumulative_trapezoid(values, sky.range, initial=0.0)
+    return np.asarray(integral - integral[..., start : start + 1])

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
 
+from benchmarks.accuracy.comparison import (
+    BIAS,
+    COVERAGE,
+    RMSE,
+    comparison,
+    score_errors,
+    time_profiles,
+)
 from benchmarks.accuracy.homogeneous_cases import (
     BACKGROUND,
     QUANTITIES,
     TAIL_MEAN,
     PathSolver,
     Scenario,
-    background_bias,
-    least_errors,
     methods,
     scenarios,
 )
 from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
 from benchmarks.harness.figure import Figure, cpu_time, share
-from benchmarks.harness.plots import Chart
-from benchmarks.harness.results import Chapter, Effort, Results, Study, Work, frame
-from benchmarks.harness.statistics import TWO_SIDED, mean, root, share_inside
+from benchmarks.harness.results import Effort, Results, Study, Work
+from benchmarks.harness.statistics import mean_by_block
 from benchmarks.harness.timing import CPU_TIME
 from benchmarks.harness.verdicts import Score, Scores
 from lidarops.retrieve.background.cubic_and_tail import cubic
@@ -37,7 +43,14 @@ _ROUNDS: Final = 3
 """Timed calls, of which the least counts: others share the processor."""
 _INFORMED: Final = frozenset({"linearized", "known_background", "known_extinction"})
 """Methods that are given more than the profile."""
-_RMSE: Final = "RMSE over bound"
+_NOTE: Final = (
+    "Paths of 225 bins through white noise, from 2.5 or 10.5 km over 1.7 or 8 km, extinction 0.01 "
+    "to 5 per km, signal 15 to 100 000 times the noise. The bound is the inverse Fisher matrix of "
+    "background, amplitude and extinction. Profiles that a method rejects do not count for its "
+    "error. The iterative peers start from the fit of the mean of 64 profiles, and test no "
+    "residuals. Median over the paths of the RMSE over the bound; RMSE and bias of the worst path; "
+    "mean shares of flagged and rejected profiles."
+)
 
 
 def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study:
@@ -59,46 +72,19 @@ def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study
             rounds = 1 if name in SLOW else _ROUNDS
             scores[name].append(score_path(solver, scenario, power[:few], rounds))
         effort.progress(1)
-    summary = _summary(scores)
-    peers = {*iterative_peers(), TAIL_MEAN}
-    return Study(
-        "Homogeneous path: error against the Cramér-Rao bound",
-        effort.date,
-        [
-            Chapter(
-                "Error against time",
-                "Paths of 225 bins through white noise, from 2.5 or 10.5 km over 1.7 or 8 km, "
-                "extinction 0.01 to 5 per km, signal 15 to 100 000 times the noise. The bound is "
-                "the inverse Fisher matrix of background, amplitude and extinction. Profiles that "
-                "a method rejects do not count for its error. The iterative peers start from the "
-                "fit of the mean of 64 profiles, and test no residuals.",
-                [
-                    Results(
-                        "All paths",
-                        summary,
-                        "Median over the paths of the RMSE over the bound; RMSE and bias of the "
-                        "worst path; least and largest coverage of the 95 percent interval; mean "
-                        "shares of flagged and rejected profiles. In brackets the Monte Carlo "
-                        "standard error in the last digits.",
-                        case="error of",
-                    )
-                ],
-                [
-                    Chart(
-                        "work-precision",
-                        "RMSE over bound against CPU time",
-                        "Hollow: peers, and methods that know more than the profile.",
-                        frame(summary),
-                        _RMSE,
-                        peers | _INFORMED,
-                        level=1.0,
-                    )
-                ],
-            ),
-            _offsets_chapter(published_offsets(count)),
-        ],
-        list(_works(scores, peers)),
+    offsets = Results(
+        "Mean error of the background, in units of the noise of one profile",
+        published_offsets(count),
+        "Tables 1 and 2 of bobrovsky2024 give a background that decreases with the length of the "
+        "section. This is due to noise: with a lag of one bin and no correction for the noise, the "
+        "cubic counts part of the signal as background, however many profiles are averaged. The "
+        "remaining error of the direct fit is the bias of all least-squares solutions to second "
+        "order in the noise; averaging removes it. Mean error and, in brackets, its standard "
+        "error: of the cubic with a lag of one bin, and of the direct fit with its scatter.",
+        case="section",
+        method="mean of",
     )
+    return comparison("homogeneous path", effort, list(_works(scores)), _NOTE, [offsets])
 
 
 def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int = 1) -> Score:
@@ -113,74 +99,56 @@ def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int =
         Timed calls.
     """
     solver(power[:_WARM], scenario)
-    seconds = []
-    for _ in range(rounds):
-        begin = time.process_time()
-        solution = solver(power, scenario)
-        seconds.append(time.process_time() - begin)
-    least = least_errors(scenario)
+    spent, solution = time_profiles(partial(solver, power, scenario), len(power), rounds)
     score: Score = {
-        "profiles": len(power),
         "flagged": share(float(solution.flagged.mean())),
         "rejected": share(float(solution.rejected.mean())),
-        CPU_TIME: cpu_time(1e9 * min(seconds) / len(power)),
+        CPU_TIME: spent,
     }
+    least = scenario.least_errors()
     for name in QUANTITIES:
-        error = (solution.values[name] - scenario.truth[name]) / least[name]
+        error = (solution.values[name] - getattr(scenario, name)) / least[name]
         stated = solution.standard_errors[name] / least[name]
         kept = np.isfinite(error) & ~solution.rejected
         # A value that is given has no score.
         if kept.sum() >= 2 and np.any(stated[kept] > 0):
-            error, stated = error[kept], stated[kept]
-            score[f"{name}: RMSE"] = root(mean(error**2))
-            score[f"{name}: bias"] = mean(error)
-            score[f"{name}: 95 %"] = share_inside(np.abs(error) <= TWO_SIDED * stated)
+            errors = score_errors(error, stated, kept)
+            score |= {f"{name}: {quantity}": figure for quantity, figure in errors.items()}
     return score
+
+
+def _works(scores: dict[str, list[Score]]) -> Iterator[Work]:
+    """Yield the errors of extinction on all paths together."""
+    for method, paths in scores.items():
+        errors = _ranked(paths, f"extinction: {RMSE}")
+        if errors:
+            half = len(errors) // 2
+            times = [figure.value for figure in _ranked(paths, CPU_TIME)]
+            shares = {name: _ranked(paths, name) for name in ("flagged", "rejected")}
+            yield Work(
+                f"median of {len(paths)} paths",
+                "extinction, RMSE over the Cramér-Rao bound",
+                method,
+                errors[half],
+                _ranked(paths, f"extinction: {COVERAGE}")[half],
+                cpu_time(float(np.median(times))),
+                ours=method not in {*iterative_peers(), TAIL_MEAN},
+                informed=method in _INFORMED,
+                more={
+                    "worst": errors[-1],
+                    BIAS: max(_ranked(paths, f"extinction: {BIAS}"), key=lambda f: abs(f.value)),
+                    **{
+                        name: share(float(np.mean([figure.value for figure in figures])))
+                        for name, figures in shares.items()
+                    },
+                },
+            )
 
 
 def _ranked(paths: Sequence[Score], quantity: str) -> list[Figure]:
     """Return the figures of a quantity on all paths that have one, the smallest first."""
     figures = [score[quantity] for score in paths if quantity in score]
-    return sorted((f for f in figures if isinstance(f, Figure)), key=lambda figure: figure.value)
-
-
-def _median(figures: Sequence[Figure]) -> float:
-    return float(np.median([figure.value for figure in figures]))
-
-
-def _summary(scores: dict[str, list[Score]]) -> Scores:
-    """Return the scores of all paths together, by unknown and method."""
-    summary: Scores = {}
-    for quantity in QUANTITIES:
-        for method, paths in scores.items():
-            errors = _ranked(paths, f"{quantity}: RMSE")
-            line: Score = {"solved": "all" if len(errors) == len(paths) else f"{len(errors):,}"}
-            if errors:
-                coverage = _ranked(paths, f"{quantity}: 95 %")
-                bias = max(_ranked(paths, f"{quantity}: bias"), key=lambda each: abs(each.value))
-                line |= {_RMSE: errors[len(errors) // 2], "worst": errors[-1], "bias": bias}
-                line |= {"95 %": coverage[0], "to": coverage[-1]}
-            for name in ("flagged", "rejected"):
-                line[name] = share(float(np.mean([each.value for each in _ranked(paths, name)])))
-            line[CPU_TIME] = cpu_time(_median(_ranked(paths, CPU_TIME)))
-            summary[quantity.replace("_", " "), method] = line
-    return summary
-
-
-def _works(scores: dict[str, list[Score]], peers: set[str]) -> Iterator[Work]:
-    for method, paths in scores.items():
-        errors = _ranked(paths, "extinction: RMSE")
-        if errors:
-            yield Work(
-                f"median of {len(paths)} paths",
-                "extinction, RMSE over the Cramér-Rao bound",
-                method,
-                errors[len(errors) // 2],
-                _ranked(paths, "extinction: 95 %")[len(errors) // 2],
-                cpu_time(_median(_ranked(paths, CPU_TIME))),
-                ours=method not in peers,
-                informed=method in _INFORMED,
-            )
+    return sorted(figures, key=lambda figure: figure.value)
 
 
 # Background of the published cubic ------------------------------------------------------------
@@ -200,27 +168,26 @@ def published_offsets(count: int) -> Scores:
     The tables do not state the signal. A signal of 17 times the noise at 2.5 km, bins of 15 m and
     an extinction of 0.03 km-1 reproduce the decrease of the published background with length.
     """
-    fade = np.exp(-2 * _PAPER_EXTINCTION * (10500.0 - 2500.0)) * (2500.0 / 10500.0) ** 2
-    signals = {2500.0: _PAPER_SIGNAL, 10500.0: float(_PAPER_SIGNAL * fade)}
     sections = [(start, length) for start, lengths in _PAPER_LENGTHS for length in lengths]
     scores: Scores = {}
-    for averaged in (1, _AVERAGED):
-        # The mean of white noise is white noise: powers in units of its standard deviation.
-        scale = float(np.sqrt(averaged))
-        for seed, (start, length) in enumerate(sections):
-            path = Scenario(
-                start,
-                length,
-                _PAPER_EXTINCTION,
-                signals[start] * scale,
-                background=BACKGROUND * scale,
-                bins=round(length / _PAPER_STEP) + 1,
-            )
-            score = _offset(path, path.powers(count, seed), scale)
-            if start < 5e3:
-                score["published"] = _PUBLISHED.get(length)
-            scores[f"{start / 1e3:g} + {length / 1e3:g} km", f"{averaged}"] = score
+    for averaged, (seed, (start, length)) in product((1, _AVERAGED), enumerate(sections)):
+        path = published_path(start, length, averaged)
+        score = _offset(path, path.powers(count, seed), averaged**0.5)
+        if start < 5e3:
+            score["published"] = _PUBLISHED.get(length)
+        scores[f"{start / 1e3:g} + {length / 1e3:g} km", f"{averaged}"] = score
     return scores
+
+
+def published_path(start: float, length: float, averaged: int) -> Scenario:
+    """Return a section of the published tables, whose profiles are means of so many."""
+    away = start - _PAPER_LENGTHS[0][0]
+    fade = np.exp(-2 * _PAPER_EXTINCTION * away) * (_PAPER_LENGTHS[0][0] / start) ** 2
+    # The mean of white noise is white noise: powers in units of its standard deviation.
+    scale = averaged**0.5
+    bins = round(length / _PAPER_STEP) + 1
+    signal = float(_PAPER_SIGNAL * fade) * scale
+    return Scenario(start, length, _PAPER_EXTINCTION, signal, BACKGROUND * scale, bins)
 
 
 def _offset(path: Scenario, power: Any, scale: float) -> Score:
@@ -228,33 +195,13 @@ def _offset(path: Scenario, power: Any, scale: float) -> Score:
     published = cubic(power, path.range, lag=1, variance=0.0).background
     solution = methods()[HomogeneousMethod.DIRECT](power, path)
     background = solution.values["background"]
+    errors = {"lag 1": published - path.background, "direct": background - path.background}
     return {
         "length of the section (km)": path.length / 1e3,
-        "lag 1": mean((published - path.background) / scale),
-        "direct": mean((background - path.background) / scale),
+        **{
+            name: mean_by_block(error / scale, np.isfinite(error), 1)
+            for name, error in errors.items()
+        },
         "scatter": float(np.nanstd(background)) / scale,
-        "expected": background_bias(path) / scale,
         "flagged": share(float(solution.flagged.mean())),
     }
-
-
-def _offsets_chapter(scores: Scores) -> Chapter:
-    return Chapter(
-        "Background of the published cubic",
-        "Tables 1 and 2 of bobrovsky2024 give a background that decreases with the length of "
-        "the section. This is due to noise: with a lag of one bin and no correction for the "
-        "noise, the cubic counts part of the signal as background, however many profiles are "
-        "averaged. The remaining error of the direct fit is the bias of all least-squares "
-        "solutions to second order in the noise; averaging removes it.",
-        [
-            Results(
-                "Mean error of the background, in units of the noise of one profile",
-                scores,
-                "Mean error and, in brackets, its standard error: of the cubic with a lag of one "
-                "bin, and of the direct fit with its scatter. Expected: second-order bias "
-                "of least squares, not meaningful where it exceeds the scatter.",
-                case="section",
-                method="mean of",
-            ),
-        ],
-    )

@@ -21,11 +21,8 @@ from lidarops.simulate.signal import optical_depth
 BINS: Final = 225
 BACKGROUND: Final = 370.0
 """In standard deviations of the noise, like all powers here."""
-QUANTITIES: Final = ("extinction", "background", "log_amplitude")
-"""B is the signal extrapolated to range zero, by an optical depth of up to 100 here. Its logarithm
-is nearly normally distributed, with the relative error of B."""
-SOLVED: Final = ("extinction", "background", "amplitude")
-"""The unknowns as the solvers return them."""
+QUANTITIES: Final = ("extinction", "background")
+"""The compared unknowns; the third, the amplitude, is the signal extrapolated to range zero."""
 TAIL_MEAN: Final = "tail_mean"
 """Solver: the mean of the last tenth of the bins as the background, as is usual."""
 WRONG_PRIOR: Final = 0.8
@@ -82,17 +79,6 @@ class Scenario:
         return np.linspace(self.start, self.start + self.length, self.bins)
 
     @property
-    def amplitude(self) -> float:
-        """B of ``P = P* + B R^-2 exp(-2 extinction R)``, in m2."""
-        return float(self.signal * self.start**2 * np.exp(2 * self.extinction * self.start))
-
-    @property
-    def truth(self) -> Mapping[str, float]:
-        """Truth of the three unknowns, by name."""
-        values = (self.extinction, self.background, float(np.log(self.amplitude)))
-        return dict(zip(QUANTITIES, values, strict=True))
-
-    @property
     def mean(self) -> Array:
         """Noise-free power."""
         air = np.ones(self.bins)
@@ -112,69 +98,54 @@ class Scenario:
         noise = np.random.default_rng([_SEED, seed]).standard_normal((count, self.bins))
         return (self.mean + noise).astype(dtype)
 
+    def least_errors(self) -> dict[str, float]:
+        """Return the Cramér-Rao bound of the standard error of each of `QUANTITIES`."""
+        bounds = least_errors(self.range, self.extinction, self.signal)
+        return {name: float(bound[0]) for name, bound in bounds.items()}
 
-def least_errors(scenario: Scenario) -> dict[str, float]:
-    r"""Return the Cramér-Rao bound of the standard error of each unknown.
+    def difficulty(self) -> float:
+        """Return the least standard error of extinction over extinction + 1 / mean range."""
+        scale = self.extinction + 1.0 / float(self.range.mean())
+        return self.least_errors()["extinction"] / scale
 
-    The inverse Fisher matrix of ``(P*, B, extinction)`` with Gaussian noise of unit variance,
 
-    .. math:: F = J^T J, \quad J = [1, \; \phi, \; -2 R B \phi],
-        \quad \phi = R^{-2} e^{-2 \sigma R}
+def least_errors(
+    distance: Array, extinction: npt.ArrayLike, signal: npt.ArrayLike
+) -> dict[str, Array]:
+    r"""Return the Cramér-Rao bounds of the standard errors of paths, each (profile,).
 
-    (kay1993). It is inverted in terms of ``b = B phi`` at the mean range, where it is well
-    conditioned, and converted to log B by the exact derivatives.
+    The inverse Fisher matrix of background, signal in the first bin and extinction with Gaussian
+    noise of unit variance (kay1993),
+
+    .. math:: F = J^T J, \quad J = [1, \; \phi, \; -2 (R - R_0) S \phi],
+        \quad \phi = (R_0 / R)^2 e^{-2 \sigma (R - R_0)}
+
+    The bound of an unknown is the reciprocal norm of what its column adds to the others: the last
+    diagonal element of the triangular factor.
+
+    Parameters
+    ----------
+    distance : (bin,) float
+        m.
+    extinction, signal : (profile, 1) float
+        m-1, and the signal in the first bin over the noise.
     """
-    height, covariance = _information(scenario)[1:]
-    middle = float(scenario.range.mean())
-    gradient = np.array([0.0, 1.0 / height, 2 * middle])
-    return {
-        "extinction": float(np.sqrt(covariance[2, 2])),
-        "background": float(np.sqrt(covariance[0, 0])),
-        "log_amplitude": float(np.sqrt(gradient @ covariance @ gradient)),
-    }
-
-
-def background_bias(scenario: Scenario) -> float:
-    r"""Return the bias of the background common to all least-squares solutions.
-
-    To second order, with the inverse Fisher matrix C and the second derivatives H of the model
-    (box1971),
-
-    .. math:: -\tfrac12 \, C \sum_i J_i \, \mathrm{tr}(C H_i)
-    """
-    slopes, height, covariance = _information(scenario)
-    away = scenario.range - scenario.range.mean()
-    shape = slopes[:, 1]
-    curvature = (
-        2 * covariance[1, 2] * (-2 * away * shape) + covariance[2, 2] * 4 * height * away**2 * shape
-    )
-    return float(-0.5 * (covariance @ (slopes.T @ curvature))[0])
-
-
-def _information(scenario: Scenario) -> tuple[Array, float, Array]:
-    """Return derivatives by (P*, b, extinction), b at the mean range, and their covariance."""
-    distance = scenario.range
-    middle = float(distance.mean())
-    shape = (middle / distance) ** 2 * np.exp(-2 * scenario.extinction * (distance - middle))
-    height = scenario.amplitude * middle**-2 * np.exp(-2 * scenario.extinction * middle)
-    slopes = np.stack(
-        [np.ones_like(distance), shape, -2 * height * (distance - middle) * shape], axis=1
-    )
-    scale = np.sqrt(np.sum(slopes**2, axis=0))
-    covariance = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
-    return slopes, float(height), covariance
-
-
-def difficulty(scenario: Scenario) -> float:
-    """Return the least standard error of extinction over extinction + 1 / mean range."""
-    scale = scenario.extinction + 1.0 / float(scenario.range.mean())
-    return least_errors(scenario)["extinction"] / scale
+    depth = distance - distance[0]
+    shape = (distance[0] / distance) ** 2 * np.exp(-2.0 * np.atleast_2d(extinction) * depth)
+    slope = -2.0 * depth * signal * shape
+    last = {"extinction": (np.ones_like(shape), shape, slope),
+            "background": (shape, slope, np.ones_like(shape))}  # fmt: skip
+    bounds = {}
+    for name, columns in last.items():
+        factor = np.asarray(np.linalg.qr(np.stack(columns, -1), mode="r"))
+        bounds[name] = 1.0 / np.maximum(np.abs(factor[:, -1, -1]), np.finfo(float).tiny)
+    return bounds
 
 
 def scenarios(*, quick: bool = False) -> list[Scenario]:
-    """Return the paths of the benchmark: those with a `difficulty` of at most 0.1, or 8 of them."""
+    """Return the paths of the benchmark: those with a difficulty of at most 0.1, or 8 of them."""
     grid = product(_STARTS, _LENGTHS, _EXTINCTIONS, _AMPLITUDES)
-    solvable = [s for values in grid if difficulty(s := Scenario(*values)) <= _SOLVABLE]
+    solvable = [s for values in grid if (s := Scenario(*values)).difficulty() <= _SOLVABLE]
     if not quick:
         return solvable
     selected = np.linspace(0, len(solvable) - 1, _QUICK).round().astype(int)
@@ -183,7 +154,7 @@ def scenarios(*, quick: bool = False) -> list[Scenario]:
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """Estimates of a solver, one value per profile."""
+    """Estimates of a solver, one value per profile, by `QUANTITIES`."""
 
     values: Mapping[str, Array]
     standard_errors: Mapping[str, Array]
@@ -221,59 +192,29 @@ def methods() -> dict[str, PathSolver]:
 
 def _fit_above_tail(power: Any, scenario: Scenario) -> Estimates:
     tail = cubic_and_tail.tail_mean(power, scenario.range, variance=1.0)
-    return estimates(
-        path_fit.fit_homogeneous_path(
-            power,
-            scenario.range,
-            variance=1.0,
-            method="known_background",
-            background=tail.background,
-            background_standard_error=tail.background_standard_error,
-        )
-    )
+    fit = path_fit.fit_homogeneous_path(
+        power, scenario.range, variance=1.0, method="known_background", background=tail.background,
+        background_standard_error=tail.background_standard_error,
+    )  # fmt: skip
+    return _estimates(fit)
 
 
 def _solver(method: HomogeneousMethod) -> PathSolver:
     def solve(power: Any, scenario: Scenario) -> Estimates:
-        fit = path_fit.fit_homogeneous_path(
-            power,
-            scenario.range,
-            variance=1.0,
-            method=method.value,
-            **method_arguments(method, scenario),
+        options = method_arguments(method, scenario)
+        return _estimates(
+            path_fit.fit_homogeneous_path(
+                power, scenario.range, variance=1.0, method=method.value, **options
+            )
         )
-        return estimates(fit)
 
     return solve
 
 
-def estimates(fit: HomogeneousResult) -> Estimates:
-    """Return the estimates of a fit."""
-    return estimated(
-        {name: getattr(fit, name) for name in SOLVED},
-        {name: getattr(fit, f"{name}_standard_error") for name in SOLVED},
+def _estimates(fit: HomogeneousResult) -> Estimates:
+    return Estimates(
+        values={name: getattr(fit, name) for name in QUANTITIES},
+        standard_errors={name: getattr(fit, f"{name}_standard_error") for name in QUANTITIES},
         flagged=fit.quality != 0,
         rejected=(fit.quality & rejecting((*Quality, *HomogeneousQuality))) != 0,
-    )
-
-
-def estimated(
-    values: Mapping[str, Array],
-    standard_errors: Mapping[str, Array],
-    *,
-    flagged: Any,
-    rejected: Any,
-) -> Estimates:
-    """Return the estimates of `SOLVED`, with the logarithm of the amplitude or NaN."""
-    amplitude = values["amplitude"]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        logarithm = np.log(amplitude)
-        relative = standard_errors["amplitude"] / amplitude
-    linear = QUANTITIES[:2]
-    return Estimates(
-        values={name: values[name] for name in linear} | {"log_amplitude": logarithm},
-        standard_errors={name: standard_errors[name] for name in linear}
-        | {"log_amplitude": relative},
-        flagged=flagged,
-        rejected=rejected,
     )

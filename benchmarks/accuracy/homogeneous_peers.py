@@ -7,13 +7,14 @@ suits profiles of the same air.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Final
 
 import numba
 import numpy as np
 from scipy.optimize import curve_fit
 
-from benchmarks.accuracy.homogeneous_cases import Estimates, PathSolver, Scenario, estimated
+from benchmarks.accuracy.homogeneous_cases import Estimates, PathSolver, Scenario
 from benchmarks.harness.figure import Array
 
 KILOMETRE: Final = 1e3
@@ -29,11 +30,7 @@ _START_EXTINCTIONS: Final = np.geomspace(3e-3, 10.0, 40)
 
 def iterative_peers() -> dict[str, PathSolver]:
     """Return the iterative solvers by name."""
-    return {
-        JIT: _by_levenberg_marquardt,
-        PROJECTION: _by_projection,
-        CURVE_FIT: _by_scipy,
-    }
+    return {JIT: _by_levenberg_marquardt, PROJECTION: _by_projection, CURVE_FIT: _by_scipy}
 
 
 def start(power: Any, scenario: Scenario) -> Array:
@@ -55,13 +52,13 @@ def _by_levenberg_marquardt(power: Any, scenario: Scenario) -> Estimates:
     unknowns = np.empty((len(power), _UNKNOWNS))
     covariance = np.empty((len(power), _UNKNOWNS, _UNKNOWNS))
     fit_levenberg_marquardt(power, ratio, depth, start(power, scenario), unknowns, covariance)
-    return _estimates(unknowns, covariance, scenario)
+    return _estimates(unknowns, covariance)
 
 
 def _by_projection(power: Any, scenario: Scenario) -> Estimates:
     """Solve by `fit_variable_projection`."""
     extinction = float(start(power, scenario)[2])
-    return _estimates(*_project(power, _geometry(scenario), extinction), scenario)
+    return _estimates(*_project(power, _geometry(scenario), extinction))
 
 
 def _project(power: Any, geometry: tuple[Array, Array], extinction: float) -> tuple[Array, Array]:
@@ -91,46 +88,22 @@ def _slopes(geometry: tuple[Array, Array], _: float, signal: float, sigma: float
 def _by_scipy(power: Any, scenario: Scenario) -> Estimates:
     """Solve by `scipy.optimize.curve_fit`, profile by profile."""
     geometry, begin = _geometry(scenario), start(power, scenario)
-    noise = np.ones(scenario.bins)
-    fits = [
-        curve_fit(
-            _model,
-            geometry,
-            np.asarray(row, np.float64),
-            p0=begin,
-            sigma=noise,
-            absolute_sigma=True,
-            jac=_slopes,
-        )
-        for row in power
-    ]
+    fit = partial(
+        curve_fit, _model, geometry, p0=begin, sigma=np.ones(scenario.bins), absolute_sigma=True,
+        jac=_slopes,
+    )  # fmt: skip
+    fits = [fit(ydata=np.asarray(row, np.float64)) for row in power]
     unknowns, covariance = zip(*fits, strict=True)
-    return _estimates(np.stack(unknowns), np.stack(covariance), scenario)
+    return _estimates(np.stack(unknowns), np.stack(covariance))
 
 
-def _estimates(unknowns: Array, covariance: Array, scenario: Scenario) -> Estimates:
-    """Convert the signal at the first range to the amplitude, with its standard error."""
-    background, signal, sigma = unknowns.T
-    near = scenario.start
-    amplitude = signal * near**2 * np.exp(2.0 * sigma / KILOMETRE * near)
-    of_signal, of_extinction = 1.0 / signal, 2.0 * near / KILOMETRE
-    relative = (
-        of_signal**2 * covariance[:, 1, 1]
-        + 2.0 * of_signal * of_extinction * covariance[:, 1, 2]
-        + of_extinction**2 * covariance[:, 2, 2]
-    )
+def _estimates(unknowns: Array, covariance: Array) -> Estimates:
+    """Return the estimates in SI units."""
+    factors = {"extinction": (2, KILOMETRE), "background": (0, 1.0)}
     failed = np.asarray(~np.isfinite(unknowns).all(axis=1))
-    return estimated(
-        {
-            "extinction": sigma / KILOMETRE,
-            "background": background,
-            "amplitude": amplitude,
-        },
-        {
-            "extinction": np.sqrt(covariance[:, 2, 2]) / KILOMETRE,
-            "background": np.sqrt(covariance[:, 0, 0]),
-            "amplitude": np.abs(amplitude) * np.sqrt(relative),
-        },
+    return Estimates(
+        {name: unknowns[:, k] / unit for name, (k, unit) in factors.items()},
+        {name: np.sqrt(covariance[:, k, k]) / unit for name, (k, unit) in factors.items()},
         flagged=failed,
         rejected=failed,
     )
@@ -139,35 +112,25 @@ def _estimates(unknowns: Array, covariance: Array, scenario: Scenario) -> Estima
 # A Levenberg-Marquardt fit, one profile at a time: the usual fast solver ----------------------
 
 _UNKNOWNS: Final = 3
-_MOST: Final = 60
-"""Most iterations of a fit."""
+_MOST: Final = 200
+"""Most steps of a fit."""
 _TOLERANCE: Final = 1e-10
 """Relative decrease of the sum of squares below which a fit has converged."""
 _DAMPING: Final = 1e-3
 _LARGEST_DAMPING: Final = 1e12
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fill_shape(unknowns: Array, ratio: Array, depth: Array, shape: Array) -> None:
-    for i in range(ratio.size):
-        shape[i] = ratio[i] * np.exp(-2.0 * unknowns[2] * depth[i])
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _squares(power: Any, unknowns: Array, shape: Array) -> float:
-    total = 0.0
-    for i in range(shape.size):
-        total += (power[i] - unknowns[0] - unknowns[1] * shape[i]) ** 2
-    return total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _normal_equations(
-    power: Any, unknowns: Array, depth: Array, shape: Array, matrix: Array, side: Array
-) -> None:
-    s1 = s2 = s3 = s4 = s5 = r0 = r1 = r2 = 0.0
-    for i in range(shape.size):
-        first = shape[i]
+    power: Any, ratio: Array, depth: Array, unknowns: Array, matrix: Array, side: Array
+) -> float:
+    """Fill the normal equations at these unknowns, and return the sum of squares."""
+    s1 = s2 = s3 = s4 = s5 = r0 = r1 = r2 = squares = 0.0
+    for i in range(depth.size):
+        first = ratio[i] * np.exp(-2.0 * unknowns[2] * depth[i])
         second = -2.0 * unknowns[1] * depth[i] * first
         residual = power[i] - unknowns[0] - unknowns[1] * first
         s1 += first
@@ -178,14 +141,16 @@ def _normal_equations(
         r0 += residual
         r1 += first * residual
         r2 += second * residual
-    matrix[0, 0], matrix[1, 1], matrix[2, 2] = shape.size, s3, s5
+        squares += residual * residual
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = depth.size, s3, s5
     matrix[0, 1] = matrix[1, 0] = s1
     matrix[0, 2] = matrix[2, 0] = s2
     matrix[1, 2] = matrix[2, 1] = s4
     side[0], side[1], side[2] = r0, r1, r2
+    return squares
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _inverse(matrix: Array, damping: float, inverse: Array) -> None:
     """Invert the damped symmetric matrix by its cofactors."""
     grown = 1.0 + damping
@@ -200,50 +165,10 @@ def _inverse(matrix: Array, damping: float, inverse: Array) -> None:
     inverse /= a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fit(power: Any, ratio: Array, depth: Array, unknowns: Array, inverse: Array) -> int:
-    matrix, side = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    shape, trial_shape, trial = np.empty(ratio.size), np.empty(ratio.size), np.empty(_UNKNOWNS)
-    _fill_shape(unknowns, ratio, depth, shape)
-    squares = _squares(power, unknowns, shape)
-    if not np.isfinite(squares):
-        unknowns[:] = np.nan
-        inverse[:] = np.nan
-        return 0
-    damping = _DAMPING
-    iterations = 0
-    done = False
-    while iterations < _MOST and not done:
-        iterations += 1
-        _normal_equations(power, unknowns, depth, shape, matrix, side)
-        while True:
-            _inverse(matrix, damping, inverse)
-            for j in range(_UNKNOWNS):
-                trial[j] = unknowns[j] + np.sum(inverse[j] * side)
-            _fill_shape(trial, ratio, depth, trial_shape)
-            trial_squares = _squares(power, trial, trial_shape)
-            if trial_squares <= squares:
-                damping *= 0.1
-                break
-            damping *= 10.0
-            if damping > _LARGEST_DAMPING:
-                trial_squares = squares
-                trial[:] = unknowns
-                trial_shape[:] = shape
-                break
-        done = squares - trial_squares <= _TOLERANCE * squares
-        squares = trial_squares
-        unknowns[:] = trial
-        shape[:] = trial_shape
-    _normal_equations(power, unknowns, depth, shape, matrix, side)
-    _inverse(matrix, 0.0, inverse)
-    return iterations
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def fit_levenberg_marquardt(
     power: Any, ratio: Array, depth: Array, start: Array, unknowns: Array, covariance: Array
-) -> int:
+) -> None:
     """Fit background, signal at the start and extinction to profiles of unit variance.
 
     Parameters
@@ -259,17 +184,28 @@ def fit_levenberg_marquardt(
         Filled; NaN where a bin is not finite.
     covariance : (profile, 3, 3) float64
         Filled with the inverse normal matrix at the solution.
-
-    Returns
-    -------
-    int
-        Iterations of all profiles.
     """
-    total = 0
+    matrix, side = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
+    trial_matrix, trial_side = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
     for k in range(power.shape[0]):
-        unknowns[k] = start
-        total += _fit(power[k], ratio, depth, unknowns[k], covariance[k])
-    return total
+        solution, inverse = unknowns[k], covariance[k]
+        solution[:] = start
+        squares = _normal_equations(power[k], ratio, depth, solution, matrix, side)
+        damping, steps, done = _DAMPING, 0, not np.isfinite(squares)
+        while not done and steps < _MOST and damping <= _LARGEST_DAMPING:
+            _inverse(matrix, damping, inverse)
+            trial = solution + inverse @ side
+            new = _normal_equations(power[k], ratio, depth, trial, trial_matrix, trial_side)
+            steps += 1
+            if new <= squares:
+                done = squares - new <= _TOLERANCE * squares
+                damping, squares = 0.1 * damping, new
+                solution[:], matrix[:], side[:] = trial, trial_matrix, trial_side
+            else:
+                damping *= 10.0
+        _inverse(matrix, 0.0, inverse)
+        if not np.isfinite(squares):
+            solution[:] = np.nan
 
 
 # Variable projection: the strongest simple peer ----------------------------------------------
@@ -284,10 +220,12 @@ _CONVERGED: Final = 0.05
 """Last step in standard errors of the extinction: a further one would be a few hundredths of it."""
 _LANES: Final = 8
 """Interleaved recurrences, which the compiler turns into vectors."""
-_FAST: Final = {"reassoc", "contract", "arcp"}
+_fast = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp"}
+)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@_fast
 def _tables(ratio: Array, depth: Array, sigma: float, first: Array, second: Array) -> Any:
     """Fill the shape and its slope, and return their sums."""
     step = np.exp(-2.0 * sigma * _LANES * (depth[1] - depth[0]))
@@ -307,7 +245,7 @@ def _tables(ratio: Array, depth: Array, sigma: float, first: Array, second: Arra
     return f, d, ff, fd, dd
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@_fast
 def _start_sums(power: Any, first: Array, second: Array) -> Any:
     """Return the sum of a profile, and those of its products with shape and slope."""
     total = yf = yd = 0.0
@@ -318,7 +256,7 @@ def _start_sums(power: Any, first: Array, second: Array) -> Any:
     return total, yf, yd
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@_fast
 def _sums(power: Any, ratio: Array, depth: Array, sigma: float, shape: Array) -> Any:
     """Return the sums of the shape, of its slope and of their products with the profile."""
     step = np.exp(-2.0 * sigma * _LANES * (depth[1] - depth[0]))
@@ -340,7 +278,7 @@ def _sums(power: Any, ratio: Array, depth: Array, sigma: float, shape: Array) ->
     return f, d, ff, fd, dd, yf, yd
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def fit_variable_projection(
     power: Any, ratio: Array, depth: Array, start: float, unknowns: Array, covariance: Array
 ) -> None:

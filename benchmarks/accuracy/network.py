@@ -11,10 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.accuracy import network_cases as cases
+from benchmarks.accuracy.comparison import comparison
 from benchmarks.accuracy.network_cases import BLOCK, LidarLine, Signals
 from benchmarks.accuracy.network_peers import network_by_scipy, network_by_scipy_of_means
 from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share
-from benchmarks.harness.results import Chapter, Effort, Results, Study, Work
+from benchmarks.harness.results import Effort, Results, Study, Work
 from benchmarks.harness.statistics import SIGMAS, mean_by_block, root_by_block, share_by_block
 from benchmarks.harness.timing import CPU_TIME, READ, READS, timed
 from benchmarks.harness.verdicts import Score, Scores
@@ -75,43 +76,28 @@ def measure_network(
             )
         )
         works += _works(lidars, scores, comparisons)
-    return Study(
-        "Networks of lidars: error of extinction and visibility against run time",
-        effort.date,
-        [
-            Chapter(
-                "Errors against run time",
-                f"{math.prod(chunks):,} profiles of each case, bins of {cases.STEP:g} m, relative "
-                "noise of each bin as given, plus 1 % of the power at the first crossing of the "
-                f"beam; blocks of {BLOCK} profiles. Errors are relative and clipped at 300 %, "
-                "because a quotient of noise has no variance.",
-                tables,
-            ),
-            Chapter(
-                "Comparison with a plain fit",
-                f"Noise {_percent(cases.PEER_NOISE)}: extinctions and beam constants by "
-                "scipy.optimize.least_squares, weighted as if point values were independent, "
-                "without errors or flags, and with all points; lidarops leaves out those that are "
-                "too noisy. Of single profiles, and of the mean of a block, whose extinction is "
-                "taken for all of its profiles: the network with its prior has the block, too. In "
-                "air that stays as it is, a mean is hard to surpass; in air that moves, it is "
-                "wrong.",
-                [
-                    Results(
-                        "Networks and scipy, the same profiles and crossings",
-                        comparisons,
-                        "Of extinction at the near crossings that all solve, clipped at 300 %. "
-                        "Network / scipy: ratio of the RMSE, below 1 where ours is more accurate. "
-                        "Difference: root mean square of scipy and the network without prior, over "
-                        "its stated standard errors.",
-                        case="network",
-                        method="air",
-                    ),
-                ],
-            ),
-        ],
-        works,
+    beside = Results(
+        "Networks and scipy, the same profiles and crossings",
+        comparisons,
+        f"Noise {_percent(cases.PEER_NOISE)}: extinctions and beam constants by "
+        "scipy.optimize.least_squares, weighted as if point values were independent, without "
+        "errors or flags, and with all points; lidarops leaves out those that are too noisy. Of "
+        "single profiles, and of the mean of a block, whose extinction is taken for all of its "
+        "profiles: the network with its prior has the block, too. In air that stays as it is, a "
+        "mean is hard to surpass; in air that moves, it is wrong. Of extinction at the near "
+        "crossings that all solve, clipped at 300 %. Network / scipy: ratio of the RMSE, below 1 "
+        "where ours is more accurate. Difference: root mean square of scipy and the network "
+        "without prior, over its stated standard errors.",
+        case="network",
+        method="air",
     )
+    note = (
+        f"{math.prod(chunks):,} profiles of each case, bins of {cases.STEP:g} m, relative noise of "
+        "each bin as given, plus 1 % of the power at the first crossing of the beam; blocks of "
+        f"{BLOCK} profiles. Errors are relative and clipped at 300 %, because a quotient of noise "
+        "has no variance."
+    )
+    return comparison("networks of lidars", effort, works, note, [*tables, beside])
 
 
 def _percent(part: float) -> str:

@@ -42,10 +42,6 @@ class Chart:
     """Drawn against the CPU time; the CPU time itself is drawn with a line for each method."""
     hollow: Container[str] = ()
     """Methods that are peers, or know more than the profile; the front leaves them out."""
-    gain: float = 0.98
-    """Ratio of errors above which a gain is Monte Carlo noise."""
-    level: float | None = None
-    """Least possible error."""
 
 
 def draw(chart: Chart) -> bytes:
@@ -59,16 +55,11 @@ def draw(chart: Chart) -> bytes:
     return stream.getvalue()
 
 
-def pareto(
-    points: Sequence[tuple[float, float]], gain: float = 1.0
-) -> tuple[tuple[float, float], ...]:
-    """Return the points with no other point below and to the left of them, from left to right.
-
-    Each point is lower than `gain` times the height of the previous point.
-    """
+def pareto(points: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """Return the points with no other point below and to the left of them, from left to right."""
     front: list[tuple[float, float]] = []
     for x, y in sorted(points):
-        if not front or y < gain * front[-1][1]:
+        if not front or y < front[-1][1]:
             front.append((x, y))
     return tuple(front)
 
@@ -83,8 +74,7 @@ def _wide(chart: Chart, quantity: str) -> pd.DataFrame:
 
 def _draw_errors(chart: Chart, figure: Figure) -> None:
     times = _wide(chart, CPU_TIME)[["value"]].rename(columns={"value": "value_of_time"})
-    both = times.join(_wide(chart, chart.quantity))
-    both = both.dropna(subset="value")
+    both = times.join(_wide(chart, chart.quantity)).dropna(subset="value")
     cases = both.index.unique("case")
     looks = {method: (f"C{k % 10}", _MARKS[k % len(_MARKS)])
              for k, method in zip(count(), both.index.unique("method"))}  # fmt: skip
@@ -100,12 +90,10 @@ def _draw_errors(chart: Chart, figure: Figure) -> None:
             axes.errorbar([row["value_of_time"]], [row["value"]], bar, label=method, ls="",
                           marker=mark, color=colour, markerfacecolor=fill)  # fmt: skip
         solid = drawn[[method not in chart.hollow for method in drawn.index]]
-        front = pareto([(row.value_of_time, row.value) for row in solid.itertuples()], chart.gain)
+        front = pareto([(row.value_of_time, row.value) for row in solid.itertuples()])
         corners = np.reshape(front, (-1, 2)).T
         axes.step(corners[0], corners[1], where="post", color="0.5", lw=0.8, zorder=0)
         axes.set(xscale="log", yscale="log", title=case, xlabel=f"{CPU_TIME} (µs)")
-        if chart.level is not None:
-            axes.axhline(chart.level, color="0.5", lw=0.8)
     panels[0].set_ylabel(chart.quantity + _DRAWN[Unit(both["unit"].iloc[0])][1])
     _add_legend(figure, panels)
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Any, Final
@@ -14,8 +13,8 @@ import pandas as pd
 
 from benchmarks.harness.figure import Figure, Unit, format_time, with_error
 from benchmarks.harness.plots import Chart, draw
-from benchmarks.harness.timing import Machine, machine
-from benchmarks.harness.verdicts import Judgement, Scores
+from benchmarks.harness.timing import machine
+from benchmarks.harness.verdicts import Judgement, Score, Scores
 from lidarops.errors import CatalogError
 from lidarops.system.files import write_atomically
 
@@ -32,17 +31,9 @@ _STYLE: Final = (
 )
 
 
-class BenchmarkKind(StrEnum):
-    """Quantity that a benchmark measures."""
-
-    ACCURACY = "accuracy"
-    THROUGHPUT = "throughput"
-    STABILITY = "stability"
-
-
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Size of a run, its stated date, and the progress callback."""
+    """Size of a run, its stated date, its inputs, and the progress callback."""
 
     quick: bool = False
     repeats: int | None = None
@@ -51,6 +42,10 @@ class Effort:
     """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
+    data: Path | None = None
+    """Folder of published signals, for the accuracy of the elastic retrieval."""
+    files: Sequence[Path] = ()
+    """Raw files of one layout, for the reader."""
 
 
 def frame(scores: Scores) -> pd.DataFrame:
@@ -63,7 +58,7 @@ def frame(scores: Scores) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS, dtype=object)
 
 
-def _parts(value: Figure | Judgement | float | str | None) -> tuple[Any, float, str]:
+def _parts(value: Any) -> tuple[Any, float, str]:
     if isinstance(value, Figure):
         return value.value, value.error, value.unit
     return str(value) if isinstance(value, Judgement) else value, 0.0, Unit.NUMBER
@@ -113,6 +108,7 @@ class Results:
     title: str
     scores: Scores
     note: str = ""
+    """What was simulated and what the columns are."""
     case: str = "case"
     """Heading of the column of cases."""
     method: str = "method"
@@ -126,18 +122,8 @@ class Results:
 
 
 @dataclass(frozen=True, slots=True)
-class Chapter:
-    """A part of a study."""
-
-    title: str
-    text: str
-    results: Sequence[Results]
-    charts: Sequence[Chart] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Work:
-    """Error and run time of one method in one setting, for the page of all retrievals."""
+    """Error and run time of one method in one setting, for the comparison of methods."""
 
     setting: str
     quantity: str
@@ -153,6 +139,8 @@ class Work:
     """Whether a method of lidarops; else a peer."""
     informed: bool = False
     """Whether the method knows more than the profile."""
+    more: Score = field(default_factory=dict)
+    """Further figures of the method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +149,8 @@ class Study:
 
     title: str
     date: str
-    chapters: Sequence[Chapter]
+    results: Sequence[Results]
+    charts: Sequence[Chart] = ()
     works: Sequence[Work] = ()
     missed: Sequence[str] = ()
     """Targets that are missed; the command fails where there is one."""
@@ -169,12 +158,6 @@ class Study:
     """Those of them for which no reason is stated."""
     cpu_seconds: float = 0.0
     """CPU time of the whole benchmark, with its child processes."""
-    machine: Machine = field(default_factory=machine)
-
-    @property
-    def results(self) -> list[Results]:
-        """The tables of all chapters."""
-        return [results for chapter in self.chapters for results in chapter.results]
 
     def figures(self, title: str) -> dict[tuple[str, str, str], Any]:
         """Return the rows under a heading by case, method and quantity."""
@@ -183,16 +166,15 @@ class Study:
         return {(row.case, row.method, row.quantity): row for row in rows}
 
     def json(self) -> str:
-        """Return all rows, by the headings of their tables, as JSON."""
-        shown = self.results
+        """Return all rows, by the headings of their tables, and the machine as JSON."""
         document = {
             "title": self.title,
             "date": self.date,
-            "machine": asdict(self.machine),
+            "machine": machine(),
             "cpu_seconds": round(self.cpu_seconds, 1),
-            "tables": {each.title: frame(each.scores).to_dict("records") for each in shown},
-            "headings": {each.title: [each.case, each.method] for each in shown},
-            "notes": {each.title: each.note for each in shown},
+            "tables": {each.title: frame(each.scores).to_dict("records") for each in self.results},
+            "headings": {each.title: [each.case, each.method] for each in self.results},
+            "notes": {each.title: each.note for each in self.results},
         }
         return json.dumps(document, indent=1, allow_nan=False)
 
@@ -206,7 +188,7 @@ class Study:
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            for chart in (chart for chapter in self.chapters for chart in chapter.charts):
+            for chart in self.charts:
                 write_atomically(folder / f"{chart.name}.svg", draw(chart))
             write_atomically(folder / INDEX, "\n".join(self._page()).encode())
             write_atomically(folder / RESULT, self.json().encode())
@@ -219,24 +201,18 @@ class Study:
         return folder / INDEX
 
     def _page(self) -> list[str]:
-        about = self.machine
-        packages = ", ".join(f"{name} {number}" for name, number in about.packages.items())
-        facts = f"{self.date}, {about.processor}, {about.cores} cores, Python {about.python}"
+        facts = escape(f"{self.date}, {', '.join(f'{k}: {v}' for k, v in machine().items())}")
         lines = [
             f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{self.title}</title>',
             f"<style>{_STYLE}</style><h1>{escape(self.title)}</h1>",
-            f'<p>{escape(facts)}, {packages}. <a href="{RESULT}">All numbers</a></p>',
+            f'<p>{facts}. <a href="{RESULT}">All numbers</a></p>',
         ]
-        for chapter in self.chapters:
-            lines += [f"<h2>{escape(chapter.title)}</h2>", f"<p>{escape(chapter.text)}</p>"]
-            lines += [
-                f'<figure><img src="{chart.name}.svg" alt="{escape(chart.title)}">'
-                f"<figcaption>{escape(chart.caption)}</figcaption></figure>"
-                for chart in chapter.charts
-            ]
-            for results in chapter.results:
-                state = "" if results.folded else " open"
-                text = results.table.to_html(index=False, border=0)
-                lines += [f"<details{state}><summary>{escape(results.title)}</summary>", text]
-                lines += [f"<p>{escape(results.note)}</p></details>"]
+        for chart in self.charts:
+            image = f'<img src="{chart.name}.svg" alt="{escape(chart.title)}">'
+            lines += [f"<figure>{image}<figcaption>{escape(chart.caption)}</figcaption></figure>"]
+        for results in self.results:
+            state = "" if results.folded else " open"
+            lines += [f"<details{state}><summary>{escape(results.title)}</summary>"]
+            lines += [results.table.to_html(index=False, border=0)]
+            lines += [f"<p>{escape(results.note)}</p></details>"]
         return lines

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -17,33 +16,6 @@ SIGMAS: Final = (1.0, TWO_SIDED)
 """Standard errors within which truths are counted."""
 _LIMIT_WITHOUT_EVENTS: Final = -math.log(0.05)
 """Expected events of which none are seen in 5 percent of all cases."""
-
-
-def mean(values: npt.NDArray[np.generic]) -> Figure:
-    """Return the mean of the finite values of independent profiles."""
-    finite = np.asarray(values[np.isfinite(values)], dtype=np.float64)
-    return Figure(float(finite.mean()), float(finite.std() / np.sqrt(finite.size)))
-
-
-def root(square: Figure) -> Figure:
-    """Return the square root of a mean of squares."""
-    value = math.sqrt(square.value)
-    return Figure(value, square.error / (2.0 * value) if value > 0 else 0.0, square.unit)
-
-
-def share_inside(inside: Mask) -> Figure:
-    """Return the share of independent profiles that are inside."""
-    # Where all or none are inside, half a profile keeps the error from being zero.
-    probability = (inside.sum() + 0.5) / (inside.size + 1)
-    error = float(np.sqrt(probability * (1 - probability) / inside.size))
-    return share(Figure(float(inside.mean()), error))
-
-
-def over_blocks(means: Sequence[float]) -> Figure:
-    """Return the mean of the means of independent blocks; NaN where there is none."""
-    finite = np.array(means)[np.isfinite(means)]
-    error = float(finite.std(ddof=1) / np.sqrt(finite.size)) if finite.size > 1 else 0.0
-    return Figure(float(finite.mean()) if finite.size else math.nan, error)
 
 
 def clustered_share(events: Array, trials: Array, effect: float = 1.0) -> Figure:
@@ -126,7 +98,10 @@ def share_by_block(inside: Mask, kept: Mask, block: int) -> Figure | None:
 def root_by_block(errors: Array, kept: Mask, block: int) -> Figure | None:
     """Return the root mean square of kept errors, with its error from the scatter of blocks."""
     square = mean_by_block(errors**2, kept, block)
-    return None if square is None else root(square)
+    if square is None:
+        return None
+    value = math.sqrt(square.value)
+    return Figure(value, square.error / (2.0 * value) if value > 0 else 0.0)
 
 
 def _sums(values: Array) -> Array:

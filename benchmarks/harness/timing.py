@@ -6,14 +6,13 @@ import multiprocessing
 import os
 import platform
 import resource
-import sys
 import time
 from collections.abc import Callable, Container, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import Final, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar
 
 from benchmarks.harness.figure import cpu_time
 from benchmarks.harness.verdicts import Scores
@@ -31,61 +30,39 @@ _TRIED: Final = 16
 _LONGEST: Final = 0.06
 """Longest time of one round of a solver, s; slower solvers get fewer profiles."""
 _PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
-_STATUS: Final = Path("/proc/self/status")
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """Machine and software of a benchmark run."""
-
-    processor: str
-    cores: int
-    python: str
-    packages: Mapping[str, str]
-    """Versions of installed packages by name."""
-    code: str
-    """Digest of the code that was measured (`lidarops.system.code_version.source_version`)."""
-
-
-def machine() -> Machine:
-    """Return the machine and the packages of this process."""
-    return Machine(
-        processor=_processor(),
-        cores=os.cpu_count() or 1,
-        python=platform.python_version(),
-        packages={name: number for name in _PACKAGES if (number := _version(name))},
-        code=source_version(),
-    )
+def machine() -> dict[str, Any]:
+    """Return processor, cores, versions of Python and packages, and the digest of the code."""
+    models = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        if line.startswith("model name")
+    ]
+    return {
+        "processor": models[0] if models else platform.machine(),
+        "cores": os.cpu_count() or 1,
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
+        "code": source_version(),
+    }
 
 
-def least_times(
-    functions: Mapping[str, Callable[[], object]], repeats: int, *, clock: str = "process_time"
-) -> dict[str, float]:
-    """Return the least time in seconds of each function, by name.
+def least_times(functions: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Return the least CPU time in seconds of each function, by name.
 
     The functions take turns, so that other load of the machine affects all of them. One round
     before that is not counted: it compiles and fills caches.
-
-    Parameters
-    ----------
-    functions : mapping of str to callable
-    repeats : int
-        Counted rounds, at least 1.
-    clock : {"process_time", "perf_counter"}
-        CPU time of all threads of the process, or wall time.
     """
-    read: Callable[[], float] = getattr(time, clock)
     least = dict.fromkeys(functions, float("inf"))
     for function in functions.values():
         function()
     for _ in range(repeats):
         for name, function in functions.items():
-            begin = read()
-            function()
-            least[name] = min(least[name], max(read() - begin, _SHORTEST))
+            least[name] = min(least[name], timed(function)[0])
     return least
 
 
@@ -133,40 +110,16 @@ def in_fresh_process(
 def peak_memory() -> float:
     """Return the peak memory of this process so far, bytes."""
     # The maximum of `resource` includes the memory of the parent process.
-    if _STATUS.exists():
-        peak = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
-        return 1024.0 * float(peak.split()[1])
-    maximum = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float(maximum) if sys.platform == "darwin" else 1024.0 * maximum
-
-
-def _processor() -> str:
-    """Return the model of this machine's processor."""
-    facts = Path("/proc/cpuinfo")
-    if facts.is_file():
-        for line in facts.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
+    status = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return 1024.0 * float(next(line for line in status if line.startswith("VmHWM")).split()[1])
 
 
 def affordable(call: Callable[[int], object], most: int) -> int:
     """Return how many profiles a call may get; the call takes a number of profiles."""
+    few = min(_TRIED, most)
     # The fixed cost of a call counts less with more profiles: estimate twice.
-    few = _within(call, min(_TRIED, most), most)
-    return few if few == most else _within(call, few, most)
-
-
-def _within(call: Callable[[int], object], count: int, most: int) -> int:
-    call(count)
-    begin = time.perf_counter()
-    call(count)
-    per_profile = (time.perf_counter() - begin) / count
-    return int(min(most, max(round(_LONGEST / per_profile), _TRIED)))
+    for _ in range(2):
+        call(few)
+        per_profile = timed(partial(call, few))[0] / few
+        few = min(most, max(round(_LONGEST / per_profile), _TRIED))
+    return few

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from benchmarks.harness.figure import Figure, Unit, share_text
 
@@ -47,8 +47,8 @@ class Judgement:
         return self.verdict is Verdict.MET
 
 
-Score = dict[str, Figure | Judgement | float | str | None]
-"""Values of one method in one case, by quantity; None where it has none."""
+Score = dict[str, Any]
+"""Figures, judgements, numbers and texts of one method in one case; None where it has none."""
 Scores = dict[tuple[str, str], Score]
 """Scores by case and method."""
 

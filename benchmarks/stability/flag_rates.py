@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.harness.statistics import clustered_share
 from benchmarks.harness.verdicts import Scores, Target
@@ -29,13 +29,8 @@ _DECIDING: Final = 200
 """Profiles of a cluster in which single bits decide."""
 
 
-class Part(NamedTuple):
-    """Events among trials in one cluster."""
-
-    case: str
-    figure: str
-    events: float
-    trials: float
+Part = tuple[str, str, float, int]
+"""Case, figure, and events among trials in one cluster."""
 
 
 def few_counts(cluster: int, *, counts: float) -> Iterator[Part]:
@@ -52,7 +47,7 @@ def few_counts(cluster: int, *, counts: float) -> Iterator[Part]:
         )
         for bit in (Quality.OUTLIER, HomogeneousQuality.POOR_FIT):
             flagged = float(np.count_nonzero(fit.quality & np.int32(bit)))
-            yield Part(f"{bit.name}, {limits}", f"{counts:g} counts a bin", flagged, _COUNTED)
+            yield f"{bit.name}, {limits}", f"{counts:g} counts a bin", flagged, _COUNTED
 
 
 def deciding_bits(cluster: int) -> Iterator[Part]:
@@ -74,27 +69,18 @@ def deciding_bits(cluster: int) -> Iterator[Part]:
         valued = np.isfinite(value)
         for bit in _DECIDED:
             alone = valued & ((fit.quality & _REJECTED) == np.int32(bit))
-            events, trials = float(np.count_nonzero(alone)), float(np.count_nonzero(valued))
-            yield Part(f"{bit.name} alone", method, events, trials)
-
-
-_DRAWS: Final[tuple[Callable[[int], Iterator[Part]], ...]] = (
-    *(partial(few_counts, counts=counts) for counts in _FEW),
-    deciding_bits,
-)
+            events = float(np.count_nonzero(alone))
+            yield f"{bit.name} alone", method, events, int(np.count_nonzero(valued))
 
 
 def flag_rates(clusters: int) -> Scores:
     """Return the shares of flagged profiles, by flag and condition."""
-    counts: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for draw in _DRAWS:
-        for cluster in range(clusters):
-            for part in draw(cluster):
-                counts.setdefault((part.case, part.figure), []).append((part.events, part.trials))
+    parts = [p for c in _FEW for cluster in range(clusters) for p in few_counts(cluster, counts=c)]
+    parts += [part for cluster in range(clusters) for part in deciding_bits(cluster)]
+    rows = pd.DataFrame(parts, columns=["case", "figure", "events", "trials"])
     scores: Scores = {}
-    for (case, figure), pairs in counts.items():
-        events, trials = (np.array(column, dtype=float) for column in zip(*pairs, strict=True))
-        share = clustered_share(events, trials)
+    for (case, figure), group in rows.groupby(["case", "figure"], sort=False):
+        share = clustered_share(*group[["events", "trials"]].to_numpy(dtype=float).T)
         judged = _NEEDLESS.judged(share) if "Poisson" in case else None
-        scores[case, figure] = {"values": int(trials.sum()), SHARE: share, TARGET: judged}
+        scores[case, figure] = {"values": int(group["trials"].sum()), SHARE: share, TARGET: judged}
     return scores

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -191,42 +191,31 @@ def _process(counts: Array, noise: Array, base: elastic_cases.SimulatedSky) -> _
     bridged = outlying_bins.bridge_outliers(counts, r, noise, background=rough)
     counts, noise = np.asarray(bridged.power, dtype=np.float64), bridged.variance
     fit = known_shape.fit_known_shape(counts, r, base.shape, variance=noise)
-    power = np.where(base.inverted, counts - fit.background[:, np.newaxis], np.nan)
+    power = elastic_cases.subtract_background(counts, base, fit.background)
     clouds = elastic_cases.find_clouds(power, noise, base)
     window = elastic_cases.choose_window(
         power, noise, base, clouds, background_error=fit.background_standard_error,
         candidates=_WINDOWS,
     )  # fmt: skip
-    solved = _solve(power, noise, base, window.edges, _input_errors(fit, window))
-    return _Processed(fit, clouds, window, solved)
-
-
-def _input_errors(
-    fit: known_shape.KnownShapeResult, window: reference_window.ReferenceWindow
-) -> Array:
-    """Return standard errors of the background and relative ones of the reference."""
-    background = np.nan_to_num(fit.background_standard_error)
-    return np.stack([background, window.relative_error(_REFERENCE.relative_error)])
+    return _Processed(fit, clouds, window, _solve(power, noise, base, fit, window))
 
 
 def _solve(
     power: Array,
     noise: Array,
     base: elastic_cases.SimulatedSky,
-    edges: tuple[Array, Array],
-    input_errors: Array,
+    fit: known_shape.KnownShapeResult,
+    window: reference_window.ReferenceWindow,
+    rows: Any = slice(None),
 ) -> inversion.ElasticResult:
-    return inversion.invert_elastic(
-        power,
-        base.range,
-        air=inversion.Air(base.molecular_backscatter, base.molecular_extinction, _AIR_ERROR),
-        lidar_ratio=inversion.LidarRatio(
-            elastic_cases.LIDAR_RATIO, _RATIO_ERROR * elastic_cases.LIDAR_RATIO
-        ),
-        reference=inversion.Reference(edges, relative_error=input_errors[1]),
-        variance=noise,
-        background_standard_error=input_errors[0],
-    )
+    """Return the inversion with the background errors and windows of some rows."""
+    bottom, top = window.edges
+    return elastic_cases.invert_particles(
+        power, base, (bottom[rows], top[rows]), noise=noise,
+        background_error=np.nan_to_num(fit.background_standard_error)[rows],
+        reference_error=window.relative_error(_REFERENCE.relative_error)[rows],
+        assumed_errors=(_RATIO_ERROR, _AIR_ERROR),
+    )  # fmt: skip
 
 
 def visible_misfit_of_sky(
@@ -261,7 +250,7 @@ def visible_misfit_of_sky(
     fit = known_shape.fit_known_shape(
         rows, base.range, base.shape, variance=noise, start=starts, stop=stops
     )
-    power = np.where(base.inverted, rows - fit.background[:, np.newaxis], np.nan)
+    power = elastic_cases.subtract_background(rows, base, fit.background)
     inside = (base.range >= bottom[:, np.newaxis]) & (base.range <= top[:, np.newaxis])
     inside &= base.inverted
     weight = np.where(inside, 1.0 / noise, 0.0)
@@ -269,10 +258,8 @@ def visible_misfit_of_sky(
     norm = np.maximum(np.sum(weight * base.shape**2, axis=1), np.finfo(float).tiny)
     scale = np.sum(weight * base.shape * signal, axis=1) / norm
     misfit = np.sum(weight * (signal - scale[:, np.newaxis] * base.shape) ** 2, axis=1)
-    input_errors = _input_errors(processed.background, processed.window)
-    solved = _solve(
-        power, np.broadcast_to(noise, rows.shape), base, (bottom, top), input_errors[:, first]
-    )
+    noises = np.broadcast_to(noise, rows.shape)
+    solved = _solve(power, noises, base, processed.background, processed.window, first)
     misfits = np.sqrt(fit.chi2 + misfit + _negative_chi_square(solved, power, noise))
     return np.asarray(misfits[index.reshape(-1)])
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from scipy import stats
 
-from benchmarks.accuracy.homogeneous_cases import relative_signal
+from benchmarks.accuracy.homogeneous_cases import least_errors, relative_signal
 from benchmarks.accuracy.multiangle_cases import correlated
 from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import COVERED, Failure, ScoredValues
@@ -196,20 +196,9 @@ def least_relative_error(paths: Paths) -> Array:
     """Return the least error of extinction over the scale on which the signal falls, (profile,).
 
     The scale is extinction + 1 / mean range, at most half of 1 / bin width: of a signal that dies
-    within a bin, the transmission of one bin is what the data determine. The error is from the
-    inverse information matrix of background, amplitude and extinction with unit noise,
-    by elimination of the two linear unknowns.
+    within a bin, the transmission of one bin is what the data determine.
     """
-    shape = paths.clean
-    middle = np.sum(shape**2 * paths.depth, axis=1, keepdims=True) / np.sum(
-        shape**2, axis=1, keepdims=True
-    )
-    slope = 2.0 * shape * (paths.depth - middle)
-    flat = shape - shape.mean(axis=1, keepdims=True)
-    remainder = slope - slope.mean(axis=1, keepdims=True)
-    norm = np.maximum(np.sum(flat**2, axis=1, keepdims=True), np.finfo(float).tiny)
-    remainder = remainder - flat * np.sum(remainder * flat, axis=1, keepdims=True) / norm
-    least = 1.0 / np.sqrt(np.maximum(np.sum(remainder**2, axis=1), np.finfo(float).tiny))
+    least = least_errors(paths.range, paths.extinction, paths.signal)["extinction"]
     bin_width = float(paths.range[1] - paths.range[0])
     scale = paths.extinction[:, 0] + 1.0 / float(paths.range.mean())
     return np.asarray(least / np.minimum(scale, 0.5 / bin_width))

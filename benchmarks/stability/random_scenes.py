@@ -118,8 +118,7 @@ class Tally:
         """Count the values of a chunk; its first axis is that of scenes."""
         self._failures[values.failure.name] = values.failure
         pooled = HELD if values.failure.satisfied else BROKEN
-        own = {"quantity": values.quantity, "scenes": len(values.error),
-               "measured": values.misfit is not None, **counts(values)}  # fmt: skip
+        own = {"quantity": values.quantity, "measured": values.misfit is not None, **counts(values)}
         self._rows += [own | {"class": name} for name in (values.failure.name, pooled)]
 
     def rates(self, needless: float | None, *, pooled: bool = True) -> Scores:
@@ -132,17 +131,14 @@ class Tally:
         pooled : bool
             Whether to add all classes that satisfy the model together, and all that do not.
         """
-        table = pd.DataFrame(self._rows)
-        groups = table.groupby(["quantity", "class"], sort=False)
-        keys = table[["quantity", "class"]].drop_duplicates().itertuples(index=False, name=None)
+        target = None if needless is None else Target(needless, own=True)
+        groups = dict(list(pd.DataFrame(self._rows).groupby(["quantity", "class"], sort=False)))
         # Of each quantity, what is pooled comes last.
-        names = sorted(keys, key=lambda key: (key[0], key[1] in POOLED))
         return {
-            (quantity, name): _score(groups.get_group((quantity, name)), self._failures[name],
-                                     None if needless is None else Target(needless, own=True))
-            for quantity, name in names
+            (quantity, name): _score(groups[quantity, name], self._failures[name], target)
+            for quantity, name in sorted(groups, key=lambda key: (key[0], key[1] in POOLED))
             if pooled or name not in POOLED
-        }  # fmt: skip
+        }
 
 
 def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> Score:
@@ -164,7 +160,6 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
     # A class has intervals of its own; those of all classes together may hide it.
     alone = holds and failure.name not in POOLED
     return {
-        "scenes": int(chunks["scenes"].sum()),
         "clusters": len(chunks),
         "values": int(chunks["values"].sum()),
         "not rejected": part("kept", "values"),
@@ -174,7 +169,6 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
         ONE_TARGET: _judged(covered_by_one, COVERED_BY_68 if alone else None),
         "stated / median error": _stated_over_median(chunks["sizes"].sum()),
         FALSE_RANDOM: false_random,
-        "false, with systematic": part("false", "kept"),
         FALSE_PLAIN: false_plain,
         # Where the model holds, random errors alone must cover the truth.
         TARGET: _judged(false_random, Target(SATISFIED))
@@ -182,9 +176,7 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
         else _judged(false_plain, Target(VIOLATED)),
         "of these undetectable": part("false hidden", "plain", known=measured),
         f"and below {HALF:g}": part("false half", "plain", known=measured),
-        "share of the detectable": _detectable(chunks) if measured else None,
         "without any flag": part("false bare", "bare"),
-        "rejected but accurate": part("fine rejected", "rejected"),
         NEEDLESS: flagged,
         NEEDLESS_TARGET: _judged(flagged, needless),
         "detectable in the data": f"no: {failure.unseen}" if failure.unseen else "yes",
@@ -193,13 +185,6 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
 
 def _judged(figure: Figure | None, target: Target | None) -> Judgement | None:
     return None if figure is None or target is None else target.judged(figure)
-
-
-def _detectable(chunks: pd.DataFrame) -> Figure | None:
-    """Return the share of false values among those whose violation is detectable."""
-    seen = (chunks["false plain"] - chunks["false hidden"]).to_numpy()
-    visible = (chunks["plain"] - chunks["plain hidden"]).to_numpy()
-    return clustered_share(seen, visible) if visible.any() else None
 
 
 def _stated_over_median(sizes: Array) -> float | None:
@@ -280,13 +265,10 @@ def counts(values: ScoredValues) -> dict[str, Any]:
         "plain": plain,
         "bare": bare,
         "false random": kept & false_random,
-        "false": kept & false,
         "false plain": plain & false,
-        "plain hidden": plain & hidden,
         "false hidden": plain & false & hidden,
         "false half": plain & false & half,
         "false bare": bare & false,
-        "rejected": valued & rejected,
         "fine rejected": valued & rejected & (size <= FINE * stated),
         "solvable": solvable,
         "solvable rejected": solvable & ~plain,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
@@ -34,19 +33,8 @@ _MEAN_OF: Final = slice(100, 300)
 """Bins whose mean is scored: single bins hold too few counts for Gaussian errors."""
 
 
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """Errors of the values of some profiles."""
-
-    quantity: str
-    error: Array
-    random: Array
-    """Stated standard error."""
-    bits: Any
-    systematic: Any = 0.0
-    """Stated systematic error."""
-    misfit: Any = None
-    """Of the violation, in standard deviations of the noise; None: unknown."""
+Errors = dict[str, Any]
+"""Errors of the values of some profiles: the fields of `ScoredValues` that depend on them."""
 
 
 def _logarithmic(rng: Random, low: float, high: float) -> float:
@@ -62,7 +50,7 @@ def _mean(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Error
         error = np.where(valid, power, 0.0).sum(axis=1) / count - truth
         variance = np.where(valid, signal.variance[:, _MEAN_OF], 0.0).sum(axis=1) / count**2
     bits = np.bitwise_or.reduce(signal.quality[:, _MEAN_OF], axis=1)
-    return Errors(quantity, error, np.sqrt(variance), bits)
+    return Errors(quantity=quantity, error=error, random=np.sqrt(variance), bits=bits)
 
 
 def _bin(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Errors:
@@ -70,7 +58,8 @@ def _bin(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Errors
     k = _BINS // 2
     error = np.asarray(signal.power[:, k] - truth, dtype=np.float64)
     stated = np.sqrt(np.asarray(signal.variance[:, k], dtype=np.float64))
-    return Errors(f"{quantity} of a bin", error, stated, signal.quality[:, k])
+    bits = signal.quality[:, k]
+    return Errors(quantity=f"{quantity} of a bin", error=error, random=stated, bits=bits)
 
 
 def _counts(rng: Random, rate: float, dead_time: float, shots: int, profiles: int, *,
@@ -96,10 +85,9 @@ def _photon(
     )  # fmt: skip
     errors = _mean(signal, rate, "count rate")
     # As products state it (`signal_dead_time_error`), from the rate that was found.
-    change = (errors.error + rate) ** 2 * _PER_MEGAHERTZ_SQUARED
-    return replace(
-        errors, systematic=change * counts_to_signal.dead_time_standard_error(_DEAD_TIME)
-    )
+    change = (errors["error"] + rate) ** 2 * _PER_MEGAHERTZ_SQUARED
+    systematic = change * counts_to_signal.dead_time_standard_error(_DEAD_TIME)
+    return errors | {"systematic": systematic}
 
 
 def _analog(
@@ -153,17 +141,15 @@ def _known_shape(rng: Random, profiles: int, *, haze: float = 0.0) -> Errors:
             rows, sky.range, shape, variance=variance, start=fit.start, stop=fit.stop
         )
         misfit = np.sqrt(noise_free_fit.chi2)
-    error = fit.background - level
-    return Errors(
-        "background, known shape", error, fit.background_standard_error, bits, misfit=misfit
-    )
+    return Errors(quantity="background, known shape", error=fit.background - level,
+                  random=fit.background_standard_error, bits=bits, misfit=misfit)  # fmt: skip
 
 
 def _tail(rng: Random, profiles: int) -> Errors:
     sky, _, counts, variance, level = _far(rng, profiles)
     result = estimate.from_tail(counts, sky.range, np.broadcast_to(variance, counts.shape))
-    error = result.background - level
-    return Errors("background, mean of the tail", error, result.standard_error, result.quality)
+    return Errors(quantity="background, mean of the tail", error=result.background - level,
+                  random=result.standard_error, bits=result.quality)  # fmt: skip
 
 
 def _cubic(rng: Random, profiles: int) -> Errors:
@@ -174,8 +160,8 @@ def _cubic(rng: Random, profiles: int) -> Errors:
     model = level + amount * (from_range[0] / from_range) ** 2 * fall
     power = model + rng.standard_normal((profiles, from_range.size))
     result = cubic_and_tail.cubic(power, from_range, variance=1.0)
-    error = result.background - level
-    return Errors("background, cubic", error, result.background_standard_error, result.quality)
+    return Errors(quantity="background, cubic", error=result.background - level,
+                  random=result.background_standard_error, bits=result.quality)  # fmt: skip
 
 
 _WRONG_DEAD_TIME: Final = "a wrong dead time distorts the rates and leaves no trace in one profile"
@@ -218,14 +204,13 @@ def score_signals(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield the scored values of random counts, class by class."""
     for number, (failure, process) in held_first(FAILURES):
         rng = np.random.default_rng((75, cluster, number))
-        errors = process(rng, profiles)
+        errors: Errors = {"systematic": 0.0, **process(rng, profiles)}
         clean = failure.satisfied and process is not _cubic
+        uncertain = (errors["bits"] & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0
+        solvable = np.isfinite(errors["error"]) if clean else None
         yield ScoredValues(
-            failure, errors.quantity, errors.error, errors.random, errors.systematic,
-            np.asarray(errors.bits), HomogeneousQuality,
-            solvable=np.isfinite(errors.error) if clean else None, misfit=errors.misfit,
-            uncertain=(errors.bits & np.int32(Quality.BACKGROUND_UNCERTAIN)) != 0,
-        )  # fmt: skip
+            failure, own=HomogeneousQuality, uncertain=uncertain, solvable=solvable, **errors
+        )
 
 
 _ROUNDED: Final = (0.05, 0.1, 0.2)
@@ -249,11 +234,8 @@ def score_digitizers(cluster: int, profiles: int) -> Iterator[ScoredValues]:
         )  # fmt: skip
         error = np.asarray(signal.power - level * _STEP, dtype=np.float64)
         stated = np.sqrt(np.asarray(signal.variance, dtype=np.float64))
-        places = {
-            "steep": (distance > 320.0) & (distance < 1200.0),
-            "flat": distance > 1500.0,
-        }
-        for place, bins in places.items():
+        steep = (distance > 320.0) & (distance < 1200.0)
+        for place, bins in (("steep", steep), ("flat", distance > 1500.0)):
             failure = Failure(f"noise of {noise:g} steps, {place} bins", satisfied=True)
             yield ScoredValues(
                 failure, "voltage of a bin", error[:, bins], stated[:, bins], 0.0,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 from benchmarks.harness.figure import cpu_time, share_text
-from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.harness.timing import CPU_TIME, cpu_seconds
 from benchmarks.harness.verdicts import Judgement, Scores, Verdict
 from benchmarks.stability import (
@@ -23,12 +22,9 @@ from benchmarks.stability import (
     reproducibility,
 )
 from benchmarks.stability.random_scenes import (
-    BROKEN,
     COVERED,
     FALSE,
-    FINE,
     HALF,
-    HELD,
     SATISFIED,
     TARGET,
     TARGETS,
@@ -38,7 +34,6 @@ from benchmarks.stability.random_scenes import (
     collect,
 )
 from benchmarks.stability.reasons import Unmet, read_reasons, why
-from lidarops.errors import CampaignError
 
 LONGEST: Final = 1200.0
 """s, most CPU time of the whole benchmark."""
@@ -46,13 +41,33 @@ COST: Final = "CPU time of the parts"
 FLAGS: Final = "Flags of few photon counts, and bits that decide alone"
 REPRODUCIBLE: Final = "Order of profiles, machine and work"
 WHOLE: Final = "all parts"
+_NOTE: Final = (
+    "A value is false if it differs from the truth by more than "
+    f"{FALSE:g} stated standard errors. Targets for values that no flag rejects: "
+    f"{share_text(SATISFIED)} where the model holds, by random errors alone; {share_text(VIOLATED)}"
+    " of everything drawn elsewhere, with the stated systematic errors, excluding values that "
+    "flags mark as uncertain. "
+    "In brackets: Monte Carlo standard error in the last digits, from independently drawn "
+    "geometries; with few events, half of the 95 % limit for as many independent values. Not "
+    "rejected: no flag rejects the value. Not uncertain: no flag marks the stated error as "
+    f"uncertain. Within {COVERED:g} and within 1: values that are not rejected and within this "
+    "number of stated random errors; 95 % and 68 % for correct errors where the model holds. "
+    "Stated / median error: 1.48 for correct errors. A target is met or missed if 2 Monte Carlo "
+    "errors do not change that, else undecided. Undetectable, which explains but does not excuse: "
+    f"the misfit of the violation is below {VISIBLE:g} standard deviations of the noise. Even the "
+    "best test that knows the shape of the violation, but not its sign, misses 7 % or more of "
+    f"these at our rate of false alarms; half or more of those below {HALF:g}. Needlessly flagged: "
+    "flagged although the value can be determined; extinction of a signal that dies within a bin "
+    "is judged by the transmission of one bin; a value of a network, by its stated error. Own "
+    "targets are ours, chosen after measuring."
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Draws:
     """Random scenes of one retrieval."""
 
-    retrieval: str
+    name: str
     case: str
     """Name by which the command runs this part with others."""
     score: Callable[[int, int], Iterator[ScoredValues]]
@@ -68,55 +83,34 @@ class Draws:
     pooled: bool = False
     """Whether to add the classes where the model holds together, and all others."""
 
-    def measure(self, effort: Effort) -> Scores:
+    @property
+    def title(self) -> str:
+        """Title of the table."""
+        return f"Values that differ by more than {FALSE:g} stated errors: {self.name}"
+
+    def measure(self, effort: Effort) -> Results:
         """Return the rates of false values."""
         clusters = self.quick if effort.quick else self.clusters
         tally = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
-        return tally.rates(self.needless, pooled=self.pooled)
-
-    def chapter(self, scores: Scores) -> Chapter:
-        """Return the table of the part."""
-        drawn: Counter[str] = Counter()
-        for (quantity, name), score in scores.items():
-            if name not in {HELD, BROKEN}:
-                drawn[quantity] += int(str(score["scenes"]))
-        return Chapter(
-            f"False values: {self.retrieval}",
-            f"{max(drawn.values()):,} random scenes. A value is false if it differs from the truth "
-            f"by more than {FALSE:g} stated standard errors. Targets for values that no flag "
-            f"rejects: {share_text(SATISFIED)} where the model holds, by random errors alone; "
-            f"{share_text(VIOLATED)} of everything drawn elsewhere, with the stated systematic "
-            f"errors, excluding values that flags mark as uncertain. {targets(scores)}",
-            [
-                Results(
-                    results_title(self.retrieval), scores, _NOTE, case="quantity", method="class"
-                )
-            ],
-        )
+        scores = tally.rates(self.needless, pooled=self.pooled)
+        return Results(self.title, scores, _NOTE, case="quantity", method="class")
 
 
 @dataclass(frozen=True, slots=True)
 class Other:
     """A part without random scenes."""
 
-    case: str
     name: str
-    retrieval: str
-    """Title of its table."""
-    text: str
+    case: str
+    title: str
     score: Callable[[bool], Scores]
     """Returns the scores, given whether the run is quick."""
     columns: tuple[str, str]
     """Headings of the columns of cases and methods."""
 
-    def measure(self, effort: Effort) -> Scores:
+    def measure(self, effort: Effort) -> Results:
         """Return the scores."""
-        return self.score(effort.quick)
-
-    def chapter(self, scores: Scores) -> Chapter:
-        """Return the table of the part."""
-        results = Results(self.retrieval, scores, "", *self.columns)
-        return Chapter(self.retrieval, self.text, [results])
+        return Results(self.title, self.score(effort.quick), "", *self.columns)
 
 
 def _blocks(
@@ -159,25 +153,12 @@ DRAWS: Final = (
     Draws("networks, varying lidar ratio", "network", _networks.score_lidar_ratios, 6, 200, 4),
 )  # fmt: skip
 OTHERS: Final = (
-    Other(
-        "flags",
-        "flags",
-        FLAGS,
-        "How many profiles of few photon counts are flagged although the model holds, and how"
-        " many values of homogeneous paths a single bit rejects.",
-        lambda quick: flag_rates.flag_rates(2 if quick else 60),
-        ("flag", "condition"),
-    ),
-    Other(
-        "order",
-        "order and machine",
-        REPRODUCIBLE,
-        "How far values change with the order of the profiles of a block, and with the kernel of "
-        "linear algebra.",
-        lambda quick: reproducibility.measure_reproducibility(*((2, 1) if quick else (60, 6))),
-        ("case", "figure"),
-    ),
-)
+    Other("flags", "flags", FLAGS, lambda quick: flag_rates.flag_rates(2 if quick else 60),
+          ("flag", "condition")),
+    Other("order and machine", "order", REPRODUCIBLE,
+          lambda quick: reproducibility.measure_reproducibility(*((2, 1) if quick else (60, 6))),
+          ("case", "figure")),
+)  # fmt: skip
 
 
 def measure_stability(
@@ -191,41 +172,40 @@ def measure_stability(
     draws : tuple of Draws
     case : str, optional
         Only parts of this case, or the part of this name; None for all.
-
-    Raises
-    ------
-    CampaignError
-        If no part has this case or name.
     """
-    parts: dict[str, Draws | Other] = {draw.retrieval: draw for draw in draws}
-    parts |= {other.name: other for other in OTHERS}
-    selected = {name: part for name, part in parts.items() if case in {None, part.case, name}}
-    if not selected:
-        names = dict.fromkeys(part.case for part in parts.values())
-        raise CampaignError(
-            f"no case {case!r}",
-            remedy=f"choose: {' or '.join(names)}, or a part such as {draws[-1].retrieval!r}",
-        )
-    chapters: list[Chapter] = []
+    results: list[Results] = []
     unmet: list[Unmet] = []
     costs: dict[str, float] = {}
-    for name, part in selected.items():
-        begin = cpu_seconds()
-        scores = part.measure(effort)
-        chapters.append(part.chapter(scores))
-        unmet += unmet_targets(part.retrieval, scores)
-        costs[name] = cpu_seconds() - begin
+    parts: tuple[Draws | Other, ...] = (*draws, *OTHERS)
+    for part in parts:
+        if case in {None, part.case, part.name}:
+            begin = cpu_seconds()
+            results.append(part.measure(effort))
+            unmet += unmet_targets(part.title.rpartition(": ")[2], results[-1].scores)
+            costs[part.name] = cpu_seconds() - begin
     of_cost = cost_scores(costs, whole=case is None)
-    text = "CPU time with child processes and compilation."
-    chapters.append(Chapter(COST, text, [Results(COST, of_cost, method="part")]))
+    note = "CPU time with child processes and compilation."
+    results.append(Results(COST, of_cost, note, method="part"))
     unmet += unmet_targets(COST, of_cost)
     missed = [one for one in unmet if one.judgement.verdict is Verdict.MISSED]
     reasons = read_reasons()
     return Study(
-        "Stability: false values without a flag", effort.date, chapters,
+        "Stability: false values without a flag", effort.date, results,
         missed=[str(one) for one in missed],
         unnamed=[str(one) for one in missed if reasons and not why(one, reasons)],
     )  # fmt: skip
+
+
+def _of(case: str) -> Callable[[Effort], Study]:
+    return lambda effort: measure_stability(effort, case=case)
+
+
+CASES: Final[dict[str, Callable[[Effort], Study]]] = {
+    "all": measure_stability,
+    **{part.case: _of(part.case) for part in (*DRAWS, *OTHERS)},
+    **{part.name: _of(part.name) for part in (*DRAWS, *OTHERS)},
+}
+"""The benchmark of all parts, of those of a case, and of each."""
 
 
 def cost_scores(costs: Mapping[str, float], *, whole: bool = True) -> Scores:
@@ -240,43 +220,6 @@ def cost_scores(costs: Mapping[str, float], *, whole: bool = True) -> Scores:
         target = Judgement(f"{LONGEST / 60.0:g} min", verdict)
         scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), TARGET: target}
     return scores
-
-
-_NOTE: Final = (
-    "In brackets: Monte Carlo standard error in the last digits, from independently drawn "
-    "geometries; with few events, half of the 95 % limit for as many independent values. Not "
-    "rejected: no flag rejects the value. Not uncertain: no flag marks the stated error as "
-    f"uncertain. Within {COVERED:g} and within 1: values that are not rejected and within this "
-    "number of stated random errors; 95 % and 68 % for correct errors where the model holds. "
-    "Stated / median error: 1.48 for correct errors. The target of false values applies to "
-    "everything drawn: to random errors alone where the model holds, else to values that are not "
-    "uncertain, with the stated systematic errors. A target is met or missed if 2 Monte Carlo "
-    "errors do not change that, else undecided. Undetectable, which explains but does not excuse: "
-    f"the misfit of the violation is below {VISIBLE:g} standard deviations of the noise. Even the "
-    "best test that knows the shape of the violation, but not its sign, misses 7 % or more of "
-    f"these at our rate of false alarms; half or more of those below {HALF:g}. Share of the "
-    "detectable: false values among those whose violation is detectable but raised no flag. "
-    f"Rejected but accurate: differs by less than {FINE:g} errors. Needlessly flagged: flagged "
-    "although the value can be determined; extinction of a signal that dies within a bin is judged "
-    "by the transmission of one bin; a value of a network, by its stated error. Own targets are "
-    "ours, chosen after measuring."
-)
-
-
-def results_title(retrieval: str) -> str:
-    """Return the title of the table of a retrieval."""
-    return f"Values that differ by more than {FALSE:g} stated errors: {retrieval}"
-
-
-def targets(scores: Scores) -> str:
-    """Return which classes miss their targets, and for which that is undecided."""
-    unmet = unmet_targets("", scores)
-    sentences = []
-    for verdict, words in ((Verdict.MISSED, "Missed"), (Verdict.UNDECIDED, "Undecided")):
-        names = [one.place for one in unmet if one.judgement.verdict is verdict]
-        if names:
-            sentences.append(f"{words}: {', '.join(names)}.")
-    return " ".join(sentences) or "All targets are met."
 
 
 def unmet_targets(part: str, scores: Scores) -> list[Unmet]:

@@ -18,9 +18,12 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
+from benchmarks.harness.figure import Array
 from benchmarks.stability import random_scenes
 from benchmarks.stability.random_scenes import ScoredValues
 
+PAGES: Final = Path(__file__).resolve().parents[2] / "docs/algorithms"
+"""Of the tables."""
 BASE: Final = "all guards"
 RATES: Final = {
     "false, model holds": ("false plain where satisfied", "plain where satisfied"),
@@ -93,14 +96,15 @@ def _counts(values: ScoredValues, guard: Guard) -> dict[str, Any]:
     counts = random_scenes.counts(
         replace(values, bits=values.bits & ~np.int32(guard.bits), uncertain=uncertain)
     )
+    del counts["sizes"]
     counts |= {"scored": float(values.error.size), "lost": values.error.size - counts["plain"]}
     kind = "satisfied" if values.failure.satisfied else "violated"
     return {
         "guard": guard.name,
         "quantity": values.quantity,
         "class": values.failure.name,
-        **{name: number for name, number in counts.items() if name != "sizes"},
-        **{f"{name} where {kind}": number for name, number in counts.items() if name != "sizes"},
+        **counts,
+        **{f"{name} where {kind}": number for name, number in counts.items()},
     }
 
 
@@ -108,17 +112,20 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
     """Yield the lines of a Markdown table: rates with all guards, then changes without each."""
     yield "| guard off | value | " + " | ".join(RATES) + " | moves |"
     yield "| --- | --- |" + " --- |" * (len(RATES) + 1)
-    sides = {
-        key: part.groupby("cluster", sort=False).sum()
-        for key, part in counts.groupby(["guard", "quantity"], sort=False)
-    }
-    names = (counts.index.unique(level) for level in ("guard", "quantity"))
-    for guard, quantity in (key for key in product(*names) if key in sides):
-        own, base = sides[guard, quantity], sides[BASE, quantity]
+    parts = [*dict.fromkeys(name for pair in RATES.values() for name in pair)]
+    sides = counts.reindex(columns=parts).fillna(0.0)
+    sides = sides.groupby(["guard", "quantity", "cluster"], sort=False).sum()
+    for guard, quantity in product(*(sides.index.unique(level) for level in ("guard", "quantity"))):
+        own, base = sides.loc[guard, quantity], sides.loc[BASE, quantity]
         cells, moves = [], []
-        for name, parts in RATES.items():
-            value, error = _change(*(side.reindex(columns=parts).fillna(0.0).to_numpy()
-                                     for side in (own, base)), of_base=guard == BASE)  # fmt: skip
+        for name, pair in RATES.items():
+            (value, without), (of_base, base_without) = (
+                _jackknife(*side[list(pair)].to_numpy().T) for side in (own, base)
+            )
+            if guard != BASE:
+                value, without = value - of_base, without - base_without
+            scatter = np.sum((without - without.mean()) ** 2)
+            error = np.sqrt((without.size - 1) / without.size * scatter)
             if guard != BASE and abs(value) > 2.0 * error:
                 moves.append(name)
             sign = "" if guard == BASE else "+"
@@ -126,20 +133,10 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
         yield f"| {guard} | {quantity} | " + " | ".join(cells) + f" | {', '.join(moves)} |"
 
 
-def _change(own: np.ndarray, base: np.ndarray, *, of_base: bool) -> tuple[float, float]:
-    """Return a rate, or its change, with the jackknife error; counts are (cluster, 2)."""
-
-    def rates(counts: np.ndarray) -> tuple[float, np.ndarray]:
-        total = counts.sum(axis=0)
-        events, trials = (total - counts).T
-        return float(total[0] / max(total[1], 1.0)), events / np.maximum(trials, 1.0)
-
-    value, without = rates(own)
-    if not of_base:
-        base_value, base_without = rates(base)
-        value, without = value - base_value, without - base_without
-    count = without.size
-    return value, float(np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2)))
+def _jackknife(events: Array, trials: Array) -> tuple[float, Array]:
+    """Return a rate, and the rates without each of the clusters."""
+    others = (events.sum() - events) / np.maximum(trials.sum() - trials, 1.0)
+    return float(events.sum() / max(trials.sum(), 1.0)), others
 
 
 def write_table(page: Path, mark: str, lines: Iterable[str]) -> None:
@@ -152,8 +149,8 @@ def write_table(page: Path, mark: str, lines: Iterable[str]) -> None:
     page.write_text("".join((before, begin, *(f"{line}\n" for line in lines), end, after)), "utf-8")
 
 
-def cluster_count(description: str | None, default: int) -> int:
+def requested_number(description: str | None, default: int) -> int:
     """Return the number of clusters that the command line of a study requests."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("clusters", nargs="?", type=int, default=default)
-    return int(parser.parse_args().clusters)
+    parser.add_argument("number", nargs="?", type=int, default=default)
+    return int(parser.parse_args().number)

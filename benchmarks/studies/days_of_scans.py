@@ -21,14 +21,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from support.archives.scan_campaign import ALTITUDE, TREE
 
-from benchmarks.studies.ablation import cluster_count, write_table
+from benchmarks.studies.ablation import PAGES, requested_number, write_table
 from lidarops.campaign.model import load_campaign
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.run.archive import reprocess
 from lidarops.simulate.campaign import simulate_campaign
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/multiangle.md"
 DAYS = 20
 CLASSES = {"no flag": 0, "prior_dominated": int(MultiAngleQuality.PRIOR_DOMINATED)}
 TERMS = ("standard", "gradient", "dead_time")
@@ -70,12 +69,8 @@ def main(days: int) -> None:
             scores, flags = day_of_scores(Path(folder), seed)
         for name, bits in CLASSES.items():
             chosen = np.abs(scores[(flags == bits) & np.isfinite(scores)])
-            shares = (
-                [100.0 * np.mean(chosen > k) for k in LIMITS]
-                if chosen.size
-                else [np.nan] * len(LIMITS)
-            )
-            rates[name].append([chosen.size, *shares])
+            shares = [100.0 * np.sum(chosen > k) / max(chosen.size, 1) for k in LIMITS]
+            rates[name].append([chosen.size, *(shares if chosen.size else np.full(3, np.nan))])
     lines = [
         f"| {days} days, values with | a day | {' | '.join(f'> {k:g}, %' for k in LIMITS)} |",
         "| --- | --- | --- | --- | --- |",
@@ -85,8 +80,8 @@ def main(days: int) -> None:
         mean, error = np.nanmean(table, axis=0), np.nanstd(table, axis=0, ddof=1) / days**0.5
         cells = [f"{m:.3f} ± {e:.3f}" for m, e in zip(mean[1:], error[1:], strict=True)]
         lines.append(f"| {name} | {mean[0]:.0f} | {' | '.join(cells)} |")
-    write_table(PAGE, "days", lines)
+    write_table(PAGES / "multiangle.md", "days", lines)
 
 
 if __name__ == "__main__":
-    main(cluster_count(__doc__, DAYS))
+    main(requested_number(__doc__, DAYS))

@@ -1,7 +1,4 @@
-"""Ablation of the guards of the elastic inversion: ``python -m benchmarks.studies.elastic_guards``.
-
-It writes a table into ``docs/algorithms/elastic.md``.
-"""
+"""Ablation of guards of the elastic inversion: ``python -m benchmarks.studies.elastic_guards``."""
 
 from __future__ import annotations
 
@@ -18,10 +15,11 @@ import numpy as np
 
 from benchmarks.stability import random_elastic
 from benchmarks.studies.ablation import (
+    PAGES,
     Guard,
-    cluster_count,
     measure,
     replaced,
+    requested_number,
     table,
     without,
     write_table,
@@ -34,7 +32,6 @@ from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.inversion import THRESHOLDS
 
-PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/elastic.md"
 CLUSTERS: Final = 60
 PROFILES: Final = 10
 
@@ -132,6 +129,6 @@ GUARDS: Final = (
 )
 
 if __name__ == "__main__":
-    clusters = cluster_count(__doc__, CLUSTERS)
-    counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), range(clusters), GUARDS)
-    write_table(PAGE, "guards", table(counts))
+    clusters = range(requested_number(__doc__, CLUSTERS))
+    counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), clusters, GUARDS)
+    write_table(PAGES / "elastic.md", "guards", table(counts))

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from benchmarks.stability import random_homogeneous
 from benchmarks.studies.ablation import (
+    PAGES,
     Guard,
-    cluster_count,
     measure,
     replaced,
+    requested_number,
     table,
     without,
     write_table,
@@ -23,11 +23,8 @@ from lidarops.retrieve.homogeneous import _fit_quality, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
-PAGE: Final = Path(__file__).resolve().parents[2] / "docs/algorithms/homogeneous.md"
 CLUSTERS: Final = 150
 PROFILES: Final = 60
-
-
 _LIMITS: Final = _fit_quality._limits
 _FIT: Final = path_fit.fit_homogeneous_path
 
@@ -39,13 +36,10 @@ def _no_widening(*arguments: Any, **options: Any) -> Any:
 
 def _no_bend(power: Any, range_: Any, **options: Any) -> Any:
     """Return a fit without the part of the model errors by a signal that bends."""
-    result = _FIT(power, range_, **options)
-    slope = THRESHOLDS.model_error * (np.abs(result.extinction) + 1.0 / np.mean(range_))
-    return replace(
-        result,
-        extinction_model_error=slope,
-        background_model_error=np.zeros_like(result.background),
-    )
+    fit = _FIT(power, range_, **options)
+    slope = THRESHOLDS.model_error * (np.abs(fit.extinction) + 1.0 / np.mean(range_))
+    none = np.zeros_like(fit.background)
+    return replace(fit, extinction_model_error=slope, background_model_error=none)
 
 
 GUARDS: Final = (
@@ -60,20 +54,16 @@ GUARDS: Final = (
     Guard("widening of estimated noise", off=without((_fit_quality, "_limits", _no_widening))),
     Guard("bend in the model error", off=without((path_fit, "fit_homogeneous_path", _no_bend))),
 )
-
 SHORT: Final = (Guard("TOO_FEW_BINS", int(Quality.TOO_FEW_BINS)),)
 """Guard of sections of fewer than 8 bins, all of which it withholds."""
-TABLES: Final = {
-    "guards": ((8, 800), GUARDS),
-    "guards of 4 to 7 bins": ((4, 7), SHORT),
-}
+TABLES: Final = {"guards": ((8, 800), GUARDS), "guards of 4 to 7 bins": ((4, 7), SHORT)}
 """Mark of the table in the page -> numbers of bins and guards."""
 
 if __name__ == "__main__":
-    clusters = cluster_count(__doc__, CLUSTERS)
+    clusters = range(requested_number(__doc__, CLUSTERS))
     for mark, (bins, guards) in TABLES.items():
         with replaced((random_homogeneous, "_BINS", bins)):
             counts = measure(
-                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), range(clusters), guards
+                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), clusters, guards
             )
-        write_table(PAGE, mark, table(counts))
+        write_table(PAGES / "homogeneous.md", mark, table(counts))

@@ -1,6 +1,5 @@
-"""Time and memory of retrievals, readers, archives and whole campaigns.
+"""Time and memory of retrievals, readers and whole campaigns.
 
-`retrievals` and `readers` time single functions. `archives` times runs over
-archives of many scenes, most of them stand-ins (`stand_in_archives`). `campaigns` times all stages
-of simulated campaigns, and `memory` measures the peak of processes.
+`retrievals`, `raman_night` and `readers` time single functions. `campaigns` times all stages of
+simulated campaigns, and `memory` measures the peak of processes.
 """

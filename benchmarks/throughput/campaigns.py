@@ -1,4 +1,7 @@
-"""CPU time of a campaign from raw files to report, by stage, and its growth with the size."""
+"""CPU time of a campaign from raw files to report, by stage, and its growth with the size.
+
+Of archives of up to 10^5 small files, the growth of the cost per file shows what 10^8 files cost.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +19,7 @@ import yaml
 from scipy import stats
 
 from benchmarks.harness.figure import share
-from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.harness.timing import timed
 from benchmarks.harness.verdicts import Scores
 from lidarops.campaign.model import Campaign, load_campaign
@@ -34,30 +36,21 @@ _INTERVAL: Final = 60
 """s; duration of a file."""
 _SHORTEST: Final = 1e-4
 """s; least time, because a coarse clock may not advance during a fast call."""
-
-
-class Stage(StrEnum):
-    """Stage of processing a campaign."""
-
-    SCAN = "scan"
-    READ = "read"
-    RETRIEVE = "retrieve"
-    WRITE = "write"
-    ORCHESTRATION = "orchestration"
-    REPORT = "report"
-    UNCHANGED = "all unchanged"
-
-
-_ABOUT: Final[Mapping[Stage, str]] = {
-    Stage.SCAN: "headers of all files into the catalog",
-    Stage.READ: "digest and header of each file of a scene",
-    Stage.RETRIEVE: "counts to results, including reading the channels",
-    Stage.WRITE: "products as NetCDF",
-    Stage.ORCHESTRATION: "scenes, plans, staleness, ledger",
-    Stage.REPORT: "page and figures",
-    Stage.UNCHANGED: "a second run without anything to process",
+STAGES: Final = {
+    "scan": "headers of all files into the catalog",
+    "read": "digest and header of each file of a scene",
+    "retrieve": "counts to results, including reading the channels",
+    "write": "products as NetCDF",
+    "orchestration": "scenes, plans, staleness, ledger",
+    "report": "page and figures",
+    "scan, all known": "list the files and compare them with the catalog",
+    "all unchanged": "a second run without anything to process",
 }
-_SCENE_STAGES: Final = {"digest": Stage.READ, "retrieve": Stage.RETRIEVE, "write": Stage.WRITE}
+"""Stages of processing a campaign, and what is done in each."""
+_OF_SCENES: Final = {"digest": "read", "retrieve": "retrieve", "write": "write"}
+"""Stages by the names of the laps of a scene."""
+_AGAIN: Final = ("scan, all known", "all unchanged")
+"""Stages of a run that is not the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,11 +77,13 @@ _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     "profiles": tuple(CampaignSize(profiles=n) for n in (15, 30, 60, 120)),
     "bins": tuple(CampaignSize(bins=n) for n in (500, 1000, 2000, 4000)),
     "angles": tuple(CampaignSize(angles=n, profiles=120, bins=2000) for n in (5, 9, 17)),
+    "files": tuple(CampaignSize(n, 480, 200, retrieved=False) for n in (2, 20, 200)),
 }
 _QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
-    name: sizes[:3] for name, sizes in _ALONG.items() if name != "angles"
+    **{name: _ALONG[name][:3] for name in ("scenes", "profiles", "bins")},
+    "files": tuple(CampaignSize(n, 480, 200, retrieved=False) for n in (1, 2, 4)),
 }
-Cost = tuple[CampaignSize, dict[Stage, float]]
+Cost = tuple[CampaignSize, dict[str, float]]
 """Size of a campaign, and its CPU time by stage, s."""
 
 
@@ -112,41 +107,36 @@ def measure_campaigns(
         name: [_cost(size, effort) for size in sizes]
         for name, sizes in (along or (_QUICK if effort.quick else _ALONG)).items()
     }
-    chapter = Chapter(
-        "Cost of each stage, and its growth",
-        "Simulated campaigns of one lidar, from raw files on disk to products and report, "
-        "in one process. CPU time; that of a run is divided among its stages in proportion to "
-        "wall time. Slope: of the logarithm of time against that of the size, with its 95 % "
-        "interval; 1 is linear.",
-        [growth(name, costs) for name, costs in growths.items()],
-    )
-    return Study("Campaigns: CPU time by stage", effort.date, [chapter])
+    results = [growth(name, costs) for name, costs in growths.items()]
+    return Study("Campaigns: CPU time by stage", effort.date, results)
 
 
 def _cost(size: CampaignSize, effort: Effort) -> Cost:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         campaign = simulate_campaign(size, Path(folder))
-        seconds = {Stage.SCAN: _timed(lambda: archive.update_catalog(campaign))}
+        seconds = {"scan": _timed(lambda: archive.update_catalog(campaign))}
         started = time.perf_counter()
         cpu, record = timed(lambda: archive.reprocess(campaign))
         wall = time.perf_counter() - started
         if record is None:
             raise CampaignError("the simulated campaign has nothing to process", field="simulation")
         seconds |= _stage_times(record, cpu, wall)
-        seconds[Stage.REPORT] = _timed(lambda: archive.report_run(campaign, record))
-        seconds[Stage.UNCHANGED] = _timed(lambda: archive.reprocess(campaign))
+        seconds["report"] = _timed(lambda: archive.report_run(campaign, record))
+        again, unchanged = _AGAIN
+        seconds[again] = _timed(lambda: archive.update_catalog(campaign))
+        seconds[unchanged] = _timed(lambda: archive.reprocess(campaign))
     effort.progress(1)
     return size, seconds
 
 
-def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[Stage, float]:
+def _stage_times(record: RunRecord, cpu: float, wall: float) -> dict[str, float]:
     """Return the CPU time of a run by stage, in proportion to wall time."""
-    laps = dict.fromkeys(_SCENE_STAGES.values(), 0.0)
+    laps = dict.fromkeys(_OF_SCENES.values(), 0.0)
     for outcome in record.scenes:
         for name, lap in outcome.seconds.items():
-            if name in _SCENE_STAGES:
-                laps[_SCENE_STAGES[name]] += lap
-    laps[Stage.ORCHESTRATION] = wall - sum(laps.values())
+            if name in _OF_SCENES:
+                laps[_OF_SCENES[name]] += lap
+    laps["orchestration"] = wall - sum(laps.values())
     return {stage: max(cpu * lap / wall, _SHORTEST) for stage, lap in laps.items()}
 
 
@@ -155,13 +145,7 @@ def _timed(call: Callable[[], object]) -> float:
 
 
 def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
-    """Simulate a campaign of this size and write its raw files.
-
-    Returns
-    -------
-    Campaign
-        The campaign, not processed yet.
-    """
+    """Return a simulated campaign of this size, whose raw files are written."""
     path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
     campaign = load_campaign(path)
@@ -236,22 +220,9 @@ def _scanning(size: CampaignSize) -> dict[str, Any]:
 
 
 def _recorded(size: CampaignSize) -> dict[str, Any]:
-    return {
-        "acquisition": {
-            "interval": _INTERVAL,
-            "shots": 1000,
-            "repetition_rate": 20,
-            "bins": size.bins,
-        },
-        "detectors": [
-            {
-                "wavelength": 532,
-                "signal_rate": 5.0,
-                "background": {"night": 0.05, "day": 0.5},
-                "photon": {},
-            }
-        ],
-    }
+    detector = {"wavelength": 532, "signal_rate": 5.0, "background": {"night": 0.05, "day": 0.5}}
+    acquisition = {"interval": _INTERVAL, "shots": 1000, "repetition_rate": 20, "bins": size.bins}
+    return {"acquisition": acquisition, "detectors": [detector | {"photon": {}}]}
 
 
 def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
@@ -265,21 +236,24 @@ def growth(along: str, costs: Sequence[Cost]) -> Results:
     """Return the times of the stages of the largest campaign, and how they grow with the size."""
     size, spent = costs[-1]
     sizes = [getattr(each, along) for each, _ in costs]
-    total = sum(seconds for stage, seconds in spent.items() if stage is not Stage.UNCHANGED)
+    total = sum(seconds for stage, seconds in spent.items() if stage not in _AGAIN)
     scores: Scores = {}
     for stage, seconds in spent.items():
         steepness, half = slope(sizes, [of_stage[stage] for _, of_stage in costs])
         scores["", stage] = {
-            "work": _ABOUT[stage],
+            "work": STAGES[stage],
             "CPU time (s)": seconds,
-            "share": None if stage is Stage.UNCHANGED else share(seconds / total),
+            "share": None if stage in _AGAIN else share(seconds / total),
             "ms per file": 1e3 * seconds / size.files,
             "slope": f"{steepness:.2f} ± {half:.2f}",
         }
     return Results(
         f"By number of {along}; times at {getattr(size, along)}",
         scores,
+        "Simulated campaigns of one lidar on a local disk, which TMPDIR selects, in one process: "
         f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
-        + (f", {size.angles} directions." if size.angles else "."),
+        + (f", {size.angles} directions. " if size.angles else ". ")
+        + "CPU time; that of a run is divided among its stages in proportion to wall time. Slope: "
+        "of the logarithm of time against that of the size, with its 95 % interval; 1 is linear.",
         method="stage",
     )

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import yaml
 
-from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.harness.timing import in_fresh_process, peak_memory
 from benchmarks.harness.verdicts import Scores
 from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings
@@ -135,21 +135,14 @@ def measure_memory(effort: Effort) -> Study:
             "slope": (peak.above - first.above) / more if more else None,
         }
         effort.progress(1)
-    chapter = Chapter(
-        "Peak memory above the base of a process",
+    note = (
         f"Scenes of one analog and one photon-counting channel with {BINS:,} bins, each in a fresh "
         "process. The base is the peak after a tiny scene of the same case, with imports and "
-        "compiled code.",
-        [
-            Results(
-                "Peak memory",
-                scores,
-                "Slope: growth above the base from the smallest scene, MB for 1 MB of raw counts.",
-                method="raw MB",
-            )
-        ],
+        "compiled code. Slope: growth above the base from the smallest scene, MB for 1 MB of raw "
+        "counts."
     )
-    return Study("Memory of a process, by size of the scene", effort.date, [chapter])
+    results = Results("Peak memory", scores, note, method="raw MB")
+    return Study("Memory of a process, by size of the scene", effort.date, [results])
 
 
 def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:

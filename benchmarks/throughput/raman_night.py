@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from benchmarks.harness.figure import Figure, cpu_time
-from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.harness.timing import CPU_TIME, READ, time_methods
 from benchmarks.harness.verdicts import Scores
 from lidarops.records import DetectionMode
@@ -59,15 +59,14 @@ def measure_raman(effort: Effort, *, profiles: int = PROFILES) -> Study:
     whole = profiles * sum(part.value for part in parts if isinstance(part, Figure))
     scores[case, WHOLE] = {"lidarops": True, "profiles": 1, CPU_TIME: cpu_time(whole)}
     effort.progress(1)
-    chapter = Chapter(
-        "A night of two Raman pairs",
+    note = (
         f"{len(CHANNELS)} channels of photon counting, {BINS} bins: signals with noise and quality,"
         " means over half an hour without outlying parts; then extinction, backscatter and lidar"
         " ratio of two pairs, and water vapour. Reading and writing of files are left out. One"
-        " thread.",
-        [Results("CPU time of a profile", scores, f"Reads: multiples of {READ}.", case="night")],
+        f" thread. Reads: multiples of {READ}."
     )
-    return Study("Raman: time of a night", effort.date, [chapter])
+    results = Results("CPU time of a profile", scores, note, case="night")
+    return Study("Raman: time of a night", effort.date, [results])
 
 
 def night(profiles: int, bins: int = BINS) -> xr.Dataset:
@@ -119,36 +118,22 @@ def screened_average(counts: xr.Dataset, names: Sequence[str]) -> ClockAverage:
     """Return the means over half an hour of the channels of a product, still without profiles."""
     distance, geometry = counts["range"].to_numpy(), counts[["time", "time_bnds"]]
     records = [
-        IntervalSums(
-            geometry,
-            distance,
-            seconds=1800.0,
-            shots=counts[f"photon_{name}_shots"],
-            parts=THRESHOLDS.most_parts,
-        )
+        IntervalSums(geometry, distance, seconds=1800.0, shots=counts[f"photon_{name}_shots"],
+                     parts=THRESHOLDS.most_parts)
         for name in names
-    ]
+    ]  # fmt: skip
     return ClockAverage(records, Screening(cloud_contrast(CHANNELS[names[0]]), _HIGHEST))
 
 
 def retrieved(means: dict[str, xr.Dataset]) -> list[xr.Dataset]:
     """Return the products of both pairs."""
     water = labeled.WaterVapour(means["408"], CHANNELS["408"], 0.2, 0.01)
+    pairs = (("355", "387", water), ("532", "607", None))
     return [
-        _pair(means, "355", "387", water),
-        _pair(means, "532", "607", None),
-    ]
-
-
-def _pair(
-    means: dict[str, xr.Dataset], laser: str, raman: str, water: labeled.WaterVapour | None
-) -> xr.Dataset:
-    return labeled.retrieve(
-        means[laser].assign_coords(zenith_angle=0.0),
-        means[raman],
-        molecules=MolecularProfile.us_standard(),
-        station_altitude=100.0,
-        wavelengths=(CHANNELS[laser], CHANNELS[raman]),
-        settings=RamanSettings(),
-        water=water,
-    )
+        labeled.retrieve(
+            means[laser].assign_coords(zenith_angle=0.0), means[raman],
+            molecules=MolecularProfile.us_standard(), station_altitude=100.0,
+            wavelengths=(CHANNELS[laser], CHANNELS[raman]), settings=RamanSettings(), water=of_pair,
+        )
+        for laser, raman, of_pair in pairs
+    ]  # fmt: skip

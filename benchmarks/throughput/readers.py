@@ -13,7 +13,7 @@ import dask
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness.results import Chapter, Effort, Results, Study
+from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.harness.timing import least_times
 from benchmarks.harness.verdicts import Scores
 from lidarops.errors import RawFormatError
@@ -21,7 +21,7 @@ from lidarops.raw.archive import open_archive
 from lidarops.raw.licel import read_counts, read_header, select
 
 
-def measure_readers(effort: Effort, paths: Sequence[Path]) -> Study:
+def measure_readers(effort: Effort) -> Study:
     """Return the speed of the header scan, of raw files to float32 and of opening an archive.
 
     The floors come first: reading the bytes; reading them with ``np.frombuffer`` and one
@@ -31,14 +31,14 @@ def measure_readers(effort: Effort, paths: Sequence[Path]) -> Study:
     Parameters
     ----------
     effort : Effort
-    paths : sequence of Path
-        Files of one layout.
+        With files of one layout.
 
     Raises
     ------
     RawFormatError
         If there is no file, or one cannot be read.
     """
+    paths = effort.files
     if not paths:
         raise RawFormatError("at least one file is needed", field="paths")
     size = sum(read_header(path).size for path in paths)
@@ -63,10 +63,9 @@ def measure_readers(effort: Effort, paths: Sequence[Path]) -> Study:
         }
         for name, seconds in times.items()
     }
-    text = "Raw files to arrays, from the page cache, against floors measured in the same run."
-    results = Results("One core, CPU time", scores, method="what")
-    chapter = Chapter("Throughput", text, [results])
-    return Study("Reader: files per second", effort.date, [chapter])
+    note = "Raw files to arrays, from the page cache, against floors measured in the same run."
+    results = Results("One core, CPU time", scores, note, method="what")
+    return Study("Reader: files per second", effort.date, [results])
 
 
 def _multiply(

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.accuracy.homogeneous_cases import PathSolver, Scenario, method_arguments
 from benchmarks.accuracy.homogeneous_peers import iterative_peers
 from benchmarks.harness.plots import Chart
-from benchmarks.harness.results import Chapter, Effort, Results, Study, frame
+from benchmarks.harness.results import Effort, Results, Study, frame
 from benchmarks.harness.timing import CPU_TIME, READ, affordable, time_methods
 from benchmarks.harness.verdicts import Scores
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
@@ -21,26 +21,6 @@ PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000
 _PRECISIONS: Final = ("float32", "float64")
 _MISSING: Final = 0.3
 """Share of the bins that are NaN, at random."""
-
-
-def _study(title: str, effort: Effort, name: str, text: str, scores: Scores) -> Study:
-    """Return the study of the CPU time of methods, with a table for each case."""
-    cases = dict.fromkeys(case for case, _ in scores)
-    chapter = Chapter(
-        "CPU time per profile",
-        f"{text} One thread, least CPU time of interleaved repeats; numba is timed once compiled. "
-        f"{READ} is a vectorised maximum of the same array in the same run: the floor.",
-        [
-            Results(
-                case,
-                {key: score for key, score in scores.items() if key[0] == case},
-                "Reads: multiples of the read. Profiles: of a call, fewer for slow methods.",
-            )
-            for case in cases
-        ],
-        [Chart(name, "CPU time per profile", "A mark for each case.", frame(scores), CPU_TIME)],
-    )
-    return Study(title, effort.date, [chapter])
 
 
 def measure_solvers(effort: Effort, *, profiles: int | None = None) -> Study:
@@ -58,11 +38,19 @@ def measure_solvers(effort: Effort, *, profiles: int | None = None) -> Study:
     for missing, variance, dtype in product((0.0, _MISSING), (1.0, None), _PRECISIONS):
         scores |= _solver_costs(dtype, variance, missing, (count, repeats))
         effort.progress(1)
-    text = (
+    note = (
         f"Path {PATH.label}, {PATH.bins} bins; one variance for all profiles or none, no "
-        "correlation length or exposure. All outputs and flags."
+        "correlation length or exposure. All outputs and flags. One thread, least CPU time of "
+        "interleaved repeats; numba is timed once compiled. Reads: multiples of the read, "
+        f"{READ}, a vectorised maximum of the same array in the same run: the floor. Profiles: of "
+        "a call, fewer for slow methods."
     )
-    return _study("Homogeneous path: time per profile", effort, "time", text, scores)
+    results = [
+        Results(case, {key: score for key, score in scores.items() if key[0] == case}, note)
+        for case in dict.fromkeys(case for case, _ in scores)
+    ]
+    chart = Chart("time", "CPU time per profile", "A mark for each case.", frame(scores), CPU_TIME)
+    return Study("Homogeneous path: time per profile", effort.date, results, [chart])
 
 
 def _powers(dtype: str, missing: float, count: int) -> Any:

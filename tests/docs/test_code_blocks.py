@@ -29,9 +29,8 @@ import yaml
 from support.pages import REPOSITORY, Block, blocks, name_of, pages
 from typer.testing import CliRunner
 
+from benchmarks.__main__ import BENCHMARKS
 from benchmarks.__main__ import app as benchmarks
-from benchmarks.harness.results import BenchmarkKind
-from benchmarks.registry import Benchmark
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.run.clusters import Scheduler
@@ -201,8 +200,7 @@ def check_arguments(tool: str, arguments: list[str]) -> None:
         assert find_spec(arguments[1])
     if tool == "python" and arguments[:2] == ["-m", "benchmarks"]:
         words = typer.main.get_command(benchmarks).make_context("benchmarks", arguments[2:]).params
-        assert words["what"] in list(BenchmarkKind)
-        assert words["case"] in [*Benchmark, None]
+        assert words["case"] in [*BENCHMARKS[words["what"]], None]
     if tool == "pip":
         # One wheel, or a checkout: a name alone is that of any package of the index.
         assert arguments[0] == "install", arguments

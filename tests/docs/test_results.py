@@ -12,11 +12,9 @@ import typer
 import verdicts
 from support.cases import each
 
-from benchmarks.__main__ import app
+from benchmarks.__main__ import BENCHMARKS, app
 from benchmarks.harness.figure import Figure, Unit
-from benchmarks.harness.results import BenchmarkKind
 from benchmarks.harness.verdicts import Judgement, Target, Verdict
-from benchmarks.registry import Benchmark
 from benchmarks.stability import study
 from benchmarks.stability.random_scenes import TARGETS
 from benchmarks.stability.reasons import Unmet
@@ -108,14 +106,13 @@ def test_committed_results_are_small_and_state_their_machine(name: str) -> None:
     command, words = result["command"].split()[:3], result["command"].split()[3:]
     assert command == ["python", "-m", "benchmarks"]
     values = typer.main.get_command(app).make_context("benchmarks", words).params
-    assert values["what"] in list(BenchmarkKind)
-    assert values["case"] in [*Benchmark, None]
+    assert values["case"] in [*BENCHMARKS[values["what"]], None]
 
 
 def test_published_targets_are_those_of_the_code() -> None:
     """Rates of an older rule or with other columns are measured again."""
     tables = benchmark_results.read("stability")["tables"]
-    titles = [study.results_title(draws.retrieval) for draws in study.DRAWS]
+    titles = [draws.title for draws in study.DRAWS]
     assert list(tables) == [*titles, study.FLAGS, study.REPRODUCIBLE, study.COST]
     judged = 0
     for title in titles:
@@ -169,7 +166,7 @@ def test_no_reason_is_for_a_target_that_is_met() -> None:
 def test_every_reason_is_that_of_a_target() -> None:
     used = {verdicts.why(one) for one in verdicts.every_unmet()}
     undecided = Verdict.UNDECIDED
-    idle = [each for each in verdicts.stated_reasons() if each.why not in used]
+    idle = [each for each in verdicts.stated_reasons() if each["why"] not in used]
     assert [reason for reason in idle if reason.verdict != undecided] == []
 
 

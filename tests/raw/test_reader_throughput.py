@@ -14,7 +14,7 @@ def test_ways_and_rates(tmp_path):
     paths = [tmp_path / f"file{number}" for number in range(3)]
     for path in paths:
         path.write_bytes(raw_file())
-    rows = readers.measure_readers(Effort(repeats=2), paths).figures("One core, CPU time")
+    rows = readers.measure_readers(Effort(repeats=2, files=paths)).figures("One core, CPU time")
     names = list(dict.fromkeys(name for _, name, _ in rows))
     assert names == [
         "read bytes (floor)",
@@ -35,6 +35,6 @@ def test_ways_and_rates(tmp_path):
 
 def test_needs_files(tmp_path):
     with pytest.raises(RawFormatError, match="at least one file"):
-        readers.measure_readers(Effort(), [])
+        readers.measure_readers(Effort())
     with pytest.raises(RawFormatError, match="cannot be opened"):
-        readers.measure_readers(Effort(), [tmp_path / "absent"])
+        readers.measure_readers(Effort(files=[tmp_path / "absent"]))

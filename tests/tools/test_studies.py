@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.studies import path_guards
-from benchmarks.studies.ablation import BASE
+from benchmarks.studies.ablation import BASE, PAGES
 
 pytestmark = pytest.mark.slow
 
@@ -51,7 +51,7 @@ def test_a_study_states_its_arguments(repository: Path) -> None:
 
 @pytest.mark.parametrize("mark", path_guards.TABLES)
 def test_the_page_of_the_homogeneous_path_holds_the_tables_of_its_study(mark: str) -> None:
-    text = path_guards.PAGE.read_text(encoding="utf-8")
+    text = (PAGES / "homogeneous.md").read_text(encoding="utf-8")
     table = text.partition(f"<!-- {mark} -->\n")[2].partition(f"<!-- end of {mark} -->")[0]
     names = {line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()[2:]}
     _, guards = path_guards.TABLES[mark]

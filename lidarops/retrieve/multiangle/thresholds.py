@@ -9,7 +9,6 @@ class Thresholds(NamedTuple):
     """Numbers of the multi-angle retrieval, dimensionless unless stated.
 
     The last words of each entry state what set the number; "assumed" where nothing is recorded.
-    ``python -m benchmarks.studies.scan_guards --thresholds`` halves and doubles each of them.
     """
 
     # Directions and cycles (`scan_cycles`, `slant_paths`).

@@ -15,7 +15,6 @@ from benchmarks.accuracy.multiangle import StudySize
 from benchmarks.harness import statistics
 from benchmarks.harness.figure import Figure
 from benchmarks.harness.results import Effort
-from benchmarks.harness.timing import CPU_TIME
 from lidarops.retrieve.multiangle import mld
 
 pytestmark = pytest.mark.slow
@@ -185,26 +184,25 @@ def test_the_common_spline_is_as_good_as_a_spline_for_each_profile():
 
 def test_methods_are_compared_where_all_have_a_value():
     scene = multiangle_cases.clear(300.0, bins=150)
-    scores = multiangle._compare(scene, replace(SMALL, blocks=2, profiles=12), 1)
-    joint, spline = (
-        scores[scene.label, name] for name in (multiangle_cases.JOINT, multiangle_peers.SPLINE)
-    )
-    assert spline["solved"].value < joint["solved"].value
-    common = "RMSE where all have a value"
-    assert joint[common].value < joint[DEPTH].value
-    assert spline[common].value == pytest.approx(spline[DEPTH].value, rel=0.1)
+    size = replace(SMALL, blocks=2, profiles=12)
+    works = {work.method: work for work in multiangle.compare(scene, size, 1)}
+    joint, spline = works[multiangle_cases.JOINT], works[multiangle_peers.SPLINE]
+    assert spline.more["solved"].value < joint.more["solved"].value
+    assert joint.error.value < joint.more[multiangle.DEPTH].value
+    assert spline.error.value == pytest.approx(spline.more[multiangle.DEPTH].value, rel=0.1)
 
 
 # Statistics -----------------------------------------------------------------------------------
 
 
 def test_errors_come_from_independent_blocks():
-    figure = statistics.over_blocks([1.0, 2.0, math.nan, 6.0])
+    values, kept = np.array([1.0, 2.0, math.nan, 6.0]), np.array([True, True, False, True])
+    figure = statistics.mean_by_block(np.nan_to_num(values), kept, 1)
     assert figure.value == pytest.approx(3.0)
-    assert figure.error == pytest.approx(np.std([1, 2, 6], ddof=1) / math.sqrt(3))
-    square = statistics.root(Figure(4.0, 0.4))
-    assert (square.value, square.error) == pytest.approx((2.0, 0.1))
-    assert statistics.root(Figure(0.0, 0.0)) == Figure(0.0, 0.0)
+    square = statistics.root_by_block(np.array([1.0, 3.0]), np.ones(2, bool), 1)
+    assert (square.value, square.error) == pytest.approx((math.sqrt(5.0), 4.0 / math.sqrt(20.0)))
+    assert statistics.root_by_block(np.zeros(2), np.ones(2, bool), 1) == Figure(0.0, 0.0)
+    assert statistics.root_by_block(np.zeros(2), np.zeros(2, bool), 1) is None
     part = statistics.clustered_share(np.array([10.0, 0.0, 30.0]), np.array([100.0, 100.0, 200.0]))
     assert part.value == pytest.approx(0.1)
     assert part.error == pytest.approx(math.sqrt(0 + 100 + 100) / 400)
@@ -219,33 +217,29 @@ def test_errors_come_from_independent_blocks():
 # Results --------------------------------------------------------------------------------------
 
 
-DEPTH = "RMSE of optical depth"
-SLOPE = "RMSE of extinction (km⁻¹)"
-
-
 def test_every_method_is_scored_in_every_scene(study):
     names = [*multiangle_cases.scan_methods(), *multiangle_peers.scan_peers()]
     for scene in (SHORT.label, multiangle_cases.cloud().label):
-        rows = study.figures("Methods and peers in four scenes")
-        assert list(dict.fromkeys(name for at, name, _ in rows if at == scene)) == names
+        works = {work.method: work for work in study.works if work.setting == scene}
+        assert list(works) == names
 
-        def value(method, quantity, scene=scene, rows=rows):
-            return rows[scene, method, quantity].value
+        def value(method, quantity, works=works):
+            return works[method].more[quantity].value
 
-        assert value("kano_hamilton", "profiles") == SMALL.blocks * SMALL.profiles
-        assert value("scipy lsq_linear", "profiles") == SMALL.blocks * SMALL.slow
         lines, spline = (
-            value(f"straight lines, {name}", DEPTH) for name in ("numpy", "GCV spline")
+            value(f"straight lines, {name}", multiangle.DEPTH) for name in ("numpy", "GCV spline")
         )
         # In the clear scene a spline through all altitudes is the best one.
         assert spline < (1.0 if scene == SHORT.label else 0.95) * lines
+        line = value("kano_hamilton", multiangle.DEPTH)
         assert value("kano_hamilton", "solved") == 1.0
-        assert value("joint", DEPTH) < 0.6 * value("kano_hamilton", DEPTH)
-        assert value("joint", SLOPE) < 0.2 * value("kano_hamilton", SLOPE)
-        assert value("kano_hamilton", "within 1.96") == pytest.approx(0.95, abs=0.06)
-        bias = rows[scene, "kano_hamilton", "mean error"]
+        assert value("joint", multiangle.DEPTH) < 0.6 * line
+        assert value("joint", multiangle.SLOPE) < 0.2 * value("kano_hamilton", multiangle.SLOPE)
+        assert works["kano_hamilton"].coverage.value == pytest.approx(0.95, abs=0.06)
+        bias = works["kano_hamilton"].more["mean error"]
         assert abs(bias.value) < 5.0 * bias.error + 1e-3
-        assert value("scipy lsq_linear", "within 1") is None
-        assert value("two_angle", DEPTH) > value("kano_hamilton", DEPTH)
+        assert works["scipy lsq_linear"].coverage is None
+        assert works["scipy lsq_linear"].more["within 1"] is None
+        assert value("two_angle", multiangle.DEPTH) > line
         assert value("mld", "mean error") < 0.0
-        assert all(value(name, CPU_TIME) > 0 for name in names)
+        assert all(work.time.value > 0 for work in works.values())

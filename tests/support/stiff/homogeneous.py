@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.accuracy.homogeneous_cases import Scenario, least_errors
+from benchmarks.accuracy.homogeneous_cases import Scenario
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
@@ -110,7 +110,7 @@ def scattered(path: Path, **arguments: Any) -> Answer:
     """Return errors over the Cramér-Rao bound, of all profiles, rejected or not."""
     answer = solve_path(**arguments)
     error = answer.value("extinction") - path.extinction
-    bound = least_errors(path.scenario)["extinction"]
+    bound = path.scenario.least_errors()["extinction"]
     within = np.abs(error) <= 1.96 * answer.value("extinction_standard_error")
     values = {
         "RMSE over bound": np.sqrt(np.mean(error**2)) / bound,
