@@ -126,7 +126,7 @@ def measure(what: str, case: str | None, effort: Effort) -> Study:
     if what not in BENCHMARKS:
         raise CampaignError(f"no benchmark {what!r}", remedy=f"choose: {' or '.join(BENCHMARKS)}")
     cases = BENCHMARKS[what]
-    case = case or ("reader" if effort.files else next(iter(cases)))
+    case = case or ("reader" if effort.files and "reader" in cases else next(iter(cases)))
     if case not in cases:
         raise CampaignError(f"no case {case!r} of {what}", remedy=f"choose: {' or '.join(cases)}")
     for option, places in _OPTIONS.items():

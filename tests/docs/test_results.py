@@ -167,7 +167,7 @@ def test_every_reason_is_that_of_a_target() -> None:
     used = {verdicts.why(one) for one in verdicts.every_unmet()}
     undecided = Verdict.UNDECIDED
     idle = [each for each in verdicts.stated_reasons() if each["why"] not in used]
-    assert [reason for reason in idle if reason.verdict != undecided] == []
+    assert [reason for reason in idle if reason.get("verdict") != undecided] == []
 
 
 def test_the_page_of_targets_counts_those_that_are_not_met() -> None:

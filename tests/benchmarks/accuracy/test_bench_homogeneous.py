@@ -191,8 +191,8 @@ def test_scores_of_known_errors():
     assert score["extinction: RMSE"].value == pytest.approx(math.sqrt(11 / 3), rel=1e-6)
     bias = score["extinction: mean error"]
     assert bias.value == pytest.approx(1.0, rel=1e-6)
-    # The scatter of three values, of which the mean is known from them alone.
-    assert bias.error == pytest.approx(math.sqrt(8 / 3 / 2), rel=1e-6)
+    # The scatter of the sums of five profiles, two of which have no value.
+    assert bias.error == pytest.approx(math.sqrt(8 * 5 / 4) / 3, rel=1e-6)
     assert score["extinction: 95 %"].value == pytest.approx(2 / 3)
     assert "background: RMSE" not in score, "a given value has no score"
     assert (score["flagged"].value, score["rejected"].value) == (0.6, 0.4)
