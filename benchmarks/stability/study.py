@@ -196,14 +196,14 @@ def measure_stability(
     )  # fmt: skip
 
 
-def _of(case: str) -> Callable[[Effort], Study]:
+def _measured(case: str) -> Callable[[Effort], Study]:
     return lambda effort: measure_stability(effort, case=case)
 
 
 CASES: Final[dict[str, Callable[[Effort], Study]]] = {
     "all": measure_stability,
-    **{part.case: _of(part.case) for part in (*DRAWS, *OTHERS)},
-    **{part.name: _of(part.name) for part in (*DRAWS, *OTHERS)},
+    **{part.case: _measured(part.case) for part in (*DRAWS, *OTHERS)},
+    **{part.name: _measured(part.name) for part in (*DRAWS, *OTHERS)},
 }
 """The benchmark of all parts, of those of a case, and of each."""
 

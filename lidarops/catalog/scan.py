@@ -381,17 +381,6 @@ class _Unclaimed:
         return tuple(path for _, path in self._best[pattern])
 
 
-def scan_keys(campaign: Campaign) -> dict[tuple[str, Role], str]:
-    """Return a digest of the settings that affect the granules of each instrument and role.
-
-    Returns
-    -------
-    dict
-        (instrument, role) -> scan key of files that only this instrument claims.
-    """
-    return {(claim.instrument, claim.role): claim.scan_key for claim in _claims(campaign)}
-
-
 def _claims(campaign: Campaign) -> list[_Claim]:
     claims: list[_Claim] = []
     version = reading_version()
