@@ -115,8 +115,10 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
     parts = [*dict.fromkeys(name for pair in RATES.values() for name in pair)]
     sides = counts.reindex(columns=parts).fillna(0.0)
     sides = sides.groupby(["guard", "quantity", "cluster"], sort=False).sum()
-    for guard, quantity in product(*(sides.index.unique(level) for level in ("guard", "quantity"))):
-        own, base = sides.loc[guard, quantity], sides.loc[BASE, quantity]
+    names = [sides.index.unique(level) for level in ("guard", "quantity")]
+    parts_of = dict(list(sides.groupby(["guard", "quantity"], sort=False)))
+    for guard, quantity in (key for key in product(*names) if key in parts_of):
+        own, base = parts_of[guard, quantity], parts_of[BASE, quantity]
         cells, moves = [], []
         for name, pair in RATES.items():
             (value, without), (of_base, base_without) = (
