@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
-from lidarops.retrieve.signal.dead_time import ProfileGroup, estimate_dead_time
-
-DISTANCE = 7.5 * (np.arange(4000) + 0.5)
-LIGHT = 400.0 * (300.0 / DISTANCE) ** 2 * np.exp(-2e-4 * DISTANCE)
-"""MHz."""
-LAG = 10
-SLOPE = 60.0
-"""MHz mV-1."""
+from benchmarks.stability.random_dead_times import (
+    DISTANCE,
+    LAG,
+    LIGHT,
+    NONLINEAR,
+    SCENES,
+    draw_group,
+    draw_scene,
+)
+from lidarops.retrieve.signal.dead_time import estimate_dead_time
 
 
 def record(
@@ -22,47 +22,11 @@ def record(
 ):
     """Return groups of one profile each, of the same light."""
     return [
-        group(rng, dead_time, [light], [shots], sky, paralysable=paralysable, baseline=baseline)
+        draw_group(
+            rng, dead_time, [light], [shots], sky, paralysable=paralysable, baseline=baseline
+        )
         for _ in range(groups)
     ]
-
-
-def group(rng, dead_time, lights, shots, sky=0.5, *, paralysable=False, baseline=0.0, bend=0.0):
-    """Return a group of profiles, whose largest analog signal is too large by a share `bend`."""
-    true = np.where(DISTANCE > 150.0, np.stack(lights), 0.0) + sky
-    load = dead_time * 1e6 * true
-    rate = true * np.exp(-load) if paralysable else true / (1.0 + load)
-    exposure = np.array(shots) * 0.05
-    mean_counts = rate * exposure[:, np.newaxis]
-    # The dead time makes counts more regular than Poisson.
-    regular = 1.0 if paralysable else 1.0 / (1.0 + load)
-    counts = mean_counts + regular * (rng.poisson(mean_counts) - mean_counts)
-    noise = 2e-3 * np.sqrt(600.0 / exposure.sum() * 0.05)
-    mean = exposure / exposure.sum() @ true
-    clear = np.interp(np.arange(DISTANCE.size) - LAG, np.arange(DISTANCE.size), mean) / SLOPE
-    clear *= 1.0 + bend * clear / clear.max()
-    clear += baseline * np.exp(-DISTANCE / 3000.0)
-    analog = 4.8 + clear + rng.normal(0.0, noise, DISTANCE.size)
-    return ProfileGroup(counts, exposure, analog, np.full(analog.shape, noise**2))
-
-
-def varying_air(rng, number):
-    """Return the light of profiles through layers that rise, of different strength."""
-    height, strength = 300.0 + 100.0 * number, rng.uniform(0.0, 3.0)
-    return LIGHT * (1.0 + strength * np.exp(-(((DISTANCE - height) / 150.0) ** 2)))
-
-
-SCENES = {
-    "like profiles": lambda _rng, _number: LIGHT,
-    "a laser that varies": lambda rng, _number: LIGHT * max(rng.normal(1.0, 0.4), 0.05),
-    "a laser that fails in half of the profiles": lambda _rng, number: (
-        LIGHT * (1.0 if number % 2 else 0.03)
-    ),
-    "air that varies": varying_air,
-    "a scan": lambda _rng, number: (
-        LIGHT * np.exp(2e-4 * DISTANCE * (1.0 - 1.0 / math.cos(math.radians(2.5 * number))))
-    ),
-}
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -70,14 +34,9 @@ SCENES = {
 def test_profiles_need_not_be_alike(scene, dead_time):
     """Errors are those of noise: a mean over profiles of different light has another rate."""
     rng = np.random.default_rng(7)
-    light = SCENES[scene]
     deviations = []
     for _ in range(4):
-        groups = [
-            group(rng, dead_time, [light(rng, number) for number in range(32)], [600] * 32)
-            for _ in range(4)
-        ]
-        estimate = estimate_dead_time(groups, LAG)
+        estimate = estimate_dead_time(draw_scene(rng, scene, dead_time), LAG)
         assert estimate.standard_error < 0.01 * dead_time
         deviations.append((estimate.dead_time - dead_time) / estimate.standard_error)
     assert np.max(np.abs(deviations)) < 2.0
@@ -87,12 +46,7 @@ def test_profiles_need_not_be_alike(scene, dead_time):
 def test_a_nonlinear_analog_record_lies_within_the_error(scene):
     """One percent at the largest signal."""
     rng = np.random.default_rng(8)
-    light = SCENES[scene]
-    groups = [
-        group(rng, 4e-9, [light(rng, k) for k in range(32)], [600] * 32, bend=0.01)
-        for _ in range(4)
-    ]
-    estimate = estimate_dead_time(groups, LAG)
+    estimate = estimate_dead_time(draw_scene(rng, scene, 4e-9, NONLINEAR), LAG)
     assert abs(estimate.dead_time - 4e-9) < 2.0 * estimate.standard_error
 
 
