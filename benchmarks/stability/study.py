@@ -143,7 +143,7 @@ DRAWS: Final = (
     Draws("near the cut", "homogeneous", _paths.score_near_the_cut, 1000, 400, 6),
     Draws("dying signals", "homogeneous", _paths.score_dying_signals, 300, 2500, 6),
     Draws("quiet digitizers", "signal", random_signals.score_digitizers, 5, 60, 6),
-    Draws("dead times", "signal", random_dead_times.score_dead_times, 1, 200, 2),
+    Draws("dead times", "signal", random_dead_times.score_dead_times, 1, 100, 2, pooled=True),
     _scans(1),
     _scans(2),
     Draws("scans of photon counts", "multiangle", _scanned.score_counted_scans, 8, 250, 6),
