@@ -86,7 +86,9 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
         for kind, names in _COLUMNS
         for name in names.split()
     }
-    for name in _flag_names(rows):
+    known = [str(bit.name) for kind in kinds() for bit in flags_of(kind)]
+    # Those of older products last.
+    for name in dict.fromkeys([*known, *(name for facts in rows for name in facts.flagged)]):
         counts = [facts.flagged.get(name, 0) for facts in rows]
         arrays[f"flag_{name.lower()}"] = arrow.array(counts, arrow.int64())
     table = arrow.table(arrays).replace_schema_metadata({_KEY: FORMAT})
@@ -126,12 +128,6 @@ def _types(arrow: Any) -> dict[str, Any]:
         "time": arrow.timestamp("ms", tz="UTC"),
         "bytes": arrow.binary(_PREFIX_BYTES),
     }
-
-
-def _flag_names(products: Iterable[Facts]) -> list[str]:
-    """Return the names of the bits of all kinds, then those of older products."""
-    known = [str(bit.name) for kind in kinds() for bit in flags_of(kind)]
-    return list(dict.fromkeys([*known, *(name for facts in products for name in facts.flagged)]))
 
 
 def find_products(

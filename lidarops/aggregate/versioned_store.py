@@ -344,15 +344,11 @@ def _create(store: Any, name: str, pattern: xr.Dataset) -> None:
 
 
 def _chunk(variable: xr.Variable) -> tuple[int, ...]:
-    if not _is_long(variable):
+    if not {"time", PRODUCT.name} & set(variable.dims):
         return variable.shape
     row = variable.dtype.itemsize * int(np.prod(variable.shape[1:]))
     rows = min(max(_ROWS, _LEAST_CHUNK // row), max(1, _LARGEST_CHUNK // row))
     return (rows, *variable.shape[1:])
-
-
-def _is_long(variable: xr.Variable) -> bool:
-    return bool({"time", PRODUCT.name} & set(variable.dims))
 
 
 @dataclass(slots=True)

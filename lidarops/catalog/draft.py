@@ -199,7 +199,10 @@ def _instrument(
     if site.coordinates is None:
         yield "    header_position: ignore  # headers state no position on Earth"
     else:
-        yield f"    header_position: {site.order}  # ? order of {_pair(site.coordinates)}"
+        yield (
+            f"    header_position: {site.order}  # ? order of {site.coordinates[0]:g},"
+            f" {site.coordinates[1]:g} in headers"
+        )
     pointing = headers.main.header_pointing
     if pointing != "stated":
         yield f"    header_pointing: {pointing}  # ? elevation or zenith_angle: headers do not tell"
@@ -332,10 +335,6 @@ def _text(value: str) -> str:
 def _list(patterns: Sequence[str]) -> str:
     texts = [_text(pattern) for pattern in patterns]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
-
-
-def _pair(coordinates: tuple[float, float]) -> str:
-    return f"{coordinates[0]:g}, {coordinates[1]:g} in headers"
 
 
 def _key(name: str) -> str:

@@ -386,14 +386,14 @@ def instruments_of(
 def _by_instrument(groups: Iterable[FileGroup]) -> list[list[FileGroup]]:
     sets: list[list[FileGroup]] = []
     for group in groups:
-        alike = [own for own in sets if any(_one_instrument(group, other) for other in own)]
+        alike = [
+            own
+            for own in sets
+            if any(group.pattern == one.pattern or _lidar(group) == _lidar(one) for one in own)
+        ]
         sets = [own for own in sets if own not in alike]
         sets.append([member for own in alike for member in own] + [group])
     return sets
-
-
-def _one_instrument(one: FileGroup, other: FileGroup) -> bool:
-    return one.pattern == other.pattern or _lidar(one) == _lidar(other)
 
 
 def _patterns(groups: Sequence[FileGroup], everything: Sequence[str]) -> Iterator[str]:
@@ -405,8 +405,9 @@ def _patterns(groups: Sequence[FileGroup], everything: Sequence[str]) -> Iterato
     foreign = [path for path in everything if path not in own]
     for stem, members in by_stem.items():
         folders = {group.folder for group in members}
-        common = _common(folders)
-        whole = f"{literal_pattern(common)}**/{stem}*"
+        # The deepest folder that holds all.
+        common = os.path.commonpath([f"/{folder}" for folder in folders]).strip("/")
+        whole = f"{literal_pattern(f'{common}/' if common else '')}**/{stem}*"
         if len(folders) > 1 and not _matches(whole, foreign):
             yield whole
             continue
@@ -415,12 +416,6 @@ def _patterns(groups: Sequence[FileGroup], everything: Sequence[str]) -> Iterato
                 yield from (literal_pattern(p) for p in sorted(own) if _matches(pattern, [p]))
             else:
                 yield pattern
-
-
-def _common(folders: Iterable[str]) -> str:
-    """Return the deepest folder that holds all folders, with a slash at its end."""
-    common = os.path.commonpath([f"/{folder}" for folder in folders]).strip("/")
-    return f"{common}/" if common else ""
 
 
 def _matches(pattern: str, paths: Iterable[str]) -> bool:

@@ -117,7 +117,9 @@ def scan_archive(
     headers = Headers(work.source, campaign, store.campaign)
     crashed = partial(unread_row, headers, reason=CRASHED)
     with store.fingerprints() as known, Processes(processes, headers) as readers:
-        due = work.due(_joined(work.source.files(work.is_claimed), known))
+        # Of no other file is the size requested.
+        listed = work.source.files(lambda path: bool(work.owners(path)))
+        due = work.due(_joined(listed, known))
         rows = readers.map_items(
             read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES, lost=crashed
         )
@@ -180,7 +182,7 @@ class _Scan:
     ) -> Iterator[UnreadFile]:
         """Compare each file with the catalog, and yield those whose header must be read."""
         for file, before in pairs:
-            owners = [] if file is None else self._owners(file.path)
+            owners = [] if file is None else self.owners(file.path)
             if self._idle and file is not None:
                 self._idle.difference_update(owners)
                 if not owners:
@@ -209,11 +211,8 @@ class _Scan:
         same = known == (file.size, file.mtime_ns, key)
         return same and (not before.is_damaged or self._digest(file.path) == before.sha256)
 
-    def is_claimed(self, path: str) -> bool:
-        """Return whether an instrument claims a path."""
-        return bool(self._owners(path))
-
-    def _owners(self, path: str) -> list[_Claim]:
+    def owners(self, path: str) -> list[_Claim]:
+        """Return the claims of instruments on a path."""
         # The index of a web server encodes names: "+45" is "%2B45".
         encoded = "%" in path and self._archive.startswith(("http://", "https://"))
         owners: list[_Claim] = []

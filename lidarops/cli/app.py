@@ -148,7 +148,13 @@ def command(
                 # Typer ends quietly where the reader of a pipe has gone.
                 if error.errno == errno.EPIPE:
                     raise
-                show_error(_of_system(error))
+                name = error.filename
+                problem = LidarOpsError(
+                    error.strerror or repr(error),
+                    file=None if name is None else os.fsdecode(name),
+                    remedy="check permissions, space and connection, then run the command again",
+                )
+                show_error(problem)
                 raise typer.Exit(REFUSED) from error
 
         return program.command(name, help=_paragraphs(function.__doc__ or ""), **options)(wrapped)
@@ -166,14 +172,6 @@ def from_here(place: Path | str) -> str:
     """Return a path within the working folder relative to it, any other place as it is."""
     path, here = Path(place), Path.cwd()
     return str(path.relative_to(here) if path.is_relative_to(here) else place)
-
-
-def _of_system(error: OSError) -> LidarOpsError:
-    return LidarOpsError(
-        error.strerror or repr(error),
-        file=None if error.filename is None else os.fsdecode(error.filename),
-        remedy="check permissions, space and connection, then run the command again",
-    )
 
 
 def _print_version(requested: bool) -> None:  # noqa: FBT001 - typer calls it so

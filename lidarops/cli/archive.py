@@ -45,7 +45,7 @@ from lidarops.cli.app import (
 from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Iterator
     from contextlib import AbstractContextManager
 
     from distributed import Client
@@ -402,7 +402,10 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
     _show_changes(result)
     refused = refused_files(campaign, result)
     _show_refused(refused)
-    _show_unused(result, {granule.path for granule in refused})
+    listed = {granule.path for granule in refused}
+    set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
+    unused = (*set_aside, *result.empty_scenes.items())
+    show_rows("Not used", ("file or scene", "reason"), unused)
     show_findings(result.findings)
     for title, where, found in (
         ("Channels that disagree", "channels", disagreement_rows(scenes)),
@@ -455,12 +458,6 @@ def _show_changes(result: Result) -> None:
     show_rows("Products made again", ("file", "change", "difference", "cause"), rows)
     title = "Frozen products that would be replaced (--thaw replaces them)"
     show_rows(title, ("file", "reason"), result.frozen.items())
-
-
-def _show_unused(result: Result, listed: Collection[str]) -> None:
-    set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
-    rows = (*set_aside, *result.empty_scenes.items())
-    show_rows("Not used", ("file or scene", "reason"), rows)
 
 
 def _show_orphans(result: Result, removed: int | None) -> None:

@@ -177,17 +177,13 @@ def _show_judged(judged: Judgement, *, stale: bool, everything: bool) -> None:
     memory = _memory(judged)["to_be_made" if stale else "everything"]
     needs = f"about {memory / 1e6:.0f} MB of memory"
     if everything:
-        _show_all(judged, needs, plan=not stale)
+        title = f"{_scene_title(judged)}, {needs}"
+        if not stale:
+            _show_plan(title, judged.requested)
+        _show_stale(title, judged)
     else:
         _show_scene(judged, needs, plan=not stale)
     _show_kept(judged)
-
-
-def _show_all(judged: Judgement, needs: str, *, plan: bool) -> None:
-    title = f"{_scene_title(judged)}, {needs}"
-    if plan:
-        _show_plan(title, judged.requested)
-    _show_stale(title, judged)
 
 
 def _show_plan(title: str, plan: Plan) -> None:

@@ -227,7 +227,11 @@ def _difference(
     measure = Measure.SIZE
     if error is not None:
         measure = Measure.ERROR if name == quantity else Measure.OF_ERROR
-    usual = _usual(before) if count else 0.0
+    usual = 0.0
+    if count:
+        # The root mean square.
+        total = sum(float(np.sum(_numbers(before, part) ** 2)) for part in _parts(before))
+        usual = math.sqrt(total / max(before.size, 1))
     lost, largest = 0, 0.0
     for part in _parts(before):
         stated, now_stated = (_stated(product, quantity, part) for product in (old, new))
@@ -277,12 +281,6 @@ def _numbers(variable: xr.Variable, part: Any) -> NDArray[np.float64]:
     """Return the values of a part, 0 where they are missing."""
     values = np.asarray(variable[part].values, np.float64)
     return np.where(np.isfinite(values), values, 0.0)
-
-
-def _usual(variable: xr.Variable) -> float:
-    """Return the root mean square of a variable."""
-    total = sum(float(np.sum(_numbers(variable, part) ** 2)) for part in _parts(variable))
-    return math.sqrt(total / max(variable.size, 1))
 
 
 def _making(file: Path) -> dict[str, dict[str, str]]:

@@ -190,6 +190,9 @@ def _description(context: Context, layout: Layout) -> dict[str, Any]:
         f" {_DETECTION[context.detection]}) of {context.instrument_name} at {station}."
     )
     references = (metadata.references, *layout.references)
+    program = f"lidarops {__version__} ({context.code_version})"
+    # The plan of a product holds what it depends on, such as the corrections of glued channels.
+    lines = [*context.plan.lines(context.channel), f"wrote the {context.kind} product"]
     return {
         "title": f"{context.title}: {layout.title}, channel {context.channel}, {station}",
         "summary": f"{context.summary.strip()} {summary}".strip(),
@@ -202,23 +205,16 @@ def _description(context: Context, layout: Layout) -> dict[str, Any]:
         # As the templates of NCEI name time series of profiles at stations.
         "cdm_data_type": "Station",
         "product_version": str(context.stamp.version),
-        "history": _history(context),
+        # One line for each step, as CF requires: date, step, program.
+        "history": "\n".join(
+            f"{iso(context.written)} {' '.join(line.split())} [{program}]" for line in lines
+        ),
         "references": "\n".join(text for text in references if text),
         "comment": f"{metadata.comment.strip()} {layout.comment.strip()}".strip(),
         "acknowledgement": metadata.acknowledgement,
         "license": metadata.license,
         "standard_name_vocabulary": STANDARD_NAME_TABLE,
     }
-
-
-def _history(context: Context) -> str:
-    """Return one line for each step, as CF requires: date, step, program."""
-    program = f"lidarops {__version__} ({context.code_version})"
-    # The plan of a product holds what it depends on, such as the corrections of glued channels.
-    lines = [*context.plan.lines(context.channel), f"wrote the {context.kind} product"]
-    return "\n".join(
-        f"{iso(context.written)} {' '.join(line.split())} [{program}]" for line in lines
-    )
 
 
 def _people(context: Context) -> dict[str, str]:
