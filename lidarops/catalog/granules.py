@@ -13,9 +13,8 @@ from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
-from lidarops.catalog.database import Database
+from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
 from lidarops.catalog.headers import NO_NOTES, GranuleRow
-from lidarops.catalog.schema import CHANNEL_NAME, GRANULE, LAYOUT
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
     ChannelLayout,

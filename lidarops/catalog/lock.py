@@ -18,8 +18,7 @@ from typing import Final
 
 import sqlalchemy as sa
 
-from lidarops.catalog.database import Database
-from lidarops.catalog.schema import LOCK
+from lidarops.catalog.database import LOCK, Database
 from lidarops.errors import CatalogError
 
 HEARTBEAT: Final = 5.0

@@ -14,10 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
-from lidarops.catalog.granules import Granules
-from lidarops.catalog.headers import RETRY, row_of
-from lidarops.catalog.lock import Lock
-from lidarops.catalog.schema import (
+from lidarops.catalog.database import (
     FILE_SET,
     GRANULE,
     LOCK,
@@ -28,6 +25,9 @@ from lidarops.catalog.schema import (
     STAGE,
     VERDICT,
 )
+from lidarops.catalog.granules import Granules
+from lidarops.catalog.headers import RETRY, row_of
+from lidarops.catalog.lock import Lock
 from lidarops.errors import CatalogError
 from lidarops.kinds import kinds
 from lidarops.records import (

@@ -105,7 +105,7 @@ def catalog(
     from lidarops.catalog.store import Store
     from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
-    from lidarops.run.channels import ChannelNames
+    from lidarops.run.day_states import ChannelNames
 
     settings = loaded_campaign(campaign, archive, out, catalog)
     with progress_bar("catalog", None) as bar:

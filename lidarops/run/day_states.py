@@ -1,5 +1,7 @@
 """The state of each day: if it is that of the last verdict, nothing of the day is stale.
 
+And the names of channels, which follow from recorders, and from what the facts state.
+
 A run with nothing to do imports this module, so it imports no numerics.
 """
 
@@ -8,18 +10,21 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import defaultdict
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cached_property
 from math import ceil
 from typing import Any, Final, NamedTuple
 
-from lidarops.campaign.model import OPERATION, Campaign
+from lidarops.campaign.model import OPERATION, Campaign, InstrumentFacts
+from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.store import RecordedProduct, Store, Verdict
 from lidarops.constants import DARK_REACH
 from lidarops.errors import AncillaryError
 from lidarops.kinds import Scope, kinds_of
-from lidarops.records import Role, UnusedFile, day_of, digest, first_of_month
-from lidarops.run.channels import ChannelNames
+from lidarops.raw.header import Layout, named_layout, recorder_names
+from lidarops.records import FileNote, Granule, Role, UnusedFile, day_of, digest, first_of_month
 from lidarops.run.options import Selection, requested_kinds
 from lidarops.run.outlying_headers import NEAR_DAYS
 from lidarops.run.scenes import RefusedFile, dated
@@ -30,8 +35,13 @@ DARK_DAYS: Final = ceil(DARK_REACH.total_seconds() / 86400)
 REACH: Final = NEAR_DAYS + DARK_DAYS
 """Days before and after a file on which products may use it."""
 
+FIRST: Final = datetime.min.replace(tzinfo=UTC)
+LAST: Final = datetime.max.replace(tzinfo=UTC)
+"""Edges of facts that hold from the first time on, and to the last."""
+_ROUNDING_OF_WAVELENGTHS: Final = 1e-9
+"""m; headers hold whole nanometres."""
 _PLANNING: Final = (
-    "lidarops.run.channels",
+    "lidarops.run.day_states",
     "lidarops.run.outlying_headers",
     "lidarops.scene.plan",
     "lidarops.run.scenes",
@@ -199,3 +209,73 @@ def _looks_right(root: str, made: RecordedProduct) -> bool:
     except OSError:
         return False
     return (status.st_size, status.st_mtime_ns) == (made.size, made.mtime_ns)
+
+
+def validity_edges(campaign: Campaign) -> list[datetime]:
+    """Return the times at which facts of any instrument change, rising."""
+    edges = {
+        edge
+        for instrument in campaign.instruments.values()
+        for facts in instrument.facts
+        for edge in (facts.valid_from, facts.valid_to)
+    }
+    return sorted(edges - {FIRST, LAST})
+
+
+def overridden_wavelengths(layout: Layout, facts: InstrumentFacts) -> Iterator[str]:
+    """Yield facts of the campaign that override the wavelengths of headers."""
+    for channel in layout:
+        given = facts.channels.get(channel.name)
+        wavelength = given.wavelength if given else None
+        # Not where the wavelength of the header is implausible, and so NaN.
+        if wavelength and abs(wavelength - channel.wavelength) > _ROUNDING_OF_WAVELENGTHS:
+            yield (
+                f"{channel.name}: wavelength {wavelength * 1e9:.5g} nm of the campaign overrides"
+                f" {channel.wavelength * 1e9:.5g} nm of the header"
+            )
+
+
+class ChannelNames:
+    """Names that mean one recorder in all files of an instrument that the catalog knows."""
+
+    def __init__(self, campaign: Campaign, store: Store) -> None:
+        self._instruments = campaign.instruments
+        self._stored = store.holdings(validity_edges(campaign))
+        self._bound = store.channel_names()
+        self._layouts: dict[tuple[object, Layout], Layout] = {}
+        self.holdings = [
+            replace(held, layout=self._layout(held.instrument, held.layout, facts))
+            for held in self._stored
+            if held.instrument in campaign.instruments
+            for facts in [campaign.instruments[held.instrument].facts_at(held.since)]
+        ]
+        """Those of the instruments of the campaign, with these names."""
+
+    def granule(self, granule: Granule) -> Granule:
+        """Return a good granule whose channels have these names."""
+        if granule.instrument not in self._instruments or granule.start is None:
+            return granule
+        facts = self._instruments[granule.instrument].facts_at(granule.start)
+        layout = self._layout(granule.instrument, granule.layout, facts)
+        notes = (*granule.notes, *overridden_wavelengths(layout, facts))
+        return replace(granule, layout=layout, notes=notes)
+
+    def notes(self, instruments: Collection[str]) -> tuple[FileNote, ...]:
+        """Return a note for each wavelength in the headers of instruments that facts override."""
+        return joined_notes(
+            FileNote(held.instrument, text, contradicts=False, files=held.files)
+            for held in self.holdings
+            if held.instrument in instruments
+            for facts in [self._instruments[held.instrument].facts_at(held.since)]
+            for text in overridden_wavelengths(held.layout, facts)
+        )
+
+    def _layout(self, instrument: str, layout: Layout, facts: InstrumentFacts) -> Layout:
+        stated = {name: fact.recorder for name, fact in facts.channels.items() if fact.recorder}
+        key = (instrument, *stated.items())
+        if (key, layout) not in self._layouts:
+            own = (held for held in self._stored if held.instrument == instrument)
+            files = ((held.layout, held.files, held.first) for held in own)
+            names = recorder_names(files, stated, self._bound.get(instrument))
+            self._layouts[key, layout] = named_layout(layout, names)
+        return self._layouts[key, layout]

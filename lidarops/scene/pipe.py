@@ -1,30 +1,41 @@
 """The pipe from raw counts to the profiles of a channel, and the air: its stages, in their order.
 
 Of each stage there is a function ``plan_...``, which decides on the headers and the campaign
-whether it runs; those of glued channels are in `lidarops.scene.gluing`. `channel_signal` carries
+whether it runs. `channel_signal` carries
 out what is planned.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 
+from lidarops.campaign.model import channel_facts
 from lidarops.constants import (
     DARK_REACH,
     DEAD_TIME_UNCERTAINTY,
     DEFAULT_DEAD_TIME,
     LICEL_RANGE_PER_MICROSECOND,
 )
-from lidarops.records import DetectionMode, Granule, LeftOut, PlannedStep, Role, is_glued
+from lidarops.records import (
+    DetectionMode,
+    Granule,
+    LeftOut,
+    PlannedStep,
+    Role,
+    glued_parts,
+    is_glued,
+)
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
 from lidarops.retrieve.signal.dead_time import (
@@ -33,11 +44,11 @@ from lidarops.retrieve.signal.dead_time import (
     estimate_dead_time,
 )
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
-from lidarops.retrieve.signal.lag import enough_bins, profile_groups
+from lidarops.retrieve.signal.lag import PROFILES_AT_ONCE, ChannelLag, enough_bins, profile_groups
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.scene import gluing
 from lidarops.scene.case import (
     DARK_FILES,
+    LAG_STEP,
     READ_STEP,
     REQUEST,
     ChannelCase,
@@ -46,8 +57,100 @@ from lidarops.scene.case import (
     lag_is_unknown,
     prepared_channels,
 )
-from lidarops.scene.profiles import ChannelSignal, FileProfiles, Source, bin_ranges
+from lidarops.scene.profiles import ChannelSignal, FileProfiles, GluedProfiles, Source, bin_ranges
 from lidarops.settings import SettingsModel, quantity
+
+_Power = npt.NDArray[np.float64]
+
+
+class LagSettings(SettingsModel):
+    """Settings of the stage ``lag``."""
+
+    method: Literal["estimate", "given"]
+    lag: float | None = quantity(None, unit="bins", description="with the method ``given``")
+
+
+def plan_lag(case: ChannelCase[Any]) -> Entry:
+    """Find the lag of the analog record, but where the ranges of the campaign state it."""
+    analog, photon = glued_parts(case.channel.name)
+    lag = channel_facts(case.facts, analog).lag
+    if isinstance(lag, float):
+        settings = LagSettings(method="given", lag=lag)
+        return case.run(LAG_STEP, "given by the campaign", settings, number=lag)
+    if not enough_bins(case.channel.bins):
+        return case.leave(LAG_STEP, f"the {case.channel.bins} bins are too few for an estimate")
+    if not lag_is_unknown(case.facts, analog, photon):
+        reason = "the range offsets that the campaign gives for both channels state the lag"
+        return case.leave(LAG_STEP, reason)
+    estimate = "requests an estimate," if lag else "gives none: estimated"
+    reason = f"the campaign {estimate} from noise common to both records"
+    return case.run(LAG_STEP, reason, LagSettings(method="estimate"))
+
+
+class GlueSettings(SettingsModel):
+    """Settings of the stage ``glue``."""
+
+    analog: str
+    photon: str
+
+
+def plan_glue(case: ChannelCase[Any]) -> Entry:
+    """Glue the profiles of both channels: the channel is there because a product needs it."""
+    parts = analog, photon = glued_parts(case.channel.name)
+    return case.run(
+        "glue",
+        "the campaign requests the glued channel",
+        GlueSettings(analog=analog, photon=photon),
+        needs=("read", LAG_STEP, *(f"{part}/noise" for part in parts)),
+    )
+
+
+def glue(settings: GlueSettings, signal: ChannelSignal, *, estimated: bool) -> GluedProfiles:
+    """Return the glued profiles.
+
+    Parameters
+    ----------
+    settings : GlueSettings
+    signal : ChannelSignal
+    estimated : bool
+        Whether the lag is to be estimated. A given one has shifted the analog ranges.
+    """
+    # Parts of a glued channel are channels of the files.
+    analog, photon = (
+        cast("FileProfiles", signal.channels[part].profiles)
+        for part in (settings.analog, settings.photon)
+    )
+    archive = signal.source.archive
+    lag = ChannelLag(labeled_gluing.range_lag(analog.range, photon.range))
+    if estimated:
+        lag = labeled_gluing.estimate_lag(_groups(archive, analog, photon), known=lag.bins)
+
+    @functools.cache
+    def slope() -> labeled_gluing.Slope:
+        return labeled_gluing.scene_slope(_samples(archive, analog, photon), lag)
+
+    return GluedProfiles(analog, photon, lag, slope)
+
+
+def _groups(
+    archive: xr.Dataset, analog: FileProfiles, photon: FileProfiles
+) -> Iterator[tuple[_Power, _Power]]:
+    """Yield the power of the first profiles of a scene in both channels, (time, range)."""
+    for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
+        counts = archive.isel(time=rows)
+        yield analog.of(counts)["power"].to_numpy(), photon.of(counts)["power"].to_numpy()
+
+
+def _samples(
+    archive: xr.Dataset, analog: FileProfiles, photon: FileProfiles
+) -> Iterator[tuple[xr.Dataset, xr.Dataset]]:
+    """Yield profiles of both channels from all over a scene, some at a time."""
+    number, together = archive.sizes["time"], PROFILES_AT_ONCE // 4
+    rows = np.unique(np.linspace(0, number - 1, labeled_gluing.SLOPE_PROFILES).astype(int))
+    for first in range(0, rows.size, together):
+        counts = archive.isel(time=rows[first : first + together])
+        yield analog.of(counts), photon.of(counts)
+
 
 Array = npt.NDArray[np.float64]
 
@@ -349,8 +452,8 @@ PIPE: Final[Mapping[str, Callable[[ChannelCase[Any]], Entry]]] = MappingProxyTyp
         "dark": plan_dark,
         "dead_time": plan_dead_time,
         "noise": plan_noise,
-        "lag": gluing.plan_lag,
-        "glue": gluing.plan_glue,
+        "lag": plan_lag,
+        "glue": plan_glue,
         "molecular": plan_molecular,
     }
 )
@@ -372,8 +475,8 @@ class Stages(SettingsModel):
     dark: DarkSettings | None = None
     dead_time: DeadTimeSettings | None = None
     noise: NoiseSettings | None = None
-    lag: gluing.LagSettings | None = None
-    glue: gluing.GlueSettings | None = None
+    lag: LagSettings | None = None
+    glue: GlueSettings | None = None
     molecular: MolecularSettings | None = None
 
 
@@ -445,7 +548,7 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
         )
     if stages.glue is not None:
         estimated = stages.lag is not None and stages.lag.method == "estimate"
-        signal.profiles = gluing.glue(stages.glue, signal, estimated=estimated)
+        signal.profiles = glue(stages.glue, signal, estimated=estimated)
     if stages.molecular is not None:
         file, known = stages.molecular.molecular_profile, source.ancillaries.profiles
         signal.molecules = MolecularProfile.us_standard() if file is None else known[file]

@@ -19,9 +19,9 @@ from support.archives import raw_archives
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import headers
 from lidarops.catalog import scan as scan_module
+from lidarops.catalog.database import GRANULE, LAYOUT
 from lidarops.catalog.headers import GranuleRow, row_of
 from lidarops.catalog.scan import ScanSummary, scan_archive
-from lidarops.catalog.schema import GRANULE, LAYOUT
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Role, Status

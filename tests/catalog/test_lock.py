@@ -11,8 +11,8 @@ import pytest
 import sqlalchemy as sa
 
 from lidarops.catalog import lock as lock_module
+from lidarops.catalog.database import LOCK, PRODUCT_INPUT, SCHEMA_VERSION
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.schema import LOCK, PRODUCT_INPUT, SCHEMA_VERSION
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Role

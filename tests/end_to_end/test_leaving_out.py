@@ -17,7 +17,7 @@ from support.cases import each
 from support.counts_read import counts_read
 from support.oracles.angle_scenes import on_altitudes
 
-from lidarops.catalog.schema import GRANULE
+from lidarops.catalog.database import GRANULE
 from lidarops.catalog.store import Store
 from lidarops.raw.formats import RawFile
 from lidarops.records import Plan, PlannedStep, ProductRecord, Role, RunRecord

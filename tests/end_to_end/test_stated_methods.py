@@ -29,11 +29,11 @@ BACKGROUND = {
 """Functions of the methods that products state; a later one may call an earlier one too."""
 RETRIEVAL = {
     "homogeneous": {
-        "direct": "homogeneous/_methods:solve_by_direct_fit",
-        "cubic": "homogeneous/_methods:solve_by_cubic",
-        "known_background": "homogeneous/_methods:solve_with_known_background",
-        "linearized": "homogeneous/_methods:solve_by_linearization",
-        "known_extinction": "homogeneous/_methods:solve_with_known_extinction",
+        "direct": "homogeneous/path_fit:solve_by_direct_fit",
+        "cubic": "homogeneous/path_fit:solve_by_cubic",
+        "known_background": "homogeneous/path_fit:solve_with_known_background",
+        "linearized": "homogeneous/path_fit:solve_by_linearization",
+        "known_extinction": "homogeneous/path_fit:solve_with_known_extinction",
     },
     "multiangle": {
         "two_angle": "multiangle/_methods:_two_angle",

@@ -13,7 +13,8 @@ from support import factories
 from lidarops.catalog.headers import row_of
 from lidarops.catalog.store import Store
 from lidarops.records import Granule, Role, Unmet
-from lidarops.run.channels import unavailable_channels, validity_edges
+from lidarops.run.day_states import validity_edges
+from lidarops.run.findings import unavailable_channels
 from lidarops.run.options import Selection
 
 DAY = 1440
