@@ -289,18 +289,17 @@ class Database:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     @property
     def place(self) -> str:
         """The URL without its password."""
         return _without_passwords(self._url)
 
-    def close(self) -> None:
+    def close(self, *_: object) -> None:
         """Close the database connections."""
         self._engine.dispose()
         self._copied.close()
+
+    __exit__ = close
 
     @contextmanager
     def transaction(self) -> Iterator[sa.Connection]:
@@ -510,7 +509,7 @@ def without_writing(campaign: Campaign) -> Iterator[Campaign]:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         copy = Path(folder, file.name)
         if file.exists():
-            with closing(Database(campaign.catalog_url, campaign.name, create=False)) as source:
+            with Database(campaign.catalog_url, campaign.name, create=False) as source:
                 source.copy_to(copy)
         yield campaign.model_copy(update={"catalog": f"sqlite:///{copy}"})
 

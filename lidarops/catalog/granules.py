@@ -253,12 +253,10 @@ class Granules(Database):
             .join(LAYOUT, LAYOUT.c.hash == groups.c.layout)
             .order_by(groups.c.instrument, groups.c.period, groups.c.layout)
         )
-
-        def holding(row: Any) -> Holding:
-            name, k, _, files, first, text = row
-            return Holding(name, begins[k], _layout_from(text), files, first)
-
-        return self.read(query, holding)
+        return [
+            Holding(name, begins[k], _layout_from(text), files, first)
+            for name, k, _, files, first, text in self.read(query, tuple)
+        ]
 
     def channel_names(self) -> Mapping[str, Names]:
         """Return the names that recorders have for good, by instrument."""

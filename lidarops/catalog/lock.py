@@ -85,9 +85,6 @@ class Lock(AbstractContextManager["Lock"]):
         self.held = False
         self._row = (_L.campaign == database.campaign, _L.token == self.token)
 
-    def __exit__(self, *_: object) -> None:
-        self.release()
-
     @staticmethod
     def holder_name() -> str:
         """Return user, host and number of this process."""
@@ -112,7 +109,7 @@ class Lock(AbstractContextManager["Lock"]):
         """
         if self.held:
             return False
-        waited = self._wait_for(self._try)
+        waited = self.wait_for(self._try)
         self.held = True
         _held.add(self.token)
         self._thread = threading.Thread(target=self._beat, name="lidarops-lock", daemon=True)
@@ -124,22 +121,18 @@ class Lock(AbstractContextManager["Lock"]):
         if self.acquire():
             raise OvertakenError
 
-    def wait_until_free(self) -> None:
-        """Wait until no other process holds the lock, without acquiring it.
+    def is_taken(self, *, by_others: bool = False) -> bool:
+        """Return whether a living process holds the lock, or that of another campaign."""
+        return not all(holder.dead for holder in self._holders(others=by_others))
+
+    def wait_for(self, attempt: Callable[[], bool]) -> bool:
+        """Repeat an attempt until it succeeds; return whether it failed at first.
 
         Raises
         ------
         CatalogError
             If the holder, which the message names, does not release the lock in time.
         """
-        self._wait_for(lambda: not self.is_taken())
-
-    def is_taken(self, *, by_others: bool = False) -> bool:
-        """Return whether a living process holds the lock, or that of another campaign."""
-        return not all(holder.dead for holder in self._holders(others=by_others))
-
-    def _wait_for(self, attempt: Callable[[], bool]) -> bool:
-        """Repeat an attempt until it succeeds; return whether it failed at first."""
         until = time.monotonic() + self._wait
         waited = False
         while not attempt():
@@ -149,7 +142,7 @@ class Lock(AbstractContextManager["Lock"]):
             time.sleep(_POLL)
         return waited
 
-    def release(self) -> None:
+    def release(self, *_: object) -> None:
         """Release the lock if it is held."""
         if not self.held:
             return
@@ -164,6 +157,8 @@ class Lock(AbstractContextManager["Lock"]):
         except CatalogError as error:
             # The disk is full: the next process takes over when this one has ended.
             _LOG.warning("the lock stays until the next run: %s", error)
+
+    __exit__ = release
 
     def holder(self) -> Holder | None:
         """Return the present holder of the lock."""

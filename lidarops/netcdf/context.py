@@ -317,6 +317,11 @@ def prov_json(provenance: Provenance) -> str:
             "lidarops:path": paths[0] if len(paths) == 1 else paths,
             "lidarops:sha256": digest,
         }
+    plan, omissions = provenance.plan, []
+    for omission in plan.left_out:
+        number = "" if omission.number is None else f", {omission.number:g}"
+        rule = f" [{omission.rule}{number}]" if omission.rule else ""
+        omissions.append(f"{omission.name} of {omission.channel}: {omission.reason}{rule}")
     return prov_document(
         "lidarops:product",
         ("lidarops:processing", {"lidarops:scene": provenance.scene}),
@@ -330,7 +335,13 @@ def prov_json(provenance: Provenance) -> str:
                 "lidarops:channel": provenance.channel,
                 "lidarops:settings": canonical(dict(provenance.settings)),
             },
-            "lidarops:plan": _plan(provenance),
+            "lidarops:plan": {
+                "prov:type": prov_type("prov:Plan"),
+                "lidarops:sha256": plan.hash,
+                # The text of this digest.
+                "lidarops:json": plan.text,
+                "lidarops:left_out": omissions,
+            },
             **files,
         },
         ({"prov:entity": f"sha256:{record.sha256}", "prov:role": record.role} for record in inputs),
@@ -389,21 +400,6 @@ def prov_document(
 def prov_type(name: str) -> dict[str, str]:
     """Return the type of an entity or agent."""
     return {"$": name, "type": "prov:QUALIFIED_NAME"}
-
-
-def _plan(provenance: Provenance) -> dict[str, Any]:
-    plan, omissions = provenance.plan, []
-    for omission in plan.left_out:
-        number = "" if omission.number is None else f", {omission.number:g}"
-        rule = f" [{omission.rule}{number}]" if omission.rule else ""
-        omissions.append(f"{omission.name} of {omission.channel}: {omission.reason}{rule}")
-    return {
-        "prov:type": prov_type("prov:Plan"),
-        "lidarops:sha256": plan.hash,
-        # The text of this digest.
-        "lidarops:json": plan.text,
-        "lidarops:left_out": omissions,
-    }
 
 
 def product_id(provenance: Provenance) -> str:

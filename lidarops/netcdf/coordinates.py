@@ -100,8 +100,7 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
     ]
     extents = {
         **_horizontal_extent(horizontal, _SPREADS.get(layout.sampled, "along the beam")),
-        **_vertical_extent(vertical),
-        **_time_extent(moments, bounds),
+        **_other_extents(vertical, moments, bounds),
     }
     return Located(variables, moving, extents, vertical.profiles)
 
@@ -366,23 +365,19 @@ def _horizontal_extent(positions: Sequence[Values], spread: str) -> dict[str, An
     }
 
 
-def _vertical_extent(vertical: _Vertical) -> dict[str, Any]:
+def _other_extents(vertical: _Vertical, moments: Values, bounds: Values) -> dict[str, Any]:
+    """Return the extents in height and time."""
     # ACDD wants the resolution in every file.
     resolution = f"{vertical.step:.6g} m" if vertical.step else "none: the beam is level"
+    ends = bounds[:, 0].min(), bounds[:, 1].max()
+    start, stop = (end.astype("datetime64[us]").item().replace(tzinfo=UTC) for end in ends)
+    intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
     return {
         "geospatial_vertical_min": float(vertical.altitude.min()),
         "geospatial_vertical_max": float(vertical.altitude.max()),
         "geospatial_vertical_units": "m",
         "geospatial_vertical_positive": "up",
         "geospatial_vertical_resolution": "not constant" if vertical.step is None else resolution,
-    }
-
-
-def _time_extent(moments: Values, bounds: Values) -> dict[str, str]:
-    ends = bounds[:, 0].min(), bounds[:, 1].max()
-    start, stop = (end.astype("datetime64[us]").item().replace(tzinfo=UTC) for end in ends)
-    intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
-    return {
         "time_coverage_start": iso(start),
         "time_coverage_end": iso(stop),
         "time_coverage_duration": duration((stop - start).total_seconds()),

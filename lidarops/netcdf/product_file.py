@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -249,7 +250,9 @@ class ProductWriter:
                 continue
             attrs = attributes(row, mode=mode, coordinates=auxiliary_names(row, coordinates))
             yield row.name, xr.Variable(row.dims, values, attrs)
-        station = rows.station(profiles=self._located.vertical)
+        # Of profiles it identifies the time series.
+        role = "timeseries_id" if self._located.vertical else None
+        station = replace(rows.STATION, cf_role=role)
         name = self._context.station.name or self._context.station_key
         yield station.name, as_text(station, name, mode)
         provenance = prov_json(self._context)

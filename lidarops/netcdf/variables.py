@@ -610,7 +610,7 @@ def deployment(row: Row) -> Row:
     )
 
 
-_STATION: Final = Row(
+STATION: Final = Row(
     "station",
     "name of the station, or of the network of lidars",
     dims=("station_strlen",),
@@ -637,11 +637,6 @@ PROVENANCE: Final = Row(
     coverage=Coverage.REFERENCE,
     dtype="S1",
 )
-
-
-def station(*, profiles: bool) -> Row:
-    """Return the row of the station's name; with `profiles` it identifies the time series."""
-    return replace(_STATION, cf_role="timeseries_id") if profiles else _STATION
 
 
 def quality(flags: Flags, quantity: str = "", **more: Any) -> Row:

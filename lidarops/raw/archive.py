@@ -128,7 +128,8 @@ def open_archive(
     RawFormatError
         If a file cannot be read or is of another format or layout; the error names the file.
     """
-    files = _raw_files(source, root, channels, header_position, stretches)
+    stated = _read_headers(_files(source, root), header_position)
+    files = RawFiles(stated, channels, header_position, stretches)
     profiles = profiles_per_chunk
     if profiles is None:
         largest = max(channel.bins for channel in files.selected)
@@ -165,20 +166,8 @@ def open_counts(
 
     As `open_archive`, but lazy without dask, with what the granules state in place of headers.
     """
-    return build_raw_dataset(
-        _raw_files(granules, root, channels, "ignore", stretches), scaled=False
-    )
-
-
-def _raw_files(
-    source: Source,
-    root: str | os.PathLike[str] | None,
-    channels: Iterable[str] | None,
-    position_order: Position,
-    stretches: Mapping[str, Stretches] | None,
-) -> RawFiles:
-    stated = _read_headers(_files(source, root), position_order)
-    return RawFiles(stated, channels, position_order, stretches)
+    stated = _read_headers(_files(granules, root), "ignore")
+    return build_raw_dataset(RawFiles(stated, channels, "ignore", stretches), scaled=False)
 
 
 def _files(source: Source, root: str | os.PathLike[str] | None) -> dict[str, Granule | None]:

@@ -116,7 +116,7 @@ def bring_up_to_date(
         objects_frozen(),
     ):
         # "Nothing to do" would not count what another run is about to do.
-        lock.wait_until_free()
+        lock.wait_for(lambda: not lock.is_taken())
         while True:
             try:
                 return _pass(DayStates(campaign, store, selection), lock, options, client)
@@ -130,7 +130,6 @@ def assess(
     selection: Selection | None = None,
     everything: bool = False,
     update: bool = True,
-    wait: float = 0.0,
 ) -> Iterator[Judgement]:
     """Judge what every scene needs, and why. Processes nothing.
 
@@ -143,8 +142,6 @@ def assess(
         Whether to yield also scenes that need nothing.
     update : bool
         Whether to update the catalog first.
-    wait : float
-        s to wait for another run on the same catalog.
 
     Yields
     ------
@@ -153,7 +150,7 @@ def assess(
     selection = selection or Selection()
     check_selection(campaign, selection)
     if update:
-        update_catalog(campaign, wait=wait)
+        update_catalog(campaign)
     from lidarops.run.staleness import Judge  # noqa: PLC0415 - loads the numerics
 
     with Store(campaign.catalog_url, campaign.name) as store:

@@ -158,7 +158,10 @@ class LedgerRun:
             products=tuple(new),
             digests=dict(read.items() - known.items()),
         )
-        outcome = replace(outcome, left_out=self._left_out_of_request(judged, outcome))
+        planned = set(() if outcome.plan is None else outcome.plan.left_out)
+        others = tuple(left for left in judged.requested.left_out if left not in planned)
+        # Share equal tuples: nearly all scenes of an instrument have the same.
+        outcome = replace(outcome, left_out=self._left_out.setdefault(others, others))
         self._named += outcome.granules
         # A million file names would fill memory, and the page shows few.
         brief = outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
@@ -174,13 +177,6 @@ class LedgerRun:
         _log(outcome)
         self._outcomes[outcome.scene] = brief
         return outcome
-
-    def _left_out_of_request(self, judged: Judgement, outcome: SceneOutcome) -> tuple[LeftOut, ...]:
-        """Return the left-out steps of the request that are in no plan of a product."""
-        planned = set(() if outcome.plan is None else outcome.plan.left_out)
-        others = tuple(left for left in judged.requested.left_out if left not in planned)
-        # Share equal tuples: nearly all scenes of an instrument have the same.
-        return self._left_out.setdefault(others, others)
 
     def _new_products(
         self, judge: Judge, judged: Judgement, outcome: SceneOutcome

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path, PurePosixPath
@@ -128,11 +128,12 @@ class Recipe:
             if "network" not in settings:
                 return self._scene_of(archive, settings, self.inputs)
             members = tuple(
-                self._scene_of(archive, member, self._files_of(member["files"]))
+                self._scene_of(archive, member, own)
                 # The members of a product are sorted by name; the network defines their order.
                 for name in settings["network"]["instruments"]
                 for member in [settings["members"].get(name)]
                 if member is not None
+                for own in [[used for used in self.inputs if used.path in set(member["files"])]]
             )
             whole = self._scene_of(archive, settings, ())
         except (KeyError, TypeError, ValueError) as error:
@@ -145,10 +146,6 @@ class Recipe:
             dark=tuple(sorted(dark, key=_order)),
             members=members,
         )
-
-    def _files_of(self, names: Sequence[str]) -> tuple[InputRecord, ...]:
-        """Return the raw files of one member of a network."""
-        return tuple(record for record in self.inputs if record.path in set(names))
 
     def _scene_of(
         self, archive: Path, part: Mapping[str, Any], inputs: Iterable[InputRecord]

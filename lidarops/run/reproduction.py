@@ -107,7 +107,8 @@ def reproduce_product(
     read = [record for record in recipe.inputs if record.role is Role.PRODUCT]
     others = [record for record in recipe.inputs if record not in (*raw, *read)]
     place = archive or (_folder(recipe, raw, "--archive", catalog) if raw else recipe.file.parent)
-    products = _products_root(recipe.file)
+    # Below it lie station, instrument, kind and year.
+    products = recipe.file.resolve().parents[:5][-1]
     with _staged(recipe, raw, str(place), catalog) as (root, wrong):
         ancillaries = root
         if others:
@@ -127,12 +128,6 @@ def reproduce_product(
     if differences:
         differences = (*differences, *software)
     return Reproduction(str(product), identical=not differences, differences=differences)
-
-
-def _products_root(product: Path) -> Path:
-    """Return the folder below which a product has its path."""
-    # Station, instrument, kind and year.
-    return product.resolve().parents[:5][-1]
 
 
 @contextmanager

@@ -448,7 +448,10 @@ class Judge(DayStates):
                 if known and known.path in self.lost.protected:
                     kept.append(one)
                 elif known and not restored and frozen_period:
-                    frozen.append(self._with_remedy(one))
+                    if not (self.campaign.products_root / path).exists():
+                        remedy = "only a copy restores this version, --thaw makes a new one"
+                        one = replace(one, reason=f"{reason}; {remedy}")
+                    frozen.append(one)
                 else:
                     stale.append(one)
                     if not restored:
@@ -471,13 +474,6 @@ class Judge(DayStates):
         keys = [key for step in closure.products for key in dependence.read_products(step)]
         of_scene = (self._product_to_read(product_file(scene, key), made) for key in keys)
         return dependence.product_inputs(closure, of_scene if scene.granules else scene.products)
-
-    def _with_remedy(self, frozen: Stale) -> Stale:
-        """Return a frozen product whose reason says, if its file is missing, what restores it."""
-        if frozen.before is None or (self.campaign.products_root / frozen.before.path).exists():
-            return frozen
-        remedy = "only a copy restores this version, --thaw makes a new one"
-        return replace(frozen, reason=f"{frozen.reason}; {remedy}")
 
     def judgement(self, scene: Scene, whole: Plan, files: Mapping[str, Role]) -> Judgement:
         """Return a judgement by which every product of a scene is stale.

@@ -280,7 +280,12 @@ def guarded(work: Callable[[], T]) -> T | Failure:
         may_pass = passing and not error.wrong_use
         return Failure(str(error), final=not may_pass)
     except MemoryError as error:
-        return Failure(str(_too_large(error)), final=False)
+        problem = SceneError(
+            f"the scene does not fit in memory: {error or 'no memory left'}",
+            remedy="process fewer profiles at a time with a smaller --profiles-per-chunk, or give"
+            " each process more memory",
+        )
+        return Failure(str(problem), final=False)
     except Exception as error:  # noqa: BLE001 - a bug in one scene must not stop the others
         # A disk may have failed where its error is not expected.
         return Failure.of_bug(error, final=not isinstance(error, OSError))
@@ -289,11 +294,3 @@ def guarded(work: Callable[[], T]) -> T | Failure:
 def _storable(text: str) -> str:
     """Return a text without keys, and with escapes for what a database cannot hold."""
     return without_keys(text).encode("utf-8", "backslashreplace").decode().replace("\0", r"\0")
-
-
-def _too_large(error: MemoryError) -> SceneError:
-    return SceneError(
-        f"the scene does not fit in memory: {error or 'no memory left'}",
-        remedy="process fewer profiles at a time with a smaller --profiles-per-chunk, or give each"
-        " process more memory",
-    )

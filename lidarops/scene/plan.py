@@ -65,7 +65,12 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
         states why.
     """
     if scene.members:
-        entries = _network_entries(scene, campaign)
+        requested = campaign.networks[scene.instrument].requested
+        entries: Entries = (
+            entry
+            for kind, request in requested.items()
+            for entry in making(kind, NetworkRetrieval).needs(NetworkCase(scene, campaign, request))
+        )
     elif scene.granules:
         entries = _entries(scene, campaign)
     else:
@@ -87,11 +92,6 @@ def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
             *(LeftOut(READ_STEP, channel, reason, rule="channel") for channel in unused),
         ),
     )
-
-
-def _network_entries(scene: Scene, campaign: Campaign) -> Entries:
-    for kind, request in campaign.networks[scene.instrument].requested.items():
-        yield from making(kind, NetworkRetrieval).needs(NetworkCase(scene, campaign, request))
 
 
 def _entries(scene: Scene, campaign: Campaign) -> Entries:

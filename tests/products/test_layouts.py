@@ -15,12 +15,12 @@ from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import (
     PROVENANCE,
+    STATION,
     Coverage,
     Row,
     attributes,
     judging,
     layout_of,
-    station,
     summary_of,
 )
 from lidarops.records import DetectionMode
@@ -31,7 +31,7 @@ def rows() -> Iterator[tuple[str, Row]]:
     """Yield the rows of all kinds, each with its name for a message."""
     for kind in kinds():
         layout = layout_of(kind)
-        for row in (*layout.coordinates, *layout.variables, station(profiles=True), PROVENANCE):
+        for row in (*layout.coordinates, *layout.variables, STATION, PROVENANCE):
             yield f"{kind}: {row.name}", row
 
 

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
@@ -45,18 +44,6 @@ Section = tuple[float, float]
 
 LEVEL: Final = THRESHOLDS.level * (1.0 + 1e-6)
 """m, largest climb along a section. Headers and campaign files round angles differently."""
-
-
-def _climbs(case: Case, near: float, far: float) -> list[float]:
-    """Return the climb of the beam of each file of a scene along a section, m.
-
-    Infinite where the zenith angle is unknown, so that the beam does not count as level.
-    """
-    angles = [granule.zenith_angle for granule in case.scene.granules]
-    return [
-        math.inf if angle is None else (far - near) * abs(math.cos(math.radians(angle)))
-        for angle in angles
-    ]
 
 
 def _method(case: Case, level: Sequence[Section]) -> Method:
@@ -160,7 +147,11 @@ def _needs(case: Case) -> Entries:
         for near, far in request.sections
         if far <= case.last and (far - near) / case.channel.bin_width >= fewest
     ]
-    climbs = {section: _climbs(case, *section) for section in inside}
+    # Climbs of the beam of each file, m: infinite where its zenith angle is unknown, so that the
+    # beam does not count as level.
+    angles = [granule.zenith_angle for granule in case.scene.granules]
+    rises = [math.inf if a is None else abs(math.cos(math.radians(a))) for a in angles]
+    climbs = {(near, far): [(far - near) * rise for rise in rises] for near, far in inside}
     steep = {section: sum(height > LEVEL for height in climbs[section]) for section in inside}
     level = [section for section in inside if case.all_steps or steep[section] < files]
     method = _method(case, level)
@@ -283,7 +274,10 @@ class _Sections(ProductStream):
         if overlap is not None:
             # The signal still holds its background, so it cannot be divided by the overlap: bins
             # with partial overlap are excluded.
-            quality = quality | _partial(overlap)
+            partial_overlap = np.where(
+                overlap >= THRESHOLDS.full_overlap, 0, int(Quality.INCOMPLETE_OVERLAP)
+            )
+            quality = quality | xr.DataArray(partial_overlap.astype(np.int32), dims="range")
         # An estimated variance scatters, which must not count as misfit.
         estimated = self._signal.relative_variance
         counts = None if estimated else counts_per_power(conditioned, shots, glued=True)
@@ -337,12 +331,6 @@ class _Sections(ProductStream):
         product = sections.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
         paper = _PAPERS.get(method)
         return in_one_batch(product.assign_attrs(references=paper) if paper else product)
-
-
-def _partial(overlap: npt.NDArray[np.float64]) -> xr.DataArray:
-    """Return the quality bit of bins with partial overlap."""
-    bits = np.where(overlap >= THRESHOLDS.full_overlap, 0, int(Quality.INCOMPLETE_OVERLAP))
-    return xr.DataArray(bits.astype(np.int32), dims="range")
 
 
 def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:
