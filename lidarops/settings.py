@@ -95,11 +95,6 @@ def _utc(value: datetime) -> datetime:
     return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
-def _as_list(value: Any) -> Any:
-    """Return a single text as a list."""
-    return [value] if isinstance(value, str) else value
-
-
 def _clean_pattern(value: str) -> str:
     if value.startswith(("/", "~")) or ".." in value.split("/"):
         raise ValueError(
@@ -168,7 +163,10 @@ Inside = Annotated[str, AfterValidator(_clean_pattern)]
 """Path below the folder of the campaign file, relative to it."""
 Patterns = Annotated[
     list[Inside],
-    BeforeValidator(_as_list, json_schema_input_type=str | list[str]),
+    BeforeValidator(
+        lambda given: [given] if isinstance(given, str) else given,
+        json_schema_input_type=str | list[str],
+    ),
     AfterValidator(_words),
 ]
 """Patterns of paths below the archive, as of a shell; `sources.path_pattern` reads each."""

@@ -100,14 +100,13 @@ def explain_yaml_error(
     messages: dict[str, str] = {}
     for problem in problems:
         # Pydantic names an error for each member of a union: the nested ones say more.
-        nested = any(_is_below(other.keys, problem.keys) for other in problems)
+        above = problem.keys
+        nested = any(
+            len(other.keys) > len(above) and other.keys[: len(above)] == above for other in problems
+        )
         if not (problem.of_union and nested):
             messages.setdefault(problem.place, problem.message())
     return list(messages.values())
-
-
-def _is_below(keys: list[str], above: list[str]) -> bool:
-    return len(keys) > len(above) and keys[: len(above)] == above
 
 
 class _Problem:

@@ -289,7 +289,9 @@ class _Workers:
             self._missing_since = now
         elif now - self._missing_since > WORKER_TIMEOUT:
             self._missing_since = now
-            if _is_local(self._client):
+            from distributed import LocalCluster  # noqa: PLC0415 - takes a second to import
+
+            if isinstance(self._client.cluster, LocalCluster):
                 raise SceneError(
                     "the workers on this machine are gone, and none replaces them",
                     remedy="find out what ended them, and run again: finished scenes are kept",
@@ -365,12 +367,6 @@ class _ClusterQueue:
             future = _submit(self._client, job)
             self._running[future] = job
             future.add_done_callback(self._done.put)
-
-
-def _is_local(client: Client) -> bool:
-    from distributed import LocalCluster  # noqa: PLC0415 - takes a second to import
-
-    return isinstance(client.cluster, LocalCluster)
 
 
 def _outcome_of(future: Future, job: Job) -> EndedScene | None:

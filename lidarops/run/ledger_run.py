@@ -91,6 +91,8 @@ class LedgerRun:
         self._campaign, self._store, self._lock = campaign, store, lock
         self._output = Path(campaign.output)
         self._journals = journal
+        self._keeps = campaign.superseded == "keep"
+        """Whether replaced versions of products are kept."""
         self._journal: Journal | None = None
         self._run: Run | None = None
         self._outcomes: dict[str, SceneOutcome] = {}
@@ -133,7 +135,7 @@ class LedgerRun:
         run, scene = self.begin(), judged.scene.id
         for stale in judged.stale:
             _LOG.info("%s %s of %s: %s", stale.kind, stale.channel, scene, stale.reason)
-            if stale.before is not None and self._campaign.superseded == "keep":
+            if stale.before is not None and self._keeps:
                 product_files.keep(self._output, stale.before.path, stale.before.sha256)
         if note:
             self._store.begin_scene(scene, judged.day, run.id, self._lock.token)
@@ -173,7 +175,11 @@ class LedgerRun:
         self._store.record(entry, run.id, self._lock.token)
         if _went_as_planned(judged, outcome, known):
             self.fresh.add(judged.scene.id)
-        self._drop_unreplaced(judged, outcome)
+        now = {record.path: record.sha256 for record in outcome.products}
+        for before in (stale.before for stale in judged.stale if self._keeps):
+            # A kept version that was not replaced.
+            if before and now.get(before.path, before.sha256) == before.sha256:
+                product_files.drop(self._output, before.path, before.sha256)
         _log(outcome)
         self._outcomes[outcome.scene] = brief
         return outcome
@@ -194,14 +200,6 @@ class LedgerRun:
             depends_on, used = judge.depends_on(judged.scene, judged.plan, product, outcome.inputs)
             new.append(NewProduct(record, status.st_mtime_ns, depends_on, used))
         return new, outcome
-
-    def _drop_unreplaced(self, judged: Judgement, outcome: SceneOutcome) -> None:
-        """Drop kept versions that were not replaced."""
-        now = {record.path: record.sha256 for record in outcome.products}
-        kept = [stale.before for stale in judged.stale if self._campaign.superseded == "keep"]
-        for before in filter(None, kept):
-            if now.get(before.path, before.sha256) == before.sha256:
-                product_files.drop(self._output, before.path, before.sha256)
 
     def clear_up(self, *, lost_worker: bool) -> None:
         """Remove half files, of workers of this run, or of a killed one if this has not begun."""

@@ -92,8 +92,13 @@ def scenes_without_product(planned: Sequence[Planned], campaign: Campaign) -> di
     for scene, plan in planned:
         if plan.product_keys:
             continue
-        networks = _networks_of_member(scene, campaign)
-        if not networks:
+        owner = campaign.instruments.get(scene.instrument)
+        networks = [
+            name
+            for name, network in campaign.networks.items()
+            if owner and scene.instrument in network.instruments
+        ]
+        if not networks or (owner and owner.products.requested):
             reasons[scene.id] = nothing_to_do(plan)
         elif not any(granule.path in in_networks for granule in scene.granules):
             reasons[scene.id] = (
@@ -127,14 +132,6 @@ def unmade_products(campaign: Campaign, planned: Iterable[Planned]) -> dict[str,
             )
             unmade[f"{owner} {kind} {channel}"] = list(reasons) or [""] * bool(plans[owner])
     return unmade
-
-
-def _networks_of_member(scene: Scene, campaign: Campaign) -> list[str]:
-    """Return the networks of an instrument that has no requested product of its own."""
-    owner = campaign.instruments.get(scene.instrument)
-    if owner is None or owner.products.requested:
-        return []
-    return [name for name, net in campaign.networks.items() if scene.instrument in net.instruments]
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,8 @@ class Air:
         backscatter = molecular / molecular_lidar_ratio(wavelength)
         factor = 1.0 if self._eddies is None else self._eddies.at(points, self._seconds(moment))
         for aerosol, at_reference in self._particles(points, moment):
-            particles = factor * at_reference * _spectral(aerosol, wavelength)
+            spectral = (wavelength / REFERENCE_WAVELENGTH) ** -aerosol.angstrom_exponent
+            particles = factor * at_reference * spectral
             extinction += particles
             backscatter += particles / aerosol.lidar_ratio
         for cloud in self._settings.clouds:
@@ -272,10 +273,6 @@ def _points(beam: Beam, distance: Array) -> _Points:
         beam.north + level * math.cos(azimuth),
         beam.height + climb,
     )
-
-
-def _spectral(aerosol: Aerosol, wavelength: float) -> float:
-    return float((wavelength / REFERENCE_WAVELENGTH) ** -aerosol.angstrom_exponent)
 
 
 def _gradient_extinction(gradient: Gradient, points: _Points) -> Array:

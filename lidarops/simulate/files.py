@@ -211,7 +211,9 @@ class Simulator:
         facts = site.instrument.facts_at(planned.start)
         zenith, azimuth = site.pointing_of(planned, facts)
         sun = solar_elevation(middle, site.station.latitude, site.station.longitude)
-        air_time = self._air_time(middle)
+        air_time, begin = middle, site.settings.start
+        if site.settings.fast:
+            air_time = begin + (middle - begin) // _AIR_STEP * _AIR_STEP
         return _Conditions(
             planned=planned,
             acquisition=acquisition,
@@ -406,12 +408,6 @@ class Simulator:
             return self._paths[key]
         path = self._air.along(conditions.beam, bin_centres(*grid), conditions.air_time, wavelength)
         return _cache(self._paths, key, path)
-
-    def _air_time(self, middle: datetime) -> datetime:
-        start = self.site.settings.start
-        if not self.site.settings.fast:
-            return middle
-        return start + (middle - start) // _AIR_STEP * _AIR_STEP
 
     def _profile(self, conditions: _Conditions) -> dict[str, NDArray[np.float32]] | None:
         planned, grid = conditions.planned, self.grid

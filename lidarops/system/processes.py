@@ -337,17 +337,10 @@ _KEPT: list[Any] = []
 def _prepare(kept: object) -> None:
     # Ctrl-C reaches all processes of a terminal, but the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    # It would wait for tasks for ever where its parent is killed.
+    threading.Thread(target=_await_parent, daemon=True).start()
     keep_memory()
     _KEPT[:] = [kept]
-
-
-def end_with_parent() -> None:
-    """Let this process of `multiprocessing` end when its parent is killed.
-
-    A process of a pool would wait for tasks for ever.
-    """
-    threading.Thread(target=_await_parent, daemon=True).start()
 
 
 def _await_parent() -> None:

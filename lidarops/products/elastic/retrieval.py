@@ -35,7 +35,6 @@ from lidarops.scene.profiles import (
     ChannelSignal,
     Chunk,
     ProductStream,
-    Source,
     gluing,
 )
 from lidarops.scene.retrieval import Retrieval, Workload
@@ -167,7 +166,11 @@ class _Inversion(ProductStream):
             Screening(cloud_contrast(signal.wavelength), self._reference.highest),
         )
         self._begun = False
-        self._lidar_ratio = _ratio_at(settings.elastic, signal.source)
+        constant = settings.elastic.lidar_ratio, settings.elastic.lidar_ratio_standard_error
+        self._lidar_ratio = labeled.constant_ratio(*constant)
+        if name := settings.elastic.lidar_ratio_profile:
+            profile = signal.source.ancillaries.lidar_ratios[name]
+            self._lidar_ratio = partial(profile.at, beyond=constant)
 
     def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
         """Add the next profiles to their averages, and yield those that are complete, inverted."""
@@ -199,15 +202,6 @@ class _Inversion(ProductStream):
         flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
         glued = flagged.assign(gluing(averages))
         return with_methods(glued, signal.molecules, known_shape=self._known_shape)
-
-
-def _ratio_at(settings: InversionSettings, source: Source) -> labeled.RatioAt:
-    """Return the function of altitude that gives the lidar ratio and its standard error."""
-    constant = settings.lidar_ratio, settings.lidar_ratio_standard_error
-    name = settings.lidar_ratio_profile
-    if name is None:
-        return labeled.constant_ratio(*constant)
-    return partial(source.ancillaries.lidar_ratios[name].at, beyond=constant)
 
 
 RETRIEVAL: Final = Retrieval(settings=ElasticPlan, needs=_needs, stream=_Inversion, held=_held)

@@ -75,15 +75,6 @@ def _window(case: Case, level: Sequence[Section], method: Method) -> Entry:
     return case.run(WINDOW, reason, WindowSettings(bins=((0, bins),)), number=float(bins))
 
 
-def _along_path(case: Case) -> Entry:
-    """Add visibility along the sections where the campaign requests it."""
-    definition = case.request.visibility
-    if definition is None:
-        return case.leave("along_path", "the campaign requests no visibility along the sections")
-    reason = "the campaign requests visibility along the sections"
-    return case.run("along_path", reason, number=definition.threshold)
-
-
 class PathSettings(SettingsModel):
     """Settings of the entry ``homogeneous``."""
 
@@ -157,7 +148,12 @@ def _needs(case: Case) -> Entries:
     method = _method(case, level)
     if level:
         yield _window(case, level, method)
-        yield _along_path(case)
+        if (visibility := request.visibility) is None:
+            reason = "the campaign requests no visibility along the sections"
+            yield case.leave("along_path", reason)
+        else:
+            reason = "the campaign requests visibility along the sections"
+            yield case.run("along_path", reason, number=visibility.threshold)
     for section in request.sections:
         if section not in inside:
             yield _outside(case, *section, fewest)

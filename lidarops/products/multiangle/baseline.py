@@ -48,17 +48,14 @@ def plan_baseline(case: ChannelCase[MultiAngleSettings]) -> Entry:
 
 def held_of_low_beams(work: Workload) -> float:
     """Return the bytes of the low beams that are averaged together."""
-    return _BYTES_OF_A_BIN * min(_TOGETHER, _low_profiles(work)) * work.bins
+    # So low that they may be blocked.
+    limit = 90.0 - THRESHOLDS.lowest_free
+    low = sum((granule.zenith_angle or 0.0) > limit for granule in work.scene.granules)
+    return _BYTES_OF_A_BIN * min(_TOGETHER, low) * work.bins
 
 
 _BYTES_OF_A_BIN: Final = 90.0
 """Bytes per bin of a low beam while it is averaged, at the peak."""
-
-
-def _low_profiles(work: Workload) -> int:
-    """Return the number of profiles so low that they may be blocked."""
-    limit = 90.0 - THRESHOLDS.lowest_free
-    return sum((granule.zenith_angle or 0.0) > limit for granule in work.scene.granules)
 
 
 def add_low_beams(beams: BlockedBeams, chunk: Chunk, profiles: Profiles) -> None:

@@ -415,19 +415,16 @@ class _Scans(ProductStream):
             retrieval_method=LAYOUT.row("retrieval_method").code(optical_depth.attrs["method"]),
             background_method=BACKGROUND_METHOD.code(self._background.method),
         )
-        papers = self._papers()
+        # Beside those of all methods.
+        differentiates = self._settings.method in _DIFFERENTIATING
+        papers = [MULTIANGLE_PAPER] if differentiates else []
+        papers += [KNOWN_SHAPE_PAPERS] if self._known_shape else []
         if papers:
             optical_depth = optical_depth.assign_attrs(references="\n".join(papers))
         if baseline is not None:
             optical_depth = with_baseline(optical_depth, baseline, self._signal.source.geometry)
         least = settings.least_signal_to_noise
         return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
-
-    def _papers(self) -> list[str]:
-        """Return the papers of what runs, beside those of all methods."""
-        differentiates = self._settings.method in _DIFFERENTIATING
-        of_method = [MULTIANGLE_PAPER] if differentiates else []
-        return of_method + ([KNOWN_SHAPE_PAPERS] if self._known_shape else [])
 
 
 RETRIEVAL: Final = Retrieval(

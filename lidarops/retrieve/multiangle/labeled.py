@@ -87,6 +87,11 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
     depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
     quality = _quality(retrieval)
+    texts = [
+        f"{step.step if step.ran else f'left out {step.step}'}: {step.reason}"
+        for step in retrieval.steps
+    ]
+    methods = set(optical_depth.MultiAngleMethod)
     product = xr.Dataset(
         {
             **values,
@@ -99,7 +104,10 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
             "shots": beams["shots"],
         },
         coords={name: beams[name] for name in beams.coords},
-        attrs={"steps": _step_texts(retrieval), "method": _method_of(retrieval)},
+        attrs={
+            "steps": "; ".join(texts),
+            "method": next(s.step for s in retrieval.steps if s.ran and s.step in methods),
+        },
     )
     product = product.assign(_plane_variables(signals, scan))
     product = product.assign(
@@ -216,7 +224,8 @@ def _plane_variables(signals: ScanSignals, scan: _Scan) -> dict[str, xr.Variable
         for quantity in ("optical_depth", "extinction"):
             stacked[f"{quantity}_gradient_error"] *= scale
     cube = ("time", "plane", "altitude")
-    azimuths = [_azimuth_of_plane(azimuth, zenith_angle, own) for own in planes]
+    # That of the lowest beam of a plane.
+    azimuths = [float(azimuth[own][np.argmax(zenith_angle[own])]) for own in planes]
     return {
         "plane": xr.Variable("plane", np.arange(len(planes), dtype=np.int32)),
         "plane_azimuth": xr.Variable("plane", np.array(azimuths)),
@@ -261,11 +270,6 @@ def _planes_with_leverage(
     ]
 
 
-def _azimuth_of_plane(azimuth: Array, zenith_angle: Array, members: Integers) -> float:
-    """Return the azimuth of the lowest beam of a plane, degree."""
-    return float(azimuth[members][np.argmax(zenith_angle[members])])
-
-
 def _layer_variables(
     retrieval: MultiAngleResult, quality: Flags, levels: Indices, bounds: Array
 ) -> dict[str, xr.Variable]:
@@ -283,19 +287,6 @@ def _layer_variables(
     middle = xr.Variable("layer", bounds.mean(axis=1))
     limits = xr.Variable(("layer", "nv"), bounds)
     return {**variables, "layer_altitude": middle, "layer_bnds": limits}
-
-
-def _method_of(retrieval: MultiAngleResult) -> str:
-    """Return the method that ran."""
-    ran = (step.step for step in retrieval.steps if step.ran)
-    return next(name for name in ran if name in set(optical_depth.MultiAngleMethod))
-
-
-def _step_texts(retrieval: MultiAngleResult) -> str:
-    return "; ".join(
-        f"{step.step if step.ran else f'left out {step.step}'}: {step.reason}"
-        for step in retrieval.steps
-    )
 
 
 def _quality(retrieval: MultiAngleResult) -> Flags:

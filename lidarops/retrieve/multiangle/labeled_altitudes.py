@@ -471,6 +471,11 @@ def _visit_means(bins: _Bins, shots: Array, first: Indices) -> _Bins:
     left = np.add.reduceat(np.where(known, bins.left, 0.0), first)
     count = np.maximum(np.add.reduceat(known.astype(np.int64), first), 1)
     level = np.add.reduceat(shots**2 * bins.level_variance, first)
+    changes = {}
+    for name, change in bins.changes.items():
+        sums = RunningMean((first.size, change.shape[1]))
+        sums.add(change, bins.variance, groups=group, weights=shots)
+        changes[name] = sums.averages().values
     return _Bins(
         means.values,
         means.variance,
@@ -479,11 +484,5 @@ def _visit_means(bins: _Bins, shots: Array, first: Indices) -> _Bins:
         left / count,
         np.minimum.reduceat(bins.obstruction, first),
         bins.background[first],
-        {name: _mean_change(c, bins.variance, group, shots) for name, c in bins.changes.items()},
+        changes,
     )
-
-
-def _mean_change(change: Array, variance: Array, group: Integers, shots: Array) -> Array:
-    sums = RunningMean((int(group[-1]) + 1, change.shape[1]))
-    sums.add(change, variance, groups=group, weights=shots)
-    return sums.averages().values
