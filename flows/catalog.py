@@ -51,10 +51,6 @@ def catalog(
         Number of processes; more than one is used if thousands of files are new.
     catalog : str, optional
         SQLAlchemy URL of catalog and ledger; overrides the campaign file.
-
-    Returns
-    -------
-    ScanSummary
     """
     tie_to_this_process()
     keep_main_module_out()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -94,15 +94,7 @@ class Sums:
         used = _used(sample) & (weights > 0.0) & np.isfinite(weights)
         # Unused values must be finite too, because 0 x NaN is NaN.
         weights = np.where(used, weights, 0.0)
-        terms: dict[str | int, Array] = {
-            "weight": weights,
-            "value": weights * sample.values,
-            "random": weights**2 * sample.random**2,
-            # The error of a mean is unknown where that of one profile is.
-            **{number: weights * error for number, error in enumerate(sample.shared)},
-            **{name: weights * error for name, error in sample.systematic.items()},
-        }
-        for key, term in terms.items():
+        for key, term in _terms(sample, weights):
             self.totals[key] = self.totals.get(key, 0.0) + np.where(used, term, 0.0).sum(axis=0)
         self._spread(np.where(used, sample.values, 0.0), used)
 
@@ -151,6 +143,16 @@ def _used(sample: Sample) -> NDArray[np.bool_]:
         # One that does not apply, as that of the dead time to analog signals, is missing.
         used &= np.any([np.isfinite(error) for error in sample.systematic.values()], axis=0)
     return used
+
+
+def _terms(sample: Sample, weights: Array) -> Iterator[tuple[str | int, Array]]:
+    """Yield what is summed, by its key in `Sums.totals`."""
+    yield "weight", weights
+    yield "value", weights * sample.values
+    yield "random", weights**2 * sample.random**2
+    # The error of a mean is unknown where that of one profile is.
+    yield from ((number, weights * error) for number, error in enumerate(sample.shared))
+    yield from ((name, weights * error) for name, error in sample.systematic.items())
 
 
 @dataclass(frozen=True, slots=True)

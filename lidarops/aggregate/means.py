@@ -82,10 +82,6 @@ def write_means(
     period : Period
     weights : Weights
 
-    Returns
-    -------
-    MeansResult
-
     Raises
     ------
     ProductError

@@ -111,12 +111,6 @@ def averaged(source: Layout) -> tuple[Row, ...]:
 def layout(kind: str, period: Period, weights: Weights) -> Layout:
     """Return the layout of the means of a product kind.
 
-    Parameters
-    ----------
-    kind : str
-    period : Period
-    weights : Weights
-
     Returns
     -------
     Layout

@@ -120,10 +120,6 @@ def update_store(
     runs : mapping of str to str
         Product path -> run that made it, for the message of the commit.
 
-    Returns
-    -------
-    StoreUpdate
-
     Raises
     ------
     ProductError

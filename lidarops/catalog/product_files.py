@@ -279,10 +279,6 @@ def publish_products(campaign: Campaign, url: str) -> Published:
     url : str
         Destination, such as ``s3://bucket/prefix``; the driver finds the credentials.
 
-    Returns
-    -------
-    Published
-
     Raises
     ------
     CatalogError
@@ -307,10 +303,6 @@ def publish_site(campaign: Campaign, url: str) -> Published:
     campaign : Campaign
     url : str
         Destination of the products; the site goes beside them.
-
-    Returns
-    -------
-    Published
 
     Raises
     ------

@@ -101,10 +101,6 @@ def scan_archive(
         Largest number of local processes that read headers, used if thousands of files are new or
         changed; does not affect the catalog. Headers behind a URL are read by this process.
 
-    Returns
-    -------
-    ScanSummary
-
     Raises
     ------
     CatalogError

@@ -189,10 +189,6 @@ def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> H
     size : int, optional
         Bytes of the whole file; by default the length of `buffer`.
 
-    Returns
-    -------
-    Header
-
     Raises
     ------
     RawFormatError

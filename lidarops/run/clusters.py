@@ -218,10 +218,6 @@ def choose_cluster(
     memory : str, optional
         Memory limit of a local worker, such as ``2GiB``; other clusters set it themselves.
 
-    Returns
-    -------
-    Cluster
-
     Raises
     ------
     ClusterError

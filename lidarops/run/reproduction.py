@@ -87,10 +87,6 @@ def reproduce_product(
         SQLAlchemy URL of a catalog that knows the archive, and where raw files were moved; default
         that of ``LIDAROPS_CATALOG``, or the nearest ``catalog.sqlite`` above the product.
 
-    Returns
-    -------
-    Reproduction
-
     Raises
     ------
     ProductError

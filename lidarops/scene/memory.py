@@ -69,13 +69,7 @@ class SceneMemory:
 
 
 def scene_memory(scene: Scene, plan: Plan) -> SceneMemory:
-    """Return the estimated memory of a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-    plan : Plan
-    """
+    """Return the estimated memory of a scene."""
     held: defaultdict[str, float] = defaultdict(float)
     together = 1
     members = {member.instrument: member for member in scene.members}

@@ -53,11 +53,6 @@ from lidarops.settings import ChannelProduct
 def plan_scene(scene: Scene, campaign: Campaign) -> Plan:
     """Decide what runs for a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-    campaign : Campaign
-
     Returns
     -------
     Plan

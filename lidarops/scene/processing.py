@@ -84,10 +84,6 @@ from lidarops.system.files import sha256_of
 def process_scene(job: Job) -> SceneOutcome:
     """Process one scene and return its products, or why there are none.
 
-    Parameters
-    ----------
-    job : Job
-
     Returns
     -------
     SceneOutcome

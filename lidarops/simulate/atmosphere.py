@@ -226,11 +226,6 @@ class Air:
 class _Eddies:
     r"""Turbulence: a log-normal random field of mean 1 that drifts with the wind.
 
-    Parameters
-    ----------
-    settings : Turbulence
-    seed : int
-
     Notes
     -----
     :math:`\exp(s g - s^2 / 2)` with :math:`g = \sqrt{2 / M} \sum_m \cos(k_m x + \phi_m)`: plane

@@ -123,12 +123,7 @@ class _Nominal(NamedTuple):
 
 
 class Simulator:
-    """Simulator of the files of one instrument.
-
-    Parameters
-    ----------
-    site : SimulatedInstrument
-    """
+    """Simulator of the files of one instrument."""
 
     def __init__(self, site: SimulatedInstrument) -> None:
         self.site = site

@@ -183,10 +183,6 @@ def visibility_from_extinction(
     contrast : float
         Threshold: 0.05 (meteorological optical range, the default), 0.02, or exp(-3).
 
-    Returns
-    -------
-    VisibilityResult
-
     Raises
     ------
     RetrievalInputError

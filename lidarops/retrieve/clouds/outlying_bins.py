@@ -69,10 +69,6 @@ def bridge_outliers(
     background : (...) float, optional
         Rough background of the power; 0 where not given.
 
-    Returns
-    -------
-    BridgedProfiles
-
     Raises
     ------
     RetrievalInputError

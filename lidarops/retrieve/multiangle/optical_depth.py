@@ -78,10 +78,6 @@ def retrieve_optical_depth(
         Bits of the signals of all beams, which tell why values are missing; by default
         INPUT_MISSING where no beam has a signal and its variance.
 
-    Returns
-    -------
-    MultiAngleResult
-
     Raises
     ------
     RetrievalInputError

@@ -51,10 +51,6 @@ def directions(zenith_angle: npt.ArrayLike, azimuth: npt.ArrayLike | None = None
     azimuth : (profile,) float, optional
         degree; NaN if unknown. NaN for all profiles is the same as no azimuth.
 
-    Returns
-    -------
-    Directions
-
     Raises
     ------
     RetrievalInputError

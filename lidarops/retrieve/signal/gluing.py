@@ -113,10 +113,6 @@ def glue(
         Bins; the integral correlation length of analog noise
         (`lidarops.retrieve.signal.noise_correlation`), which raises the errors of the line.
 
-    Returns
-    -------
-    GluedSignal
-
     Raises
     ------
     RetrievalInputError
