@@ -345,17 +345,6 @@ def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list
     return [low + int(share * (high - low)) for low, high in zip(least, whole, strict=True)]
 
 
-@command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def bench() -> None:
-    """Say where the benchmarks are."""
-    raise LidarOpsError(
-        "the benchmarks are beside the package",
-        field="bench",
-        remedy="in a checkout, run: python -m benchmarks",
-        wrong_use=True,
-    )
-
-
 def loaded_campaign(
     campaign: Path,
     archive: str | None,

@@ -209,7 +209,6 @@ def test_the_command_line_reprocesses_and_reports(
         (["report", "/nowhere"], 2, "/nowhere"),
         (["report", "/"], 2, "run.json"),
         (["site", "/nowhere"], 2, "/nowhere"),
-        (["bench", "throughput", "--quick"], 2, "python -m benchmarks"),
     ],
 )
 def test_wrong_use_is_reported(
