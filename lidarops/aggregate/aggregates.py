@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lidarops.aggregate.facts import (
+    EVERYTHING,
     Facts,
+    ProductSelection,
     Refused,
     grid_notes,
     groups,
@@ -18,7 +20,6 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import write_index
 from lidarops.aggregate.means import MeansFile, write_means
 from lidarops.aggregate.means_variables import Period, Weights
-from lidarops.aggregate.selection import EVERYTHING, ProductSelection
 from lidarops.aggregate.stac import write_stac
 from lidarops.aggregate.versioned_store import StoreUpdate, stored_kinds, update_store
 from lidarops.errors import ProductError

@@ -18,8 +18,7 @@ from uuid import UUID
 import pandas as pd
 
 from lidarops.aggregate import need
-from lidarops.aggregate.facts import FOLDER, Facts
-from lidarops.aggregate.selection import EVERYTHING, ProductSelection, parse_selection
+from lidarops.aggregate.facts import EVERYTHING, FOLDER, Facts, ProductSelection, parse_selection
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.kinds import flags_of, kinds
 from lidarops.system.files import write_atomically

@@ -14,15 +14,16 @@ import xarray as xr
 from lidarops.aggregate._join import Part, join, pattern_of
 from lidarops.aggregate.facts import (
     Group,
+    ProductSelection,
     groups,
     list_products,
     opened_undecoded,
+    parse_selection,
     read_header,
     refuse_duplicates,
     refuse_several,
 )
 from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
-from lidarops.aggregate.selection import ProductSelection, parse_selection
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.netcdf.variables import judging, summary_of

@@ -23,6 +23,7 @@ from lidarops.aggregate import need
 from lidarops.aggregate._join import Part, Source, pattern_of, shared_attributes, sorted_by_time
 from lidarops.aggregate.facts import (
     Facts,
+    ProductSelection,
     Refused,
     groups,
     plain,
@@ -30,7 +31,6 @@ from lidarops.aggregate.facts import (
     refuse_several,
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
-from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError
 from lidarops.system.files import only_one, within
 

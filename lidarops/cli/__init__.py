@@ -8,7 +8,7 @@ from lidarops.system import use_one_thread
 
 use_one_thread()
 
-from lidarops.cli import archive, files, ledger, many, plan, preparation
+from lidarops.cli import archive, files, many, plan, preparation
 from lidarops.cli.app import app
 
-__all__ = ["app", "archive", "files", "ledger", "many", "plan", "preparation"]
+__all__ = ["app", "archive", "files", "many", "plan", "preparation"]

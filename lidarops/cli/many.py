@@ -81,8 +81,8 @@ def aggregate(
     Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
     """
     from lidarops.aggregate.aggregates import AggregateOptions, make_aggregates
+    from lidarops.aggregate.facts import parse_choice, parse_selection
     from lidarops.aggregate.means_variables import Period, Weights
-    from lidarops.aggregate.selection import parse_choice, parse_selection
 
     root, runs = _root(out, with_runs=store)
     options = AggregateOptions(

@@ -14,6 +14,7 @@ from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate.facts import (
     Facts,
+    ProductSelection,
     Refused,
     grid_notes,
     groups,
@@ -21,7 +22,6 @@ from lidarops.aggregate.facts import (
     read_product_facts,
     within,
 )
-from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError
 from lidarops.kinds import flags_of
 from lidarops.netcdf.write import write_plain

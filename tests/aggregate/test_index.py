@@ -13,9 +13,8 @@ import pytest
 from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate import index as indices
-from lidarops.aggregate.facts import Facts
+from lidarops.aggregate.facts import Facts, ProductSelection
 from lidarops.aggregate.index import INDEX, find_in_index, find_products, write_index
-from lidarops.aggregate.selection import ProductSelection
 from lidarops.errors import ProductError, RetrievalInputError
 
 pytest.importorskip("pyarrow")

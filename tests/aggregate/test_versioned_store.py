@@ -18,9 +18,8 @@ from support.archives.aggregate_archive import add_day, facts_of
 from support.products.made_products import MAKERS
 
 from lidarops.aggregate import versioned_store
-from lidarops.aggregate.facts import UNSHARED, Refused
+from lidarops.aggregate.facts import EVERYTHING, UNSHARED, ProductSelection, Refused
 from lidarops.aggregate.open_products import open_products
-from lidarops.aggregate.selection import EVERYTHING, ProductSelection
 from lidarops.aggregate.versioned_store import StoreUpdate, store_path, update_store
 from lidarops.errors import ProductError, RetrievalInputError
 
