@@ -18,9 +18,9 @@ from lidarops.cli import app
 MOST = {
     "lines": 69_674,
     "lines of code alone": 45_364,
-    "modules": 283,
+    "modules": 277,
     "dataclasses": 249,
-    "lines of dataclasses": 6_618,
+    "lines of dataclasses": 6_615,
     "tuning numbers": 220,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
@@ -28,8 +28,8 @@ MOST = {
     "lines of the largest package": 5_553,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 283, "functions": 595, "changes": 215},
-    "elastic": {"modules": 283, "functions": 740, "changes": 232},
+    "homogeneous": {"modules": 61, "functions": 585, "changes": 215},
+    "elastic": {"modules": 71, "functions": 730, "changes": 232},
 }
 
 
