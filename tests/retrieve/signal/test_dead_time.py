@@ -4,29 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.dead_times import DISTANCE, LAG, LIGHT, NONLINEAR, SCENES, draw_scene, record
 
-from benchmarks.stability.random_dead_times import (
-    DISTANCE,
-    LAG,
-    LIGHT,
-    NONLINEAR,
-    SCENES,
-    draw_group,
-    draw_scene,
-)
 from lidarops.retrieve.signal.dead_time import estimate_dead_time
-
-
-def record(
-    rng, dead_time, *, light=LIGHT, sky=0.5, groups=4, shots=600, paralysable=False, baseline=0.0
-):
-    """Return groups of one profile each, of the same light."""
-    return [
-        draw_group(
-            rng, dead_time, [light], [shots], sky, paralysable=paralysable, baseline=baseline
-        )
-        for _ in range(groups)
-    ]
 
 
 @pytest.mark.parametrize("scene", SCENES)
