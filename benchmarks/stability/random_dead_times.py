@@ -12,6 +12,7 @@ from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.signal.dead_time import ProfileGroup, estimate_dead_time
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 Random = np.random.Generator
 
@@ -75,7 +76,9 @@ SCENES: Final[dict[str, Callable[[Random, int], Array]]] = {
 """Name -> function that returns the light of a profile, given its number of 32."""
 
 NONLINEAR: Final = 0.01
-"""Share by which the largest analog signal is too large, in scenes of a nonlinear record."""
+"""Share by which the largest analog signal may be too large, as the stated error assumes."""
+_MOST: Final = 3.0 * NONLINEAR
+"""Largest share in random scenes."""
 _UNSEEN: Final = "a nonlinear analog record looks like a dead time"
 
 
@@ -91,17 +94,26 @@ def draw_scene(rng: Random, scene: str, dead_time: float, bend: float = 0.0) -> 
 def score_dead_times(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield estimated dead times of 2 to 12 ns, by scene, with a linear and a nonlinear record."""
     for number, scene in enumerate(SCENES):
-        for bend in (0.0, NONLINEAR):
+        for nonlinear in (False, True):
             rng = np.random.default_rng((91, cluster, number))
             truths = np.exp(rng.uniform(math.log(2e-9), math.log(1.2e-8), profiles))
-            found = [estimate_dead_time(draw_scene(rng, scene, t, bend), LAG) for t in truths]
-            failure = Failure(f"{scene}, nonlinear analog record", unseen=_UNSEEN)
+            bends = rng.uniform(-_MOST, _MOST, profiles) * nonlinear
+            found = [
+                estimate_dead_time(draw_scene(rng, scene, truth, bend), LAG)
+                for truth, bend in zip(truths, bends, strict=True)
+            ]
+            values, stated, loads = (
+                np.array([math.nan if one is None else getattr(one, name) for one in found])
+                for name in ("dead_time", "standard_error", "highest_load")
+            )
+            bent = THRESHOLDS.analog_nonlinearity * (1.0 - loads) / loads * values
+            failure = Failure(f"{scene}, analog record nonlinear by up to 3 %", unseen=_UNSEEN)
             yield ScoredValues(
-                failure if bend else Failure(scene),
+                failure if nonlinear else Failure(scene, satisfied=True),
                 "dead time",
-                np.array([np.nan if one is None else one.dead_time for one in found]) - truths,
-                np.array([np.nan if one is None else one.standard_error for one in found]),
-                0.0,
+                values - truths,
+                np.sqrt(stated**2 - bent**2),
+                bent,
                 np.zeros(profiles, dtype=np.int32),
                 HomogeneousQuality,
             )
