@@ -48,8 +48,8 @@ _NOTE: Final = (
     "to 5 per km, signal 15 to 100 000 times the noise. The bound is the inverse Fisher matrix of "
     "background, amplitude and extinction. Profiles that a method rejects do not count for its "
     "error. The iterative peers start from the fit of the mean of 64 profiles, and test no "
-    "residuals. Median over the paths of the RMSE over the bound; RMSE and bias of the worst path; "
-    "mean shares of flagged and rejected profiles."
+    "residuals. Median over the paths of the RMSE over the bound; its largest value, and the "
+    "largest mean error, each over all paths; mean shares of flagged and rejected profiles."
 )
 
 

@@ -121,13 +121,13 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
         own, base = parts_of[guard, quantity], parts_of[BASE, quantity]
         cells, moves = [], []
         for name, pair in RATES.items():
-            (value, without), (of_base, base_without) = (
+            (value, left), (of_base, base_left) = (
                 _jackknife(*side[list(pair)].to_numpy().T) for side in (own, base)
             )
             if guard != BASE:
-                value, without = value - of_base, without - base_without
-            scatter = np.sum((without - without.mean()) ** 2)
-            error = np.sqrt((without.size - 1) / without.size * scatter)
+                value, left = value - of_base, left - base_left
+            scatter = np.sum((left - left.mean()) ** 2)
+            error = np.sqrt((left.size - 1) / left.size * scatter)
             if guard != BASE and abs(value) > 2.0 * error:
                 moves.append(name)
             sign = "" if guard == BASE else "+"

@@ -535,7 +535,8 @@ def deflate_chunks(
 ) -> Iterator[tuple[Offset, bytes]]:
     """Cut an array into chunks, and shuffle and deflate each.
 
-    Equal values give equal bytes, with one version of libdeflate.
+    Equal values give equal bytes, with one version of libdeflate on one architecture of
+    processor.
 
     Parameters
     ----------

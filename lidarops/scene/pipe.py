@@ -1,8 +1,7 @@
 """The pipe from raw counts to the profiles of a channel, and the air: its stages, in their order.
 
 Of each stage there is a function ``plan_...``, which decides on the headers and the campaign
-whether it runs. `channel_signal` carries
-out what is planned.
+whether it runs. `channel_signal` carries out what is planned.
 """
 
 from __future__ import annotations

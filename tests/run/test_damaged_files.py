@@ -102,12 +102,18 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], tuple[Ca
     ],
 )  # fmt: skip
 def test_a_damaged_line_end_between_datasets_costs_its_file_only(
-    whole: Callable[[bool], tuple[Campaign, Campaign]], tmp_path: Path, name: str, remote: bool
+    whole: Callable[[bool], tuple[Campaign, Campaign]],
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    name: str,
+    remote: bool,
 ) -> None:
     campaign, other = whole(remote)
     campaign = campaign.model_copy(update={"output": str(tmp_path)})
     file = campaign.folder / "raw/rich" / name
     content = file.read_bytes()
+    # The other cases share the file.
+    request.addfinalizer(lambda: file.write_bytes(content))
     file.write_bytes(damage.flip_line_end(content, random.Random(name)))
     result = bring_up_to_date(campaign)
     assert result.has_failures
