@@ -118,25 +118,25 @@ def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int =
 
 
 def _works(scores: dict[str, list[Score]]) -> Iterator[Work]:
-    """Yield the errors of extinction on all paths together."""
-    for method, paths in scores.items():
-        errors = _ranked(paths, f"extinction: {RMSE}")
+    """Yield the errors of extinction, then of background, on all paths together."""
+    for quantity, (method, paths) in product(QUANTITIES, scores.items()):
+        errors = _ranked(paths, f"{quantity}: {RMSE}")
         if errors:
             half = len(errors) // 2
             times = [figure.value for figure in _ranked(paths, CPU_TIME)]
             shares = {name: _ranked(paths, name) for name in ("flagged", "rejected")}
             yield Work(
                 f"median of {len(paths)} paths",
-                "extinction, RMSE over the Cramér-Rao bound",
+                f"{quantity}, RMSE over the Cramér-Rao bound",
                 method,
                 errors[half],
-                _ranked(paths, f"extinction: {COVERAGE}")[half],
+                _ranked(paths, f"{quantity}: {COVERAGE}")[half],
                 cpu_time(float(np.median(times))),
                 ours=method not in {*iterative_peers(), TAIL_MEAN},
                 informed=method in _INFORMED,
                 more={
                     "worst": errors[-1],
-                    BIAS: max(_ranked(paths, f"extinction: {BIAS}"), key=lambda f: abs(f.value)),
+                    BIAS: max(_ranked(paths, f"{quantity}: {BIAS}"), key=lambda f: abs(f.value)),
                     **{
                         name: share(float(np.mean([figure.value for figure in figures])))
                         for name, figures in shares.items()

@@ -16,6 +16,7 @@ from benchmarks.__main__ import BENCHMARKS, app, measure
 from benchmarks.accuracy import homogeneous
 from benchmarks.accuracy.homogeneous_cases import (
     QUANTITIES,
+    TAIL_MEAN,
     Estimates,
     Scenario,
     methods,
@@ -209,9 +210,12 @@ def test_least_squares_reaches_the_bound():
             assert score[f"{quantity}: 95 %"].value > 0.85
 
 
-def test_every_method_that_solves_extinction_is_compared(accuracy):
-    names = {work.method for work in accuracy.works}
-    assert names == (set(methods()) | set(iterative_peers())) - {"known_extinction"}
+@pytest.mark.parametrize(
+    ("quantity", "given"), [("extinction", "known_extinction"), ("background", "known_background")]
+)
+def test_every_method_that_solves_a_quantity_is_compared(accuracy, quantity, given):
+    names = {work.method for work in accuracy.works if work.quantity.startswith(quantity)}
+    assert names - {TAIL_MEAN} == (set(methods()) | set(iterative_peers())) - {given, TAIL_MEAN}
 
 
 def test_lag_1_is_biased_as_published_and_least_squares_is_not():
