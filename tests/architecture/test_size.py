@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_674,
-    "lines of code alone": 45_364,
+    "lines": 69_339,
+    "lines of code alone": 45_248,
     "modules": 277,
     "dataclasses": 249,
     "lines of dataclasses": 6_615,
@@ -25,7 +25,7 @@ MOST = {
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 5_553,
+    "lines of the largest package": 5_497,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 61, "functions": 585, "changes": 215},
