@@ -106,6 +106,8 @@ UNREADABLE: Final = "cannot be read"
 """Start of the reason if a disk or a network did not give a file."""
 UNKNOWN_FORMAT: Final = "is of no known raw format"
 """Start of the reason if no installed format recognises a file."""
+INVALID: Final = "is of a period that the facts declare invalid"
+"""Start of the reason if a campaign wants no product of a file."""
 FEWEST_ALIKE: Final = 3
 """Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 LONGEST_REASON: Final = 300
@@ -159,6 +161,11 @@ class Granule(Header):
     """Statements of the campaign on the station that the header contradicts, in words."""
     sha256: str | None = None
     """Digest of the file; None until the whole file has been read."""
+
+    @property
+    def is_declared_invalid(self) -> bool:
+        """Whether the campaign refuses the file, not its content."""
+        return self.reason.startswith(INVALID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -733,9 +740,13 @@ class RunRecord:
 
     @property
     def failed(self) -> bool:
-        """Whether a file was refused, a scene failed or is unusable, or the findings failed."""
+        """Whether a file was refused, a scene failed or is unusable, or the findings failed.
+
+        Files that the campaign declares invalid do not count.
+        """
         return (
-            bool(self.refused or self.empty_scenes or self.cut_short)
+            bool(self.empty_scenes or self.cut_short)
+            or not all(granule.is_declared_invalid for granule in self.refused)
             or self.findings.failed
             or any(scene.error or scene.refused or scene.unusable for scene in self.scenes)
         )

@@ -195,6 +195,11 @@ class InstrumentFacts(SettingsModel):
     valid_to: Instant = Field(
         default=datetime.max.replace(tzinfo=UTC), description="end of the period, not included"
     )
+    invalid: str = Field(
+        default="",
+        description="why no product is made of the files of the period, in words; they stay in"
+        " catalog and reports",
+    )
     zenith_angle: float | None = quantity(
         None,
         unit="degree",
@@ -255,6 +260,10 @@ class InstrumentFacts(SettingsModel):
             if len(given) > 1:
                 raise ValueError(f"{' and '.join(given)} name the same file, {name}")
         return self
+
+
+NO_FACTS: Final = InstrumentFacts()
+"""Facts of the times that no period holds."""
 
 
 def _fields(*scopes: Scope) -> dict[str, Any]:
@@ -326,7 +335,10 @@ class Instrument(SettingsModel):
         description="largest difference between headers and station in altitude",
     )
     facts: list[InstrumentFacts] = Field(
-        default=[InstrumentFacts()], description="about the instrument, one entry for each period"
+        default=[InstrumentFacts()],
+        min_length=1,
+        description="about the instrument, one entry for each period; files of no period are"
+        " refused",
     )
     products: Products = Products()
 
@@ -339,12 +351,15 @@ class Instrument(SettingsModel):
         return self
 
     def facts_at(self, moment: datetime, *, by_clock: bool = False) -> InstrumentFacts:
-        """Return the facts of a time, UTC or by the clock of the instrument; or empty facts."""
+        """Return the facts of a time, UTC or by the clock of the instrument.
+
+        `NO_FACTS` where it is in none of the periods: its files are refused.
+        """
         for fact in self.facts:
             behind = timedelta(seconds=fact.clock_offset if by_clock else 0.0)
             if fact.valid_from <= moment - behind < fact.valid_to:
                 return fact
-        return InstrumentFacts()
+        return NO_FACTS
 
 
 class NetworkMembers(SettingsModel):

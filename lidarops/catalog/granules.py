@@ -17,6 +17,7 @@ from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
 from lidarops.catalog.headers import NO_NOTES, GranuleRow
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
+    INVALID,
     ChannelLayout,
     DetectionMode,
     FileNote,
@@ -202,6 +203,12 @@ class Granules(Database):
         """Return the number of granules."""
         conditions = [] if status is None else [_C.status == status.value]
         query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *conditions)
+        return int(self.read(query, tuple)[0][0])
+
+    def count_refused(self) -> int:
+        """Return the number of refused granules that the campaign does not declare invalid."""
+        unexpected = _C.status == Status.REFUSED.value, _C.reason.not_like(f"{INVALID}%")
+        query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *unexpected)
         return int(self.read(query, tuple)[0][0])
 
     def day_sums(self) -> list[DaySum]:

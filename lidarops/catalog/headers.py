@@ -19,6 +19,7 @@ from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, read_start
 from lidarops.raw.header import RawHeader
 from lidarops.records import (
+    INVALID,
     UNKNOWN_FORMAT,
     UNREADABLE,
     ChannelLayout,
@@ -137,6 +138,10 @@ def _accepted(
     due: UnreadFile, header: RawHeader, instrument: Instrument, station: Station
 ) -> Granule:
     facts = instrument.facts_at(header.start, by_clock=True)
+    shift = timedelta(seconds=facts.clock_offset)
+    left_out = _left_out(header, facts, instrument)
+    if left_out:
+        return _refused(due, left_out, header.start - shift)
     header = header.read_as(instrument.header_pointing)
     if header.doubt and facts.zenith_angle is None:
         raise RawFormatError(
@@ -146,7 +151,6 @@ def _accepted(
             remedy="leave the file out, or set header_pointing if it states no scan, or give"
             " zenith_angle in the facts if the beam is fixed: it holds for all files of the period",
         )
-    shift = timedelta(seconds=facts.clock_offset)
     order = instrument.header_position
     position = None if order == "ignore" else header.position(order)
     latitude, longitude = position or (station.latitude, station.longitude)
@@ -169,6 +173,18 @@ def _accepted(
         contradictions=tuple(_contradictions(header, position, instrument, station)),
         **{name: getattr(header, name) for name in _STATED} | of_campaign,
     )
+
+
+def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument) -> str:
+    """Return why the facts of the campaign let no product be made of a file; else empty."""
+    if facts.invalid:
+        return f"{INVALID}: {facts.invalid}"
+    if not any(facts is stated for stated in instrument.facts):
+        return (
+            f"starts at {header.start:%Y-%m-%d %H:%M} UTC, which is in no period of the facts (give"
+            " one that holds it, or one that is `invalid`)"
+        )
+    return ""
 
 
 def _is_near(instrument: Instrument, station: Station, latitude: float, longitude: float) -> bool:

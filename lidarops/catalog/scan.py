@@ -32,6 +32,10 @@ _WORTH_PROCESSES = 5000
 _MOST_PROCESSES = 8
 """Further processes would wait for the one that writes the catalog."""
 
+_FACTS_OF_HEADERS: Final = {
+    "valid_from", "valid_to", "invalid", "zenith_angle", "azimuth", "clock_offset"
+}  # fmt: skip
+"""Facts on which the granule of a file depends."""
 _NAMES_OF_FOLDER: Final = 3
 """Files of a folder that are compared with patterns that match nothing."""
 _LEAST_LIKENESS: Final = 0.5
@@ -51,7 +55,8 @@ class ScanSummary:
     unchanged: int
     vanished: int
     refused: int
-    """Refused granules in the whole catalog, not only the new ones."""
+    """Refused granules in the whole catalog, not only the new ones; without those of periods that
+    the campaign declares invalid."""
     moved: int = 0
     """Files with a new path and known content; they count neither as added nor as vanished."""
     idle_patterns: tuple[IdlePattern, ...] = ()
@@ -296,7 +301,7 @@ class _Scan:
             changed=self._changed,
             unchanged=self._files - added - self._changed - len(moved),
             vanished=len(self._gone) - len(moved),
-            refused=self._store.count(status=Status.REFUSED),
+            refused=self._store.count_refused(),
             moved=len(moved),
             idle_patterns=tuple(
                 IdlePattern(
@@ -396,7 +401,7 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 instrument.altitude_tolerance,
                 station.model_dump(),
                 [
-                    (str(fact.valid_from), fact.zenith_angle, fact.azimuth, fact.clock_offset)
+                    fact.model_dump(mode="json", include=_FACTS_OF_HEADERS)
                     for fact in instrument.facts
                 ],
             ]

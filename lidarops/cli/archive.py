@@ -143,7 +143,7 @@ def catalog(
                 " of no present scene (raw files gone, or scenes cut otherwise);"
                 f" {rebuilt.known} known before"
             )
-    failed = bool(refused) or findings.failed or bool(rebuilt and rebuilt.problems)
+    failed = bool(summary.refused) or findings.failed or bool(rebuilt and rebuilt.problems)
     exit_with_status(failed=failed)
 
 

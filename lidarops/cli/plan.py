@@ -108,6 +108,7 @@ def _plan(
     findings = survey(settings, selection=selection, wait=wait)
     with Store(settings.catalog_url, settings.name) as store:
         refused = store.refused()
+    unexpected = not all(granule.is_declared_invalid for granule in refused)
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
     earlier = earlier_problems(settings, selection)
     scenes = []
@@ -147,7 +148,7 @@ def _plan(
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
-    exit_with_status(failed=failed or bool(refused) or any(earlier) or findings.failed)
+    exit_with_status(failed=failed or unexpected or any(earlier) or findings.failed)
 
 
 def _show_rest(

@@ -119,7 +119,8 @@ def _facts_notes(
     for name in instruments:
         instrument = states.campaign.instruments[name]
         times = [held.since for held in states.names.holdings if held.instrument == name]
-        for facts in instrument.facts if times else ():
+        valid = [facts for facts in instrument.facts if not facts.invalid]
+        for facts in valid if times else ():
             period = period_of(facts)
             if not any(facts.valid_from <= time < facts.valid_to for time in times):
                 reason = "hold for no file: their period and the times of the files do not overlap"

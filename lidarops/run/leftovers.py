@@ -19,6 +19,7 @@ from lidarops.catalog.sources import path_pattern
 from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import product_path
 from lidarops.records import (
+    INVALID,
     FactsNote,
     Granule,
     LostFiles,
@@ -181,9 +182,12 @@ class Leftovers:
         signals = self._signals(product)
         if not self._in_scenes.isdisjoint({*signals, *signals.values()}):
             return "its files belong to other scenes now", False, False
-        if not self._idle.isdisjoint(signals):
+        idle = [self._idle[path] for path in signals if path in self._idle]
+        if idle:
             # Unreadable files may be the only copies.
-            return "its raw files are refused, or belong to no scene", True, False
+            kept = not all(reason.startswith(INVALID) for reason in idle)
+            why = "are refused, or belong to no scene" if kept else "are declared invalid"
+            return f"its raw files {why}", kept, False
         return "no raw file of its scene is left", False, True
 
     def _left_out(self, product: RecordedProduct) -> tuple[str, bool]:
@@ -230,8 +234,10 @@ class Leftovers:
         return {name for granule in granules for name in (granule.path, granule.sha256)}
 
     @cached_property
-    def _idle(self) -> set[str]:
-        return {granule.path for granule in (*self.store.refused(), *self.cut.set_aside)}
+    def _idle(self) -> dict[str, str]:
+        """Files that belong to no scene, and why they are refused."""
+        idle = (*self.store.refused(), *self.cut.set_aside)
+        return {granule.path: granule.reason for granule in idle}
 
 
 def product_file(scene: Scene, product: ProductKey) -> str:
