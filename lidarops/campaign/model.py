@@ -195,8 +195,9 @@ class InstrumentFacts(SettingsModel):
     valid_to: Instant = Field(
         default=datetime.max.replace(tzinfo=UTC), description="end of the period, not included"
     )
-    invalid: str = Field(
-        default="",
+    invalid: str | None = Field(
+        default=None,
+        pattern=r"\S",
         description="why no product is made of the files of the period, in words; they stay in"
         " catalog and reports",
     )

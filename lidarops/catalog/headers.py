@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -46,6 +46,8 @@ _TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
 
 HEADER_BYTES: Final = 16384
 """Bytes that hold the header of any format."""
+_CLOCKS_DIFFER: Final = timedelta(days=2)
+"""A clock of raw files may be a day ahead of UTC, by `clock_offset`."""
 _ROUNDING_OF_ANGLES: Final = 1.0
 """degree; headers hold whole degrees."""
 
@@ -137,6 +139,7 @@ def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Gra
 def _accepted(
     due: UnreadFile, header: RawHeader, instrument: Instrument, station: Station
 ) -> Granule:
+    _check_future(header)
     facts = instrument.facts_at(header.start, by_clock=True)
     shift = timedelta(seconds=facts.clock_offset)
     left_out = _left_out(header, facts, instrument)
@@ -173,6 +176,17 @@ def _accepted(
         contradictions=tuple(_contradictions(header, position, instrument, station)),
         **{name: getattr(header, name) for name in _STATED} | of_campaign,
     )
+
+
+def _check_future(header: RawHeader) -> None:
+    """Refuse a file that starts after today."""
+    if header.start > datetime.now(UTC) + _CLOCKS_DIFFER:
+        raise RawFormatError(
+            f"lies in the future: {header.start:%Y-%m-%d %H:%M}",
+            file=header.path,
+            field="start",
+            remedy="leave the file out, or correct its header; clock_offset is at most a day",
+        )
 
 
 def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument) -> str:

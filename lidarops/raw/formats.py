@@ -107,7 +107,7 @@ class RawFile(AbstractContextManager["RawFile"]):
         return UnreadableFileError(f"cannot be read: {error.strerror}", file=self.path)
 
 
-def _not_stated(_: bytes) -> None:
+def _not_stated(_: object) -> None:
     return None
 
 
@@ -132,6 +132,8 @@ class RawFormat:
     of bins (None for all), row."""
     read_start: Callable[[bytes], datetime | None] = _not_stated
     """First bytes of a file that is refused -> when it starts; None where they do not tell."""
+    named_time: Callable[[str], datetime | None] = _not_stated
+    """Name of a file -> about when it was recorded, by its clock; None where it does not tell."""
 
     def read_channel(
         self,

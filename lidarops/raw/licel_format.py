@@ -131,4 +131,5 @@ FORMAT: Final = RawFormat(
     parse_header=_parse_header,
     read_counts=read_dataset,
     read_start=licel_header.stated_start,
+    named_time=licel_header.named_time,
 )

@@ -49,7 +49,8 @@ _MAX_BITS = 32
 _MAX_INPUT_RANGE = 100.0
 _SHORTEST, _LONGEST_WAVE = 1e-7, 2e-5
 """m."""
-_YEARS = (1960, 2200)
+_YEARS = (1990, 2200)
+"""Of the recorders; clocks without battery start in 1970 or 1980."""
 _ICE_POINT = 273.15
 
 _NUMBER = re.compile(r"[+-]?(?:\d{1,9}(?:[.,]\d{0,9})?|[.,]\d{1,9})", re.ASCII)
@@ -57,6 +58,9 @@ _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
 _DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
 _DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
+_NAMED = re.compile(r"[A-Za-z_]*(\d{2})([1-9A-C])(\d{2})(\d{2})\.(\d{2})(\d)(\d)?\d{0,3}", re.ASCII)
+"""Name as Licel writes it: year, month in hexadecimal, day and hour, then minute and second,
+or minute and tens of seconds (`licel2023`)."""
 _BLOCK_LINE = re.compile(rb".*?\r\n", re.DOTALL)
 _DECIMAL = r"[+-]?\d{1,4}[.,]\d{1,6}"
 _SCAN = re.compile(rf" *{_DECIMAL}(?: +{_DECIMAL}){{6}} *", re.ASCII)
@@ -211,6 +215,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
     start, stop = _moments(dates)
+    _check_name(first.strip(), start)
     place, notes = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, unknown = _parse_lasers(third)
     block_end = _dataset_lines_end(buffer, block_start, number)
@@ -345,13 +350,46 @@ def _pointing(
 
 
 def stated_start(buffer: bytes) -> datetime | None:
-    """Return the start that the first lines of a file state; None where they state none."""
+    """Return the start that the first lines of a file state; None where they state no sure one."""
     try:
         first, second = _line_ends(buffer, 0, 2)
         dates = _DATES.search(buffer[first + 2 : second].decode("latin-1"))
-        return _moments(dates)[0] if dates else None
+        if dates is None:
+            return None
+        start = _moments(dates)[0]
+        _check_name(buffer[:first].decode("latin-1").strip(), start)
     except RawFormatError:
         return None
+    return start
+
+
+def named_time(name: str) -> datetime | None:
+    """Return the time that the name of a file tells, UTC as its header; None where it tells none.
+
+    It is the start or the stop, and in some archives a local time.
+    """
+    found = _NAMED.fullmatch(name)
+    if found is None:
+        return None
+    year, month, *others, tens, ones = found.groups()
+    day, hour, minute = map(int, others)
+    seconds = int(tens + (ones or "0"))
+    try:
+        return datetime(2000 + int(year), int(month, 16), day, hour, minute, seconds, tzinfo=UTC)
+    except ValueError:
+        return None
+
+
+def _check_name(name: str, start: datetime) -> None:
+    """Refuse a start that is more than a day away from the time in the name of the file."""
+    named = named_time(name)
+    if named is not None and abs(start - named) > _LONGEST:
+        raise RawFormatError(
+            f"states {start:%Y-%m-%d %H:%M}, the name of the file in its first line ({name})"
+            f" {named:%Y-%m-%d %H:%M}",
+            field="start",
+            remedy="leave the file out, or correct its header: one of them is wrong",
+        )
 
 
 def _refuse_export(data: bytes) -> None:

@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import fields, replace
+from statistics import median
 from typing import Any, Final, NamedTuple
 
+from lidarops.raw.formats import raw_formats
 from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import FEWEST_ALIKE, Granule, Role, Status, day_of
 
@@ -101,6 +103,7 @@ def outlying_headers(
         if len(around) <= FEWEST_ALIKE:
             continue
         statements = [*_setups(around, day, read), *_intervals(around, day, read)]
+        statements += _times(around, day)
         if role is Role.SIGNAL:
             statements += _pointings(around, day)
         for place, stated in statements:
@@ -180,6 +183,34 @@ def _intervals(
             yield place, Outlying(text, "")
         else:
             yield place, Outlying("", text)
+
+
+def _times(around: Sequence[Granule], day: int) -> Iterator[tuple[int, Outlying]]:
+    """Yield places of files that start away from the time in their name as no other file does.
+
+    Names tell start or stop, in any time zone: the other files show how far they are from it. A
+    clock that is set moves both.
+    """
+    away: dict[int, float] = {}
+    longest = 0.0
+    for place, granule in enumerate(around):
+        named = raw_formats()[granule.format].named_time(granule.path.rpartition("/")[2])
+        if named and granule.start and granule.stop:
+            away[place] = (granule.start - named).total_seconds()
+            longest = max(longest, (granule.stop - granule.start).total_seconds())
+    if len(away) <= FEWEST_ALIKE:
+        return
+    usual = median(away.values())
+    for place, own in away.items():
+        granule = around[place]
+        if any(abs(own - other) <= longest + _JITTER for at, other in away.items() if at != place):
+            continue
+        if granule.start and day_of(granule.start) == day:
+            text = (
+                f"the start {granule.start:%Y-%m-%d %H:%M:%S} UTC, {own - usual:+.0f} s away from"
+            )
+            text += " where its name and the files around it have it"
+            yield place, Outlying(text, "")
 
 
 def _shots(header: RawHeader | None) -> int:

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,17 @@ def test_an_unreadable_file_does_not_abort(campaign: Campaign, store: Store) -> 
     os.mkfifo(root / "coast" / "h-pipe")
     assert scan_archive(campaign, store) == ScanSummary(9, 9, 0, 0, 0, 3)
     assert len(store.granules(status=Status.GOOD)) == 6
+
+
+def test_a_file_of_the_future_is_refused(campaign: Campaign, store: Store) -> None:
+    root = _fill(campaign)
+    ahead = datetime.now(UTC).replace(microsecond=0) + timedelta(days=10) - factories.DAY
+    late = raw_archives.content(ahead / timedelta(minutes=1))
+    raw_archives.write(root / "coast" / "h9", late)
+    assert scan_archive(campaign, store).refused == 1
+    (granule,) = store.refused()
+    assert granule.path == "coast/h9"
+    assert "lies in the future" in granule.reason
 
 
 def test_a_file_of_two_instruments_is_refused(campaign: Campaign, store: Store) -> None:

@@ -17,7 +17,7 @@ from support.physical import read_physical
 from lidarops.errors import RawFormatError
 from lidarops.raw import licel
 from lidarops.raw.archive import open_archive
-from lidarops.raw.formats import parse_raw_header
+from lidarops.raw.formats import parse_raw_header, read_start
 from lidarops.records import DetectionMode
 
 DATES = "02/10/2024 17:30:00 02/10/2024 17:30:10"
@@ -246,6 +246,39 @@ def test_an_interval_of_more_than_a_day_is_refused():
     with pytest.raises(RawFormatError, match=r"lies 1\.0 days after the start") as error:
         parse(line_2=f" LidarPi  {DATES.replace(' 02/', ' 03/')} 0411 -064.1 -031.2 00")
     assert error.value.field == "stop"
+
+
+@pytest.mark.parametrize(
+    ("name", "refused"),
+    [
+        ("h24A0217.301035", False),
+        # By local time, or of the stop.
+        ("h24A0122.301035", False),
+        ("RM24A0217.301", False),
+        ("h24A0317.304512", True),
+        ("h23A0217.301035", True),
+        ("RM2490217.301", True),
+        # Names that tell no time.
+        ("morning.dat", False),
+        ("h24A4217.301035", False),
+        ("2024100217.3010", False),
+    ],
+)
+def test_a_start_far_from_the_time_in_the_name_is_refused(name, refused):
+    content = raw_file(line_1=f" {name}")
+    if not refused:
+        assert licel.parse_header(content).start == datetime(2024, 10, 2, 17, 30, tzinfo=UTC)
+        return
+    with pytest.raises(RawFormatError, match=f"states 2024-10-02 17:30.*{name}") as error:
+        licel.parse_header(content)
+    assert error.value.field == "start"
+    assert read_start(content) is None
+
+
+def test_years_before_the_first_recorders_are_refused():
+    with pytest.raises(RawFormatError, match="1970 is not within 1990") as error:
+        parse(line_2=" LidarPi  01/01/1970 00:00:00 01/01/1970 00:00:10 0411 -064.1 -031.2 00")
+    assert error.value.field == "start"
 
 
 def test_values_without_shots_are_nan(tmp_path):

@@ -169,7 +169,7 @@ def test_other_time_zones_are_written_in_utc():
         ({"stop": datetime(2024, 10, 2, 17, 29, tzinfo=UTC)}, "before the start"),
         ({"site": "two\r\nlines"}, "does not print"),
         ({"site": "\u4e0a\u6d77"}, "Latin-1"),
-        ({"site": "a 01/01/2020 00:00:00 01/01/2020 00:00:10"}, "altitude"),
+        ({"site": "a 02/10/2024 00:00:00 02/10/2024 00:00:10"}, "altitude"),
         ({"name": "two\nlines"}, "does not print"),
         ({"lasers": []}, "two or three"),
         ({"lasers": [licel.Laser(1, 10)] * 2, "timestamp": 3}, "timestamp"),

@@ -39,7 +39,8 @@ def scan_file(
     line_2 = LINE_2.format("02:59:43", stop, elevation, azimuth)
     grid = GRID.format(offset)
     lines = {"line_2": line_2, "line_3": f"{grid.ljust(78)}\r\n{lasers}"}
-    return raw_file(**{"datasets": CHANNELS, **lines, **changes})
+    lines |= {"line_1": " R18A1802.594306", "datasets": CHANNELS}
+    return raw_file(**(lines | changes))
 
 
 @pytest.fixture

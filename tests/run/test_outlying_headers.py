@@ -251,6 +251,36 @@ def test_a_file_that_is_shorter_by_its_shots_is_no_damage(tmp_path: Path) -> Non
         assert "interval" not in opened.attrs.get("lidarops_input_notes", "")
 
 
+@pytest.mark.parametrize(
+    ("hours", "names_differ", "refused"),
+    [
+        ({2: "12"}, 0, ["poor/h2630110.020000"]),
+        ({2: "12", 4: "07"}, 0, ["poor/h2630110.020000", "poor/h2630110.040000"]),
+        # Names are by local time: all are six hours off.
+        ({2: "12"}, 6, ["poor/h2630104.020000"]),
+        # A clock was set: names and headers are its own.
+        ({3: "12", 4: "12"}, 0, []),
+    ],
+)
+def test_a_start_that_its_name_and_all_around_it_contradict_is_refused(
+    tmp_path: Path, hours: dict[int, str], names_differ: int, refused: list[str]
+) -> None:
+    archive = Archive(tmp_path, days=0)
+    del archive.tree["instruments"]["rich"]
+    for k in range(FILES):
+        path = archive.raw(f"poor/h26301{10 - names_differ:02d}.{k:02d}0000", 600.0 + k, seed=k)
+        if k in hours:
+            for minute in (k, k + 1):
+                old, new = (f"{hour}:{minute:02d}:00".encode() for hour in ("10", hours[k]))
+                path.write_bytes(path.read_bytes().replace(old, new))
+    archive.write()
+    result, _ = _run(archive)
+    assert sorted(result.set_aside) == refused
+    assert all(
+        "its name and the files around it have it" in why for why in result.set_aside.values()
+    )
+
+
 @pytest.mark.parametrize("name", ["pilar", "saopaulo", "manaus", "savant"])
 def test_no_measured_file_lies_off_those_around_it(
     name: str, data_root: Path, tmp_path: Path
