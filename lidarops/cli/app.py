@@ -272,8 +272,10 @@ def show(table: Table) -> None:
         Console(width=width).print(table)
 
 
-def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Print a table of plain text, unless it has no rows.
+def show_rows(
+    title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]], most: int | None = None
+) -> None:
+    """Print a table of plain text, of at most so many rows, unless it has none.
 
     On a terminal, cells fold between words only, so that names can be read and copied. Where the
     words are too long for columns, each row is a paragraph.
@@ -283,6 +285,9 @@ def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]])
     cells = [[visible(str(cell)) for cell in row] for row in rows]
     if not cells:
         return
+    if most is not None and len(cells) > most:
+        title += f", the first {most} of {len(cells)} (--all)"
+        del cells[most:]
     # As the title of the table it would fold at the width of the table.
     say_wrapped(title, "")
     widths = _column_widths(names, cells, terminal_width())
@@ -452,8 +457,8 @@ def findings_document(findings: Findings) -> dict[str, Any]:
     }
 
 
-def show_findings(findings: Findings) -> None:
-    """Print the findings as tables."""
+def show_findings(findings: Findings, most: int | None = None) -> None:
+    """Print the findings as tables, each of at most so many rows."""
     from lidarops.reports.findings import finding_rows, lacking
 
     columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
@@ -461,14 +466,15 @@ def show_findings(findings: Findings) -> None:
         (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
         for unmet in findings.unmet
     )
-    show_rows("Requested, but not in the files", columns, unmet)
+    show_rows("Requested, but not in the files", columns, unmet, most)
     columns = ("instrument", "what", "finding")
     for title, fails in (
         ("The archive is not what the campaign states", True),
         ("Notes on files and products", False),
     ):
         rows = [row for row in finding_rows(findings) if row.fails is fails]
-        show_rows(title, columns, ((row.instrument, row.subject, row.problem) for row in rows))
+        cells = ((row.instrument, row.subject, row.problem) for row in rows)
+        show_rows(title, columns, cells, most)
 
 
 def never_made(findings: Findings) -> str:

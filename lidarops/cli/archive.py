@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter, defaultdict
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -45,7 +46,7 @@ from lidarops.cli.app import (
 from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from distributed import Client
@@ -53,11 +54,18 @@ if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
     from lidarops.records import (
         Granule,
+        ProductRecord,
         RunRecord,
         SceneOutcome,
     )
     from lidarops.run.archive import Result
 
+_MANY_PRODUCTS = 12
+"""More products are summed by kind and channel, unless --all is given."""
+_FEW_ROWS = 3
+"""Most rows of other tables, without --all."""
+_FEW_FLAGS = 4
+"""Flags that a sum of products names."""
 _LEAST_MEMORY = 2**20
 """Bytes; a smaller size probably lacks its unit."""
 
@@ -207,6 +215,9 @@ def reprocess(
             help="Profiles that are processed together, whatever the limit; affects no result.",
         ),
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="List every product, file and finding.")
+    ] = False,
     all_steps: AllStepsOption = False,
     log_level: LogLevelOption = "warning",
     log_json: LogJsonOption = False,
@@ -242,7 +253,9 @@ def reprocess(
         result = pipeline.bring_up_to_date(settings, selection=selection, options=options)
     no_scene = result.record is None and selects_no_scene(settings, selection)
     if not as_json:
-        _print_result(settings, result, no_scene=no_scene, removing=remove_orphans)
+        _print_result(
+            settings, result, no_scene=no_scene, removing=remove_orphans, everything=everything
+        )
     page, removed, report_note = None, None, ""
     earlier: list[Path] = []
     try:
@@ -267,7 +280,7 @@ def reprocess(
             if report_note:
                 typer.echo(report_note)
     if removed is not None and not as_json:
-        _show_orphans(result, removed)
+        _show_orphans(result, removed, None if everything else _FEW_ROWS)
     if result.signal:
         raise typer.Exit(128 + result.signal)
     left = result if removed is None else replace(result, orphans=())
@@ -309,9 +322,9 @@ def _cluster(
     return partial(clusters.connect_client, chosen)
 
 
-def _show_refused(refused: list[Granule]) -> None:
+def _show_refused(refused: list[Granule], most: int | None = None) -> None:
     rows = ((granule.path, granule.instrument, granule.reason) for granule in refused)
-    show_rows("Refused", ("file", "instrument", "reason"), rows)
+    show_rows("Refused", ("file", "instrument", "reason"), rows, most)
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
@@ -383,41 +396,34 @@ def _print_places(result: Result, page: Path | None) -> None:
         )
 
 
-def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removing: bool) -> None:
+def _print_result(
+    campaign: Campaign, result: Result, *, no_scene: bool, removing: bool, everything: bool
+) -> None:
     from lidarops.reports.findings import disagreement_rows, scene_note_rows
     from lidarops.run.archive import refused_files
 
-    scenes = result.scenes
-    columns: tuple[str, ...] = (
-        "scene",
-        "kind",
-        "channel",
-        "values",
-        "good",
-        "care",
-        "reject",
-        "flags",
-    )
-    show_rows("Products", columns, (row for scene in scenes for row in _product_rows(scene)))
-    _show_changes(result)
+    scenes, most = result.scenes, None if everything else _FEW_ROWS
+    _show_products(scenes, everything=everything)
+    _show_changes(result, most)
     refused = refused_files(campaign, result)
-    _show_refused(refused)
+    _show_refused(refused, most)
     listed = {granule.path for granule in refused}
     set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
     unused = (*set_aside, *result.empty_scenes.items())
-    show_rows("Not used", ("file or scene", "reason"), unused)
-    show_findings(result.findings)
+    show_rows("Not used", ("file or scene", "reason"), unused, most)
+    show_findings(result.findings, most)
     for title, where, found in (
         ("Channels that disagree", "channels", disagreement_rows(scenes)),
         ("Not found in the data", "in", scene_note_rows(scenes)),
     ):
         rows = ((row.instrument, row.subject, row.problem) for row in found)
-        show_rows(title, ("instrument", where, "finding"), rows)
+        show_rows(title, ("instrument", where, "finding"), rows, most)
     if not removing:
-        _show_orphans(result, None)
+        _show_orphans(result, None, most)
     kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
-    show_rows("Requested products that could not be made again (kept)", ("file", "reason"), kept)
-    _show_scenes_with_problems(result)
+    title = "Requested products that could not be made again (kept)"
+    show_rows(title, ("file", "reason"), kept, most)
+    _show_scenes_with_problems(result, most)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
@@ -435,6 +441,40 @@ def _print_result(campaign: Campaign, result: Result, *, no_scene: bool, removin
         say(f"nothing to do: {state}{never_made(result.findings)}")
 
 
+def _show_products(scenes: Sequence[SceneOutcome], *, everything: bool) -> None:
+    """Print what was made; of many products, the sums of each kind and channel."""
+    numbers = "values", "good", "care", "reject"
+    made = [product for scene in scenes for product in scene.products]
+    if everything or len(made) <= _MANY_PRODUCTS:
+        single = "scene", "kind", "channel", *numbers, "flags"
+        show_rows("Products", single, (row for scene in scenes for row in _product_rows(scene)))
+        return
+    alike: dict[tuple[str, str, str], list[ProductRecord]] = defaultdict(list)
+    for scene in scenes:
+        for product in scene.products:
+            alike[scene.instrument, product.kind, product.channel].append(product)
+    columns = "instrument", "kind", "channel", "products", *numbers, "flags of most values"
+    rows = (
+        (*names, len(products), *_summed(products)) for names, products in sorted(alike.items())
+    )
+    show_rows(f"{len(made)} products, summed (--all lists them)", columns, rows, _MANY_PRODUCTS)
+    errors = [(scene.scene, scene.error) for scene in scenes if scene.error]
+    show_rows("Failed", ("scene", "error"), errors, _FEW_ROWS)
+
+
+def _summed(products: Sequence[ProductRecord]) -> tuple[object, ...]:
+    """Return numbers of values of products, and the most frequent flags with their shares."""
+    values = sum(product.values for product in products)
+    verdicts = (sum(numbers) for numbers in zip(*(p.verdicts for p in products), strict=True))
+    flags: Counter[str] = Counter()
+    for product in products:
+        flags.update(product.flagged)
+    frequent = [
+        f"{name.lower()} {count / values:.0%}" for name, count in flags.most_common(_FEW_FLAGS)
+    ]
+    return values, *verdicts, ", ".join(frequent)
+
+
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
     for product in scene.products:
         flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
@@ -444,7 +484,7 @@ def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
         yield scene.scene, "none", "", "", "", "", "", scene.error
 
 
-def _show_changes(result: Result) -> None:
+def _show_changes(result: Result, most: int | None) -> None:
     """Print how products differ from those that they replace, and frozen ones that would."""
     from lidarops.figures.wording import change_in_words
 
@@ -455,29 +495,30 @@ def _show_changes(result: Result) -> None:
         for change in [product.change]
         if change is not None
     )
-    show_rows("Products made again", ("file", "change", "difference", "cause"), rows)
+    show_rows("Products made again", ("file", "change", "difference", "cause"), rows, most)
     title = "Frozen products that would be replaced (--thaw replaces them)"
-    show_rows(title, ("file", "reason"), result.frozen.items())
+    show_rows(title, ("file", "reason"), result.frozen.items(), most)
 
 
-def _show_orphans(result: Result, removed: int | None) -> None:
+def _show_orphans(result: Result, removed: int | None, most: int | None) -> None:
     fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
     rows = ((orphan.path, orphan.reason) for orphan in result.orphans if not orphan.requested)
     title = f"Products that the campaign no longer requests ({fate})"
-    show_rows(title, ("file", "reason"), rows)
+    show_rows(title, ("file", "reason"), rows, most)
 
 
-def _show_scenes_with_problems(result: Result) -> None:
+def _show_scenes_with_problems(result: Result, most: int | None) -> None:
     from lidarops.run.options import NO_USABLE_VALUE
 
     processed = {scene.scene for scene in result.scenes}
     unusable = dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE)
     columns = ("scene", "problem")
     now = ((scene, problem) for scene, problem in unusable.items() if scene in processed)
-    show_rows("Without a usable value", columns, now)
+    show_rows("Without a usable value", columns, now, most)
     earlier = (*result.failures.items(), *unusable.items())
     show_rows(
         "From earlier runs, unchanged since",
         columns,
         ((scene, problem) for scene, problem in earlier if scene not in processed),
+        most,
     )

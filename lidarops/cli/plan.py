@@ -1,6 +1,7 @@
 """The command that shows scenes, their plans, and what is stale.
 
-By default a screen of text for each scene, whose words stay whole; with --all tables of all steps.
+By default a screen of text, on which scenes of which the same is to be said are one; with --all
+tables of all steps of each scene.
 """
 
 from __future__ import annotations
@@ -44,11 +45,15 @@ if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
     from lidarops.records import LeftOut, Plan, PlannedStep
     from lidarops.run.options import Selection
-    from lidarops.run.staleness import Judgement
+    from lidarops.run.staleness import Judgement, Stale
 
 
 _REASONS: Final = 3
 """Reasons of refused files that fit on the screen."""
+_SCREEN: Final = 40
+"""Lines about scenes, without --all."""
+_FEW: Final = 5
+"""Rows of a table of findings, without --all."""
 
 
 @command("plan")
@@ -77,10 +82,10 @@ def show_plan(
 
     Makes no folder: without an output folder the catalog is made for the moment.
 
-    Shows a summary of each scene, with the memory that a process needs for it; with --all every
-    step with its settings and reasons. Exit code 1 if a file is refused, a scene cannot be planned,
-    failed before or gave no usable value, a pattern or channel is in no file, or headers contradict
-    a station.
+    Shows a screen of summaries, one for all scenes that are alike, with the memory that a process
+    needs for a scene; with --all every step of each scene with its settings and reasons. Exit code
+    1 if a file is refused, a scene cannot be planned, failed before or gave no usable value, a
+    pattern or channel is in no file, or headers contradict a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
@@ -112,6 +117,7 @@ def _plan(
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
     earlier = earlier_problems(settings, selection)
     scenes = []
+    alike: dict[tuple[str, ...], list[Judgement]] = {}
     count = to_be_made = 0
     failed = False
     for judged in judgements:
@@ -123,8 +129,11 @@ def _plan(
                 problems.pop(judged.scene.id, None)
         if as_json:
             scenes.append(_plain(judged))
-        else:
-            _show_judged(judged, stale=stale, everything=everything)
+        elif everything:
+            _show_judged(judged, stale=stale)
+        elif not stale or judged.stale or judged.failure:
+            lines = _scene_lines(judged, plan=not stale)
+            alike.setdefault((judged.scene.instrument, *lines), []).append(judged)
     no_scene = not count and selects_no_scene(settings, selection)
     lacking = settings.metadata.lacking
     if as_json:
@@ -139,11 +148,13 @@ def _plan(
         }
         typer.echo(json.dumps(document, indent=2))
     else:
+        _show_alike(alike, stale=stale)
         if no_scene:
             say(NO_SCENE)
         _show_refused([granule.reason for granule in refused])
-        show_findings(findings)
-        _show_rest(lacking, *earlier)
+        most = None if everything else _FEW
+        show_findings(findings, most)
+        _show_rest(lacking, *earlier, most)
         # With --stale, fresh scenes are not judged.
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
@@ -152,16 +163,19 @@ def _plan(
 
 
 def _show_rest(
-    lacking: Sequence[str], failed: Mapping[str, str], unusable: Mapping[str, str]
+    lacking: Sequence[str],
+    failed: Mapping[str, str],
+    unusable: Mapping[str, str],
+    most: int | None,
 ) -> None:
     """Print the metadata that are lacking, and the scenes that are not tried again."""
     if lacking:
         names = ", ".join(lacking)
         say_wrapped(f"metadata of the campaign: products will lack {names}", "")
     unchanged = "not tried again, because nothing has changed"
-    show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed.items())
+    show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed.items(), most)
     title = f"Without a usable value; {unchanged}"
-    show_rows(title, ("scene", "problem"), unusable.items())
+    show_rows(title, ("scene", "problem"), unusable.items(), most)
 
 
 def _memory(judged: Judgement) -> dict[str, float]:
@@ -174,17 +188,18 @@ def _memory(judged: Judgement) -> dict[str, float]:
     }
 
 
-def _show_judged(judged: Judgement, *, stale: bool, everything: bool) -> None:
+def _show_judged(judged: Judgement, *, stale: bool) -> None:
+    """Print all of a scene."""
     memory = _memory(judged)["to_be_made" if stale else "everything"]
-    needs = f"about {memory / 1e6:.0f} MB of memory"
-    if everything:
-        title = f"{_scene_title(judged)}, {needs}"
-        if not stale:
-            _show_plan(title, judged.requested)
-        _show_stale(title, judged)
-    else:
-        _show_scene(judged, needs, plan=not stale)
-    _show_kept(judged)
+    scene = judged.scene
+    title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+    title += f", about {memory / 1e6:.0f} MB of memory"
+    if not stale:
+        _show_plan(title, judged.requested)
+    _show_stale(title, judged)
+    for what, products in _kept(judged):
+        rows = ((product.kind, product.channel, product.reason) for product in products)
+        show_rows(f"{scene.id}: {what}", ("product", "channel", "reason"), rows)
 
 
 def _show_plan(title: str, plan: Plan) -> None:
@@ -264,13 +279,12 @@ def _stale_rows(judged: Judgement) -> list[tuple[str, str, str]]:
     return list(_grouped((made.kind, made.reason, made.channel) for made in judged.stale))
 
 
-def _show_kept(judged: Judgement) -> None:
-    for title, products in (
+def _kept(judged: Judgement) -> tuple[tuple[str, Sequence[Stale]], ...]:
+    """Return the stale products that are not replaced, with the reason."""
+    return (
         ("frozen, would be replaced with --thaw", judged.frozen),
         ("kept, because raw files are lost", judged.kept),
-    ):
-        rows = ((product.kind, product.channel, product.reason) for product in products)
-        show_rows(f"{judged.scene.id}: {title}", ("product", "channel", "reason"), rows)
+    )
 
 
 def _plain(judged: Judgement) -> dict[str, Any]:
@@ -304,44 +318,56 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     }
 
 
-def _scene_title(judged: Judgement) -> str:
-    """Return the name of a scene with its numbers of files."""
-    scene = judged.scene
-    return f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: bool) -> None:
+    """Print scenes, those with equal lines together, until the screen is full."""
+    printed = 0
+    for place, (lines, group) in enumerate(alike.items()):
+        if printed and printed + len(lines) > _SCREEN:
+            left = sum(len(more) for more in list(alike.values())[place:])
+            say_wrapped(f"{counted(left, 'further scene')} with other lines (--all)", "")
+            return
+        printed += len(lines) + 1
+        first, last = group[0].scene, group[-1].scene
+        several = f"{first.id} to {last.id}: {counted(len(group), 'scene')}, "
+        title = several if len(group) > 1 else f"{first.id}: "
+        granules, dark = (
+            sum(map(len, files))
+            for files in zip(*((j.scene.granules, j.scene.dark) for j in group), strict=True)
+        )
+        title += f"{granules} granules, {dark} dark"
+        if len(group) == 1:
+            title += f", plan {group[0].requested.hash[:12]}"
+        say_wrapped(title, "")
+        needs = "to_be_made" if stale else "everything"
+        memory = max(_memory(judged)[needs] for judged in group)
+        say_wrapped(f"about {memory / 1e6:.0f} MB of memory", "  ")
+        for line in lines[1:]:
+            words = line.lstrip()
+            say_wrapped(words, line[: len(line) - len(words)])
 
 
-def _show_scene(judged: Judgement, needs: str, *, plan: bool) -> None:
-    """Print a scene: what is to be made and why, its steps, and what is left out.
-
-    Parameters
-    ----------
-    judged : Judgement
-    needs : str
-        Memory.
-    plan : bool
-        Whether steps are shown; a scene without anything to be made is left out otherwise.
-    """
+def _scene_lines(judged: Judgement, *, plan: bool) -> Iterator[str]:
+    """Yield what is to be made of a scene and why; with `plan` its steps and what is left out."""
     stale = _stale_rows(judged)
-    if not plan and not stale and not judged.failure:
-        return
-    say_wrapped(f"{_scene_title(judged)}, plan {judged.requested.hash[:12]}", "")
-    say_wrapped(needs, "  ")
-    say_wrapped("to be made:" if stale else "to be made: nothing", "  ")
+    yield "  to be made:" if stale else "  to be made: nothing"
     for kind, channels, reason in stale:
-        say_wrapped(f"{kind} {channels}: {reason}", "    ")
+        yield f"    {kind} {channels}: {reason}"
     if judged.failure:
         held = "; not tried again, because nothing has changed" if judged.held else ""
-        say_wrapped(f"failed before{held}: {judged.failure.error}", "  ")
+        yield f"  failed before{held}: {judged.failure.error}"
     if plan:
-        _say_steps(judged.requested)
+        yield from _step_lines(judged.requested)
+    for what, products in _kept(judged):
+        for kind, channels, reason in _grouped((p.kind, p.reason, p.channel) for p in products):
+            yield f"  {what}: {kind} {channels}: {reason}"
 
 
-def _say_steps(plan: Plan) -> None:
+def _step_lines(plan: Plan) -> Iterator[str]:
     from lidarops.scene.case import READ_STEP, REQUEST
 
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
-        say_wrapped(f"steps: {', '.join(names)}", "  ")
+        yield f"  steps: {', '.join(names)}"
     requested = [left for left in plan.left_out if left.rule != REQUEST]
     missed = [left for left in requested if left.name in kinds()]
     told = {left.channel for left in missed}
@@ -356,11 +382,11 @@ def _say_steps(plan: Plan) -> None:
         ("warning: {0} {1}: {2}", [(step.name, step.warning, step.channel) for step in warned]),
     ):
         for row in _grouped(lines):
-            say_wrapped(words.format(*row), "  ")
+            yield f"  {words.format(*row)}"
     shown = {*kinds(), READ_STEP}
     others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:
-        say_wrapped(f"skipped for some channels: {', '.join(others)}", "  ")
+        yield f"  skipped for some channels: {', '.join(others)}"
 
 
 def _show_refused(reasons: Sequence[str]) -> None:

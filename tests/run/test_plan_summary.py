@@ -11,6 +11,7 @@ import pytest
 import yaml
 from support import factories
 from support.archives import raw_archives
+from support.archives.small_archive import Archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app
@@ -18,6 +19,8 @@ from lidarops.cli.app import from_here, show_rows, wrapped
 
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 SCREEN = 24
+MOST_LINES = 60
+"""Whatever the number of scenes."""
 
 
 def terminal(width: int) -> dict[str, str]:
@@ -71,6 +74,26 @@ def test_all_shows_settings_and_reasons(campaign: Path) -> None:
     for expected in ("wavelength", "Left out", "[request]"):
         assert expected in text
         assert expected not in " ".join(planned(campaign, width=300))
+
+
+@pytest.mark.usefixtures("quickly")
+def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
+    archive = Archive(tmp_path, days=25)
+    for day in range(0, 20, 2):
+        path = tmp_path / f"raw/poor/h{day}1"
+        path.write_bytes(path.read_bytes()[:-100])
+    archive.write()
+    first = planned(archive.file)
+    assert len(first) <= MOST_LINES
+    assert "poor_20260301T000000 to poor_20260325T000000: 25 scenes, 65 granules, 0 dark" in first
+    assert len(planned(archive.file, "--all")) > MOST_LINES
+    for options in ([], ["--force"]):
+        run = CliRunner().invoke(app, ["reprocess", str(archive.file), *options])
+        assert len(run.output.splitlines()) <= MOST_LINES
+        assert "150 products, summed (--all lists them)" in run.output
+        assert "Refused, the first 3 of 10 (--all)" in run.output
+    whole = CliRunner().invoke(app, ["reprocess", str(archive.file), "--force", "--all"])
+    assert len(whole.output.splitlines()) > 150
 
 
 PATH = {"channels": ["photon_532o"], "sections": [[750, 4500]]}
