@@ -25,7 +25,13 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from lidarops.campaign.simulation import SimulationSettings
-from lidarops.campaign.yaml_errors import Loader, duplicate_keys, explain_yaml_error
+from lidarops.campaign.yaml_errors import (
+    Loader,
+    duplicate_keys,
+    explain_yaml_error,
+    with_plain_numbers,
+    with_quantities,
+)
 from lidarops.errors import CampaignError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.records import file_channels
@@ -58,6 +64,7 @@ __all__ = [
     "Station",
     "campaign_schema",
     "channel_facts",
+    "editor_schema",
     "load_campaign",
 ]
 
@@ -621,6 +628,12 @@ def campaign_schema() -> dict[str, Any]:
     return {"$schema": dialect, **Campaign.model_json_schema()}
 
 
+def editor_schema() -> dict[str, Any]:
+    """Return the JSON schema of campaign files for editors, which know no units."""
+    schema: dict[str, Any] = with_quantities(campaign_schema())
+    return schema
+
+
 def load_campaign(
     path: str | Path,
     *,
@@ -684,7 +697,7 @@ def load_campaign(
             remedy="see catalogs/demo.yaml for an example",
         )
     try:
-        campaign = Campaign.model_validate(raw)
+        campaign = Campaign.model_validate(with_plain_numbers(raw, campaign_schema))
     except ValidationError as error:
         nodes = yaml.compose(text, Loader=yaml.SafeLoader)
         lines = explain_yaml_error(error, nodes, campaign_schema())

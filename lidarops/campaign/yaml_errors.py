@@ -1,8 +1,11 @@
-"""Explain errors in a YAML file: the line, the key, the value, and what is expected there."""
+"""Read quantities of a YAML file by its schema, and explain its errors.
+
+Messages state the line, the key, the value, and what is expected there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
@@ -11,6 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from lidarops.settings import NO_UNIT, nearest
+from lidarops.units import PATTERN, is_quantity, is_small, parse_quantity, written
 
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
@@ -77,6 +81,60 @@ def duplicate_keys(tree: yaml.Node | None) -> list[str]:
                 messages.append((line, message))
             lines[key.value] = line
     return [message for _, message in sorted(messages)]
+
+
+def with_plain_numbers(content: Any, schema: Callable[[], dict[str, Any]]) -> Any:
+    """Return the content of a file with quantities, such as ``4 ns``, as numbers in the unit there.
+
+    What is none, or has a unit of another dimension, is left for the validation to name.
+
+    Parameters
+    ----------
+    content : object
+        Of YAML.
+    schema : callable
+        Returns the JSON schema of the file, with units; called where a text may be a quantity.
+    """
+    texts = _texts(content)
+    return _plain(content, Expected.root(schema())) if any(map(is_quantity, texts)) else content
+
+
+def _texts(content: Any) -> Iterator[str]:
+    """Yield all texts that are values."""
+    stack, seen = [content], set[int]()
+    while stack:
+        value = stack.pop()
+        if isinstance(value, str):
+            yield value
+        # An anchor may contain itself.
+        elif isinstance(value, dict | list) and id(value) not in seen:
+            seen.add(id(value))
+            stack += value.values() if isinstance(value, dict) else value
+
+
+def _plain(content: Any, expected: Expected | None) -> Any:
+    if expected is None:
+        return content
+    if isinstance(content, dict):
+        return {key: _plain(value, expected.below(str(key))) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_plain(value, expected.below(str(k))) for k, value in enumerate(content)]
+    if isinstance(content, str) and expected.unit and not expected.takes_any_text():
+        number = parse_quantity(content, expected.unit)
+        return content if number is None else number
+    return content
+
+
+def with_quantities(schema: Any, unit: str | None = None) -> Any:
+    """Return a JSON schema for editors, in which numbers with a unit may be quantities."""
+    if isinstance(schema, list):
+        return [with_quantities(inner, unit) for inner in schema]
+    if not isinstance(schema, dict):
+        return schema
+    unit = schema.get("unit", unit) if isinstance(schema.get("unit"), str | None) else unit
+    if schema.get("type") in ("number", "integer") and unit:
+        return {"anyOf": [schema, {"type": "string", "pattern": f"^{PATTERN}$"}]}
+    return {key: with_quantities(inner, unit) for key, inner in schema.items()}
 
 
 def explain_yaml_error(
@@ -242,6 +300,11 @@ class Expected:
         found = (choice for schema in self.schemas for choice in _choices(schema))
         return [choice for choice in found if isinstance(choice, str)]
 
+    def takes_any_text(self) -> bool:
+        """Return whether any text may be valid, not only some of a list."""
+        texts = [schema for schema in self.schemas if schema.get("type") == "string"]
+        return not all(list(_choices(schema)) for schema in texts)
+
     def words(self) -> str:
         """Return what is expected, such as ``a number from 1 to 200 sr``."""
         texts = [self._words(schema) for schema in self.schemas if schema.get("type") != "null"]
@@ -311,14 +374,20 @@ def _number(schema: Schema) -> str:
     """Return the kind of a number, its bounds and its unit."""
     least, above = schema.get("minimum"), schema.get("exclusiveMinimum")
     most, below = schema.get("maximum"), schema.get("exclusiveMaximum")
+    unit = schema.get("unit") or NO_UNIT
+    limits: list[tuple[str, Any]] = [
+        ("above", above), ("at least", least), ("below", below), ("at most", most)
+    ]  # fmt: skip
+    limits = [(word, bound) for word, bound in limits if bound is not None]
+    small = bool(limits) and all(is_small(bound, unit) for _, bound in limits)
+    bounds = {bound: written(bound, unit) if small else _digits(bound) for _, bound in limits}
     parts = ["a whole number" if schema["type"] == "integer" else "a number"]
     if least is not None and most is not None:
-        parts.append(f"from {_digits(least)} to {_digits(most)}")
+        parts.append(f"from {bounds[least]} to {bounds[most]}")
     else:
-        limits = (("above", above), ("at least", least), ("below", below), ("at most", most))
-        parts.append(" and ".join(f"{w} {_digits(x)}" for w, x in limits if x is not None))
-    unit = schema.get("unit")
-    parts.append("(no unit)" if unit in (None, NO_UNIT) else str(unit))
+        parts.append(" and ".join(f"{word} {bounds[bound]}" for word, bound in limits))
+    if not small:
+        parts.append("(no unit)" if unit == NO_UNIT else str(unit))
     return " ".join(part for part in parts if part)
 
 

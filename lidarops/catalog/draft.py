@@ -239,12 +239,12 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
 def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:
     """Return the question on a channel; empty where there is none."""
     if not channel.wavelength > 0:
-        return "; ? wavelength in m, such as 5.32e-7: that of the header is not plausible"
+        return "; ? wavelength, such as 532 nm: that of the header is not plausible"
     if channel.mode is not DetectionMode.PHOTON:
         return ""
     if estimated:
-        return "; ? dead_time in s, such as 4.0e-9, where it is known"
-    return "; ? dead_time in s, such as 4.0e-9, or estimate: without it, high rates are too low"
+        return "; ? dead_time, such as 4 ns, where it is known"
+    return "; ? dead_time, such as 4 ns, or estimate: without it, high rates are too low"
 
 
 def _pointing(headers: InstrumentHeaders) -> Iterator[str]:

@@ -258,12 +258,13 @@ def _settings(step: PlannedStep) -> Iterator[str]:
     """Yield the settings of a step with their units."""
     from lidarops.scene.retrieval import settings_model
     from lidarops.settings import unit_of
+    from lidarops.units import written
 
     model = settings_model(step)
     for key, value in step.settings.items():
-        number = f"{value:.6g}" if isinstance(value, float) else f"{value}"
         unit = "" if value is None else unit_of(model, key)
-        yield f"{key} {number} {unit}".rstrip()
+        words = written(value, unit) if isinstance(value, float) else f"{value} {unit}".rstrip()
+        yield f"{key} {words}"
 
 
 def _show_stale(title: str, judged: Judgement) -> None:

@@ -46,7 +46,7 @@ def init(
 
     Example: lidarops init raw harbour.yaml
     """
-    from lidarops.campaign.model import campaign_schema
+    from lidarops.campaign.model import editor_schema
     from lidarops.catalog.draft import draft_campaign
     from lidarops.catalog.folder import read_folder
     from lidarops.errors import CampaignError, CatalogError
@@ -71,7 +71,7 @@ def init(
         schema=_SCHEMA,
     )
     base.mkdir(parents=True, exist_ok=True)
-    (base / _SCHEMA).write_text(json.dumps(campaign_schema(), indent=2) + "\n", encoding="utf-8")
+    (base / _SCHEMA).write_text(json.dumps(editor_schema(), indent=2) + "\n", encoding="utf-8")
     campaign.write_text(text, encoding="utf-8")
     questions = sum("# ?" in line or "; ?" in line for line in text.splitlines())
     say(f"{campaign}: {questions} lines have a question; next: lidarops plan {campaign}")
@@ -120,9 +120,9 @@ def schema() -> None:
 
     Example: lidarops schema > campaign.schema.json
     """
-    from lidarops.campaign.model import campaign_schema
+    from lidarops.campaign.model import editor_schema
 
-    typer.echo(json.dumps(campaign_schema(), indent=2))
+    typer.echo(json.dumps(editor_schema(), indent=2))
 
 
 @command("compile")

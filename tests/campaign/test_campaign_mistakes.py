@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import campaign_schema, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CampaignError
+from lidarops.units import written
 
 CAMPAIGN = """\
 name: small
@@ -60,7 +61,7 @@ def _message(folder: Path, text: str) -> str:
             "dead_time: 3.0e-6",
             (
                 "line 14: instruments.lidar.facts.0.channels.photon_532o.dead_time: must be a"
-                " number from 1e-10 to 2e-07 s or 0 or 'estimate', not 3.0e-6"
+                " number from 0.1 ns to 200 ns or 0 or 'estimate', not 3.0e-6"
             ),
         ),
         (
@@ -68,14 +69,17 @@ def _message(folder: Path, text: str) -> str:
             "dead_time: 4.0e-9, dead_time_uncertainty: 20",
             "photon_532o.dead_time_uncertainty: must be a number from 0 to 1 (no unit), not 20",
         ),
+        # A unit of another dimension, and one too large.
+        ("dead_time: 4.0e-9", "dead_time: 4 m", "to 200 ns or 0 or 'estimate', not '4 m'"),
+        ("dead_time: 4.0e-9", "dead_time: 4 us", "to 200 ns or 0 or 'estimate', not 4 us"),
         # In ps, km and mm.
-        ("dead_time: 4.0e-9", "dead_time: 4.0e-12", "to 2e-07 s or 0 or 'estimate', not 4.0e-12"),
+        ("dead_time: 4.0e-9", "dead_time: 4.0e-12", "to 200 ns or 0 or 'estimate', not 4.0e-12"),
         ("[[750, 4500]]", "[[0.75, 4.5]]", "must be 0, or at least 10 m, not 0.75 m: is it in km?"),
         ("[[750, 4500]]", "[[750, 4500000]]", "from 0 to 150000 m, not 4500000"),
         (
             "dead_time: 4.0e-9",
             "dead_time: 3e-6",
-            "from 1e-10 to 2e-07 s or 0 or 'estimate', not '3e-6'",
+            "from 0.1 ns to 200 ns or 0 or 'estimate', not '3e-6'",
         ),
         (
             "latitude: 46.4",
@@ -298,7 +302,8 @@ def test_a_value_just_outside_its_bounds_is_explained_with_unit_and_bound(tmp_pa
             lines = [line for line in message.splitlines() if place in line]
             shown = str(bound) if isinstance(bound, int) else f"{bound:.12g}"
             words = "(no unit)" if unit == "1" else f" {unit}"
-            if not any(shown in line and words in line for line in lines):
+            explained = any(shown in line and words in line for line in lines)
+            if not explained and not any(written(bound, unit or "") in line for line in lines):
                 unexplained.append((names, bound, value, lines))
     assert unexplained == []
 
