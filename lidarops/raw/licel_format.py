@@ -21,7 +21,9 @@ from lidarops.raw.header import RawChannel, RawHeader, Stretches
 Counts = NDArray[np.int32]
 
 COUNTS: Final = np.dtype("<i4")
-_FIRST_LINES: Final = re.compile(rb"[^\r\n]{0,1022}\r\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d")
+_FIRST_LINES: Final = re.compile(
+    rb"[^\r\n]{0,1022}\r?\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d"
+)
 
 _WRONG_IN_THEMSELVES: Final = 1
 """Bins that may hold any counts: one of 272 measured files has one bin beyond full scale."""

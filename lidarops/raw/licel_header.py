@@ -61,7 +61,8 @@ _DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
 _NAMED = re.compile(r"[A-Za-z_]*(\d{2})([1-9A-C])(\d{2})(\d{2})\.(\d{2})(\d)(\d)?\d{0,3}", re.ASCII)
 """Name as Licel writes it: year, month in hexadecimal, day and hour, then minute and second,
 or minute and tens of seconds (`licel2023`)."""
-_BLOCK_LINE = re.compile(rb".*?\r\n", re.DOTALL)
+_EMPTY_LINES: Final = (b"\r\n", b"\n")
+_BLOCK_LINE = re.compile(rb"[^\n]*\n")
 _DECIMAL = r"[+-]?\d{1,4}[.,]\d{1,6}"
 _SCAN = re.compile(rf" *{_DECIMAL}(?: +{_DECIMAL}){{6}} *", re.ASCII)
 
@@ -82,6 +83,8 @@ class DatasetKind(IntEnum):
     PHOTON_SQUARED = 3
     POWER_METER = 4
     OVERFLOW = 5
+    OTHER = 6
+    """Whatever else a file holds, such as a photodiode."""
 
 
 _MODES = {
@@ -90,6 +93,10 @@ _MODES = {
 }
 _SIGNAL_DEVICES = ("BT", "BC")
 """Begins of the device of analog and of photon datasets (`licel2023`)."""
+_OLD_LETTERS: Final = frozenset("ls")
+_NEW_LETTERS: Final = frozenset("pr")
+"""Older Licel software wrote l for parallel beside s for perpendicular; in newer one l is left
+circular, beside r."""
 _ANALOG = frozenset({DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED})
 _PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
 
@@ -137,7 +144,7 @@ class Dataset(RawChannel):
     laser_polarisation: int
     comment: str
     line: bytes = field(compare=False, repr=False)
-    """Header line as written, with CRLF."""
+    """Header line as written, with its end."""
 
     __hash__ = RawChannel.__hash__
 
@@ -219,7 +226,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     place, notes = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, unknown = _parse_lasers(third)
     block_end = _dataset_lines_end(buffer, block_start, number)
-    data_start = block_end + 2
+    data_start = block_end + (1 if buffer.startswith(b"\n", block_end) else 2)
     block = buffer[block_start:block_end]
     parse = _parse_datasets if len(block) <= _CACHED_BLOCK else _parse_datasets.__wrapped__
     try:
@@ -228,6 +235,8 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         _refuse_export(buffer[data_start:])
         raise
     notes += unknown + _check_shots(datasets, lasers)
+    if buffer[:data_start].count(b"\n") > buffer[:data_start].count(b"\r\n"):
+        notes += ("lines of the header end with LF instead of CRLF",)
     if stop < start:
         notes += ("stop lies 1 s before start: the interval follows from the shots",)
     channels = _channels(datasets)
@@ -266,21 +275,25 @@ def _first_lines(buffer: bytes) -> tuple[str, str, str, ScanGrid | None, int]:
     """Return lines 1, 2 and 3, the grid of a scan between the last two, and where line 4 starts."""
     ends = _line_ends(buffer, 0, 3)
     first, second, third = (
-        buffer[start:end].decode("latin-1")
-        for start, end in zip((0, ends[0] + 2, ends[1] + 2), ends, strict=True)
+        _text(buffer[start:end]) for start, end in zip((0, *ends), ends, strict=False)
     )
     scan = None
     if _SCAN.fullmatch(third):
         scan = ScanGrid(*(_number(token, "grid of the scan") for token in third.split()))
-        ends += _line_ends(buffer, ends[2] + 2, 1)
-        third = buffer[ends[2] + 2 : ends[3]].decode("latin-1")
-    return first, second, third, scan, ends[-1] + 2
+        ends += _line_ends(buffer, ends[2], 1)
+        third = _text(buffer[ends[2] : ends[3]])
+    return first, second, third, scan, ends[-1]
+
+
+def _text(line: bytes) -> str:
+    """Return a line without its end, CRLF or LF."""
+    return line.removesuffix(b"\n").removesuffix(b"\r").decode("latin-1")
 
 
 def _dataset_lines_end(buffer: bytes, start: int, number: int) -> int:
     """Return the end of that many dataset lines, which an empty line must follow."""
-    end = _line_ends(buffer, start, number)[-1] + 2
-    if buffer[end : end + 2] == b"\r\n":
+    end = _line_ends(buffer, start, number)[-1]
+    if buffer.startswith(_EMPTY_LINES, end):
         return end
     if len(buffer) < end + 2:
         raise IncompleteHeaderError("the file ends inside the header", field="empty line")
@@ -353,11 +366,11 @@ def stated_start(buffer: bytes) -> datetime | None:
     """Return the start that the first lines of a file state; None where they state no sure one."""
     try:
         first, second = _line_ends(buffer, 0, 2)
-        dates = _DATES.search(buffer[first + 2 : second].decode("latin-1"))
+        dates = _DATES.search(_text(buffer[first:second]))
         if dates is None:
             return None
         start = _moments(dates)[0]
-        _check_name(buffer[:first].decode("latin-1").strip(), start)
+        _check_name(_text(buffer[:first]).strip(), start)
     except RawFormatError:
         return None
     return start
@@ -375,7 +388,8 @@ def named_time(name: str) -> datetime | None:
     day, hour, minute = map(int, others)
     seconds = int(tens + (ones or "0"))
     try:
-        return datetime(2000 + int(year), int(month, 16), day, hour, minute, seconds, tzinfo=UTC)
+        century = 1900 if int(year) >= _YEARS[0] % 100 else 2000
+        return datetime(century + int(year), int(month, 16), day, hour, minute, seconds, tzinfo=UTC)
     except ValueError:
         return None
 
@@ -403,10 +417,11 @@ def _refuse_export(data: bytes) -> None:
 
 
 def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
+    """Return where lines end, behind their CRLF, or LF alone; the size of the file proves both."""
     ends = []
     for _ in range(number):
-        end = buffer.find(b"\r\n", start, start + _LINE_LIMIT)
-        if end < 0:
+        end = buffer.find(b"\n", start, start + _LINE_LIMIT) + 1
+        if end == 0:
             if len(buffer) < start + _LINE_LIMIT:
                 raise IncompleteHeaderError("the file ends inside the header", field="header")
             raise RawFormatError(
@@ -414,7 +429,7 @@ def _line_ends(buffer: bytes, start: int, number: int) -> list[int]:
                 field="header",
             )
         ends.append(end)
-        start = end + 2
+        start = end
     return ends
 
 
@@ -607,6 +622,11 @@ def _parse_datasets(
         for d in datasets
         if d.active and d.mode is None and d.device.startswith(_SIGNAL_DEVICES)
     ]
+    notes += [
+        f"polarisation l of {d.name} is taken as parallel, as older files have it beside s"
+        for d in datasets
+        if d.active and d.polarisation == "p" and d.wavelength_label.endswith("l")
+    ]
     # By the specification, inactive datasets are not stored; some software stores them.
     expected: list[int] = []
     for all_stored in (False, True):
@@ -639,6 +659,9 @@ def _parse_lines(block: bytes) -> list[Dataset]:
         except RawFormatError as error:
             error.field = f"dataset {len(datasets) + 1}, {error.field}"
             raise
+    letters = {dataset.polarisation for dataset in datasets if dataset.mode is not None}
+    if letters >= _OLD_LETTERS and not letters & _NEW_LETTERS:
+        datasets = [_with_new_letter(dataset) for dataset in datasets]
     uses: Counter[str] = Counter()
     # Active datasets get their names first: an inactive one must not take the plain name.
     for index in sorted(range(len(datasets)), key=lambda index: not datasets[index].active):
@@ -649,32 +672,68 @@ def _parse_lines(block: bytes) -> list[Dataset]:
     return datasets
 
 
+def _with_new_letter(dataset: Dataset) -> Dataset:
+    """Return a dataset of an older file, in which l is parallel, as newer ones state it."""
+    if dataset.polarisation != "l":
+        return dataset
+    return replace(dataset, polarisation="p", name=f"{dataset.name[:-1]}p")
+
+
 def parse_dataset(line: bytes) -> Dataset:
     """Parse one dataset line outside of a header: it has no place, and its name is not yet unique.
 
     Raises
     ------
     RawFormatError
-        If a value is missing or impossible.
+        If a value is missing or impossible, of a device that may be a signal.
     """
     tokens = line.decode("latin-1").split()
     if len(tokens) < 16:
         raise RawFormatError(f"holds {len(tokens)} values instead of 16", field="line")
     if tokens[0] not in {"0", "1"}:
         raise RawFormatError(f"{tokens[0][:40]!r} is neither 0 nor 1", field="active")
+    try:
+        return _parse_signal(tokens, line)
+    except RawFormatError:
+        if tokens[15].startswith(_SIGNAL_DEVICES):
+            raise
+    # Only its length matters: what follows it has its place behind it.
+    return Dataset(
+        name=f"other_{tokens[15]}",
+        mode=None,
+        wavelength=math.nan,
+        wavelength_label=intern(tokens[7]),
+        bins=_integer(tokens[3], "bins", 1, _MAX_BINS),
+        bin_width=math.nan,
+        shots=0,
+        scale=math.nan,
+        places=(),
+        device=intern(tokens[15]),
+        kind=DatasetKind.OTHER,
+        active=tokens[0] == "1",
+        laser_polarisation=0,
+        comment=" ".join(tokens[16:]),
+        line=line,
+    )
+
+
+def _parse_signal(tokens: list[str], line: bytes) -> Dataset:
+    """Return a dataset all of whose values are possible."""
     kind = DatasetKind(_integer(tokens[1], "type", DatasetKind.ANALOG, DatasetKind.OVERFLOW))
     label = _WAVELENGTH.fullmatch(tokens[7])
     if label is None:
         raise RawFormatError(f"{tokens[7][:40]!r} is not of the form 00532.o", field="wavelength")
     polarisation = label[2].lower().replace("0", "o")
     wavelength = int(label[1]) * 1e-9
-    analog, photon = kind in _ANALOG, kind in _PHOTON
+    adc_bits = _integer(tokens[12], "ADC bits", 0, _MAX_BITS)
+    # A recorder without bits has no counts.
+    analog, photon = kind in _ANALOG and adc_bits > 0, kind in _PHOTON
     least = 1e-6 if analog else -math.inf
     level = _number(tokens[14], "input range", least, _MAX_INPUT_RANGE if analog else math.inf)
     fraction = abs(_integer(tokens[11], "bin shift"))
     dataset = Dataset(
         name=f"{kind.name.lower()}_{int(label[1])}{polarisation}",
-        mode=_MODES.get(kind),
+        mode=_MODES.get(kind) if analog or photon else None,
         wavelength=wavelength if _SHORTEST < wavelength < _LONGEST_WAVE else math.nan,
         scale=math.nan,
         places=(),
@@ -688,7 +747,7 @@ def parse_dataset(line: bytes) -> Dataset:
         wavelength_label=intern(f"{label[1]}.{label[2]}"),
         polarisation=polarisation,
         bin_shift=_integer(tokens[10], "bin shift") + float(f"0.{fraction:0{len(tokens[11])}d}"),
-        adc_bits=_integer(tokens[12], "ADC bits", 1 if analog else 0, _MAX_BITS),
+        adc_bits=adc_bits,
         shots=_integer(tokens[13], "shots", 0, 10**9),
         input_range=level if analog else None,
         discriminator=level * 1e-3 if photon else None,
