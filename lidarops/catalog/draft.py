@@ -9,11 +9,13 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Final
 
 from lidarops.catalog.folder import (
     FileGroup,
+    FirstLook,
     FolderContents,
     InstrumentHeaders,
     instruments_of,
@@ -23,7 +25,7 @@ from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
-from lidarops.records import ChannelLayout, DetectionMode, file_channels
+from lidarops.records import ChannelLayout, DetectionMode, file_channels, is_glued
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _NEAR: Final = 0.2
@@ -72,7 +74,13 @@ class _Site:
 
 
 def draft_campaign(
-    contents: FolderContents, *, archive: str, output: str, name: str, schema: str
+    contents: FolderContents,
+    *,
+    archive: str,
+    output: str,
+    name: str,
+    schema: str,
+    looks: Mapping[str, FirstLook] = MappingProxyType({}),
 ) -> str:
     """Return the text of a campaign file for the raw files of a folder.
 
@@ -87,28 +95,24 @@ def draft_campaign(
         From which the name of the campaign is made.
     schema : str
         Place of the JSON schema, for editors.
+    looks : mapping, optional
+        What a look at the data of instruments shows, by their keys in this text.
 
     Raises
     ------
     CatalogError
         If the folder holds no raw file that can be used.
     """
-    instruments = instruments_of(contents.groups)
-    if not any(instrument.files for instrument in instruments):
+    known, lone = _instruments(contents)
+    if not known:
         reasons = [reason for _, reason in contents.refused[:1]]
         raise CatalogError(
             "holds no raw file that can be used" + "".join(f": {reason}" for reason in reasons),
             file=archive,
             remedy="give the folder of the raw files",
         )
-    instruments = tuple(instrument for instrument in instruments if instrument.files)
-    scanning = [instrument for instrument in instruments if _scans(instrument)]
-    lone = [group for instrument in scanning for group in lone_beams(instrument) if _is_free(group)]
-    if lone:
-        instruments = instruments_of(contents.groups, lone)
-        instruments = tuple(instrument for instrument in instruments if instrument.files)
-    sites = _sites(instruments)
-    keys = _keys(f"{site.key}-lidar" for site in sites)
+    scanning = [headers for headers in known.values() if _scans(headers)]
+    sites = dict(zip(known, _sites(list(known.values())), strict=True))
     lines = [
         f"# yaml-language-server: $schema={schema}",
         "# Written by `lidarops init` from the headers of the raw files.",
@@ -119,17 +123,40 @@ def draft_campaign(
         f"output: {_text(output)}  # catalog, products and reports, of this campaign alone",
         "",
         "stations:",
-        *(line for site in dict.fromkeys(sites) for line in site.lines()),
+        *(line for site in dict.fromkeys(sites.values()) for line in site.lines()),
         "",
         "instruments:",
     ]
-    for key, instrument, site in zip(keys, instruments, sites, strict=True):
+    for key, headers in known.items():
         # Instruments of one archive with equal channels have equal detectors.
-        estimates = any(_channel_names(own) == _channel_names(instrument) for own in scanning)
-        lines += [*_instrument(key, instrument, site, estimates=estimates), ""]
-    lines += _networks(dict(zip(keys, zip(instruments, sites, strict=True), strict=True)))
+        estimates = any(_channel_names(own) == _channel_names(headers) for own in scanning)
+        seen = replace(headers, look=looks.get(key))
+        lines += [*_instrument(key, seen, sites[key], estimates=estimates), ""]
+    lines += _networks({key: (headers, sites[key]) for key, headers in known.items()})
     lines.append("scenes: {window: day}  # products of one file each: day, 6h, 30min")
     return "\n".join([*lines, *_left_out(contents, archive, lone), ""])
+
+
+def drafted_instruments(contents: FolderContents) -> dict[str, InstrumentHeaders]:
+    """Return the instruments of a draft by their keys; none where no raw file can be used."""
+    return _instruments(contents)[0]
+
+
+def _instruments(
+    contents: FolderContents,
+) -> tuple[dict[str, InstrumentHeaders], list[FileGroup]]:
+    """Return the instruments of a draft by their keys, and groups of beams that are left out."""
+    instruments = [one for one in instruments_of(contents.groups) if one.files]
+    lone = [
+        group
+        for instrument in filter(_scans, instruments)
+        for group in lone_beams(instrument)
+        if _is_free(group)
+    ]
+    if lone:
+        instruments = [one for one in instruments_of(contents.groups, lone) if one.files]
+    keys = _keys(f"{site.key}-lidar" for site in _sites(instruments))
+    return dict(zip(keys, instruments, strict=True)), lone
 
 
 def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
@@ -214,26 +241,41 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield "    facts:"
     yield "      - clock_offset: 0  # ? s, clock of the files minus UTC; -18000 for UTC-5"
     yield from (f"        {line}" for line in _pointing(headers))
-    yield "        full_overlap_range: 500  # ? m, nearer bins are not used; assumed"
+    yield f"        {_full_overlap(headers.look)}"
     if headers.pairs:
         yield f"        # pairs that can be joined: {', '.join(headers.pairs)}"
     if len({group.layout for group in headers.signal}) > 1:
         yield "        # ? Other files have other channels or bins, which make scenes of their own."
     yield "        channels:"
     # Without dead times, all values of a scan are rejected where rates are high (SAVANT).
-    estimated = {name for pair in headers.pairs if estimates for name in file_channels(pair)}
+    joined = headers.joined_channels if headers.reaches_clean_air else ()
+    joined = headers.pairs if estimates else joined
+    estimated = {name for pair in joined if is_glued(pair) for name in file_channels(pair)}
+    stated = {channel.name for channel in headers.main.layout if channel.wavelength > 0}
     several = Counter(map(label_of, {c.name for group in headers.signal for c in group.layout}))
     alike = Counter((label_of(c.name), c.recorder) for c in headers.layout)
     for channel in headers.layout:
         photon = channel.mode is DetectionMode.PHOTON
         facts = ["dead_time: estimate"] if photon and channel.name in estimated else []
+        lost_dot = channel.wavelength > 0 and channel.name not in stated
+        facts += [f"wavelength: {channel.wavelength * 1e9:g} nm"] if lost_dot else []
         own = label_of(channel.name), channel.recorder
         if channel.recorder and several[own[0]] > 1 == alike[own]:
             facts.insert(0, f"recorder: {_text(channel.recorder)}")
         recorder = f", {channel.recorder}" if channel.recorder else ""
         grid = f"{channel.bins} bins of {channel.bin_width:g} m{recorder}"
-        question = _unknown(channel, estimated=channel.name in estimated)
+        question = "; ? wavelength, whose dot the header lacks" if lost_dot else ""
+        question += _unknown(channel, estimated=channel.name in estimated)
         yield f"          {channel.name}: {{{', '.join(facts)}}}  # {grid}{question}"
+
+
+def _full_overlap(look: FirstLook | None) -> str:
+    if look is None or look.full_overlap is None:
+        return "full_overlap_range: 500  # ? m, nearer bins are not used; assumed"
+    return (
+        f"full_overlap_range: {look.full_overlap:g}  # ? m, nearer bins are not used; where signals"
+        " stop rising"
+    )
 
 
 def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:

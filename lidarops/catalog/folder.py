@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final
@@ -21,6 +21,7 @@ from lidarops.catalog.sources import (
     path_pattern,
     printable,
 )
+from lidarops.constants import FIXED, STEEPEST
 from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import parse_raw_header
 from lidarops.raw.header import HeaderPointing, RawHeader, named_layout, recorder_names
@@ -28,6 +29,12 @@ from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 
+_LASERS: Final = (355e-9, 532e-9, 1064e-9)
+"""m; lines of Nd:YAG lasers."""
+_SAME_LINE: Final = 0.6e-9
+"""m; rounding of headers."""
+_ROTATIONAL: Final = 3e-9
+"""m; rotational Raman lines lie within this of the laser line."""
 _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
 
@@ -88,13 +95,29 @@ class FolderContents:
 
 
 @dataclass(frozen=True, slots=True)
+class FirstLook:
+    """What some files of an instrument give, processed as a campaign would."""
+
+    files: int
+    shares: Mapping[str, float]
+    """Elastic channel, or glued one -> share of usable values in the lowest 8 km."""
+    reasons: Mapping[str, str]
+    """Channel without a usable value -> its most frequent flags, or why no product is made."""
+    raman: frozenset[str]
+    """Elastic channels of which a Raman product has usable values."""
+    full_overlap: float | None
+    """m; None where signals do not show it."""
+
+
+@dataclass(frozen=True, slots=True)
 class InstrumentHeaders:
-    """What the headers of one instrument state."""
+    """What the headers of one instrument state, and a look at its data shows."""
 
     groups: tuple[FileGroup, ...]
     files: tuple[str, ...]
     """Patterns of its files, which match those of no other instrument."""
     dark_files: tuple[str, ...]
+    look: FirstLook | None = None
 
     @property
     def signal(self) -> tuple[FileGroup, ...]:
@@ -108,8 +131,11 @@ class InstrumentHeaders:
 
     @property
     def layout(self) -> tuple[ChannelLayout, ...]:
-        """Channels of most of its files."""
-        return self.main.layout
+        """Channels of most of its files, with wavelengths that digits without a dot tell."""
+        return tuple(
+            channel if channel.wavelength > 0 else replace(channel, wavelength=_undotted(channel))
+            for channel in self.main.layout
+        )
 
     @property
     def without_zenith(self) -> int:
@@ -127,6 +153,11 @@ class InstrumentHeaders:
         """Largest minus smallest zenith angle, degree."""
         angles = self._zenith_angles
         return max(angles) - min(angles) if angles else 0.0
+
+    @property
+    def reaches_clean_air(self) -> bool:
+        """Whether the beam is fixed and steep enough for profiles of the atmosphere."""
+        return self.zenith_span <= FIXED and self.zenith_angle <= STEEPEST
 
     @property
     def pairs(self) -> tuple[str, ...]:
@@ -158,9 +189,33 @@ class InstrumentHeaders:
 
     @property
     def joined_channels(self) -> tuple[str, ...]:
-        """The elastic channels, glued where they can be."""
-        glued = {_label(name): name for name in self.pairs}
-        return tuple(glued.get(_label(name), name) for name in self.elastic_channels)
+        """One channel of each elastic detector: glued if it can be, or what gave most values."""
+        return tuple(
+            best
+            for first, *others in self.candidates
+            if (best := self._best(first, others)) is not None
+        )
+
+    def _best(self, first: str, others: Sequence[str]) -> str | None:
+        """Return the channel of a detector with most usable values; None if there is none."""
+        if self.look is None:
+            return first
+        shares = self.look.shares
+        best = max((first, *others), key=lambda name: shares.get(name, 0.0))
+        return best if shares.get(best, 0.0) > 0.0 else None
+
+    @property
+    def candidates(self) -> tuple[tuple[str, ...], ...]:
+        """The channels of each elastic detector: glued, photon counting and analog."""
+        names = {channel.name for channel in self.layout}
+        return tuple(
+            tuple(
+                f"{mode}_{label}"
+                for mode in ("glued", "photon", "analog")
+                if f"{mode}_{label}" in (*self.pairs, *names)
+            )
+            for label in map(_label, self.elastic_channels)
+        )
 
     @property
     def nitrogen_channels(self) -> dict[str, str]:
@@ -192,10 +247,15 @@ class InstrumentHeaders:
         return tuple(detectors.values())
 
     def _is_raman(self, channel: ChannelLayout) -> bool:
+        """Return whether a channel has vibrational or rotational Raman lines of another one."""
         return any(
             is_raman_line(channel.wavelength, other.wavelength, shift)
             for other in self.layout
             for shift in (NITROGEN_SHIFT, WATER_SHIFT)
+        ) or any(
+            _SAME_LINE < abs(channel.wavelength - other.wavelength) <= _ROTATIONAL
+            and any(abs(other.wavelength - line) <= _SAME_LINE for line in _LASERS)
+            for other in self.layout
         )
 
 
@@ -271,6 +331,13 @@ def _header(source: Source, file: RawFile) -> RawHeader:
 def _label(channel: str) -> str:
     """Return wavelength and polarisation of a channel, such as 532p."""
     return channel.partition("_")[2]
+
+
+def _undotted(channel: ChannelLayout) -> float:
+    """Return the wavelength in m whose five digits a label lost its dot in: 53200 is 532.00 nm."""
+    digits = re.fullmatch(r"(\d{3,4})\d\d[a-z]", _label(channel.name))
+    wavelength = float(digits[1]) * 1e-9 if digits else math.nan
+    return wavelength if wavelength in _LASERS else math.nan
 
 
 def _split(path: str) -> tuple[str, str]:

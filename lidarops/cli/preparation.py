@@ -6,6 +6,7 @@ import json
 import os
 import re
 import tempfile
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Final
@@ -38,8 +39,14 @@ def init(
         Path, typer.Argument(help="Campaign file to write.", metavar="CAMPAIGN")
     ] = Path("campaign.yaml"),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the campaign file.")] = False,
+    headers_only: Annotated[
+        bool, typer.Option("--headers-only", help="Do not look at the data of any file.")
+    ] = False,
 ) -> None:
-    """Write a commented campaign file for a folder of raw files, from their headers.
+    """Write a commented campaign file for a folder of raw files, from their headers and some data.
+
+    A few files of each fixed lidar are processed for a look: what gives no usable value is not
+    proposed, and the range of full overlap is where signals stop rising.
 
     The JSON schema of its keys is written beside it, so that editors complete them. What headers
     do not state is marked with a question in a comment.
@@ -63,13 +70,21 @@ def init(
             remedy="give the folder of the raw files",
             wrong_use=True,
         )
-    text = draft_campaign(
-        read_folder(str(root), guess_pointing=True),
+    contents = read_folder(str(root), guess_pointing=True)
+    draft = partial(
+        draft_campaign,
+        contents,
         archive=Path(os.path.relpath(root, base)).as_posix(),
         output=_free_output(campaign),
         name=root.name,
         schema=_SCHEMA,
     )
+    text = draft()
+    if not headers_only:
+        from lidarops.run.first_look import look_at_data
+
+        with progress_bar("look at data", None, "instruments") as bar:
+            text = draft(looks=look_at_data(text, contents, str(root), bar.advance))
     base.mkdir(parents=True, exist_ok=True)
     (base / _SCHEMA).write_text(json.dumps(editor_schema(), indent=2) + "\n", encoding="utf-8")
     campaign.write_text(text, encoding="utf-8")

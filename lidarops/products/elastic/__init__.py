@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import Field
 
-from lidarops.constants import FIXED, STEEPEST
 from lidarops.kinds import Kind
 from lidarops.settings import (
     ChannelProduct,
@@ -46,11 +45,21 @@ class ElasticSettings(ChannelProduct):
 
 def _section(headers: InstrumentHeaders) -> tuple[str, ...]:
     """Return the lines of the section; empty where no fixed beam reaches clean air."""
-    channels = ", ".join(headers.joined_channels)
-    if not channels or headers.zenith_span > FIXED or headers.zenith_angle > STEEPEST:
+    candidates = [name for names in headers.candidates for name in names]
+    if not candidates or not headers.reaches_clean_air:
         return ()
+    look = headers.look
+    left_out = [
+        f"# {name}: no usable value in {look.files} files ({look.reasons[name]})"
+        for name in (candidates if look else ())
+        if look and name in look.reasons
+    ]
+    channels = ", ".join(headers.joined_channels)
+    if not channels:
+        return ("# elastic: with a lidar ratio, of", *left_out)
     return (
         "elastic:",
+        *(f"  {line}" for line in left_out),
         f"  channels: [{channels}]",
         "  lidar_ratio: 50  # ? sr, of the particles: about 25 (sea salt) to 75 (smoke)",
         "  lidar_ratio_standard_error: 15  # ? sr",

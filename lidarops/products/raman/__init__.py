@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Final, Self
 
 from pydantic import Field, model_validator
 
-from lidarops.constants import FIXED, STEEPEST
 from lidarops.kinds import Kind
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.settings import (
@@ -18,6 +17,8 @@ from lidarops.settings import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from lidarops.catalog.folder import InstrumentHeaders
 
 
@@ -70,14 +71,20 @@ class RamanProduct(ChannelProduct, RamanSettings):
 def _section(headers: InstrumentHeaders) -> tuple[str, ...]:
     """Return the lines of the section; empty without a nitrogen channel or a steep beam."""
     pairs = headers.nitrogen_channels
-    if not pairs or headers.zenith_span > FIXED or headers.zenith_angle > STEEPEST:
+    if not pairs or not headers.reaches_clean_air:
         return ()
+    seen = headers.look.raman if headers.look else frozenset()
+    if seen:
+        return _lines({name: raman for name, raman in pairs.items() if name in seen})
     return (
         "# ? Needs dark nights: use it if these were measured at night.",
-        "# raman:",
-        f"#   channels: [{', '.join(pairs)}]",
-        f"#   nitrogen: {{{', '.join(f'{elastic}: {raman}' for elastic, raman in pairs.items())}}}",
+        *(f"# {line}" for line in _lines(pairs)),
     )
+
+
+def _lines(pairs: Mapping[str, str]) -> tuple[str, ...]:
+    nitrogen = ", ".join(f"{elastic}: {raman}" for elastic, raman in pairs.items())
+    return ("raman:", f"  channels: [{', '.join(pairs)}]", f"  nitrogen: {{{nitrogen}}}")
 
 
 KIND: Final = Kind(

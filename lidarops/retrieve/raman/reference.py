@@ -84,7 +84,9 @@ def choose_window(
         away = level * per_raman * (raman.value - mean)
         shape[number] = per_raman * mean
         power[number] -= away
-        variance[number] += (level * per_raman) ** 2 * noise
+        # Where there are no data, noise is infinite: neither it nor its product with 0 is used.
+        with np.errstate(invalid="ignore"):
+            variance[number] += (level * per_raman) ** 2 * noise
         # Over air, both signals have nearly the same shape, so that backgrounds are alike too.
         shift = level * (per_raman * raman.background)[inside.any(axis=0)].mean()
         background[number] = np.hypot(background[number], shift)

@@ -1,0 +1,232 @@
+"""Look at the data of a folder that no campaign describes yet: some files are processed as drafted.
+
+What gives no usable value is not proposed, and what headers do not state is taken from the data.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lidarops.campaign.model import Campaign, campaign_schema
+from lidarops.campaign.yaml_errors import with_plain_numbers
+from lidarops.catalog.draft import drafted_instruments
+from lidarops.catalog.folder import FirstLook, FolderContents, InstrumentHeaders
+from lidarops.errors import LidarOpsError
+from lidarops.netcdf.read import open_product
+from lidarops.records import RunRecord, file_channels, is_glued
+from lidarops.run.archive import reprocess
+
+_MOST_FILES: Final = 96
+"""Files of a look: all of half an hour of minutes, or four of each hour of a day."""
+_MOST_DARK: Final = 20
+_HIGHEST: Final = 8000.0
+"""m; usable values count below."""
+_NEAREST: Final = 60.0
+_FARTHEST: Final = 3000.0
+"""m; signals are expected to stop rising between these."""
+_SMOOTH: Final = 60.0
+"""m; length of the running mean."""
+_FALL: Final = 200.0
+"""m; a signal that no longer rises stays below its maximum so long."""
+_STEP: Final = 10.0
+"""m; multiples of which a full overlap is given as."""
+
+Floats = NDArray[np.float64]
+
+
+def look_at_data(
+    text: str, contents: FolderContents, root: str, progress: Callable[[int], object]
+) -> dict[str, FirstLook]:
+    """Return what the data of the instruments of a draft show, by their keys.
+
+    Of instruments for which `elastic` is drafted: a fixed beam that reaches clean air.
+
+    Parameters
+    ----------
+    text : str
+        The draft, by the headers alone.
+    contents : FolderContents
+    root : str
+        Folder of the raw files.
+    progress : callable
+        Called with the number of instruments done.
+    """
+    drafted = with_plain_numbers(yaml.safe_load(text), campaign_schema)
+    looks = {}
+    for key, headers in drafted_instruments(contents).items():
+        if "elastic" in drafted["instruments"][key]["products"]:
+            # What fails, the plan says; the draft is then that of the headers.
+            with (
+                suppress(LidarOpsError),
+                tempfile.TemporaryDirectory(prefix="lidarops-") as folder,
+            ):
+                looks[key] = _Look(drafted, key, headers, Path(root), Path(folder)).result()
+        progress(1)
+    return looks
+
+
+class _Look:
+    """Processes a sample of the files of one instrument in a folder of its own."""
+
+    def __init__(
+        self,
+        drafted: Mapping[str, Any],
+        key: str,
+        headers: InstrumentHeaders,
+        root: Path,
+        folder: Path,
+    ) -> None:
+        self.drafted, self.key, self.headers, self.folder = drafted, key, headers, folder
+        self.files = _sample(headers)
+        dark = [path for group in headers.groups if group.dark for path in group.files]
+        for place, paths in (("raw", self.files), ("dark", dark[:_MOST_DARK])):
+            for path in paths:
+                link = folder / place / path
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to((root / path).resolve())
+
+    def result(self) -> FirstLook:
+        full_overlap = self._full_overlap()
+        candidates = [name for names in self.headers.candidates for name in names]
+        nitrogen = self.headers.nitrogen_channels
+        products: dict[str, Any] = {
+            "elastic": {**self.drafted["instruments"][self.key]["products"]["elastic"]}
+        }
+        products["elastic"]["channels"] = candidates
+        if nitrogen:
+            products["raman"] = {"channels": list(nitrogen), "nitrogen": nitrogen}
+        record = self._processed(products, full_overlap or 0.0)
+        shares = {
+            channel: share
+            for channel, path in self._made(record, "elastic")
+            if (share := _usable_share(path)) > 0.0
+        }
+        raman = (name for name, path in self._made(record, "raman") if _usable_share(path) > 0.0)
+        reasons = {name: self._reason(record, name) for name in candidates if name not in shares}
+        return FirstLook(len(self.files), shares, reasons, frozenset(raman), full_overlap)
+
+    def _processed(self, products: Mapping[str, Any], full_overlap: float) -> RunRecord | None:
+        """Process the sample with these products, and dead times that are estimated."""
+        drafted = self.drafted["instruments"][self.key]
+        facts = {**drafted["facts"][0], "full_overlap_range": full_overlap}
+        for pair in filter(is_glued, (name for names in self.headers.candidates for name in names)):
+            photon = file_channels(pair)[-1]
+            facts["channels"] = {
+                **facts["channels"],
+                photon: {**(facts["channels"][photon] or {}), "dead_time": "estimate"},
+            }
+        dark = {"dark_files": ["dark/**"]} if "dark_files" in drafted else {}
+        instrument = {**drafted, **dark, "files": ["raw/**"], "facts": [facts]}
+        campaign = Campaign.model_validate(
+            {
+                **{name: self.drafted[name] for name in ("name", "title", "stations")},
+                "archive": str(self.folder),
+                "output": str(self.folder / "out"),
+                "instruments": {self.key: {**instrument, "products": products}},
+            }
+        )
+        return reprocess(campaign)
+
+    def _made(self, record: RunRecord | None, kind: str) -> Iterator[tuple[str, Path]]:
+        for scene in record.scenes if record else ():
+            for product in scene.products:
+                if product.kind == kind:
+                    yield product.channel, self.folder / "out/products" / product.path
+
+    def _reason(self, record: RunRecord | None, channel: str) -> str:
+        """Return why a channel has no usable value: flags, or what its plan left out."""
+        flags: Counter[str] = Counter()
+        left_out: list[str] = []
+        for scene in record.scenes if record else ():
+            for product in scene.products:
+                if (product.kind, product.channel) == ("elastic", channel):
+                    flags.update(product.flagged)
+            omissions = scene.plan.left_out if scene.plan else ()
+            left_out += [left.reason for left in omissions if left.channel == channel]
+        frequent = [name.lower() for name, _ in flags.most_common(2)]
+        return ", ".join(frequent) or next(iter(left_out), "no product")
+
+    def _full_overlap(self) -> float | None:
+        """Return the range from which no signal rises any more; None where they do not show it."""
+        # The last one is analog where there is such a record, which counts no pile-up.
+        channels = [names[-1] for names in self.headers.candidates]
+        record = self._processed({"signal": {"channels": channels}}, 0.0)
+        ends: dict[str, list[float]] = defaultdict(list)
+        for channel, path in self._made(record, "signal"):
+            with open_product(path, ("signal", "range")) as product:
+                known = np.isfinite(product["signal"].values)
+                total = np.where(known, product["signal"].values, 0.0).sum(axis=0)
+                mean = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+                end = rise_ends(np.asarray(product["range"].values, float), mean)
+            if end is not None:
+                ends[channel].append(end)
+        if not ends:
+            return None
+        farthest = max(float(np.median(found)) for found in ends.values())
+        return float(np.ceil(farthest / _STEP) * _STEP)
+
+
+def _sample(headers: InstrumentHeaders) -> list[str]:
+    """Return some signal files of the day with most hours, equally many of each hour."""
+    hours: dict[datetime, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
+    group = headers.main
+    for path, header in sorted(zip(group.files, group.headers, strict=True), key=_start):
+        midnight = header.start.replace(hour=0, minute=0, second=0, microsecond=0)
+        hours[midnight][header.start.hour].append(path)
+    of_day = max(hours.values(), key=lambda day: (len(day), sum(map(len, day.values()))))
+    each = max(_MOST_FILES // len(of_day), 1)
+    return [path for paths in of_day.values() for path in paths[:each]]
+
+
+def _start(pair: tuple[str, Any]) -> datetime:
+    start: datetime = pair[1].start
+    return start
+
+
+def rise_ends(ranges: Floats, signal: Floats) -> float | None:
+    """Return where a range-corrected signal stops rising, m; None where it does not by 3 km.
+
+    Below full overlap a signal rises, and in any air beyond it falls on the mean. It is the first
+    place whose running mean no place in the next 200 m exceeds.
+
+    Parameters
+    ----------
+    ranges : (range,) float
+        m.
+    signal : (range,) float
+        NaN where missing or saturated.
+    """
+    step = ranges[1] - ranges[0]
+    width, ahead = (max(round(float(length / step)), 1) for length in (_SMOOTH, _FALL))
+    near = ranges < _FARTHEST + _SMOOTH + _FALL
+    values, place = signal[near], ranges[near]
+    known = np.isfinite(values)
+    weight = np.convolve(known, np.ones(width), "same")
+    smooth = np.convolve(np.where(known, values, 0.0), np.ones(width), "same")
+    smooth = np.where(weight > 0.5 * width, smooth / np.maximum(weight, 1.0), -np.inf)
+    for k in np.flatnonzero((place >= _NEAREST) & (place <= _FARTHEST)):
+        beyond = smooth[k + 1 : k + 1 + ahead]
+        if np.isfinite(smooth[k]) and smooth[k] > 0.0 and beyond.size and smooth[k] >= beyond.max():
+            return float(place[k])
+    return None
+
+
+def _usable_share(path: Path) -> float:
+    """Return the share of usable values of a product in the lowest 8 km."""
+    names = ("range", "usable", "aerosol_backscatter", "aerosol_extinction")
+    with open_product(path, names) as product:
+        low = product["range"].values < _HIGHEST
+        main = product["aerosol_extinction" if "raman" in path.name else "aerosol_backscatter"]
+        usable = np.isfinite(main.values) & (product["usable"].values <= 1)
+    shares: Sequence[float] = usable[..., low].mean(axis=-1)
+    return float(np.mean(shares))

@@ -1,0 +1,99 @@
+"""What `init` proposes after a look at data: what gives usable values, and full overlap as seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from support.archives import raw_archives
+from typer.testing import CliRunner
+
+from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.cli import app
+from lidarops.run.archive import reprocess
+from lidarops.run.first_look import rise_ends
+
+
+def drafted(folder: Path, campaign: Path) -> tuple[Campaign, str]:
+    shown = CliRunner().invoke(app, ["init", str(folder), str(campaign)])
+    assert shown.exit_code == 0, shown.output
+    return load_campaign(campaign), campaign.read_text(encoding="utf-8")
+
+
+@given(
+    full=st.floats(200.0, 2500.0),
+    extinction=st.floats(3e-5, 3e-4),
+    power=st.floats(1.0, 3.0),
+    noise=st.floats(0.0, 0.002),
+)
+def test_a_signal_stops_rising_where_overlap_gains_less_than_air_takes(
+    full: float, extinction: float, power: float, noise: float
+) -> None:
+    """At full overlap, or before it where the logarithm of r^p falls with the air."""
+    ranges = np.arange(3.75, 12_000.0, 7.5)
+    overlap = np.minimum(ranges / full, 1.0) ** power
+    signal = overlap * np.exp(-(ranges / 8000.0) - 2.0 * extinction * ranges)
+    signal += noise * np.random.default_rng(1).standard_normal(ranges.size)
+    signal[ranges < 50.0] = np.nan
+    end = rise_ends(ranges, signal)
+    assert end is not None
+    expected = min(full, power / (1.0 / 8000.0 + 2.0 * extinction))
+    assert 0.8 * expected - 70.0 <= end <= 1.1 * expected + 100.0
+
+
+def test_a_signal_that_rises_to_the_end_shows_no_overlap() -> None:
+    ranges = np.arange(3.75, 12_000.0, 7.5)
+    assert rise_ends(ranges, ranges**2) is None
+    assert rise_ends(ranges, np.full(ranges.size, np.nan)) is None
+
+
+def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> None:
+    """Random counts, the same at all ranges."""
+    for number in range(3):
+        data = raw_archives.content(number, bins=1500, seed=number, zenith_angle=0.0)
+        raw_archives.write(tmp_path / f"raw/h26{number}", data)
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert set(lidar.products.requested) == {"signal"}
+    assert "# glued_532o: no usable value in 3 files" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "elastic", "least", "raman"),
+    [
+        ("pilar", {"532p": 454, "53200o": 454, "355p": 454}, 0.6, set()),
+        ("saopaulo", {"532o": 975, "355o": 975}, 0.6, set()),
+        ("manaus_raman", {"355o": 1600}, 0.6, {"photon_355o"}),
+        ("public/manaus_20111017_day", {"355o": 1400}, 0.05, {"photon_355o"}),
+    ],
+)
+def test_what_is_proposed_of_real_archives_is_usable(
+    name: str,
+    elastic: dict[str, float],
+    least: float,
+    raman: set[str],
+    data_root: Path,
+    tmp_path: Path,
+) -> None:
+    """By day but for the third; nobody answered a question."""
+    campaign, _ = drafted(data_root / name, tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    proposed = lidar.products.requested["elastic"].channels
+    assert {channel.partition("_")[2] for channel in proposed} == set(elastic)
+    found = lidar.products.requested.get("raman")
+    assert set(found.channels if found else ()) == raman
+    record = reprocess(campaign)
+    assert record is not None
+    products = [p for scene in record.scenes for p in scene.products if p.kind == "elastic"]
+    assert {product.channel for product in products} == set(proposed)
+    for product in products:
+        with xr.open_dataset(campaign.products_root / product.path) as opened:
+            known = (opened["usable"] <= 1) & opened["aerosol_backscatter"].notnull()
+            low = known.where(opened["range"] < 8000.0, drop=True)
+            first = opened["range"][known.any("time")].min().item()
+        assert low.mean().item() >= least
+        assert first <= elastic[product.channel.partition("_")[2]]
