@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 from types import MappingProxyType
 from typing import Final
 
@@ -18,12 +19,14 @@ from lidarops.catalog.folder import (
     FirstLook,
     FolderContents,
     InstrumentHeaders,
+    Purpose,
     instruments_of,
     lone_beams,
 )
 from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
+from lidarops.raw.formats import raw_formats
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
 from lidarops.records import ChannelLayout, DetectionMode, file_channels, is_glued
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
@@ -34,6 +37,8 @@ _ALTITUDES: Final = (-500.0, 9000.0)
 """m; those that a station of a campaign may have."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
+_USED: Final = frozenset({Purpose.MEASUREMENT, Purpose.DARK})
+"""Purposes of files that a campaign names; others are a question."""
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
 
@@ -146,7 +151,10 @@ def _instruments(
     contents: FolderContents,
 ) -> tuple[dict[str, InstrumentHeaders], list[FileGroup]]:
     """Return the instruments of a draft by their keys, and groups of beams that are left out."""
-    instruments = [one for one in instruments_of(contents.groups) if one.files]
+    tests = [group for group in contents.groups if group.purpose not in _USED]
+    if len(tests) == len(contents.groups):
+        tests = []
+    instruments = [one for one in instruments_of(contents.groups, tests) if one.files]
     lone = [
         group
         for instrument in filter(_scans, instruments)
@@ -154,7 +162,8 @@ def _instruments(
         if _is_free(group)
     ]
     if lone:
-        instruments = [one for one in instruments_of(contents.groups, lone) if one.files]
+        left_out = [*tests, *lone]
+        instruments = [one for one in instruments_of(contents.groups, left_out) if one.files]
     keys = _keys(f"{site.key}-lidar" for site in _sites(instruments))
     return dict(zip(keys, instruments, strict=True)), lone
 
@@ -220,9 +229,9 @@ def _instrument(
     yield f"    station: {site.key}"
     yield f"    files: {_list(headers.files)}"
     if headers.dark_files:
-        yield f"    dark_files: {_list(headers.dark_files)}  # ? by the word dark in their path"
+        yield f"    dark_files: {_list(headers.dark_files)}  # ? by the words in their path"
     else:
-        yield '    # dark_files: "dark/*"  # ? none of the paths holds the word dark'
+        yield '    # dark_files: "dark/*"  # ? no path holds the word dark or DC'
     if site.coordinates is None:
         yield "    header_position: ignore  # headers state no position on Earth"
     else:
@@ -239,7 +248,7 @@ def _instrument(
 
 def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield "    facts:"
-    yield "      - clock_offset: 0  # ? s, clock of the files minus UTC; -18000 for UTC-5"
+    yield f"      - clock_offset: 0  # ? s, clock of the files minus UTC; {_clock(headers.main)}"
     yield from (f"        {line}" for line in _pointing(headers))
     yield f"        {_full_overlap(headers.look)}"
     if headers.pairs:
@@ -267,6 +276,19 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
         question = "; ? wavelength, whose dot the header lacks" if lost_dot else ""
         question += _unknown(channel, estimated=channel.name in estimated)
         yield f"          {channel.name}: {{{', '.join(facts)}}}  # {grid}{question}"
+
+
+def _clock(group: FileGroup) -> str:
+    """Return what is to be said of the clock: how far names are from headers, or an example."""
+    away = [
+        (header.start - named).total_seconds()
+        for path, header in zip(group.files, group.headers, strict=True)
+        if (named := raw_formats()[header.format].named_time(path.rpartition("/")[2]))
+    ]
+    hours = round(median(away) / 3600.0) if away else 0
+    if not hours:
+        return "-18000 for UTC-5"
+    return f"headers are {hours:+d} h from names: one of both is local time"
 
 
 def _full_overlap(look: FirstLook | None) -> str:
@@ -358,6 +380,14 @@ def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup])
         (
             "of cycles of one beam, whose values a scan rejects, left out of `files`",
             [path for group in lone for path in group.files],
+        ),
+        *(
+            (
+                f"? {purpose} by the words in their path, left out of `files`",
+                [p for group in contents.groups if group.purpose is purpose for p in group.files],
+            )
+            for purpose in Purpose
+            if purpose not in _USED
         ),
         # As seen from the campaign file.
         (named, [f"{archive}/{path}" for path in tables]),

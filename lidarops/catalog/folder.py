@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -39,6 +40,28 @@ _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
 
 
+class Purpose(StrEnum):
+    """As what files were recorded."""
+
+    MEASUREMENT = "measurement"
+    DARK = "dark"
+    TELECOVER = "test of the telescope"
+    POLARISATION = "calibration of the polarisation"
+    BACKGROUND = "background"
+
+
+_WORDS: Final = {
+    Purpose.DARK: {"dark", "dc", "darkcurrent"},
+    Purpose.TELECOVER: {"telecover", "tc", "quadrant", "sector"},
+    Purpose.POLARISATION: {"dp", "depol", "polcal", "depolcal", "calibration", "+45", "-45"}
+    | {"p45", "m45", "plus45", "minus45"},
+    Purpose.BACKGROUND: {"background", "bkg"},
+}
+"""Words of folders and names, by which they are told apart from others within a word if longer."""
+_LONG_WORD: Final = 4
+"""Letters of a word that may be a part of another one."""
+
+
 @dataclass(frozen=True, slots=True)
 class FileGroup:
     """Raw files of one folder with like names, site, position and channels."""
@@ -47,8 +70,8 @@ class FileGroup:
     """Relative to the root, with a slash at its end; empty for the root."""
     stem: str
     """Letters with which the names begin."""
-    dark: bool
-    """Whether folder or name says that these are dark files."""
+    purpose: Purpose
+    """As what folder or name says that these files were recorded."""
     site: str
     coordinates: tuple[float, float] | None
     """degree, as the header orders them."""
@@ -73,6 +96,11 @@ class FileGroup:
     """By file."""
     header_pointing: HeaderPointing = "stated"
     """As what doubtful angles are read."""
+
+    @property
+    def dark(self) -> bool:
+        """Whether these are dark files."""
+        return self.purpose is Purpose.DARK
 
     @property
     def pattern(self) -> str:
@@ -378,7 +406,7 @@ def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -
     return FileGroup(
         folder=folder,
         stem=stem,
-        dark="dark" in f"{folder}{stem}".lower(),
+        purpose=_purpose(f"{folder}{stem}"),
         site=first.site,
         coordinates=first.coordinates,
         layout=first.layout,
@@ -394,6 +422,16 @@ def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -
         headers=tuple(headers),
         header_pointing=pointing,
     )
+
+
+def _purpose(path: str) -> Purpose:
+    """Return as what files were recorded by the words of their folders and the stem of names."""
+    text = path.lower()
+    words = set(re.split(r"[^a-z0-9+-]+", text))
+    for purpose, known in _WORDS.items():
+        if words & known or any(len(word) >= _LONG_WORD and word in text for word in known):
+            return purpose
+    return Purpose.MEASUREMENT
 
 
 def lone_beams(headers: InstrumentHeaders) -> tuple[FileGroup, ...]:

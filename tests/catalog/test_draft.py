@@ -320,8 +320,8 @@ def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path:
     """Without dead time, `poor_stratification` rejects all its cycles."""
     _, text = drafted(data_root / "savant", tmp_path / "campaign.yaml")
     assert "channels: [photon_355p, photon_355s, analog_355p, analog_355s]" in text
-    # One temp.dat is the copy of a record, the other one the only copy.
-    assert "2018A18/temp*" in text
+    # One temp.dat is the copy of a record, the other one the only copy, of a background.
+    assert "2018A18/temp.dat" in text
     assert "1 file, copies of the last record of the acquisition, left out:" in text
     options = ["--product", "multiangle", "--instrument", "u-c-vol-lidar", "--json"]
     shown = CliRunner().invoke(app, ["reprocess", str(tmp_path / "campaign.yaml"), *options])
@@ -332,3 +332,60 @@ def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path:
     assert quality["reject"] == 200
     (quality,) = (own for name, own in qualities.items() if "analog_355s" in name)
     assert quality["good"] + quality["care"] == 100
+
+
+@pytest.mark.parametrize(
+    ("folder", "role"),
+    [
+        ("RS_20260301_0000", Role.SIGNAL),
+        ("DC_20260301_0000", Role.DARK),
+        ("darkcurrent", Role.DARK),
+        ("DP_20260301_0000/+45", None),
+        ("polcal/m45", None),
+        ("telecover_north", None),
+        ("0755bACKGROUND", None),
+        # Words that are parts of other ones.
+        ("adcp", Role.SIGNAL),
+        ("midpoint", Role.SIGNAL),
+    ],
+)
+def test_files_of_tests_and_calibrations_are_a_question_and_no_measurements(
+    tmp_path: Path, folder: str, role: Role | None
+) -> None:
+    paths = {f"{folder}/h{number}": content(number, seed=number) for number in range(2)}
+    usual = {f"evening/h{number}": content(60.0 + number, seed=number) for number in range(3)}
+    for path, data in {**paths, **usual}.items():
+        write(tmp_path / "raw" / path, data)
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    known = {granule.path: granule.role for granule in granules(campaign)}
+    expected = dict.fromkeys(usual, Role.SIGNAL) | (dict.fromkeys(paths, role) if role else {})
+    assert known == expected
+    assert ("by the words in their path, left out of `files`" in text) == (role is None)
+    assert all(path in text for path in paths) or role is not None
+
+
+def test_only_files_of_a_calibration_are_drafted_as_they_are(tmp_path: Path) -> None:
+    write(tmp_path / "raw/calibration/h0", content(0.0))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert [granule.path for granule in granules(campaign)] == ["calibration/h0"]
+
+
+def test_the_session_folders_of_a_night_are_told_apart(data_root: Path, tmp_path: Path) -> None:
+    case = data_root / "cases/session_folders"
+    campaign, text = drafted(case, tmp_path / "campaign.yaml")
+    known = {(path.split("/")[4][:2], granule.role) for granule in granules(campaign)
+             for path in [granule.path]}  # fmt: skip
+    assert known == {("RS", Role.SIGNAL), ("DC", Role.DARK)}
+    assert "10 files, ? calibration of the polarisation" in text
+
+
+@pytest.mark.parametrize(
+    ("hour", "question"), [(10, "-18000 for UTC-5"), (5, "headers are +5 h from names")]
+)
+def test_names_by_another_time_than_headers_are_a_question(
+    tmp_path: Path, hour: int, question: str
+) -> None:
+    for number in range(3):
+        write(tmp_path / f"raw/h26301{hour:02d}.{number:02d}0000", content(600.0 + number))
+    _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert question in next(line for line in text.splitlines() if "clock_offset" in line)
