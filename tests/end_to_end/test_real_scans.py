@@ -197,7 +197,8 @@ def test_a_blocked_beam_gives_the_analog_baseline(data_root, tmp_path, products)
     for file in (data_root / "savant" / "2018-10-18-0703tRANSITION").iterdir():
         (archive / file.name).symlink_to(file)
     ray = data_root / "savant" / "2018-10-18-0254" / "R18A1803.042664"
-    (archive / ray.name).write_bytes(ray.read_bytes().replace(b"03:04:25", b"07:07:49", 2))
+    later = ray.read_bytes().replace(b"03:04:25", b"07:07:49", 2)
+    (archive / "R18A1807.074964").write_bytes(later.replace(b"R18A1803.042664", b"R18A1807.074964"))
     tree = yaml.safe_load(CAMPAIGN.read_text())
     tree["instruments"]["savant"]["files"] = "R18*"
     tree["instruments"]["savant"]["products"]["multiangle"]["channels"] = [

@@ -272,8 +272,8 @@ def test_a_plan_prints_equal_lines_of_channels_once(archive: Archive) -> None:
 
 def test_a_plan_states_the_units_of_settings(archive: Archive) -> None:
     shown = " ".join(invoke(archive, "plan", "--all", "--instrument", "rich").output.split())
-    assert "wavelength 5.32e-07 m" in shown
-    assert "dead_time 4e-09 s," in shown
+    assert "wavelength 532 nm" in shown
+    assert "dead_time 4 ns," in shown
 
 
 def test_the_version_is_printed() -> None:

@@ -70,7 +70,7 @@ def content(minutes: float, recorders: tuple[str, ...]) -> bytes:
     start = factories.DAY + timedelta(minutes=minutes)
     common: dict[str, Any] = {"wavelength": 532e-9, "bins": BINS, "bin_width": 7.5, "shots": 600}
     header = new_header(
-        name="h2630100.000000",
+        name=f"h{start:%y}{start.month:X}{start:%d%H}.{start:%M%S}00",
         site="Coast",
         start=start,
         stop=start + timedelta(minutes=1),
