@@ -96,7 +96,14 @@ class Quality(FlagBit):
         ),
     )
     TOO_FEW_BINS = 4, Severity.REJECT, "the section has fewer than 8 valid range bins"
-    NO_SIGNAL = 5, Severity.REJECT, "the profile is constant: it contains no backscatter"
+    NO_SIGNAL = (
+        5,
+        Severity.REJECT,
+        (
+            "the profile contains no backscatter, as of a laser that is off: it is constant, or"
+            " shows no light where other profiles of the scene show much, or none of them any"
+        ),
+    )
     LOW_SIGNAL = (
         6,
         Severity.REJECT,
@@ -170,6 +177,7 @@ RAW_BITS: Final = (
     Quality.SATURATED,
     Quality.PILE_UP,
     Quality.INCOMPLETE_OVERLAP,
+    Quality.NO_SIGNAL,
 )
 """Bits of raw profiles that all kinds pass on."""
 SIGNAL_BITS: Final = (
@@ -182,7 +190,11 @@ SIGNAL_BITS: Final = (
 )
 """Bits of signals that retrievals of profiles pass on."""
 WITHHELD: Final = int(
-    Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP | Quality.NO_GLUING
+    Quality.INPUT_MISSING
+    | Quality.SATURATED
+    | Quality.INCOMPLETE_OVERLAP
+    | Quality.NO_SIGNAL
+    | Quality.NO_GLUING
 )
 """Bits of bins that retrievals of profiles do not use."""
 COMPARED_BITS: Final = (Quality.CONTRADICTED, Quality.DISAGREES)

@@ -75,12 +75,13 @@ AVERAGED: Final = (
     count("profiles", "number of raw profiles in the mean", cell_methods="time: sum"),
     count(
         "profiles_left_out",
-        "number of raw profiles that are left out of the mean as outlying",
+        "number of raw profiles that are left out of the mean as outlying or without light",
         cell_methods="time: sum",
         comment="Profiles are left out where their signal, in any channel, exceeds that of all"
         " others of the interval at some range by more than the contrast of a cloud and noise"
         " allow, or lies below zero unlike that of all others, if they are at most a fifth of the"
-        " interval: a short cloud, a bird, an aircraft, interference.",
+        " interval: a short cloud, a bird, an aircraft, interference. Those without light or shots,"
+        " as of a laser that was off, are any number.",
     ),
     shots(of="all profiles in the mean"),
 )

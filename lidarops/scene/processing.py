@@ -67,7 +67,10 @@ from lidarops.scene.profiles import (
     Source,
     chunks,
     in_one_batch,
+    lightless_in_words,
+    lightless_profiles,
     profiles_together,
+    without_dark_shots,
 )
 from lidarops.scene.retrieval import (
     Derivation,
@@ -208,10 +211,13 @@ class _Work(ABC):
         subtracted = [step.channel for step in steps if step.name == "dark"]
         held = [channel.name for channel in scene.layout if channel.name in read]
         open_files = (job.campaign, scene)
+        opened = partial(open_granules, *open_files, scene.granules, self.root)
+        names = [channel.name for channel in scene.layout]
+        lightless = lightless_profiles(opened(names), job.profiles_per_chunk)
+        for words in lightless_in_words({name: lightless[name] for name in held}):
+            self.notes[words] = None
         source = Source(
-            archive=open_granules(
-                *open_files, scene.granules, self.root, held, stretches=stretches
-            ),
+            archive=without_dark_shots(opened(held, stretches=stretches), lightless),
             dark=(
                 open_granules(*open_files, scene.dark, self.root, subtracted)
                 if subtracted and scene.dark

@@ -15,8 +15,9 @@ import xarray as xr
 
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.constants import DEAD_TIME_UNCERTAINTY
+from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.signal import labeled_gluing
+from lidarops.retrieve.signal import labeled_gluing, light
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.lag import ChannelLag
@@ -28,6 +29,8 @@ CHUNK_BYTES: Final = 4_000_000
 """Bytes of raw counts that are processed together."""
 GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 """Coordinates that every product over the time of the profiles has."""
+LIGHTLESS: Final = "lightless"
+"""End of the name of the variable of a channel that tells which profiles hold no light."""
 _PARTS: Final = ("power", "variance", "quality")
 
 
@@ -89,7 +92,10 @@ class FileProfiles:
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles."""
-        return self._condition(counts, self._channel)
+        conditioned = self._condition(counts, self._channel)
+        if (dark := f"{self._channel}_{LIGHTLESS}") in counts:
+            conditioned["quality"][counts[dark].to_numpy()] = np.int32(Quality.NO_SIGNAL)
+        return conditioned
 
     def sums(
         self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
@@ -338,6 +344,59 @@ class ProductStream(ABC):
     def results(self) -> Iterator[xr.Dataset]:
         """Yield the rows of a product that is retrieved when all profiles are known."""
         return iter(())
+
+
+def lightless_profiles(
+    archive: xr.Dataset, requested: int | None
+) -> dict[str, npt.NDArray[np.bool_]]:
+    """Return the profiles of each channel that hold no light of the laser, (time,).
+
+    Parameters
+    ----------
+    archive : xr.Dataset
+        Raw counts of all channels and bins of a scene, lazy: the answer is the same whatever is
+        made of it.
+    requested : int, optional
+        Number of profiles that are read together.
+    """
+    found, lasers = {}, {}
+    for name in (str(name) for name in archive if f"{name}_shots" in archive):
+        counts, attributes = archive[name], archive[name].attrs
+        count, bins = counts.shape
+        together = max(1, requested or CHUNK_BYTES // (4 * bins))
+        parts = [
+            light.excess_over_far(counts[first : first + together].to_numpy())
+            for first in range(0, count, together)
+        ]
+        excess, variance = (np.concatenate(part) for part in zip(*parts, strict=True))
+        measured = archive[f"{name}_shots"].to_numpy() > 0
+        found[name] = light.light_of(excess, variance, measured)
+        # Without a laser in the header, channels of one wavelength have one.
+        lasers[name] = str(attributes.get("laser", attributes["wavelength_label"]))
+    return light.lightless(found, lasers)
+
+
+def without_dark_shots(
+    archive: xr.Dataset, lightless: Mapping[str, npt.NDArray[np.bool_]]
+) -> xr.Dataset:
+    """Return raw counts in which profiles without light have no shots, and are named so."""
+    dark = {name: rows for name, rows in lightless.items() if name in archive and rows.any()}
+    shots = {name: archive[f"{name}_shots"] for name in dark}
+    return archive.assign(
+        {f"{name}_{LIGHTLESS}": ("time", rows) for name, rows in dark.items()}
+    ).assign({one.name: one.copy(data=one.where(~dark[n], 0)) for n, one in shots.items()})
+
+
+def lightless_in_words(lightless: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
+    """Return a note for each number of profiles without light; none where all hold light."""
+    numbers: dict[tuple[int, int], list[str]] = {}
+    for name, rows in lightless.items():
+        numbers.setdefault((int(rows.sum()), rows.size), []).append(name)
+    return [
+        f"without light: {dark} of {count} profiles of {', '.join(names)}, which are in no mean"
+        for (dark, count), names in numbers.items()
+        if dark
+    ]
 
 
 def in_one_batch(product: xr.Dataset) -> Iterator[xr.Dataset]:

@@ -27,9 +27,7 @@ FLAGS: Final = Flags(
     kind="homogeneous",
     version=2,
     bits=(
-        *RAW_BITS,
-        Quality.TOO_FEW_BINS,
-        Quality.NO_SIGNAL,
+        *sorted((*RAW_BITS, Quality.TOO_FEW_BINS)),
         Quality.LOW_SIGNAL,
         Quality.NEGATIVE_AMPLITUDE,
         Quality.NOT_HOMOGENEOUS,

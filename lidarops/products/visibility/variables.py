@@ -32,6 +32,7 @@ FLAGS: Final = Flags(
     bits=(
         Quality.INPUT_MISSING,
         Quality.PILE_UP,
+        Quality.NO_SIGNAL,
         Quality.LOW_SIGNAL,
         Quality.SINGLE_RECORD,
         Quality.OUTLIER,

@@ -114,7 +114,7 @@ def find_layers(
         frozen(tests.margins),
         mask,
     )
-    return mask.reshape(*tests.leading, -1)
+    return mask.reshape(*tests.leading, tests.power.shape[-1])
 
 
 def find_visible_air(

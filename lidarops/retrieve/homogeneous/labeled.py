@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import RetrievalInputError
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.background.estimate import Background, from_bounded_tail
 from lidarops.retrieve.common.arrays import Array, Block, Flags
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
@@ -17,9 +17,9 @@ from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
-EXCLUDED: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.INCOMPLETE_OVERLAP)
+EXCLUDED: Final = WITHHELD & ~int(Quality.NO_GLUING)
 """Bits that exclude a bin from a fit."""
-CARRIED: Final = int(Quality.SATURATED | Quality.PILE_UP | Quality.INCOMPLETE_OVERLAP)
+CARRIED: Final = EXCLUDED & ~int(Quality.INPUT_MISSING) | int(Quality.PILE_UP)
 """Bits that a section takes over from its bins."""
 _METRES: Final = frozenset({"m", "meter", "meters", "metre", "metres"})
 _UNITS: Final = {

@@ -86,8 +86,9 @@ class AltitudeCycles:
     """Profiles of a scan in altitude cells, sorted by cycle and beam, from chunks of profiles.
 
     The variance of the background is added to that of the noise. Profiles of one cycle and
-    direction are averaged, weighted by their shots. Beams that do not rise by 3 degrees or have no
-    known direction are left out, as are cycles without other beams.
+    direction are averaged, weighted by their shots; those without shots, as without light, are left
+    out. Beams that do not rise by 3 degrees or have no known direction are left out, as are cycles
+    without other beams.
     Only the cycles are held; chunks do not change a bit of the result.
 
     Parameters
@@ -154,7 +155,9 @@ class AltitudeCycles:
         self._azimuth = None
         if azimuth is not None and np.isfinite(np.asarray(azimuth, dtype=np.float64)).any():
             self._azimuth = directions.azimuth[usable]
-        self._profile, self._cycle, self._beam = _sorted_profiles(directions, usable, numbers)
+        self._profile, self._cycle, self._beam = _sorted_profiles(
+            directions, usable, numbers, self._shots
+        )
         self._slant_edges = _slant_edges(self._zenith_angle, height)
         self._tail, self._baseline = background_range, baseline
         self._set_bins(distance, overlap)
@@ -427,13 +430,18 @@ def _slant_edges(zenith_angle: Array, height: Array) -> Array:
 
 
 def _sorted_profiles(
-    directions: scan_cycles.Directions, usable: Indices, numbers: Integers
+    directions: scan_cycles.Directions, usable: Indices, numbers: Integers, shots: Array
 ) -> tuple[Integers, Integers, Integers]:
-    """Return number, cycle and beam of each profile that is used, sorted by cycle, then beam."""
+    """Return number, cycle and beam of each profile that is used, sorted by cycle, then beam.
+
+    Profiles without shots are used in cycles only that hold no others.
+    """
     rank = np.full(directions.zenith_angle.size + 1, -1, dtype=np.int64)
     rank[usable] = np.arange(usable.size)
     beam = rank[directions.index]
     kept = np.flatnonzero(beam >= 0)
+    lit = shots[kept] > 0.0
+    kept = kept[lit | ~np.isin(numbers[kept], numbers[kept[lit]])]
     kept = kept[np.lexsort((beam[kept], numbers[kept]))]
     cycle = np.unique(numbers[kept], return_inverse=True)[1].astype(np.int64)
     return kept, cycle, beam[kept]
@@ -480,7 +488,7 @@ def _visit_means(bins: _Bins, shots: Array, first: Indices) -> _Bins:
         means.values,
         means.variance,
         np.bitwise_or.reduceat(bins.quality, first, axis=0),
-        level / np.add.reduceat(shots, first) ** 2,
+        level / np.maximum(np.add.reduceat(shots, first), 1.0) ** 2,
         left / count,
         np.minimum.reduceat(bins.obstruction, first),
         bins.background[first],

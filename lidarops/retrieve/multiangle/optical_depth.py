@@ -203,4 +203,5 @@ def _with_reasons(
     lost = ~np.isfinite(result.optical_depth) & (result.quality == 0)
     reasons = carried & np.int32(WITHHELD)
     reasons[(samples > 1) | (reasons == 0)] = np.int32(MultiAngleQuality.NO_LEVERAGE)
-    result.quality[:] |= carried & np.int32(CARE) | np.where(lost, reasons, np.int32(0))
+    passed = np.int32(CARE | Quality.NO_SIGNAL)
+    result.quality[:] |= carried & passed | np.where(lost, reasons, np.int32(0))

@@ -14,7 +14,14 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.background.estimate import detected, from_tail, shifts
-from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers, root_sum_square
+from lidarops.retrieve.common.arrays import (
+    Array,
+    Booleans,
+    Flags,
+    Indices,
+    Integers,
+    root_sum_square,
+)
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
@@ -22,7 +29,7 @@ from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error
 
-_UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING
+_UNUSABLE: Final = Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_SIGNAL | Quality.NO_GLUING
 """Bits of a bin that is not used. Bins before full overlap are excluded by range."""
 _WARNINGS: Final = Quality.PILE_UP | Quality.SINGLE_RECORD | Quality.BACKGROUND_UNCERTAIN
 """Bits of bins that are passed on to the values they contribute to."""
@@ -138,6 +145,8 @@ def retrieve_network(
     dimensions = ("time", "crossing")
     visibility = visibility_of_extinction(extinction, random, systematic, settings.visibility)
     flags = _quality_flags(result, errors, signals, network)[:, near]
+    dark = _lightless(beams, intervals, network)[:, near] & ((flags & Quality.INPUT_MISSING) != 0)
+    flags |= dark * np.int32(Quality.NO_SIGNAL)
     multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
     if settings.multiplier is None:
         multiplier = {}
@@ -207,6 +216,16 @@ def _gather_signals(
         overlap[:, used_bins],
         np.ascontiguousarray(baseline[..., used_bins]),
     )
+
+
+def _lightless(beams: Sequence[BeamAverages], intervals: Integers, network: Network) -> Booleans:
+    """Return where a beam holds no light of its laser, (interval, crossing)."""
+    dark = np.zeros((intervals.size, network.crossings), dtype=np.bool_)
+    for index, beam in enumerate(beams):
+        bits = beam.averages["quality"].to_numpy() & np.int32(Quality.NO_SIGNAL)
+        rows = np.searchsorted(intervals, beam.interval[bits.any(axis=1)])
+        dark[np.ix_(rows, network.on_beam(index)[0])] = True
+    return dark
 
 
 def _bins_used(grid: Array, network: Network) -> int:

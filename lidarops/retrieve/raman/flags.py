@@ -90,6 +90,7 @@ _OF_SIGNALS: Final = (
     Quality.INPUT_MISSING,
     Quality.SATURATED,
     Quality.PILE_UP,
+    Quality.NO_SIGNAL,
     Quality.SINGLE_RECORD,
     Quality.LOW_SIGNAL_TO_NOISE,
     Quality.BACKGROUND_UNCERTAIN,

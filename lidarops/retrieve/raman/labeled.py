@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from lidarops.flags import Quality
+from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
 from lidarops.retrieve.background import estimate
 from lidarops.retrieve.clouds import labeled as _clouds
@@ -44,7 +44,7 @@ from lidarops.retrieve.signal.labeled import (
     without_analog_background,
 )
 
-_WITHHELD: Final = int(Quality.INPUT_MISSING | Quality.SATURATED | Quality.NO_GLUING)
+_WITHHELD: Final = WITHHELD & ~int(Quality.INCOMPLETE_OVERLAP)
 _DOUBTED: Final = _WITHHELD | int(Quality.PILE_UP)
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
 _BITS_OF_ANY_BIN: Final = (

@@ -34,6 +34,7 @@ _PROFILES_IN_CACHE: Final = 32
 MEANS_TOGETHER: Final = 16
 """Means that are completed together, so that their sums take little memory."""
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
+_DARK: Final = np.int32(Quality.NO_SIGNAL)
 
 Shared = Callable[[npt.NDArray[np.datetime64]], Array]
 Units = dict[str, dict[str, Any]]
@@ -46,10 +47,12 @@ class PartSums:
     sums: RunningMean
     lengths: RunningMean
     quality: Flags
-    """(part, range), without INPUT_MISSING."""
+    """(part, range), without INPUT_MISSING, and NO_SIGNAL only of parts without a shot."""
     profiles: Flags
-    """(part,), their numbers."""
+    """(part,), their numbers, without those that have no shots."""
     shots: Flags
+    whole: int
+    """Number of all profiles of the interval."""
     units: Units
     """Attributes of power, variance and range."""
 
@@ -115,7 +118,7 @@ class IntervalSums:
         self._group = np.repeat(self._groups[:-1], counts) + part
         self._weights = shots.to_numpy().astype(np.float64)
         begins = np.flatnonzero(np.diff(self._group, prepend=-1))
-        self._profiles = np.diff(begins, append=interval.size).astype(np.int32)
+        self._profiles = np.add.reduceat((self._weights > 0.0).astype(np.int32), begins)
         self._shots = np.add.reduceat(shots.to_numpy(), begins).astype(np.int32)
         self._shared_variance = shared_variance
         self.range, self.lag = distance, lag
@@ -161,9 +164,11 @@ class IntervalSums:
             self._add(*(array[first:past] for array in arrays))
             if past - first == left:
                 groups = slice(self._first_group, self._first_group + len(self._bits))
-                numbers = self._profiles[groups], self._shots[groups]
+                profiles, shots = self._profiles[groups], self._shots[groups]
+                self._bits[profiles > 0] &= ~_DARK
+                whole = int(self._edges[self._open + 1] - self._edges[self._open])
                 self._complete.append(
-                    PartSums(self._sums, self._lengths, self._bits, *numbers, units)
+                    PartSums(self._sums, self._lengths, self._bits, profiles, shots, whole, units)
                 )
                 self._begin(self._open + 1)
             first = past
@@ -265,7 +270,8 @@ class ClockAverage:
             time. ``time`` is the middle of
             ``time_bnds``, which span the profiles of the interval. Intervals without a profile are
             omitted. A mean has all quality bits of its profiles, but INPUT_MISSING only if no
-            profile has data.
+            profile has data, and NO_SIGNAL only if none has light: profiles without shots, as those
+            without light have none, are not in it.
 
             With a screening also ``part_power`` (background subtracted) and ``part_variance`` over
             (time, part, cell) of parts that are in the mean, means over cells of ``bins``
@@ -356,7 +362,9 @@ class ClockAverage:
 
 
 def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:
-    """Return the mean of the parts that are kept."""
+    """Return the mean of the parts that are kept, without those that hold no shot."""
+    lit = kept & (sums.profiles > 0)
+    kept = lit if lit.any() else kept
     averages = sums.sums.joined(kept)
     quality = sums.quality if kept.all() else sums.quality[kept]
     return {
@@ -379,7 +387,7 @@ def _parts(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
     power[places], variance[places] = cells.power[places], cells.variance[places]
     quantum[places], of_parts[places] = cells.quantum[places], sums.profiles[places]
     return {
-        "left_out": np.int32(sums.profiles[~kept].sum()),
+        "left_out": np.int32(sums.whole - sums.profiles[kept].sum()),
         "part_power": power,
         "part_variance": variance,
         "part_quantum": quantum,

@@ -39,6 +39,7 @@ _LINE: Final = {"glue_slope": "MHz mV-1", "glue_slope_standard_error": "MHz mV-1
 _LAG: Final = {"glue_lag": "1", "glue_lag_standard_error": "1"}
 _WINDOW: Final = {"glue_bottom": "m", "glue_top": "m"}
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
+_WITHHELD: Final = Quality.INPUT_MISSING | Quality.NO_SIGNAL | Quality.NO_GLUING
 
 
 def range_lag(analog_range: Array, photon_range: Array) -> float:
@@ -258,7 +259,10 @@ def _glue(
     quality |= np.where(alone, int(Quality.SINGLE_RECORD), 0)[..., np.newaxis]
     quality |= np.where(alone | line, 0, int(Quality.NO_GLUING))[..., np.newaxis]
     quality |= np.where(distance <= 0.0, _MISSING, 0)
-    power[(quality & int(Quality.NO_GLUING | Quality.INPUT_MISSING)) != 0] = np.nan
+    # Both records are of the same light.
+    dark = (analog_quality | photon_quality) & np.int32(Quality.NO_SIGNAL)
+    quality = np.where(dark.any(axis=-1, keepdims=True), np.int32(Quality.NO_SIGNAL), quality)
+    power[(quality & int(_WITHHELD)) != 0] = np.nan
     variance[np.isnan(power)] = np.nan
     own = zip((glued.slope, glued.slope_standard_error), slope or UNKNOWN_SLOPE, strict=True)
     slopes = (np.select(records[:2], values, np.nan) for values in own)

@@ -156,5 +156,15 @@ class Thresholds(NamedTuple):
     dead_time_block: int = 2
     """Bins that are averaged; few, because the rate is no linear function of the light; assumed."""
 
+    # Profiles without light (`light`).
+    shows_light: float = 6.0
+    """Standard errors by which a profile that shows light differs from a constant: of 12 real dark
+    files at most 5.4 in strong channels (`tests/scene/test_laser_off.py`)."""
+    tells_of_light: float = 400.0
+    """The same of a channel that tells: 5 % of it are 20, far above `shows_light`."""
+    telling_share: float = 0.1
+    """Share of the profiles that show light in a channel that tells, and of those that may show
+    less than `tells_of_light`. Assumed."""
+
 
 THRESHOLDS: Final = Thresholds()

@@ -1,0 +1,120 @@
+"""Which profiles hold no light of the laser, told by all channels that the files hold.
+
+A channel tells where its profiles show light by far: one that shows none then has none. Noise of a
+weak channel alone tells nothing, and would reject its profiles one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.signal.averaging import skewness_margin
+from lidarops.retrieve.signal.thresholds import THRESHOLDS
+
+_WINDOWS: Final = 32
+"""Windows of equal length into which the bins before the far range are cut."""
+_FAR: Final = 10
+"""The far range is the last of so many equal parts of the bins."""
+_FEWEST: Final = 5
+"""Profiles; fewer tell nothing."""
+
+
+class Light(NamedTuple):
+    """How the counts of a channel vary along range."""
+
+    excess: Array
+    """(time,) greatest difference of a window from the far range, in standard errors of noise; NaN
+    where there are too few bins to tell."""
+    of_sum: float
+    """That of the sum of all profiles."""
+    measured: Booleans
+    """(time,), False where there are no shots or no counts: a gap."""
+
+    @property
+    def dark(self) -> Booleans:
+        """(time,), whether a profile shows no light."""
+        return self.measured & (self.excess < THRESHOLDS.shows_light)
+
+    @property
+    def tells(self) -> bool:
+        """Whether a profile that shows no light has none.
+
+        Of the profiles that show light, at least a tenth of all, nine tenths show so much that a
+        twentieth of it would do. They may be few: a laser may be off for most of a scene.
+        """
+        lit = self.excess[self.measured & (self.excess >= THRESHOLDS.shows_light)]
+        share = THRESHOLDS.telling_share
+        if lit.size < max(_FEWEST, share * self.excess.size):
+            return False
+        return bool(np.quantile(lit, share) >= THRESHOLDS.tells_of_light)
+
+
+def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array]:
+    """Return the counts of windows beyond those of the far range, and their variance by noise.
+
+    Of each profile by itself, so that profiles may come in any parts.
+
+    Parameters
+    ----------
+    counts : (time, range) int
+
+    Returns
+    -------
+    excess : (time, window) float64
+    variance : (time, 1) float64
+        As the bins of the far range show it, and a count more: none there do not mean no noise.
+    """
+    number, bins = counts.shape
+    far = counts[:, bins - bins // _FAR :].astype(np.float64)
+    length = (bins - far.shape[1]) // _WINDOWS
+    if length * far.shape[1] == 0 or far.shape[1] < _WINDOWS // 2:
+        return np.full((number, _WINDOWS), np.nan), np.ones((number, 1))
+    near = counts[:, : _WINDOWS * length].reshape(number, _WINDOWS, length)
+    level = far.mean(axis=1, keepdims=True)
+    scatter = (((far - level) ** 2).sum(axis=1, keepdims=True) + 1.0) / (far.shape[1] - 1)
+    excess = near.sum(axis=2, dtype=np.int64) - length * level
+    return excess, scatter * (length * (1.0 + length / far.shape[1]))
+
+
+def light_of(excess: Array, variance: Array, measured: Booleans) -> Light:
+    """Return how the counts of a channel vary, from `excess_over_far` of all its profiles."""
+    of_sum = _significance(excess.sum(axis=0), variance.sum())
+    return Light(_significance(excess, variance), float(of_sum), measured)
+
+
+def _significance(excess: Array, variance: Array) -> Array:
+    """Return the greatest deviation over its error, beyond what few counts may show."""
+    margin = skewness_margin(THRESHOLDS.shows_light)
+    beyond = np.maximum(np.abs(excess) - margin, 0.0) / np.sqrt(variance)
+    return np.asarray(beyond.max(axis=-1))
+
+
+def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str, Booleans]:
+    """Return the profiles of each channel that hold no light, (time,).
+
+    A channel that tells is judged by its own counts; another one by those of the same laser that
+    tell, where all agree. Where none shows light in the sum of all profiles, none has any.
+
+    Parameters
+    ----------
+    found : mapping
+        Channel of the files -> how its counts vary.
+    lasers : mapping
+        Channel -> its laser.
+    """
+    dark: dict[str, Booleans] = {}
+    for laser in dict.fromkeys(lasers.values()):
+        channels = [name for name in found if lasers[name] == laser]
+        own = {name: found[name].dark for name in channels if found[name].tells}
+        nothing = len(found[channels[0]].excess) >= _FEWEST and all(
+            found[name].of_sum < THRESHOLDS.shows_light for name in channels
+        )
+        unlit = np.full_like(found[channels[0]].measured, nothing)
+        agreed = np.logical_and.reduce(list(own.values())) if own else unlit
+        dark |= {name: own.get(name, agreed) for name in channels}
+    return dark
