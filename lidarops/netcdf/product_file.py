@@ -16,7 +16,6 @@ import numpy as np
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.flags import Quality
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import Context, global_attributes, prov_json
@@ -192,10 +191,6 @@ class ProductWriter:
             # Bits refer to retrieved values; an optional derived or an auxiliary value may be
             # missing without one.
             judge = self._layout.row(rows.judging(row.name, flags))
-            if row.name in flags:
-                encoded[row.name] = flags[row.name]
-                self._refuse_other_sizes(row, flags[row.name])
-                continue
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
             judged = row.dims == judge.dims and not spared
             encoded[row.name] = stored(profiles, row, flags[judge.name] if judged else None)
@@ -319,6 +314,4 @@ def _bits(row: Row, profiles: xr.Dataset) -> Values:
             field=row.name,
             remedy="add them to products/KIND/variables.py",
         )
-    # What holds no light is no gap.
-    dark = (flags & int(Quality.NO_SIGNAL)) != 0
-    return np.where(dark, flags & ~int(Quality.INPUT_MISSING), flags)
+    return flags

@@ -20,10 +20,12 @@ import xarray as xr
 from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.campaign.model import channel_facts
 from lidarops.errors import ProductError, RawFormatError
+from lidarops.flags import Quality
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import Context, product_of_path, product_path
 from lidarops.netcdf.product_file import ProductWriter, create_product
 from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.raw.header import Stretches
 from lidarops.records import (
     Disagreement,
@@ -246,7 +248,7 @@ class _Work(ABC):
         with self._writer(next(results), context) as writer:
             for rows in results:
                 self.laps.end("retrieve")
-                writer.add(rows)
+                writer.add(_told_from_gaps(rows))
                 self.laps.end("write")
 
 
@@ -340,7 +342,7 @@ class _Instrument(_Work):
                 for kind, rows in ((k, rows) for k, s in streams.items() for rows in s.add(chunk)):
                     self.laps.end("retrieve")
                     if kind in writers:
-                        writers[kind].add(rows)
+                        writers[kind].add(_told_from_gaps(rows))
                         self.laps.end("write")
                     else:
                         frame = _with_words(rows, contexts[kind], signal)
@@ -356,6 +358,14 @@ class _Instrument(_Work):
                 compared.append(Retrieved(common, contexts[kind], frame, tuple(results)))
             else:
                 self._write(contexts[kind], itertools.chain([frame], results))
+
+
+def _told_from_gaps(rows: xr.Dataset) -> xr.Dataset:
+    """Return rows of a product in whose flags no data are missing where there is no light."""
+    flags = {str(name): rows[name] for name in rows if str(name).endswith(QUALITY_FLAG)}
+    lit = {name: (bits & int(Quality.NO_SIGNAL)) == 0 for name, bits in flags.items()}
+    kept = ~int(Quality.INPUT_MISSING)
+    return rows.assign({n: bits.where(lit[n], bits & kept) for n, bits in flags.items()})
 
 
 def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> xr.Dataset:
