@@ -261,7 +261,7 @@ def _glue(
     quality |= np.where(distance <= 0.0, _MISSING, 0)
     # Both records are of the same light.
     dark = (analog_quality | photon_quality) & np.int32(Quality.NO_SIGNAL)
-    quality = np.where(dark.any(axis=-1, keepdims=True), np.int32(Quality.NO_SIGNAL), quality)
+    quality[dark.any(axis=-1)] = np.int32(Quality.NO_SIGNAL)
     power[(quality & int(_WITHHELD)) != 0] = np.nan
     variance[np.isnan(power)] = np.nan
     own = zip((glued.slope, glued.slope_standard_error), slope or UNKNOWN_SLOPE, strict=True)
