@@ -378,12 +378,13 @@ def _estimated_dead_time(
             power, variance, length = (
                 part[name].to_numpy() for name in ("power", "variance", CORRELATION_LENGTH)
             )
-            if (shot := exposure > 0.0).any():
+            shot = exposure > 0.0
+            if shot.any():
                 share = (exposure[shot] / exposure.sum())[:, np.newaxis]
                 noise = variance[shot] * length[shot, np.newaxis]
                 mean, of_mean = (power[shot] * share).sum(axis=0), (noise * share**2).sum(axis=0)
                 groups.append(ProfileGroup(counts[shot], exposure[shot], mean, of_mean))
-            yield power, counts / np.maximum(exposure, 1e-300)[:, np.newaxis]
+            yield power, counts / np.where(shot, exposure, np.nan)[:, np.newaxis]
 
     distance = bin_ranges(archive, channel, photon.range_offset)
     lag = labeled_gluing.range_lag(profiles.range, distance)

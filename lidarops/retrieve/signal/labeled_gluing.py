@@ -260,8 +260,8 @@ def _glue(
     quality |= np.where(alone | line, 0, int(Quality.NO_GLUING))[..., np.newaxis]
     quality |= np.where(distance <= 0.0, _MISSING, 0)
     # Both records are of the same light.
-    dark = (analog_quality | photon_quality) & np.int32(Quality.NO_SIGNAL)
-    quality[dark.any(axis=-1)] = np.int32(Quality.NO_SIGNAL)
+    unlit = (analog_quality | photon_quality) & np.int32(Quality.NO_SIGNAL)
+    quality[unlit.any(axis=-1)] = np.int32(Quality.NO_SIGNAL)
     power[(quality & int(_WITHHELD)) != 0] = np.nan
     variance[np.isnan(power)] = np.nan
     own = zip((glued.slope, glued.slope_standard_error), slope or UNKNOWN_SLOPE, strict=True)
