@@ -181,6 +181,8 @@ class _Work(ABC):
         """Products that are written, in the order in which they were complete."""
         self.notes: dict[str, None] = {}
         """What the data did not give, each once."""
+        self.lightless = False
+        """Whether profiles of the scene hold no light."""
         self.disagreements: tuple[Disagreement, ...] = ()
         self.refused: tuple[Granule, ...] = ()
         """Files of the scene that cannot be used, of which one turned out when steps read it."""
@@ -214,10 +216,10 @@ class _Work(ABC):
         held = [channel.name for channel in scene.layout if channel.name in read]
         open_files = (job.campaign, scene)
         opened = partial(open_granules, *open_files, scene.granules, self.root)
-        names = [channel.name for channel in scene.layout]
-        lightless = lightless_profiles(opened(names), job.profiles_per_chunk)
-        for words in lightless_in_words({name: lightless[name] for name in held}):
-            self.notes[words] = None
+        everything = opened([channel.name for channel in scene.layout])
+        lightless = lightless_profiles(everything, job.profiles_per_chunk)
+        self.lightless |= bool(lightless)
+        self.notes |= dict.fromkeys(lightless_in_words(lightless, held))
         source = Source(
             archive=without_dark_shots(opened(held, stretches=stretches), lightless),
             dark=(
@@ -247,9 +249,12 @@ class _Work(ABC):
         """Write a product from its frame and the rows that follow."""
         with self._writer(next(results), context) as writer:
             for rows in results:
-                self.laps.end("retrieve")
-                writer.add(_told_from_gaps(rows))
-                self.laps.end("write")
+                self._add(rows, writer)
+
+    def _add(self, rows: xr.Dataset, writer: ProductWriter) -> None:
+        self.laps.end("retrieve")
+        writer.add(_told_from_gaps(rows) if self.lightless else rows)
+        self.laps.end("write")
 
 
 class _Instrument(_Work):
@@ -340,11 +345,10 @@ class _Instrument(_Work):
             profiles = profiles_together(source, channels, self.job.profiles_per_chunk)
             for chunk in chunks(source, channels, streams.values(), profiles):
                 for kind, rows in ((k, rows) for k, s in streams.items() for rows in s.add(chunk)):
-                    self.laps.end("retrieve")
                     if kind in writers:
-                        writers[kind].add(_told_from_gaps(rows))
-                        self.laps.end("write")
+                        self._add(rows, writers[kind])
                     else:
+                        self.laps.end("retrieve")
                         frame = _with_words(rows, contexts[kind], signal)
                         writer = self._writer(frame, contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
@@ -363,9 +367,8 @@ class _Instrument(_Work):
 def _told_from_gaps(rows: xr.Dataset) -> xr.Dataset:
     """Return rows of a product in whose flags no data are missing where there is no light."""
     flags = {str(name): rows[name] for name in rows if str(name).endswith(QUALITY_FLAG)}
-    lit = {name: (bits & int(Quality.NO_SIGNAL)) == 0 for name, bits in flags.items()}
-    kept = ~int(Quality.INPUT_MISSING)
-    return rows.assign({n: bits.where(lit[n], bits & kept) for n, bits in flags.items()})
+    dark, missing = int(Quality.NO_SIGNAL), int(Quality.INPUT_MISSING)
+    return rows.assign({n: f.where((f & dark) == 0, f & ~missing) for n, f in flags.items()})
 
 
 def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> xr.Dataset:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -349,7 +349,7 @@ class ProductStream(ABC):
 def lightless_profiles(
     archive: xr.Dataset, requested: int | None
 ) -> dict[str, npt.NDArray[np.bool_]]:
-    """Return the profiles of each channel that hold no light of the laser, (time,).
+    """Return which profiles hold no light of the laser, (time,), of channels that have any.
 
     Parameters
     ----------
@@ -360,10 +360,12 @@ def lightless_profiles(
         Number of profiles that are read together.
     """
     found, lasers = {}, {}
-    for name in (str(name) for name in archive if f"{name}_shots" in archive):
+    count = archive.sizes["time"]
+    for name in map(str, archive if count >= light.FEWEST else ()):
+        if f"{name}_shots" not in archive:
+            continue
         counts, attributes = archive[name], archive[name].attrs
-        count, bins = counts.shape
-        together = max(1, requested or CHUNK_BYTES // (4 * bins))
+        together = max(1, requested or CHUNK_BYTES // (4 * counts.shape[1]))
         parts = [
             light.excess_over_far(counts[first : first + together].to_numpy())
             for first in range(0, count, together)
@@ -373,29 +375,35 @@ def lightless_profiles(
         found[name] = light.light_of(excess, variance, measured)
         # Without a laser in the header, channels of one wavelength have one.
         lasers[name] = str(attributes.get("laser", attributes["wavelength_label"]))
-    return light.lightless(found, lasers)
+    return {name: rows for name, rows in light.lightless(found, lasers).items() if rows.any()}
 
 
 def without_dark_shots(
     archive: xr.Dataset, lightless: Mapping[str, npt.NDArray[np.bool_]]
 ) -> xr.Dataset:
     """Return raw counts in which profiles without light have no shots, and are named so."""
-    dark = {name: rows for name, rows in lightless.items() if name in archive and rows.any()}
-    shots = {name: archive[f"{name}_shots"] for name in dark}
-    return archive.assign(
-        {f"{name}_{LIGHTLESS}": ("time", rows) for name, rows in dark.items()}
-    ).assign({one.name: one.copy(data=one.where(~dark[n], 0)) for n, one in shots.items()})
+    for name in [name for name in lightless if name in archive]:
+        shots = archive[f"{name}_shots"]
+        archive = archive.assign(
+            {
+                f"{name}_{LIGHTLESS}": ("time", lightless[name]),
+                shots.name: shots.copy(data=shots.where(~lightless[name], 0)),
+            }
+        )
+    return archive
 
 
-def lightless_in_words(lightless: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
-    """Return a note for each number of profiles without light; none where all hold light."""
-    numbers: dict[tuple[int, int], list[str]] = {}
-    for name, rows in lightless.items():
-        numbers.setdefault((int(rows.sum()), rows.size), []).append(name)
+def lightless_in_words(
+    lightless: Mapping[str, npt.NDArray[np.bool_]], held: Collection[str]
+) -> list[str]:
+    """Return a note of the channels that are held for each number of profiles without light."""
+    names: dict[tuple[int, int], list[str]] = {}
+    for name in [name for name in held if name in lightless]:
+        rows = lightless[name]
+        names.setdefault((int(rows.sum()), rows.size), []).append(name)
     return [
-        f"without light: {dark} of {count} profiles of {', '.join(names)}, which are in no mean"
-        for (dark, count), names in numbers.items()
-        if dark
+        f"without light: {dark} of {count} profiles of {', '.join(of)}, which are in no mean"
+        for (dark, count), of in names.items()
     ]
 
 

@@ -300,7 +300,7 @@ def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Boo
 
     This tests the hypothesis that the light of the cell differs by no more than the factor
     :math:`c` from part to part, whatever the aerosol and its drift. If that holds everywhere, a
-    part is outlying with a probability below `Thresholds.screening_false_alarm` for each mean:
+    part is outlying with a probability below `Thresholds.false_alarm` for each mean:
     :math:`t` is the quantile of the normal distribution for that rate over the number of cells and
     parts (Bonferroni bound), with a margin for few counts (`skewness_margin`). The same test of
     :math:`-x` finds signals below zero. Noise that exceeds the stated one in the far half of a
@@ -328,7 +328,7 @@ def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Boo
     if not most:
         return outlying
     excess = estimate_noise_correlation(cells.power, cells.variance).excess
-    least = -float(ndtri(THRESHOLDS.screening_false_alarm / (len(_SIGNS) * count * size)))
+    least = -float(ndtri(THRESHOLDS.false_alarm / (len(_SIGNS) * count * size)))
     margin = float(skewness_margin(least)) * cells.quantum
     power, variance = (frozen(array[:, compared]) for array in (cells.power, cells.variance))
     _mark_parts(power, variance, frozen(excess), frozen(margin), contrast, least, outlying)

@@ -110,7 +110,7 @@ def estimate_dead_time(groups: Sequence[ProfileGroup], lag: float) -> DeadTimeEs
     if whole is None or low is None:
         return None
     dead_time, noise, load = whole
-    if not dead_time > THRESHOLDS.least_dead_time * noise or load < THRESHOLDS.least_load:
+    if not dead_time > THRESHOLDS.least_significance * noise or load < THRESHOLDS.least_load:
         return None
     # A quadratic analog record looks like a dead time: this changes the largest signal by a share.
     bent = THRESHOLDS.analog_nonlinearity * (1.0 - load) / load * dead_time

@@ -152,7 +152,7 @@ def glue(
         common = misfit & _misfits(changed)
     empty, error = past == 0, np.sqrt(line["slope_variance"])
     with np.errstate(invalid="ignore"):
-        poor_fit = misfit | ~(line["slope"] >= THRESHOLDS.least_slope * error)
+        poor_fit = misfit | ~(line["slope"] >= THRESHOLDS.least_significance * error)
     result = GluedSignal(
         power=power,
         variance=variance,

@@ -111,7 +111,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> ChannelLag:
     scatter = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
     confidence, defined = _confidence(total, lag), bool(np.isfinite(lag))
     error = float(np.hypot(scatter, systematic)) if defined else math.nan
-    significant = confidence >= THRESHOLDS.confidence and error < 0.5 * THRESHOLDS.peak_width
+    significant = confidence >= 1.0 - THRESHOLDS.false_alarm and error < 0.5 * THRESHOLDS.peak_width
     return ChannelLag(float(lag), error, confidence, significant and not at_end)
 
 
@@ -133,8 +133,8 @@ def _noise(profiles: Array) -> Array:
     present = np.ones((1, finite.shape[-1])) if complete else finite.astype(np.float64)
     bins = np.maximum(_box(present, THRESHOLDS.high_pass), 1.0)
     rough = np.where(finite, filled - _box(filled, THRESHOLDS.high_pass) / bins, 0.0)
-    square = _box((rough**2).sum(axis=-2, keepdims=True), THRESHOLDS.scale_window)
-    bins = _box(finite.sum(axis=-2, keepdims=True).astype(np.float64), THRESHOLDS.scale_window)
+    square = _box((rough**2).sum(axis=-2, keepdims=True), THRESHOLDS.variance_window)
+    bins = _box(finite.sum(axis=-2, keepdims=True).astype(np.float64), THRESHOLDS.variance_window)
     deviation = np.sqrt(square / np.maximum(bins, 1.0))
     floor = 1e-12 * np.max(deviation, axis=-1, keepdims=True, initial=0.0)
     scaled = np.where(deviation > floor, rough / np.where(deviation > floor, deviation, 1.0), 0.0)

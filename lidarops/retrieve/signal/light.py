@@ -20,7 +20,7 @@ _WINDOWS: Final = 32
 """Windows of equal length into which the bins before the far range are cut."""
 _FAR: Final = 10
 """The far range is the last of so many equal parts of the bins."""
-_FEWEST: Final = 5
+FEWEST: Final = 5
 """Profiles; fewer tell nothing."""
 
 
@@ -49,7 +49,7 @@ class Light(NamedTuple):
         """
         lit = self.excess[self.measured & (self.excess >= THRESHOLDS.shows_light)]
         share = THRESHOLDS.telling_share
-        if lit.size < max(_FEWEST, share * self.excess.size):
+        if lit.size < max(FEWEST, share * self.excess.size):
             return False
         return bool(np.quantile(lit, share) >= THRESHOLDS.tells_of_light)
 
@@ -111,10 +111,10 @@ def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str
     for laser in dict.fromkeys(lasers.values()):
         channels = [name for name in found if lasers[name] == laser]
         own = {name: found[name].dark for name in channels if found[name].tells}
-        nothing = len(found[channels[0]].excess) >= _FEWEST and all(
+        nothing = len(found[channels[0]].excess) >= FEWEST and all(
             found[name].of_sum < THRESHOLDS.shows_light for name in channels
         )
         unlit = np.full_like(found[channels[0]].measured, nothing)
         agreed = np.logical_and.reduce(list(own.values())) if own else unlit
-        dark |= {name: own.get(name, agreed) for name in channels}
+        dark |= {name: own.get(name, agreed) & found[name].measured for name in channels}
     return dark

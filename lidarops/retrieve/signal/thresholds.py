@@ -35,8 +35,9 @@ class Thresholds(NamedTuple):
     cloud_contrast: float = 3.0
     """Factor of the rise at a cloud, at 532 nm. The scattering ratio of aerosol rarely rises by
     this factor within 2 km, that of thin cirrus does. Assumed."""
-    screening_false_alarm: float = 0.001
-    """Probability that noise makes a part of a mean outlying. Required of the product."""
+    false_alarm: float = 0.001
+    """Probability that noise makes a part of a mean outlying, which is required of the product, and
+    that noise without a common cause gives a lag."""
 
     # Analog
     baseline: float = 0.02
@@ -90,8 +91,8 @@ class Thresholds(NamedTuple):
     session_gap: float = 1800.0
     """s; dark files farther apart belong to different sessions. Assumed."""
     variance_window: int = 65
-    """Bins over which the scatter of repeats is averaged: that of 3 repeats alone is off by 100 %.
-    """
+    """Bins over which the scatter of repeats is averaged, and that of the noise that gives a lag:
+    that of 3 repeats alone is off by 100 %."""
     far_share: float = 0.5
     """Share of the bins, from the far end, that gives the noise of a file without repeats.
     Assumed."""
@@ -99,14 +100,10 @@ class Thresholds(NamedTuple):
     # Lag
     largest_lag: int = 30
     """Bins; largest lag that is searched. Assumed."""
-    confidence: float = 0.999
-    """Least probability that noise without a common cause has a lower peak. Assumed."""
     fewest_lag_bins: int = 200
     """Bins between the largest lags. Assumed."""
     high_pass: int = 17
     """Bins of the running mean that is subtracted to leave the noise. Assumed."""
-    scale_window: int = 65
-    """Bins over which the standard deviation of the noise is taken. Assumed."""
     clip: float = 5.0
     """Standard deviations at which the noise is clipped, against spikes. Assumed."""
     peak_width: int = 4
@@ -127,8 +124,9 @@ class Thresholds(NamedTuple):
     smoothing: int = 31
     """Bins over which signals are averaged before the window is chosen. Edges that follow the noise
     of single bins would bias the slope. Assumed."""
-    least_slope: float = 5.0
-    """Standard errors by which the slope must exceed 0. Assumed."""
+    least_significance: float = 5.0
+    """Standard errors by which the slope must exceed 0, as must a dead time: else weak light gives
+    up to 100 ns (`test_noise_shows_no_dead_time`)."""
     largest_misfit: float = 1.5
     """Chi-square of the line over its degrees of freedom, for many bins. Assumed."""
     misfit_false_alarm: float = 1e-4
@@ -142,9 +140,6 @@ class Thresholds(NamedTuple):
     least_load: float = 0.1
     """Share that the largest must reach: at 0.08, an analog baseline of 1 uV makes a dead time 10
     stated errors too small (`test_a_baseline_shows_no_dead_time`)."""
-    least_dead_time: float = 5.0
-    """Standard errors of noise below which there is no dead time: else weak light gives up to 100
-    ns (`test_noise_shows_no_dead_time`)."""
     analog_nonlinearity: float = 0.01
     """Share by which the largest analog signal may be wrong, and smaller ones by less in
     proportion. Assumed; without it the error is 3 to 10 times too small
