@@ -218,7 +218,7 @@ class Flags:
 
     kind: str
     version: int
-    """Raised when a bit gets another place. Version 1 is that of files that state none."""
+    """Raised when a bit gets another place."""
     bits: tuple[FlagBit, ...]
     """Bits of `Quality`, then the kind's own; rising."""
     layout: str = field(init=False)

@@ -19,7 +19,7 @@ from lidarops.aggregate.means_variables import (
 )
 from lidarops.flags import Quality
 from lidarops.netcdf.quantities import CLOUD_FRACTION, CLOUD_MASK
-from lidarops.netcdf.stored_flags import flags_names, with_current_flags
+from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, Layout, Row, judging, whole_error
 
 _ALL_BITS: Final = np.int32(-1)
@@ -161,7 +161,7 @@ class Profiles:
 
     samples: Mapping[str, Sample]
     flags: Mapping[str, NDArray[np.int32]]
-    """Variable of flags -> bits at the places of now, whatever their places in the file."""
+    """Variable of flags -> bits."""
     shots: Array
     clouds: Sample | None
     """Share of cloudy profiles of each value. None for kinds that seek no clouds."""
@@ -180,10 +180,10 @@ def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
     Raises
     ------
     ProductError
-        If it carries a quality bit that its kind does not have.
+        If it has bits of flags at other places than its kind has now.
     """
-    current = with_current_flags(product)
-    flags = {name: current[name].values for name in flags_names(current)}
+    refuse_moved_flags(product)
+    flags = {name: product[name].values for name in flags_names(product)}
     usable = {name: (bits & np.int32(layout.flags.rejecting)) == 0 for name, bits in flags.items()}
     return Profiles(
         {

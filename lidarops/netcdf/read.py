@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError
-from lidarops.netcdf.stored_flags import with_current_flags
+from lidarops.netcdf.stored_flags import refuse_moved_flags
 
 NETCDF_MAGIC: Final = (b"CDF\x01", b"CDF\x02", b"CDF\x05", b"\x89HDF")
 """First bytes of NetCDF files."""
@@ -180,8 +180,8 @@ def open_product(path: str | Path, names: Iterable[str]) -> Iterator[xr.Dataset]
     Raises
     ------
     ProductError
-        If there is no such file or it cannot be read; if ``quality_flag`` carries a bit that its
-        kind does not have; possibly only when values are read.
+        If there is no such file; if it has bits of flags at other places than its kind has now; if
+        it cannot be read, possibly only when values are.
     """
     with ExitStack() as until_closed:
         with reading(path):
@@ -193,7 +193,8 @@ def open_product(path: str | Path, names: Iterable[str]) -> Iterator[xr.Dataset]
             }
             whole = xr.Dataset(stored, attrs=store.get_attrs())
             product = xr.decode_cf(whole, decode_coords=False, decode_timedelta=False)
-            product = with_current_flags(product.drop_indexes(list(product.xindexes)))
+            refuse_moved_flags(product)
+            product = product.drop_indexes(list(product.xindexes))
             for variable in product.variables.values():
                 # Small variables are read at once: most are used several times.
                 if variable.nbytes < LAZY_BYTES:

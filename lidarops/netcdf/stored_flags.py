@@ -1,15 +1,14 @@
 """Quality bits of a file, by the ``flag_masks`` and ``flag_meanings`` that the file states.
 
 Files written by other versions may have a bit at another place than its kind has now, so a number
-alone has no meaning. Results are either those of the file, or given the places of now.
+alone has no meaning. Who goes by the places of now refuses such a file.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -19,11 +18,10 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Flags, Quality, Severity
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.variables import QUALITY_FLAG, judging, layout_of, summary_of
+from lidarops.netcdf.variables import QUALITY_FLAG, judging, summary_of
 from lidarops.records import Verdicts
 
 Values = NDArray[Any]
-Recoding = Callable[[Values], Values]
 READ_VALUES: Final = 2_000_000
 """Most flags in memory."""
 
@@ -185,75 +183,24 @@ class FlagCounter:
                 self.carried[mask] += int(np.count_nonzero(values & mask))
 
 
-def recoding(
-    attributes: Mapping[str, Any], kind: object, name: str = QUALITY_FLAG
-) -> Recoding | None:
-    """Return what moves the bits of a file's flags to their places of now.
-
-    Parameters
-    ----------
-    attributes : mapping
-        Of a variable of flags. Without ``flag_masks``, the places are those of now.
-    kind : object
-        Kind of product that the file states.
-    name : str
-        Name of the variable.
-
-    Returns
-    -------
-    callable or None
-        Raises `ProductError` where a value carries a bit that the file does not name, or that the
-        kind no longer has. None where no bit has moved, or the kind is not known.
-    """
-    flags = _flags_of_known_kind(kind)
-    meanings = None if flags is None else _meanings(attributes)
-    if flags is None or meanings is None:
-        return None
-    layout = layout_of(str(kind))
-    own = layout.row(name).flags if name in layout.rows else None
-    if meanings == {bit.word: int(bit) for bit in own or flags}:
-        return None
-    return partial(_recoded, meanings=meanings, flags=flags)
-
-
-def _recoded(values: Values, *, meanings: Mapping[str, int], flags: Flags) -> Values:
-    moved = np.zeros_like(values)
-    rest = int(np.bitwise_or.reduce(values, axis=None))
-    for word, mask in meanings.items():
-        bit = flags.named(word)
-        if bit is not None:
-            moved |= np.where(values & mask, int(bit), 0).astype(values.dtype)
-            rest &= ~mask
-    if rest:
-        raise ProductError(
-            f"carries bits that kind {flags.kind} does not have: {places(rest)}",
-            field=QUALITY_FLAG,
-            remedy="make the product again: lidarops reprocess",
-        )
-    return moved
-
-
-def with_current_flags(product: xr.Dataset) -> xr.Dataset:
-    """Return a product of a known kind with the bits of its flags at the places of now.
+def refuse_moved_flags(product: xr.Dataset) -> None:
+    """Refuse a product of a known kind whose flags have bits at other places than now.
 
     Raises
     ------
     ProductError
-        If a value carries a bit that the file does not name, or that the kind no longer has.
+        If a bit that the file names has another place, or its kind no longer has it.
     """
-    for name in flags_names(product):
-        stored = product[name]
-        recode = recoding(stored.attrs, product.attrs.get("lidarops_kind"), name)
-        if recode is None:
-            continue
-        moved = stored.copy(data=recode(stored.values))
-        flags = flags_of(product.attrs["lidarops_kind"])
-        moved.attrs |= {
-            "flag_masks": np.array(flags.bits, dtype=moved.dtype),
-            "flag_meanings": flags.words,
-        }
-        product = product.assign({name: moved})
-    return product
+    flags = _flags_of_known_kind(product.attrs.get("lidarops_kind"))
+    now = {bit.word: int(bit) for bit in flags or ()}
+    for name in flags_names(product) if now else ():
+        moved = (_meanings(product[name].attrs) or {}).items() - now.items()
+        if moved:
+            raise ProductError(
+                f"has other places of bits than this version: {', '.join(sorted(dict(moved)))}",
+                field=name,
+                remedy="make the product again: lidarops reprocess",
+            )
 
 
 def places(bits: int) -> str:

@@ -265,10 +265,13 @@ def idle_window(step: PlannedStep, steps: Collection[PlannedStep]) -> str:
     return f"{' and '.join(needing)} need{'s' if len(needing) == 1 else ''} all bins"
 
 
-def bins_with_noise(nearest: float, farthest: float, case: ChannelCase[Any]) -> tuple[int, int]:
+def bins_within(
+    nearest: float, farthest: float, case: ChannelCase[Any], *, averaged: bool = False
+) -> tuple[int, int]:
     """Return the bins of counts between ranges in m, with those that their noise needs.
 
-    The variance of a count is that of the mean over a share of the range on either side.
+    The variance of a count is that of the mean over a share of the range on either side. Bins that
+    are averaged need no others: the noise at the ends then comes from fewer bins.
 
     Returns
     -------
@@ -276,21 +279,11 @@ def bins_with_noise(nearest: float, farthest: float, case: ChannelCase[Any]) -> 
         The first bin, and the one past the last, which may lie beyond the channel.
     """
     width, offset = case.channel.bin_width, case.range_offset
+    share = THRESHOLDS.noise_window
     # Two for rounding.
     before, behind = (
-        max(math.ceil(THRESHOLDS.noise_window * distance / width), MIN_NOISE_BINS) + 2
+        2 if averaged else max(math.ceil(share * distance / width), MIN_NOISE_BINS) + 2
         for distance in (nearest, farthest)
     )
     first = math.floor((nearest - offset) / width) - before
-    return max(first, 0), math.ceil((farthest - offset) / width) + behind
-
-
-def bins_within(nearest: float, farthest: float, case: ChannelCase[Any]) -> tuple[int, int]:
-    """Return the bins of counts between ranges in m, without a margin for their noise.
-
-    For bins that are averaged: the noise at the ends then comes from fewer bins.
-    """
-    width, offset = case.channel.bin_width, case.range_offset
-    # Two for rounding.
-    first = math.floor((nearest - offset) / width) - 2
-    return max(first, 0), max(math.ceil((farthest - offset) / width) + 2, 0)
+    return max(first, 0), max(math.ceil((farthest - offset) / width) + behind, 0)

@@ -65,14 +65,13 @@ from lidarops.scene.job import (
 )
 from lidarops.scene.pipe import channel_signal
 from lidarops.scene.profiles import (
+    LIGHTLESS,
     ChannelSignal,
     Source,
     chunks,
     in_one_batch,
-    lightless_in_words,
     lightless_profiles,
     profiles_together,
-    without_dark_shots,
 )
 from lidarops.scene.retrieval import (
     Derivation,
@@ -181,8 +180,6 @@ class _Work(ABC):
         """Products that are written, in the order in which they were complete."""
         self.notes: dict[str, None] = {}
         """What the data did not give, each once."""
-        self.lightless = False
-        """Whether profiles of the scene hold no light."""
         self.disagreements: tuple[Disagreement, ...] = ()
         self.refused: tuple[Granule, ...] = ()
         """Files of the scene that cannot be used, of which one turned out when steps read it."""
@@ -218,10 +215,15 @@ class _Work(ABC):
         opened = partial(open_granules, *open_files, scene.granules, self.root)
         everything = opened([channel.name for channel in scene.layout])
         lightless = lightless_profiles(everything, job.profiles_per_chunk)
-        self.lightless |= bool(lightless)
-        self.notes |= dict.fromkeys(lightless_in_words(lightless, held))
+        archive = opened(held, stretches=stretches)
+        for name in [name for name in held if name in lightless]:
+            dark, shots = lightless[name], archive[f"{name}_shots"]
+            none = {f"{name}_{LIGHTLESS}": ("time", dark), shots.name: shots.where(~dark, 0)}
+            archive = archive.assign(none)
+            words = f"{dark.sum()} of {dark.size} profiles of {name}, which are in no mean"
+            self.notes[f"without light: {words}"] = None
         source = Source(
-            archive=without_dark_shots(opened(held, stretches=stretches), lightless),
+            archive=archive,
             dark=(
                 open_granules(*open_files, scene.dark, self.root, subtracted)
                 if subtracted and scene.dark
@@ -253,7 +255,7 @@ class _Work(ABC):
 
     def _add(self, rows: xr.Dataset, writer: ProductWriter) -> None:
         self.laps.end("retrieve")
-        writer.add(_told_from_gaps(rows) if self.lightless else rows)
+        writer.add(_told_from_gaps(rows))
         self.laps.end("write")
 
 

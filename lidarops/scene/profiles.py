@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -376,35 +376,6 @@ def lightless_profiles(
         # Without a laser in the header, channels of one wavelength have one.
         lasers[name] = str(attributes.get("laser", attributes["wavelength_label"]))
     return {name: rows for name, rows in light.lightless(found, lasers).items() if rows.any()}
-
-
-def without_dark_shots(
-    archive: xr.Dataset, lightless: Mapping[str, npt.NDArray[np.bool_]]
-) -> xr.Dataset:
-    """Return raw counts in which profiles without light have no shots, and are named so."""
-    for name in [name for name in lightless if name in archive]:
-        shots = archive[f"{name}_shots"]
-        archive = archive.assign(
-            {
-                f"{name}_{LIGHTLESS}": ("time", lightless[name]),
-                shots.name: shots.copy(data=shots.where(~lightless[name], 0)),
-            }
-        )
-    return archive
-
-
-def lightless_in_words(
-    lightless: Mapping[str, npt.NDArray[np.bool_]], held: Collection[str]
-) -> list[str]:
-    """Return a note of the channels that are held for each number of profiles without light."""
-    names: dict[tuple[int, int], list[str]] = {}
-    for name in [name for name in held if name in lightless]:
-        rows = lightless[name]
-        names.setdefault((int(rows.sum()), rows.size), []).append(name)
-    return [
-        f"without light: {dark} of {count} profiles of {', '.join(of)}, which are in no mean"
-        for (dark, count), of in names.items()
-    ]
 
 
 def in_one_batch(product: xr.Dataset) -> Iterator[xr.Dataset]:

@@ -25,7 +25,7 @@ from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.time_axis import TIME_BOUNDS
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
-from lidarops.netcdf.stored_flags import flags_names, with_current_flags
+from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.site import pages, product_contents
 from lidarops.site.links import BESIDE, Links
@@ -321,7 +321,8 @@ def _draw(
     problem = ""
     try:
         if figures is not None:
-            return _figures(with_current_flags(opened), figures.views, quality), ""
+            refuse_moved_flags(opened)
+            return _figures(opened, figures.views, quality), ""
     except UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import netCDF4
@@ -21,10 +22,9 @@ from lidarops.netcdf.read import open_product
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
     bits_of,
-    recoding,
+    refuse_moved_flags,
     rejecting_mask,
     stored_bits,
-    with_current_flags,
 )
 from lidarops.netcdf.write import write_product
 from lidarops.records import Verdicts
@@ -35,20 +35,14 @@ FIRST_PLACES = {"poorly_determined": 7, "poor_fit": 10, "at_bound": 9, "not_leve
 """Of homogeneous products before kinds had bits of their own."""
 
 
-def product_of_now(path: Path, profiles: int) -> np.ndarray:
-    """Write a homogeneous product with all bits of its kind; return them."""
+def older(path: Path, *, more: int = 0) -> np.ndarray:
+    """Write a homogeneous product with bits at their first places; return its bits of now."""
     flags = flags_of("homogeneous")
-    data = MAKERS["homogeneous"](profiles=profiles).fillna(1.0)
-    shape = data["quality_flag"].shape
-    now = np.resize(np.array([int(bit) for bit in flags], np.int32), shape)
+    data = MAKERS["homogeneous"](profiles=3).fillna(1.0)
+    bits = np.array([int(bit) for bit in flags], np.int32)
+    now = np.resize(bits, data["quality_flag"].shape)
     data["quality_flag"][:] = now
     write_product(build_product(data, context("homogeneous")), path)
-    return now
-
-
-def older(path: Path, *, profiles: int = 3, more: int = 0) -> np.ndarray:
-    """Write a homogeneous product with bits at their first places; return its bits of now."""
-    now, flags = product_of_now(path, profiles), flags_of("homogeneous")
     first = {bit.word: 1 << FIRST_PLACES.get(bit.word, int(bit).bit_length() - 1) for bit in flags}
     with netCDF4.Dataset(path, "a") as file:
         variable = file["quality_flag"]
@@ -59,18 +53,17 @@ def older(path: Path, *, profiles: int = 3, more: int = 0) -> np.ndarray:
     return now
 
 
-@pytest.mark.parametrize("profiles", [3, 4000])
-def test_reading_moves_bits_to_their_places_of_now(tmp_path: Path, profiles: int):
-    now = older(tmp_path / "older.nc", profiles=profiles)
-    with open_product(tmp_path / "older.nc", ["quality_flag"]) as product:
-        np.testing.assert_array_equal(product["quality_flag"].isel(time=slice(1, 3)), now[1:3])
-        np.testing.assert_array_equal(product["quality_flag"], now)
-    with xr.open_dataset(tmp_path / "older.nc") as product:
-        moved = with_current_flags(product)["quality_flag"]
-        np.testing.assert_array_equal(moved, now)
-        # Who reads the values goes by the places that are stated with them.
-        stated = {bit.word: bit.mask for bit in stored_bits(moved.attrs, "homogeneous")}
-        assert {bit.word: int(bit) for bit in flags_of("homogeneous")}.items() <= stated.items()
+def test_who_goes_by_the_places_of_now_refuses_others(tmp_path: Path):
+    older(tmp_path / "older.nc")
+    words = "not_level, poor_fit, poorly_determined"
+    refused = pytest.raises(ProductError, match=words)
+    with refused, open_product(tmp_path / "older.nc", ["quality_flag"]):
+        pass
+    with xr.open_dataset(tmp_path / "older.nc") as product, pytest.raises(ProductError):
+        refuse_moved_flags(product)
+    result = write_means(tmp_path, [facts_of(tmp_path / "older.nc")], Period.DAY)
+    assert not result.files
+    assert [words in refused.reason for refused in result.refused] == [True]
 
 
 def facts_of(file: Path) -> Facts:
@@ -92,36 +85,23 @@ def test_facts_and_inspection_go_by_the_meanings_of_the_file(tmp_path: Path):
     }
 
 
-def test_means_of_older_products_are_those_of_products_of_now(tmp_path: Path):
-    product_of_now(tmp_path / "now.nc", 3)
-    older(tmp_path / "older.nc")
-    means = []
-    for name in ("now", "older"):
-        (written,) = write_means(tmp_path, [facts_of(tmp_path / f"{name}.nc")], Period.DAY).files
-        means.append(xr.load_dataset(tmp_path / written.path))
-    assert means[0].quality_flag.values.any()
-    for name in ("quality_flag", "usable", "usable_share", "total_extinction"):
-        xr.testing.assert_identical(means[0][name].variable, means[1][name].variable)
-    groups = {facts_of(tmp_path / f"{name}.nc").group for name in ("now", "older")}
-    assert len(groups) == 2, "views over both would mix bits"
-
-
 def test_bits_without_a_name_are_reported_by_number(tmp_path: Path):
     older(tmp_path / "older.nc", more=1 << 25 | 1 << 27)
     rows = {row["name"]: row for row in describe(tmp_path / "older.nc")["quality"]}
     assert rows["bit_25"]["severity"] == rows["bit_27"]["severity"] == "unknown"
-    refused = pytest.raises(ProductError, match="does not have: 25, 27")
-    with refused, open_product(tmp_path / "older.nc", ["quality_flag"]):
-        pass
 
 
-def test_bits_that_a_kind_no_longer_has_are_refused_only_where_they_are_raised():
-    attributes = {"flag_masks": np.array([1, 2]), "flag_meanings": "input_missing gone"}
-    recode = recoding(attributes, "signal")
-    assert recode is not None
-    np.testing.assert_array_equal(recode(np.array([0, 1])), [0, 1])
-    with pytest.raises(ProductError, match="kind signal does not have: 1"):
-        recode(np.array([0, 3]))
+@pytest.mark.parametrize(
+    ("words", "masks", "fits"),
+    [("input_missing", 1, True), ("input_missing", 2, False), ("gone", 1, False)],
+)
+def test_a_file_may_name_fewer_bits_but_no_others(words: str, masks: int, fits: bool):
+    flags = xr.DataArray(np.zeros(4, np.int32), dims="time")
+    flags.attrs = {"flag_masks": np.int32([masks]), "flag_meanings": words}
+    product = xr.Dataset({"quality_flag": flags}, attrs={"lidarops_kind": "signal"})
+    with nullcontext() if fits else pytest.raises(ProductError, match=words):
+        refuse_moved_flags(product)
+    refuse_moved_flags(product.assign_attrs(lidarops_kind="of another package"))
 
 
 def test_masks_and_meanings_must_agree():

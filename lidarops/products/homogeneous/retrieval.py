@@ -30,7 +30,7 @@ from lidarops.scene.choices import (
     FEWEST_BINS,
     WINDOW,
     WindowSettings,
-    bins_with_noise,
+    bins_within,
     moves,
     tail,
 )
@@ -67,7 +67,7 @@ def _window(case: Case, level: Sequence[Section], method: Method) -> Entry:
         return case.leave(WINDOW, ALL_STEPS)
     if method == "known_background" and not case.request.background:
         return case.leave(WINDOW, "the background is that of the far range")
-    bins = bins_with_noise(0.0, max(far for _, far in level), case)[1]
+    bins = bins_within(0.0, max(far for _, far in level), case)[1]
     if not 0 < bins < case.channel.bins:
         reason = "a section extends to the last bin"
         return case.leave(WINDOW, reason, number=float(case.channel.bins))

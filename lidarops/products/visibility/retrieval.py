@@ -51,7 +51,6 @@ from lidarops.scene.choices import (
     WindowSettings,
     average,
     background,
-    bins_with_noise,
     bins_within,
     merged,
     tail,
@@ -80,8 +79,9 @@ def _window(case: Case, farthest: float) -> Entry:
         return case.leave(WINDOW, ALL_STEPS, rule=rule)
     width, (start, stop) = channel.bin_width, tail(case, case.request.background_range)
     low, high = window_before(start + width)
-    near = bins_with_noise(0.0, farthest + THRESHOLDS.bins_beyond * width, case)
-    far = (bins_within(low - width, high, case), bins_within(start, stop, case))
+    near = bins_within(0.0, farthest + THRESHOLDS.bins_beyond * width, case)
+    ends = (low - width, high), (start, stop)
+    far = (bins_within(*limits, case, averaged=True) for limits in ends)
     kept = merged((first, min(past, channel.bins)) for first, past in (near, *far))
     number = float(sum(past - first for first, past in kept))
     if len(kept) == 1 and number == channel.bins:

@@ -14,14 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.background.estimate import detected, from_tail, shifts
-from lidarops.retrieve.common.arrays import (
-    Array,
-    Booleans,
-    Flags,
-    Indices,
-    Integers,
-    root_sum_square,
-)
+from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers, root_sum_square
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
@@ -145,8 +138,6 @@ def retrieve_network(
     dimensions = ("time", "crossing")
     visibility = visibility_of_extinction(extinction, random, systematic, settings.visibility)
     flags = _quality_flags(result, errors, signals, network)[:, near]
-    dark = _lightless(beams, intervals, network)[:, near] & ((flags & Quality.INPUT_MISSING) != 0)
-    flags |= dark * np.int32(Quality.NO_SIGNAL)
     multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
     if settings.multiplier is None:
         multiplier = {}
@@ -202,7 +193,8 @@ def _gather_signals(
         tail_signal[rows, index] = detected(sky.left, sky.left_standard_error)
         ranges = network.on_beam(index)[1]
         used = (distance >= ranges[0]) & (distance <= ranges[-1])
-        warnings[rows, index] = np.bitwise_or.reduce(quality[:, used] & np.int32(_WARNINGS), axis=1)
+        passed = np.int32(_WARNINGS | Quality.NO_SIGNAL)
+        warnings[rows, index] = np.bitwise_or.reduce(quality[:, used] & passed, axis=1)
         warnings[rows, index] |= sky.unjudged * np.int32(Quality.BACKGROUND_UNCERTAIN)
     # Farther bins do not matter, and the network is solved many times.
     used_bins = slice(_bins_used(grid, network))
@@ -216,16 +208,6 @@ def _gather_signals(
         overlap[:, used_bins],
         np.ascontiguousarray(baseline[..., used_bins]),
     )
-
-
-def _lightless(beams: Sequence[BeamAverages], intervals: Integers, network: Network) -> Booleans:
-    """Return where a beam holds no light of its laser, (interval, crossing)."""
-    dark = np.zeros((intervals.size, network.crossings), dtype=np.bool_)
-    for index, beam in enumerate(beams):
-        bits = beam.averages["quality"].to_numpy() & np.int32(Quality.NO_SIGNAL)
-        rows = np.searchsorted(intervals, beam.interval[bits.any(axis=1)])
-        dark[np.ix_(rows, network.on_beam(index)[0])] = True
-    return dark
 
 
 def _bins_used(grid: Array, network: Network) -> int:
@@ -375,6 +357,8 @@ def _quality_flags(
     bits = result.quality.copy()
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
         bits[:, crossing] |= signals.warnings[:, index]
+    # Light of other beams gives a value.
+    bits[(bits & np.int32(Quality.INPUT_MISSING)) == 0] &= ~np.int32(Quality.NO_SIGNAL)
     with np.errstate(invalid="ignore"):
         uncertain = ~(np.hypot(errors.random, errors.systematic) < result.extinction)
     background_doubt = shifts(errors.tail_signal, errors.random)

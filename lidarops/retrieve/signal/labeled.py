@@ -185,7 +185,10 @@ def baseline_error(profiles: xr.Dataset, *, decaying: bool = False) -> xr.DataAr
 
 
 def systematic_changes(profiles: xr.Dataset, background: xr.DataArray) -> dict[str, xr.DataArray]:
-    """Return the changes of signals without background with one standard error of each cause.
+    r"""Return the changes of signals without background with one standard error of each cause.
+
+    Power :math:`P` and background :math:`P^*` of photon counting change together with the dead
+    time, by :math:`(P^2 - P^{*2}) \sigma_\tau`. All bins and profiles share this error.
 
     Parameters
     ----------
@@ -197,62 +200,32 @@ def systematic_changes(profiles: xr.Dataset, background: xr.DataArray) -> dict[s
     Returns
     -------
     dict of str to xr.DataArray
-        In the unit of the power, over its dimensions: ``dead_time`` (`dead_time_error`) of photon
-        counting, ``baseline`` (`baseline_error`) of analog, both of glued signals.
+        In the unit of the power, over its dimensions: ``dead_time`` of photon counting,
+        ``baseline`` (`baseline_error`) of analog, both of glued signals.
     """
-    dead_time, baseline = dead_time_error(profiles, background), baseline_error(profiles)
-    changes = {} if dead_time is None else {"dead_time": dead_time}
-    if baseline is not None:
-        changes["baseline"] = baseline
-    return changes
-
-
-def dead_time_error(profiles: xr.Dataset, background: xr.DataArray) -> xr.DataArray | None:
-    r"""Return the change of signals without background with one standard error of the dead time.
-
-    Power :math:`P` and background :math:`P^*` of photon counting change together, by
-    :math:`(P^2 - P^{*2}) \sigma_\tau`. All bins and profiles share this error.
-
-    Parameters
-    ----------
-    profiles : xr.Dataset
-        From `condition`, `lidarops.retrieve.signal.labeled_gluing.glue`, or means of these.
-    background : xr.DataArray, (...)
-        MHz.
-
-    Returns
-    -------
-    xr.DataArray or None
-        MHz, over the dimensions of the power; None for analog signals.
-    """
-    power = profiles["power"]
-    if DEAD_TIME_ERROR not in power.attrs:
-        return None
-    per_square = power.attrs[DEAD_TIME_ERROR] * 1e6
-    of_background = background**2 * per_square
-    error: xr.DataArray
-    if "dead_time_error" in profiles:
-        error = profiles["dead_time_error"] - of_background
-        return error
-    # In place, because these are the largest arrays of a chunk.
-    error = power**2
-    error *= per_square
-    error -= of_background
-    return error
+    changes, of_power = {}, dead_time_change(profiles)
+    if of_power is not None:
+        changes["dead_time"] = profiles["power"].copy(data=of_power[0])
+        # In place, because these are the largest arrays of a chunk.
+        changes["dead_time"] -= background**2 * of_power[1]
+    baseline = baseline_error(profiles)
+    return changes if baseline is None else {**changes, "baseline": baseline}
 
 
 def dead_time_change(profiles: xr.Dataset) -> tuple[Block, float] | None:
     """Return the change of power with one standard error of the dead time, and a factor.
 
-    That of a background is the factor times its square (`dead_time_error`); None for analog.
+    That of a background is the factor times its square; None for analog. The array is a new one.
     """
     error = profiles["power"].attrs.get(DEAD_TIME_ERROR)
     if error is None:
         return None
     per_square = error * 1e6
     if "dead_time_error" in profiles:
-        return profiles["dead_time_error"].to_numpy(), per_square
-    return profiles["power"].to_numpy() ** 2 * per_square, per_square
+        return profiles["dead_time_error"].to_numpy().copy(), per_square
+    change = profiles["power"].to_numpy() ** 2
+    change *= per_square
+    return change, per_square
 
 
 def correct_for_range(

@@ -47,12 +47,10 @@ class PartSums:
     sums: RunningMean
     lengths: RunningMean
     quality: Flags
-    """(part, range), without INPUT_MISSING, and NO_SIGNAL only of parts without a shot."""
+    """(part, range), without INPUT_MISSING, and NO_SIGNAL only where no profile has shots."""
     profiles: Flags
     """(part,), their numbers, without those that have no shots."""
     shots: Flags
-    whole: int
-    """Number of all profiles of the interval."""
     units: Units
     """Attributes of power, variance and range."""
 
@@ -122,6 +120,8 @@ class IntervalSums:
         self._shots = np.add.reduceat(shots.to_numpy(), begins).astype(np.int32)
         self._shared_variance = shared_variance
         self.range, self.lag = distance, lag
+        self.counts = counts.astype(np.int32)
+        """Numbers of all profiles of each interval."""
         self._added = 0
         self._edges = np.append(first, interval.size)
         self._complete: list[PartSums] = []
@@ -164,11 +164,10 @@ class IntervalSums:
             self._add(*(array[first:past] for array in arrays))
             if past - first == left:
                 groups = slice(self._first_group, self._first_group + len(self._bits))
-                profiles, shots = self._profiles[groups], self._shots[groups]
-                self._bits[profiles > 0] &= ~_DARK
-                whole = int(self._edges[self._open + 1] - self._edges[self._open])
+                numbers = self._profiles[groups], self._shots[groups]
+                self._bits &= ~_DARK if numbers[0].any() else -1
                 self._complete.append(
-                    PartSums(self._sums, self._lengths, self._bits, profiles, shots, whole, units)
+                    PartSums(self._sums, self._lengths, self._bits, *numbers, units)
                 )
                 self._begin(self._open + 1)
             first = past
@@ -357,14 +356,12 @@ class ClockAverage:
             part_variance=(cells, of["part_variance"]),
             part_quantum=(cells[:2], of["part_quantum"]),
             part_profiles=(cells[:2], of["part_profiles"]),
-            profiles_left_out=("time", of["left_out"]),
+            profiles_left_out=("time", record.counts[numbers] - of["profiles"]),
         )  # fmt: skip
 
 
 def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:
-    """Return the mean of the parts that are kept, without those that hold no shot."""
-    lit = kept & (sums.profiles > 0)
-    kept = lit if lit.any() else kept
+    """Return the mean of the parts that are kept."""
     averages = sums.sums.joined(kept)
     quality = sums.quality if kept.all() else sums.quality[kept]
     return {
@@ -387,7 +384,6 @@ def _parts(sums: PartSums, cells: PartCells, kept: Booleans) -> dict[str, Any]:
     power[places], variance[places] = cells.power[places], cells.variance[places]
     quantum[places], of_parts[places] = cells.quantum[places], sums.profiles[places]
     return {
-        "left_out": np.int32(sums.whole - sums.profiles[kept].sum()),
         "part_power": power,
         "part_variance": variance,
         "part_quantum": quantum,
