@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import xarray as xr
 
-from lidarops.constants import FIXED, LEAST_SPREAD, STEEPEST
+from lidarops.constants import FIXED, KNOWN_SHAPE_PAPERS, LEAST_SPREAD, STEEPEST
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
     BACKGROUND_METHOD,
@@ -35,7 +35,9 @@ FEWEST_BINS: Final = BACKGROUND.fewest_bins
 def with_methods(
     product: xr.Dataset, molecules: MolecularProfile, *, known_shape: bool
 ) -> xr.Dataset:
-    """Return the product with the source of its air and the method of its backgrounds."""
+    """Return the product with the source of its air, and method and papers of its backgrounds."""
+    if known_shape:
+        product = product.assign_attrs(references=KNOWN_SHAPE_PAPERS)
     source = "standard_atmosphere" if molecules.standard else "sounding"
     return product.assign(
         molecular_source=MOLECULAR_SOURCE.code(source),

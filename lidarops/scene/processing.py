@@ -40,6 +40,7 @@ from lidarops.records import (
     file_channels,
     mode_of_signal,
 )
+from lidarops.retrieve.signal.light import FEWEST
 from lidarops.scene.agreement import Retrieved, compare_channels
 from lidarops.scene.case import (
     READ_STEP,
@@ -210,25 +211,25 @@ class _Work(ABC):
         job = self.job
         read = {step.channel for step in steps if step.name == READ_STEP}
         subtracted = [step.channel for step in steps if step.name == "dark"]
-        held = [channel.name for channel in scene.layout if channel.name in read]
-        open_files = (job.campaign, scene)
-        opened = partial(open_granules, *open_files, scene.granules, self.root)
-        everything = opened([channel.name for channel in scene.layout])
-        lightless = lightless_profiles(everything, job.profiles_per_chunk)
-        archive = opened(held, stretches=stretches)
+        layout = [channel.name for channel in scene.layout]
+        held = [name for name in layout if name in read]
+        opened = partial(open_granules, job.campaign, scene, root=self.root)
+        archive = opened(scene.granules, channels=held, stretches=stretches)
+        # All channels and bins tell, whatever is made of them.
+        lightless = (
+            lightless_profiles(opened(scene.granules, channels=layout), job.profiles_per_chunk)
+            if len(scene.granules) >= FEWEST
+            else {}
+        )
         for name in [name for name in held if name in lightless]:
             dark, shots = lightless[name], archive[f"{name}_shots"]
-            none = {f"{name}_{LIGHTLESS}": ("time", dark), shots.name: shots.where(~dark, 0)}
-            archive = archive.assign(none)
+            unlit = {f"{name}_{LIGHTLESS}": ("time", dark), shots.name: shots.where(~dark, 0)}
+            archive = archive.assign(unlit)
             words = f"{dark.sum()} of {dark.size} profiles of {name}, which are in no mean"
             self.notes[f"without light: {words}"] = None
         source = Source(
             archive=archive,
-            dark=(
-                open_granules(*open_files, scene.dark, self.root, subtracted)
-                if subtracted and scene.dark
-                else None
-            ),
+            dark=(opened(scene.dark, channels=subtracted) if subtracted and scene.dark else None),
             ancillaries=Ancillaries.read(job.campaign.folder, ancillary_files(steps)),
             station_altitude=job.campaign.stations[scene.station].altitude,
         )

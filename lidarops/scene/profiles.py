@@ -207,6 +207,7 @@ class Averages:
         screening: Screening | None = None,
     ) -> None:
         self._channels, self._screened = channels, screening is not None
+        self._begun = False
         self._recorded = [record for channel in channels for record, _ in channel.recorded]
         first = channels[-1].range
         width = float(np.median(np.diff(first))) if first.size > 1 else 1.0
@@ -229,10 +230,18 @@ class Averages:
         profiles = (chunk.profiles(record) for record in self._recorded)
         self._means.add([one if rows is None else one.isel(time=rows) for one in profiles])
 
-    @property
-    def times(self) -> xr.Dataset:
-        """``time`` and ``time_bnds`` of all means."""
-        return self._means.times
+    def rows(self, chunk: Chunk, made: Callable[..., xr.Dataset]) -> Iterator[xr.Dataset]:
+        """Add all profiles of a chunk, and yield what is made of means, after its frame.
+
+        As a `ProductStream`; `made` takes means of each channel.
+        """
+        self.add(chunk)
+        for means in self.completed():
+            rows = made(*means)
+            if not self._begun:
+                self._begun = True
+                yield rows.drop_dims("time").assign_coords(self._means.times.coords)
+            yield rows
 
     def completed(self) -> Iterator[tuple[xr.Dataset, ...]]:
         """Yield the means that are complete, in batches, of each channel; and forget them."""
@@ -360,15 +369,14 @@ def lightless_profiles(
         Number of profiles that are read together.
     """
     found, lasers = {}, {}
-    count = archive.sizes["time"]
-    for name in map(str, archive if count >= light.FEWEST else ()):
+    for name in map(str, archive):
         if f"{name}_shots" not in archive:
             continue
         counts, attributes = archive[name], archive[name].attrs
         together = max(1, requested or CHUNK_BYTES // (4 * counts.shape[1]))
         parts = [
             light.excess_over_far(counts[first : first + together].to_numpy())
-            for first in range(0, count, together)
+            for first in range(0, len(counts), together)
         ]
         excess, variance = (np.concatenate(part) for part in zip(*parts, strict=True))
         measured = archive[f"{name}_shots"].to_numpy() > 0

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import xarray as xr
 
-from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.products.elastic import ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.retrieve.clouds.labeled import Reference
@@ -82,12 +81,6 @@ def _known_shape(case: Case) -> Entry:
     )
 
 
-def _reference(case: Case, limits: ReferenceWindowSettings) -> Entry:
-    """State where the reference window may lie."""
-    reason = "windows within the campaign's limits are tested against the molecular profile"
-    return case.run("reference", reason, limits, number=limits.highest - limits.lowest)
-
-
 def _lidar_ratio(case: Case) -> dict[str, Any]:
     """Return the settings of the lidar ratio: facts of the channel, or the settings of the kind."""
     facts = case.facts_of_channel
@@ -130,7 +123,8 @@ def _needs(case: Case) -> Entries:
     reason = "the noise of a single profile is too large for the inversion"
     yield average(case, request.average, reason)
     yield _known_shape(case)
-    yield _reference(case, limits)
+    reason = "windows within the campaign's limits are tested against the molecular profile"
+    yield case.run("reference", reason, limits, number=limits.highest - limits.lowest)
     settings = InversionSettings.taken_from(request, **_lidar_ratio(case))
     taken = (
         "read", "overlap", "noise", "glue", "molecular", "average", "known_shape", "reference"
@@ -165,7 +159,6 @@ class _Inversion(ProductStream):
             settings.average.seconds,
             Screening(cloud_contrast(signal.wavelength), self._reference.highest),
         )
-        self._begun = False
         constant = settings.elastic.lidar_ratio, settings.elastic.lidar_ratio_standard_error
         self._lidar_ratio = labeled.constant_ratio(*constant)
         if name := settings.elastic.lidar_ratio_profile:
@@ -173,14 +166,8 @@ class _Inversion(ProductStream):
             self._lidar_ratio = partial(profile.at, beyond=constant)
 
     def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
-        """Add the next profiles to their averages, and yield those that are complete, inverted."""
-        self._averages.add(chunk)
-        for (averages,) in self._averages.completed():
-            rows = self._inverted(averages)
-            if not self._begun:
-                self._begun = True
-                yield rows.drop_dims("time").assign_coords(self._averages.times.coords)
-            yield rows
+        """Add the next profiles to their averages; return those that are complete, inverted."""
+        return self._averages.rows(chunk, self._inverted)
 
     def _inverted(self, averages: xr.Dataset) -> xr.Dataset:
         signal, settings = self._signal, self._settings
@@ -196,8 +183,6 @@ class _Inversion(ProductStream):
             overlap=signal.overlap_at(averages["range"].to_numpy()),
             overlap_is_stated=signal.full_overlap_range is not None,
         )
-        if self._known_shape:
-            inverted = inverted.assign_attrs(references=KNOWN_SHAPE_PAPERS)
         least = settings.least_signal_to_noise
         flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
         glued = flagged.assign(gluing(averages))

@@ -9,7 +9,6 @@ from typing import Final, cast
 import xarray as xr
 
 from lidarops.campaign.model import channel_facts
-from lidarops.constants import KNOWN_SHAPE_PAPERS
 from lidarops.errors import SceneError
 from lidarops.products.raman import RamanProduct
 from lidarops.products.raman.variables import LAYOUT
@@ -175,7 +174,6 @@ class _Retrieval(ProductStream):
 
     def __init__(self, settings: RamanPlan, signal: ChannelSignal) -> None:
         self._settings, self._signal = settings.raman, signal
-        self._begun = False
         names = [signal.channel, *settings.raman.channels]
         highest = settings.raman.reference.highest * settings.raman.stretch
         self._averages = Averages(
@@ -187,14 +185,8 @@ class _Retrieval(ProductStream):
         )
 
     def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
-        """Add the next profiles to their averages, and yield those that are complete."""
-        self._averages.add(chunk)
-        for means in self._averages.completed():
-            rows = self._retrieved(*means)
-            if not self._begun:
-                self._begun = True
-                yield rows.drop_dims("time").assign_coords(self._averages.times.coords)
-            yield rows
+        """Add the next profiles to their averages; return what those give that are complete."""
+        return self._averages.rows(chunk, self._retrieved)
 
     def _retrieved(
         self, elastic: xr.Dataset, nitrogen: xr.Dataset, water: xr.Dataset | None = None
@@ -211,8 +203,6 @@ class _Retrieval(ProductStream):
             overlap=signal.overlap_at(elastic["range"].to_numpy()),
             overlap_is_stated=signal.full_overlap_range is not None,
         )
-        if settings.known_shape:
-            retrieved = retrieved.assign_attrs(references=KNOWN_SHAPE_PAPERS)
         weighed = [name for name in LAYOUT.weighed if name in retrieved]
         flagged = with_low_signal_to_noise(retrieved, weighed, settings.least_signal_to_noise)
         return with_methods(flagged, signal.molecules, known_shape=settings.known_shape)

@@ -146,21 +146,15 @@ def angle_between(pointing: tuple[float, float], other: tuple[float, float]) -> 
 def crossings(
     beams: Sequence[BeamPlan],
     stations: Mapping[str, Station],
-    *,
     tolerance: float,
     smallest_angle: float,
 ) -> geometry.Network:
     """Return the crossings of beams of instruments at stations; see `geometry.build_network`."""
-    places = [stations[beam.instrument] for beam in beams]
+    owners = [stations[beam.instrument] for beam in beams]
+    places = [(owner.latitude, owner.longitude, owner.altitude) for owner in owners]
     return geometry.build_network(
         [
-            geometry.Beam(
-                place.latitude,
-                place.longitude,
-                place.altitude,
-                beam.azimuth,
-                90.0 - beam.zenith_angle,
-            )
+            geometry.Beam(*place, beam.azimuth, 90.0 - beam.zenith_angle)
             for place, beam in zip(places, beams, strict=True)
         ],
         tolerance=tolerance,

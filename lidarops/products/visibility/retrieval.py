@@ -256,12 +256,7 @@ class _NetworkPlan:
 
     def _crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
         settings = self._settings
-        return crossings(
-            beams,
-            self._stations,
-            tolerance=settings.tolerance,
-            smallest_angle=settings.smallest_angle,
-        )
+        return crossings(beams, self._stations, settings.tolerance, settings.smallest_angle)
 
     def _without_lonely_beams(self, beams: list[BeamPlan]) -> Entries:
         """Take out beams with fewer than two crossings, until all remaining beams have two."""
@@ -344,12 +339,7 @@ class _NetworkStream(NetworkStream):
         stations = {beam.member.instrument: beam.member.station for beam in self._beams}
         retrieved = labeled.retrieve_network(
             [beam.signals() for beam in self._beams],
-            crossings(
-                settings.beams,
-                stations,
-                tolerance=settings.tolerance,
-                smallest_angle=settings.smallest_angle,
-            ),
+            crossings(settings.beams, stations, settings.tolerance, settings.smallest_angle),
             labeled.NetworkSettings(
                 block_intervals=round(settings.block_seconds / self._seconds),
                 visibility=settings.definition,
