@@ -369,9 +369,7 @@ def lightless_profiles(
         Number of profiles that are read together.
     """
     found, lasers = {}, {}
-    for name in map(str, archive):
-        if f"{name}_shots" not in archive:
-            continue
+    for name in [name for name in map(str, archive) if f"{name}_shots" in archive]:
         counts, attributes = archive[name], archive[name].attrs
         together = max(1, requested or CHUNK_BYTES // (4 * counts.shape[1]))
         parts = [

@@ -47,12 +47,8 @@ class Workload:
     @property
     def bins(self) -> int:
         """Number of bins of a profile."""
-        return min(self.file_bins().values())
-
-    def file_bins(self) -> dict[str, int]:
-        """Return the number of bins of each channel of the files that the channel is made from."""
-        bins = {layout.name: layout.bins for layout in self.scene.layout}
-        return {name: bins[name] for name in file_channels(self.channel)}
+        made_from = file_channels(self.channel)
+        return min(layout.bins for layout in self.scene.layout if layout.name in made_from)
 
     def intervals(self, seconds: float, instrument: str = "") -> int:
         """Return the number of clock intervals that hold profiles, of one member if named."""

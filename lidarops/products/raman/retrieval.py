@@ -135,11 +135,9 @@ def _needs(case: Case) -> Entries:
         zenith_angle=zenith,
     )
     taken = ["read", "overlap", "noise", "glue", "molecular", "average"]
-    taken += [f"{raman}/{stage}" for raman in settings.channels for stage in _FROM_COMPANIONS]
+    stages = "read", "noise", "glue"
+    taken += [f"{raman}/{stage}" for raman in settings.channels for stage in stages]
     yield case.run("raman", REQUESTED, settings, needs=taken)
-
-
-_FROM_COMPANIONS: Final = ("read", "noise", "glue")
 
 
 def _held(settings: RamanPlan, work: Workload) -> float:

@@ -349,15 +349,11 @@ class ClockAverage:
         )
         if self._screening is None:
             return labeled
-        return labeled.assign(
-            part_power=(
-                cells, of["part_power"], {"bins": self._bins, "first_range": self._first_range}
-            ),
-            part_variance=(cells, of["part_variance"]),
-            part_quantum=(cells[:2], of["part_quantum"]),
-            part_profiles=(cells[:2], of["part_profiles"]),
-            profiles_left_out=("time", record.counts[numbers] - of["profiles"]),
-        )  # fmt: skip
+        parts = [name for name in of if name.startswith("part_")]
+        labeled = labeled.assign({name: (cells[: of[name].ndim], of[name]) for name in parts})
+        labeled["part_power"].attrs = {"bins": self._bins, "first_range": self._first_range}
+        left_out = record.counts[numbers] - of["profiles"]
+        return labeled.assign(profiles_left_out=("time", left_out))
 
 
 def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:

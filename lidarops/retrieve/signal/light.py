@@ -83,15 +83,11 @@ def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array]:
 
 def light_of(excess: Array, variance: Array, measured: Booleans) -> Light:
     """Return how the counts of a channel vary, from `excess_over_far` of all its profiles."""
-    of_sum = _significance(excess.sum(axis=0), variance.sum())
-    return Light(_significance(excess, variance), float(of_sum), measured)
-
-
-def _significance(excess: Array, variance: Array) -> Array:
-    """Return the greatest deviation over its error, beyond what few counts may show."""
-    margin = skewness_margin(THRESHOLDS.shows_light)
-    beyond = np.maximum(np.abs(excess) - margin, 0.0) / np.sqrt(variance)
-    return np.asarray(beyond.max(axis=-1))
+    excess, variance = (np.vstack([part, part.sum(axis=0)]) for part in (excess, variance))
+    # Beyond what few counts may show.
+    beyond = np.maximum(np.abs(excess) - skewness_margin(THRESHOLDS.shows_light), 0.0)
+    *greatest, of_sum = (beyond / np.sqrt(variance)).max(axis=-1)
+    return Light(np.array(greatest), float(of_sum), measured)
 
 
 def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str, Booleans]:
