@@ -24,7 +24,6 @@ from lidarops.retrieve.signal.labeled import (
     baseline_error,
     counts_per_power,
 )
-from lidarops.retrieve.signal.labeled_averaging import joined
 from lidarops.scene.case import ALL_STEPS, REQUESTED, ChannelCase, Entries, Entry, NoSettings
 from lidarops.scene.choices import (
     ANALOG_NOISE,
@@ -262,7 +261,7 @@ class _Sections(ProductStream):
         sections = sections.assign(quality_flag=sections["quality_flag"] | slanted, shots=shots)
         self._parts.append(sections.assign_coords(chunk.geometry.variables))
         if len(self._parts) == _PARTS:
-            self._parts = [joined(self._parts)]
+            self._parts = [self._joined()]
         return ()
 
     def _retrieved(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.Dataset:
@@ -303,9 +302,15 @@ class _Sections(ProductStream):
         name = "total_extinction"
         return fitted.assign({f"{name}_baseline_error": np.abs(moved[name] - fitted[name])})
 
+    def _joined(self) -> xr.Dataset:
+        joined: xr.Dataset = xr.concat(
+            self._parts, dim="time", data_vars="minimal", coords="minimal"
+        )
+        return joined
+
     def results(self) -> Iterator[xr.Dataset]:
         """Yield all profiles, with visibility along the sections where it is requested."""
-        sections, requested = joined(self._parts), self._settings.visibility
+        sections, requested = self._joined(), self._settings.visibility
         stated = self._settings.slope_error
         stated = THRESHOLDS.model_error if stated is None else stated
         # They are proportional to it.

@@ -6,7 +6,7 @@ leaves out outlying parts of the intervals where it is to screen them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -196,8 +196,8 @@ class IntervalSums:
         yield from sums
 
 
-def joined(batches: Iterable[xr.Dataset]) -> xr.Dataset:
-    """Return batches of profiles, or of means, as one Dataset."""
+def joined(batches: Iterator[xr.Dataset]) -> xr.Dataset:
+    """Return batches of means as one Dataset."""
     whole: xr.Dataset = xr.concat(
         list(batches), dim="time", data_vars="minimal", coords="minimal", join="override"
     )
