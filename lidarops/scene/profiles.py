@@ -376,9 +376,9 @@ def lightless_profiles(
             light.excess_over_far(counts[first : first + together].to_numpy())
             for first in range(0, len(counts), together)
         ]
-        excess, variance = (np.concatenate(part) for part in zip(*parts, strict=True))
+        excess, variance, blank = (np.concatenate(part) for part in zip(*parts, strict=True))
         measured = archive[f"{name}_shots"].to_numpy() > 0
-        found[name] = light.light_of(excess, variance, measured)
+        found[name] = light.light_of(excess, variance, blank, measured)
         # Without a laser in the header, channels of one wavelength have one.
         lasers[name] = str(attributes.get("laser", attributes["wavelength_label"]))
     return {name: rows for name, rows in light.lightless(found, lasers).items() if rows.any()}

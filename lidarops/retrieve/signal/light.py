@@ -33,7 +33,10 @@ class Light(NamedTuple):
     of_sum: float
     """That of the sum of all profiles."""
     measured: Booleans
-    """(time,), False where there are no shots or no counts: a gap."""
+    """(time,), False where there are no shots: a gap."""
+    blank: Booleans
+    """(time,), whether all counts are zero, as of a recorder that is off: a gap, unless others of
+    the laser show that there was no light."""
 
     @property
     def dark(self) -> Booleans:
@@ -54,8 +57,8 @@ class Light(NamedTuple):
         return bool(np.quantile(lit, share) >= THRESHOLDS.tells_of_light)
 
 
-def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array]:
-    """Return the counts of windows beyond those of the far range, and their variance by noise.
+def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array, Booleans]:
+    """Return counts of windows beyond those of the far range, with their variance; and the blank.
 
     Of each profile by itself, so that profiles may come in any parts.
 
@@ -68,33 +71,37 @@ def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array]:
     excess : (time, window) float64
     variance : (time, 1) float64
         As the bins of the far range show it, and a count more: none there do not mean no noise.
+    blank : (time,) bool
+        Whether all counts are zero.
     """
     number, bins = counts.shape
     far = counts[:, bins - bins // _FAR :].astype(np.float64)
     length = (bins - far.shape[1]) // _WINDOWS
+    blank = (counts == 0).all(axis=1)
     if length * far.shape[1] == 0 or far.shape[1] < _WINDOWS // 2:
-        return np.full((number, _WINDOWS), np.nan), np.ones((number, 1))
+        return np.full((number, _WINDOWS), np.nan), np.ones((number, 1)), blank
     near = counts[:, : _WINDOWS * length].reshape(number, _WINDOWS, length)
     level = far.mean(axis=1, keepdims=True)
     scatter = (((far - level) ** 2).sum(axis=1, keepdims=True) + 1.0) / (far.shape[1] - 1)
     excess = near.sum(axis=2, dtype=np.int64) - length * level
-    return excess, scatter * (length * (1.0 + length / far.shape[1]))
+    return excess, scatter * (length * (1.0 + length / far.shape[1])), blank
 
 
-def light_of(excess: Array, variance: Array, measured: Booleans) -> Light:
+def light_of(excess: Array, variance: Array, blank: Booleans, measured: Booleans) -> Light:
     """Return how the counts of a channel vary, from `excess_over_far` of all its profiles."""
     excess, variance = (np.vstack([part, part.sum(axis=0)]) for part in (excess, variance))
     # Beyond what few counts may show.
     beyond = np.maximum(np.abs(excess) - skewness_margin(THRESHOLDS.shows_light), 0.0)
     *greatest, of_sum = (beyond / np.sqrt(variance)).max(axis=-1)
-    return Light(np.array(greatest), float(of_sum), measured)
+    return Light(np.array(greatest), float(of_sum), measured, blank)
 
 
 def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str, Booleans]:
     """Return the profiles of each channel that hold no light, (time,).
 
-    A channel that tells is judged by its own counts; another one by those of the same laser that
-    tell, where all agree. Where none shows light in the sum of all profiles, none has any.
+    A channel that tells is judged by its own counts; another one, or where it has none, by those of
+    the same laser that tell, where all agree and one has counts. Where none shows light in the sum
+    of all profiles, none has any.
 
     Parameters
     ----------
@@ -112,5 +119,8 @@ def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str
         )
         unlit = np.full_like(found[channels[0]].measured, nothing)
         agreed = np.logical_and.reduce(list(own.values())) if own else unlit
-        dark |= {name: own.get(name, agreed) & found[name].measured for name in channels}
+        agreed = agreed & ~np.logical_and.reduce([found[name].blank for name in own or channels])
+        for name in channels:
+            known = found[name].measured & (agreed | ~found[name].blank)
+            dark[name] = own.get(name, agreed) & known
     return dark

@@ -164,6 +164,22 @@ def test_a_gap_is_no_profile_without_light():
     np.testing.assert_array_equal(np.flatnonzero(dark), [40, 41, 43, 44])
 
 
+def test_a_recorder_that_is_off_is_a_gap_unless_others_show_no_light():
+    rng = np.random.default_rng(13)
+    counts = with_dark(rng, photons, 10)
+    # Off at first, and without a count of dark sky at the end.
+    counts[[2, 3, 44, 45]] = 0
+    weak = photons(rng, 1.0, number=50)
+    alone = dark_of({"photon": counts, "raman": weak})
+    for rows in alone.values():
+        np.testing.assert_array_equal(np.flatnonzero(rows), [40, 41, 42, 43, 46, 47, 48, 49])
+    both = dark_of({"photon": counts, "analog": with_dark(rng, analog, 10, 1e5), "raman": weak})
+    for rows in both.values():
+        np.testing.assert_array_equal(np.flatnonzero(rows), np.arange(40, 50))
+    # So for a whole scene without a count.
+    assert not dark_of({"photon": np.zeros_like(counts)})["photon"].any()
+
+
 def test_too_few_bins_tell_nothing():
     rng = np.random.default_rng(10)
     counts = with_dark(rng, photons, 5)[:, :100]
@@ -182,7 +198,7 @@ def test_light_states_the_errors_of_noise():
     """Of constant counts, windows differ by the errors that are stated, in a sum as in profiles."""
     rng = np.random.default_rng(12)
     for counts in (photons(rng, 0.0, number=2000), analog(rng, 0.0, number=2000)):
-        excess, variance = excess_over_far(counts)
+        excess, variance, _ = excess_over_far(counts)
         spread = (excess / np.sqrt(variance)).std()
         assert 0.97 < spread < 1.03
         assert isinstance(found(counts), Light)
