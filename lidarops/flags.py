@@ -229,8 +229,6 @@ class Flags:
     """Severity and meaning of each bit."""
     rejecting: int = field(init=False)
     """Union of the bits that reject a value."""
-    caring: int = field(init=False)
-    """Union of the bits of values to be used with care."""
 
     def __post_init__(self) -> None:
         places = [bit.bit_length() - 1 for bit in self.bits]
@@ -244,14 +242,12 @@ class Flags:
                 f"flags of {self.kind}: names and places must differ, and places rise: shared bits"
                 f" below {FIRST_OWN}, own bits from {FIRST_OWN} to {PLACES - 1}"
             )
-        union = rejecting(self.bits)
         texts = [f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in self]
         for name, value in {
             "layout": f"{self.kind} {self.version}",
             "words": " ".join(bit.word for bit in self.bits),
             "explanation": "; ".join(texts),
-            "rejecting": union,
-            "caring": sum(self.bits) - union,
+            "rejecting": rejecting(self.bits),
         }.items():
             object.__setattr__(self, name, value)
 

@@ -268,7 +268,6 @@ def test_a_kind_of_another_package_states_its_bits_by_itself():
     flags = Flags("other", 3, (Quality.SATURATED, Quality.OUTLIER, Twins.ODD))
     assert flags.layout == "other 3"
     assert flags.rejecting == Quality.SATURATED
-    assert flags.caring == Quality.OUTLIER | Twins.ODD
     assert flags.raised(int(Quality.OUTLIER | Twins.ODD) | 1) == (Quality.OUTLIER, Twins.ODD)
     assert flags.named("ODD") is flags.named("odd") is Twins.ODD
     assert flags.named("input_missing") is None

@@ -320,13 +320,10 @@ class ClockAverage:
         sky, error = tail_of_cells(power, variance)
         power -= sky
         variance += error**2
-        return PartCells(power, variance, self._quantum(sums) / self._bins)
-
-    def _quantum(self, sums: PartSums) -> Array:
-        """Return the power of a count in a bin of each part; 0 for analog records."""
-        if DEAD_TIME_ERROR not in sums.units["power"]:
-            return np.zeros(sums.shots.size)
-        return LICEL_RANGE_PER_MICROSECOND / (np.maximum(sums.shots, 1) * self._step)
+        # The power of a count in a bin; 0 for analog records.
+        counts = LICEL_RANGE_PER_MICROSECOND if DEAD_TIME_ERROR in sums.units["power"] else 0.0
+        quantum = counts / (np.maximum(sums.shots, 1) * self._step)
+        return PartCells(power, variance, quantum / self._bins)
 
     def _labeled(
         self, record: IntervalSums, numbers: slice, means: Sequence[dict[str, Any]], units: Units
