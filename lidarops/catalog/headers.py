@@ -139,7 +139,6 @@ def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Gra
 def _accepted(
     due: UnreadFile, header: RawHeader, instrument: Instrument, station: Station
 ) -> Granule:
-    _check_future(header)
     facts = instrument.facts_at(header.start, by_clock=True)
     shift = timedelta(seconds=facts.clock_offset)
     left_out = _left_out(header, facts, instrument)
@@ -178,19 +177,13 @@ def _accepted(
     )
 
 
-def _check_future(header: RawHeader) -> None:
-    """Refuse a file that starts after today."""
-    if header.start > datetime.now(UTC) + _CLOCKS_DIFFER:
-        raise RawFormatError(
-            f"lies in the future: {header.start:%Y-%m-%d %H:%M}",
-            file=header.path,
-            field="start",
-            remedy="leave the file out, or correct its header; clock_offset is at most a day",
-        )
-
-
 def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument) -> str:
-    """Return why the facts of the campaign let no product be made of a file; else empty."""
+    """Return why no product is made of a file by its time; else empty."""
+    if header.start > datetime.now(UTC) + _CLOCKS_DIFFER:
+        return (
+            f"start: {header.start:%Y-%m-%d %H:%M} lies in the future (leave the file out, or"
+            " correct its header; clock_offset is at most a day)"
+        )
     if facts.invalid:
         return f"{INVALID}: {facts.invalid}"
     if not any(facts is stated for stated in instrument.facts):
