@@ -378,7 +378,8 @@ def _estimated_dead_time(
             power, variance, length = (
                 part[name].to_numpy() for name in ("power", "variance", CORRELATION_LENGTH)
             )
-            shot = exposure > 0.0
+            # Of profiles without light in one of the records, nothing is compared.
+            shot = (exposure > 0.0) & np.isfinite(power).any(axis=1)
             if shot.any():
                 share = (exposure[shot] / exposure.sum())[:, np.newaxis]
                 noise = variance[shot] * length[shot, np.newaxis]

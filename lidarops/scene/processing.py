@@ -225,7 +225,7 @@ class _Work(ABC):
             dark, shots = lightless[name], archive[f"{name}_shots"]
             unlit = {f"{name}_{LIGHTLESS}": ("time", dark), shots.name: shots.where(~dark, 0)}
             archive = archive.assign(unlit)
-            words = f"{dark.sum()} of {dark.size} profiles of {name}, which are in no mean"
+            words = f"{dark.sum()} of {dark.size} profiles of {name}"
             self.notes[f"without light: {words}"] = None
         source = Source(
             archive=archive,

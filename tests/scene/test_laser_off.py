@@ -100,7 +100,7 @@ def test_profiles_without_light_are_rejected_and_others_are_not(products):
 
 def test_the_run_counts_profiles_without_light_apart(products):
     for channel in ("analog_532o", "photon_532o"):
-        words = f"without light: 10 of 50 profiles of {channel}, which are in no mean"
+        words = f"without light: 10 of 50 profiles of {channel}"
         assert products[2].count(words) == 1
 
 

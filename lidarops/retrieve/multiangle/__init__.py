@@ -6,7 +6,7 @@ A scan passes through these modules in order:
    groups them into directions and cycles. The background is subtracted, and `_cell_means`
    averages each beam over altitude cells.
 2. `optical_depth.retrieve_optical_depth` solves the cycles as one block, with `_methods`.
-   `_samples` takes the logarithms; `_block`, with `_kano_hamilton`, fits them against the slant
+   `_block` takes the logarithms and, with `_kano_hamilton`, fits them against the slant
    path (`slant_paths`) at each altitude.
 3. Method "joint": `smooth_profile` combines the optical depths of single altitudes into one profile
    with smooth extinction. Methods "mld" and "mld_prior": `mld` differentiates the logarithm along

@@ -68,7 +68,7 @@ class Thresholds(NamedTuple):
     """Largest correlation at neighbouring altitudes: one altitude then counts as a hundredth;
     assumed."""
 
-    # Samples (`_samples`).
+    # Samples (`_block`).
     lowest_snr: float = 3.0
     """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
     light (`test_kano_hamilton`)."""

@@ -259,8 +259,8 @@ def _glue(
     quality |= np.where(alone, int(Quality.SINGLE_RECORD), 0)[..., np.newaxis]
     quality |= np.where(alone | line, 0, int(Quality.NO_GLUING))[..., np.newaxis]
     quality |= np.where(distance <= 0.0, _MISSING, 0)
-    # Both records are of the same light.
-    unlit = (analog_quality | photon_quality) & np.int32(Quality.NO_SIGNAL)
+    # One record alone may be off, or weaker than its noise.
+    unlit = analog_quality & photon_quality & np.int32(Quality.NO_SIGNAL)
     quality[unlit.any(axis=-1)] = np.int32(Quality.NO_SIGNAL)
     power[(quality & int(_WITHHELD)) != 0] = np.nan
     variance[np.isnan(power)] = np.nan

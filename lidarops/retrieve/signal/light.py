@@ -16,10 +16,25 @@ from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
-_WINDOWS: Final = 32
-"""Windows of equal length into which the bins before the far range are cut."""
-_FAR: Final = 10
-"""The far range is the last of so many equal parts of the bins."""
+_WINDOWS: Final = 40
+"""Windows of equal length into which the bins are cut, the last of which are the far range."""
+_FAR: Final = 8
+"""Windows of the far range, whose median is the level without light: a target in it is light."""
+_NORMAL: Final = 0.6745
+"""Median of the absolute value of a standard normal number."""
+_OF_MEDIAN: Final = 1.5
+"""Variance of the median of the far windows over that of their mean."""
+_SHORTEST: Final = 4
+"""Bins of a window, of which fewer tell nothing."""
+_SLOW: Final = 2.5
+"""Scatter of half windows of the far range over that by the noise of bins, beyond which a baseline
+varies slowly along range."""
+_CLIPPED: Final = 6.0
+"""Median steps between neighbouring bins beyond which a step counts as no larger."""
+_WITNESSES: Final = 2
+"""Other channels without light beside which a faint excess is pick-up of the electronics."""
+_PICK_UP: Final = 2.0
+"""Largest such excess over `shows_light`. Dark files of Sao Paulo show up to 1.3."""
 FEWEST: Final = 5
 """Profiles; fewer tell nothing."""
 
@@ -70,57 +85,91 @@ def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array, Booleans]:
     -------
     excess : (time, window) float64
     variance : (time, 1) float64
-        As the bins of the far range show it, and a count more: none there do not mean no noise.
+        As neighbouring bins of the far range show it, or its windows if they vary far more, which
+        one bin or a target hardly changes, and a count more: none there do not mean no noise. NaN
+        where there are too few bins, or all hold the same but not zero, as at full scale.
     blank : (time,) bool
         Whether all counts are zero.
     """
     number, bins = counts.shape
-    far = counts[:, bins - bins // _FAR :].astype(np.float64)
-    length = (bins - far.shape[1]) // _WINDOWS
     blank = (counts == 0).all(axis=1)
-    if length * far.shape[1] == 0 or far.shape[1] < _WINDOWS // 2:
+    length = bins // _WINDOWS
+    if length < _SHORTEST:
         return np.full((number, _WINDOWS), np.nan), np.ones((number, 1)), blank
-    near = counts[:, : _WINDOWS * length].reshape(number, _WINDOWS, length)
-    level = far.mean(axis=1, keepdims=True)
-    scatter = (((far - level) ** 2).sum(axis=1, keepdims=True) + 1.0) / (far.shape[1] - 1)
-    excess = near.sum(axis=2, dtype=np.int64) - length * level
-    return excess, scatter * (length * (1.0 + length / far.shape[1])), blank
+    used = counts[:, : _WINDOWS * length].astype(np.float64)
+    limits = np.iinfo(counts.dtype)
+    missing = (used <= limits.min) | (used >= limits.max)
+    if missing.any():
+        used = np.where(missing, np.median(used, axis=1, keepdims=True), used)
+    far = used[:, -_FAR * length :]
+    level = np.median(far.reshape(number, _FAR, length).mean(axis=2), axis=1, keepdims=True)
+    steps = np.abs(np.diff(far, axis=1))
+    most = _CLIPPED * np.maximum(np.median(steps, axis=1, keepdims=True), 1.0)
+    noise = 0.5 * np.square(np.minimum(steps, most)).mean(axis=1, keepdims=True)
+    noise += 1.0 / far.shape[1]
+    noise[(used == used[:, :1]).all(axis=1) & ~blank] = np.nan
+    excess = used.reshape(number, _WINDOWS, length).sum(axis=2) - length * level
+    halves = far[:, : 2 * _FAR * (length // 2)].reshape(number, 2 * _FAR, -1)
+    away = np.median(np.abs(halves.mean(axis=2) - level), axis=1, keepdims=True) / _NORMAL
+    # Of white noise, one in ten thousand medians of sixteen is so large.
+    slow = np.square(away) * halves.shape[2] > _SLOW**2 * noise
+    of_sum = np.where(slow, np.square(length * away), noise * length)
+    return excess, of_sum * (1.0 + _OF_MEDIAN * length / far.shape[1]), blank
 
 
 def light_of(excess: Array, variance: Array, blank: Booleans, measured: Booleans) -> Light:
     """Return how the counts of a channel vary, from `excess_over_far` of all its profiles."""
-    excess, variance = (np.vstack([part, part.sum(axis=0)]) for part in (excess, variance))
+    known = np.isfinite(variance)
+    sums = (np.where(known, part, 0.0).sum(axis=0) for part in (excess, variance))
+    excess, variance = (
+        np.vstack([part, total]) for part, total in zip((excess, variance), sums, strict=True)
+    )
     # Beyond what few counts may show.
     beyond = np.maximum(np.abs(excess) - skewness_margin(THRESHOLDS.shows_light), 0.0)
-    *greatest, of_sum = (beyond / np.sqrt(variance)).max(axis=-1)
+    with np.errstate(invalid="ignore"):
+        *greatest, of_sum = (beyond / np.sqrt(variance)).max(axis=-1)
     return Light(np.array(greatest), float(of_sum), measured, blank)
 
 
 def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str, Booleans]:
     """Return the profiles of each channel that hold no light, (time,).
 
-    A channel that tells is judged by its own counts; another one, or where it has none, by those of
-    the same laser that tell, where all agree and one has counts. Where none shows light in the sum
-    of all profiles, none has any.
+    A channel that tells is judged by its own counts, but for faint pick-up where two others of its
+    laser show no light; another one, or where it has none, by those of
+    the same laser that tell, where all agree and one has counts. Where no channel of any laser
+    shows light in the sum of all profiles, none has any.
 
     Parameters
     ----------
     found : mapping
         Channel of the files -> how its counts vary.
     lasers : mapping
-        Channel -> its laser.
+        Channel -> its laser, as headers number it.
     """
+    nothing = all(
+        len(one.excess) >= FEWEST and one.of_sum < THRESHOLDS.shows_light for one in found.values()
+    )
     dark: dict[str, Booleans] = {}
-    for laser in dict.fromkeys(lasers.values()):
-        channels = [name for name in found if lasers[name] == laser]
-        own = {name: found[name].dark for name in channels if found[name].tells}
-        nothing = len(found[channels[0]].excess) >= FEWEST and all(
-            found[name].of_sum < THRESHOLDS.shows_light for name in channels
-        )
-        unlit = np.full_like(found[channels[0]].measured, nothing)
-        agreed = np.logical_and.reduce(list(own.values())) if own else unlit
-        agreed = agreed & ~np.logical_and.reduce([found[name].blank for name in own or channels])
-        for name in channels:
-            known = found[name].measured & (agreed | ~found[name].blank)
-            dark[name] = own.get(name, agreed) & known
+    own = _dark_of_their_own(found, lasers)
+    for name, one in found.items():
+        same = [other for other in own if lasers[other] == lasers[name]]
+        unlit = [own[other] for other in same] or [np.full_like(one.measured, nothing)]
+        agreed: Booleans = np.logical_and.reduce(unlit)
+        agreed = agreed & ~np.logical_and.reduce([found[other].blank for other in same or found])
+        dark[name] = own.get(name, agreed) & one.measured & (agreed | ~one.blank)
     return dark
+
+
+def _dark_of_their_own(
+    found: Mapping[str, Light], lasers: Mapping[str, str]
+) -> dict[str, Booleans]:
+    """Return the profiles without light of each channel that tells, faint pick-up included."""
+    shown = {name: one.dark for name, one in found.items() if one.tells}
+    own = {}
+    for name, dark in shown.items():
+        others = [shown[o] for o in shown if o != name and lasers[o] == lasers[name]]
+        faint = found[name].excess < _PICK_UP * THRESHOLDS.shows_light
+        if len(others) < _WITNESSES:
+            faint = dark
+        own[name] = dark | (found[name].measured & faint & np.logical_and.reduce([faint, *others]))
+    return own

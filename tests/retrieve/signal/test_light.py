@@ -202,3 +202,40 @@ def test_light_states_the_errors_of_noise():
         spread = (excess / np.sqrt(variance)).std()
         assert 0.97 < spread < 1.03
         assert isinstance(found(counts), Light)
+
+
+@pytest.mark.parametrize("value", [np.iinfo(np.int32).min, np.iinfo(np.int32).max, 30_000])
+@pytest.mark.parametrize("rows", [slice(7, 8), slice(None)])
+def test_a_bad_bin_of_the_far_range_hides_no_light(value, rows):
+    rng = np.random.default_rng(11)
+    counts = photons(rng, 5000.0).astype(np.int32)
+    counts[rows, 1900] = value
+    assert not dark_of({"elastic": counts})["elastic"].any()
+
+
+@pytest.mark.parametrize("light", [200.0, 20_000.0])
+@pytest.mark.parametrize("bins", [400, 1000, 2000])
+def test_a_target_in_the_far_range_is_light(light, bins):
+    """As of a wall that a level beam meets, or a cloud at the end of a short record."""
+    rng = np.random.default_rng(12)
+    counts = photons(rng, 5000.0, number=30)[:, :bins]
+    target = np.arange(bins) > 0.93 * bins
+    counts[10:20] += rng.poisson(light * target, (10, bins))
+    assert not dark_of({"elastic": counts})["elastic"].any()
+
+
+def test_counts_at_full_scale_in_all_bins_are_not_dark():
+    rng = np.random.default_rng(13)
+    counts = analog(rng, 20000.0, number=30)
+    counts[:10] = 2_457_000
+    assert not dark_of({"analog": counts})["analog"].any()
+
+
+def test_faint_pick_up_beside_others_without_light_is_none():
+    rng = np.random.default_rng(14)
+    channels = {name: with_dark(rng, analog, 10, light=20000.0) for name in "abc"}
+    channels["a"][40:, :50] += 65
+    excess = found(channels["a"]).excess[40:]
+    assert 6.0 < np.median(excess) < 12.0
+    assert dark_of(channels)["a"][40:].mean() > 0.8
+    assert not dark_of({"a": channels["a"]})["a"][40:].mean() > 0.2
