@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from decimal import Decimal
 from typing import Final
@@ -29,7 +30,8 @@ _FACTORS: Final = {
     "K": {"K": "1"},
     "m s-1": {"m s-1": "1", "km h-1": "0.2777777777777778"},
     "kg kg-1": {"kg kg-1": "1", "g kg-1": "1e-3"},
-    "1": {"%": "0.01", "bins": "1"},
+    "1": {"%": "0.01"},
+    "bins": {"bins": "1"},
 }  # fmt: skip
 """Unit of a setting -> units in which it can be written, and their factors."""
 _SMALL: Final = {"s": (1e-6, "ns"), "m": (1e-4, "nm")}
@@ -44,7 +46,7 @@ def is_quantity(text: str) -> bool:
 def parse_quantity(text: str, unit: str) -> float | None:
     """Return the value of a text such as ``4 ns`` in a unit such as ``s``.
 
-    None where the text is no number with a unit of that dimension. ``km^-1`` and ``1/km`` are
+    None where the text is no finite number with a unit of that dimension. ``km^-1`` and ``/km`` are
     ``km-1``.
     """
     found = _QUANTITY.fullmatch(text)
@@ -55,8 +57,10 @@ def parse_quantity(text: str, unit: str) -> float | None:
         above, _, below = name.partition("/")
         name = f"{above.strip()} {below.strip()}-1".strip()
     factor = _FACTORS.get(unit, {}).get(name)
+    if factor is None or not math.isfinite(float(found[1])):
+        return None
     # Decimal: 532 nm are 5.32e-7 m, to the last bit.
-    return None if factor is None else float(Decimal(found[1]) * Decimal(factor))
+    return float(Decimal(found[1]) * Decimal(factor))
 
 
 def is_small(value: float, unit: str) -> bool:

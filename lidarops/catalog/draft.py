@@ -37,6 +37,8 @@ _ALTITUDES: Final = (-500.0, 9000.0)
 """m; those that a station of a campaign may have."""
 _SHOWN: Final = 5
 """Most files of a kind that a comment names."""
+_ASSUMED_OVERLAP: Final = 500.0
+"""m; of most telescopes. A signal may stop rising earlier, by haze at the ground."""
 _USED: Final = frozenset({Purpose.MEASUREMENT, Purpose.DARK})
 """Purposes of files that a campaign names; others are a question."""
 _PROFILES: Final = (".csv", ".nc")
@@ -152,7 +154,7 @@ def _instruments(
 ) -> tuple[dict[str, InstrumentHeaders], list[FileGroup]]:
     """Return the instruments of a draft by their keys, and groups of beams that are left out."""
     tests = [group for group in contents.groups if group.purpose not in _USED]
-    if len(tests) == len(contents.groups):
+    if not any(group.purpose is Purpose.MEASUREMENT for group in contents.groups):
         tests = []
     instruments = [one for one in instruments_of(contents.groups, tests) if one.files]
     lone = [
@@ -285,18 +287,21 @@ def _clock(group: FileGroup) -> str:
         for path, header in zip(group.files, group.headers, strict=True)
         if (named := raw_formats()[header.format].named_time(path.rpartition("/")[2]))
     ]
-    hours = round(median(away) / 3600.0) if away else 0
+    hours = round(median(away) / 1800.0) / 2.0 if away else 0.0
     if not hours:
         return "-18000 for UTC-5"
-    return f"headers are {hours:+d} h from names: one of both is local time"
+    return f"headers are {hours:+g} h from names: one of both is local time"
 
 
 def _full_overlap(look: FirstLook | None) -> str:
     if look is None or look.full_overlap is None:
-        return "full_overlap_range: 500  # ? m, nearer bins are not used; assumed"
+        return f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used; assumed"
+    if look.full_overlap < _ASSUMED_OVERLAP:
+        seen = f"assumed, signals stop rising at {look.full_overlap:g} m"
+        return f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used; {seen}"
     return (
-        f"full_overlap_range: {look.full_overlap:g}  # ? m, nearer bins are not used; where signals"
-        " stop rising"
+        f"full_overlap_range: {look.full_overlap:g}  # ? m, nearer bins are not used; at least:"
+        " signals rise up to there"
     )
 
 

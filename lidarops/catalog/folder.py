@@ -34,8 +34,12 @@ _LASERS: Final = (355e-9, 532e-9, 1064e-9)
 """m; lines of Nd:YAG lasers."""
 _SAME_LINE: Final = 0.6e-9
 """m; rounding of headers."""
-_ROTATIONAL: Final = 3e-9
-"""m; rotational Raman lines lie within this of the laser line."""
+_ROTATIONAL: Final = 3.6e-9
+"""m; rotational Raman lines lie within 3 nm of the laser line, and headers round."""
+_SHORT_WORD: Final = 2
+"""Letters of a stem, which may be those of a station."""
+_CLEARLY: Final = 1.1
+"""Share of usable values over that of the first channel beyond which another one is taken."""
 _SCRATCH: Final = "temp"
 """Stem of the file in which an acquisition keeps its last record, ``temp.dat``."""
 
@@ -51,15 +55,14 @@ class Purpose(StrEnum):
 
 
 _WORDS: Final = {
-    Purpose.DARK: {"dark", "dc", "darkcurrent"},
-    Purpose.TELECOVER: {"telecover", "tc", "quadrant", "sector"},
-    Purpose.POLARISATION: {"dp", "depol", "polcal", "depolcal", "calibration", "+45", "-45"}
-    | {"p45", "m45", "plus45", "minus45"},
-    Purpose.BACKGROUND: {"background", "bkg"},
+    Purpose.DARK: r"dc|darks?|dark ?current|dark ?files?",
+    Purpose.TELECOVER: r"tc|tele ?cover",
+    Purpose.POLARISATION: r"dp|(depol|pol) ?cal|calibration|cal|plus ?45|minus ?45|[pm]45|45[pm]",
+    Purpose.BACKGROUND: r"background|bkg",
 }
-"""Words of folders and names, by which they are told apart from others within a word if longer."""
-_LONG_WORD: Final = 4
-"""Letters of a word that may be a part of another one."""
+"""Words of folders, digits may follow; those of two letters are words of folders only."""
+_TURNED: Final = re.compile(r"(?<!\d)[+-]45(?!\d)")
+"""Angle of a polariser or plate, as in ``DP+45``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,9 +231,11 @@ class InstrumentHeaders:
         """Return the channel of a detector with most usable values; None if there is none."""
         if self.look is None:
             return first
-        shares = self.look.shares
-        best = max((first, *others), key=lambda name: shares.get(name, 0.0))
-        return best if shares.get(best, 0.0) > 0.0 else None
+        share = self.look.shares.get
+        best = max((first, *others), key=lambda name: share(name, 0.0))
+        if share(best, 0.0) <= _CLEARLY * share(first, 0.0):
+            best = first
+        return best if share(best, 0.0) > 0.0 else None
 
     @property
     def candidates(self) -> tuple[tuple[str, ...], ...]:
@@ -406,7 +411,7 @@ def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -
     return FileGroup(
         folder=folder,
         stem=stem,
-        purpose=_purpose(f"{folder}{stem}"),
+        purpose=_purpose(folder, stem),
         site=first.site,
         coordinates=first.coordinates,
         layout=first.layout,
@@ -424,12 +429,14 @@ def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -
     )
 
 
-def _purpose(path: str) -> Purpose:
+def _purpose(folder: str, stem: str) -> Purpose:
     """Return as what files were recorded by the words of their folders and the stem of names."""
-    text = path.lower()
-    words = set(re.split(r"[^a-z0-9+-]+", text))
+    words = " ".join(re.split(r"[\W_]+", folder.lower()))
+    name = stem.lower() if len(stem) > _SHORT_WORD else ""
+    if _TURNED.search(folder):
+        return Purpose.POLARISATION
     for purpose, known in _WORDS.items():
-        if words & known or any(len(word) >= _LONG_WORD and word in text for word in known):
+        if re.search(rf"(?<![a-z])({known})(?![a-z])", f"{words} {name}"):
             return purpose
     return Purpose.MEASUREMENT
 

@@ -41,8 +41,10 @@ NO_NOTES: Final = "[]"
 _FIELDS: Final = tuple(item.name for item in fields(Granule))
 _STATED: Final = tuple(item.name for item in fields(Header))
 _HALF: Final = (1 << 31) - 1
-_TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT)
-"""Starts of the reason if a refused file may be readable another time, or its format be added."""
+_FUTURE: Final = "starts in the future"
+_TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT, _FUTURE)
+"""Starts of the reason if a refused file may be readable another time, its format be added, or the
+clock of this machine be set."""
 
 HEADER_BYTES: Final = 16384
 """Bytes that hold the header of any format."""
@@ -141,7 +143,7 @@ def _accepted(
 ) -> Granule:
     facts = instrument.facts_at(header.start, by_clock=True)
     shift = timedelta(seconds=facts.clock_offset)
-    left_out = _left_out(header, facts, instrument)
+    left_out = _left_out(header, facts, instrument, due.role)
     if left_out:
         return _refused(due, left_out, header.start - shift)
     header = header.read_as(instrument.header_pointing)
@@ -177,20 +179,18 @@ def _accepted(
     )
 
 
-def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument) -> str:
+def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument, role: Role) -> str:
     """Return why no product is made of a file by its time; else empty."""
     if header.start > datetime.now(UTC) + _CLOCKS_DIFFER:
         return (
-            f"start: {header.start:%Y-%m-%d %H:%M} lies in the future (leave the file out, or"
-            " correct its header; clock_offset is at most a day)"
+            f"{_FUTURE}: {header.start:%Y-%m-%d %H:%M} (leave the file out, or correct its header;"
+            " clock_offset is at most a day)"
         )
-    if facts.invalid:
+    # Dark files are judged by the scenes that use them.
+    if role is Role.SIGNAL and facts.invalid:
         return f"{INVALID}: {facts.invalid}"
-    if not any(facts is stated for stated in instrument.facts):
-        return (
-            f"starts at {header.start:%Y-%m-%d %H:%M} UTC, which is in no period of the facts (give"
-            " one that holds it, or one that is `invalid`)"
-        )
+    if role is Role.SIGNAL and not any(facts is stated for stated in instrument.facts):
+        return "is of a time that no period of the facts holds (give one, or one that is `invalid`)"
     return ""
 
 

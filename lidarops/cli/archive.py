@@ -37,6 +37,7 @@ from lidarops.cli.app import (
     never_made,
     progress_bar,
     say,
+    say_wrapped,
     selection_of,
     set_up_log,
     show_error,
@@ -142,7 +143,7 @@ def catalog(
         say(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
-            f" {summary.refused} refused"
+            f" {summary.refused} refused{_declared(refused)}"
         )
         if rebuilt is not None:
             show_rows("Not entered in the ledger", ("file", "reason"), rebuilt.problems.items())
@@ -322,6 +323,12 @@ def _cluster(
     return partial(clusters.connect_client, chosen)
 
 
+def _declared(refused: list[Granule]) -> str:
+    """Return how many files the campaign declares invalid, for the end of a line."""
+    number = sum(granule.is_declared_invalid for granule in refused)
+    return f", {number} declared invalid" if number else ""
+
+
 def _show_refused(refused: list[Granule], most: int | None = None) -> None:
     rows = ((granule.path, granule.instrument, granule.reason) for granule in refused)
     show_rows("Refused", ("file", "instrument", "reason"), rows, most)
@@ -453,26 +460,30 @@ def _show_products(scenes: Sequence[SceneOutcome], *, everything: bool) -> None:
     for scene in scenes:
         for product in scene.products:
             alike[scene.instrument, product.kind, product.channel].append(product)
-    columns = "instrument", "kind", "channel", "products", *numbers, "flags of most values"
-    rows = (
-        (*names, len(products), *_summed(products)) for names, products in sorted(alike.items())
-    )
-    show_rows(f"{len(made)} products, summed (--all lists them)", columns, rows, _MANY_PRODUCTS)
+    say(f"{len(made)} products, summed (--all lists them)")
+    for (instrument, kind, channel), products in sorted(alike.items())[:_MANY_PRODUCTS]:
+        words = f"{instrument} {kind} {channel}: {len(products)} products, {_summed(products)}"
+        say_wrapped(words, "  ")
     errors = [(scene.scene, scene.error) for scene in scenes if scene.error]
     show_rows("Failed", ("scene", "error"), errors, _FEW_ROWS)
 
 
-def _summed(products: Sequence[ProductRecord]) -> tuple[object, ...]:
-    """Return numbers of values of products, and the most frequent flags with their shares."""
+def _summed(products: Sequence[ProductRecord]) -> str:
+    """Return the shares of good values, of others and of the most frequent flags, in words."""
     values = sum(product.values for product in products)
-    verdicts = (sum(numbers) for numbers in zip(*(p.verdicts for p in products), strict=True))
     flags: Counter[str] = Counter()
     for product in products:
         flags.update(product.flagged)
-    frequent = [
-        f"{name.lower()} {count / values:.0%}" for name, count in flags.most_common(_FEW_FLAGS)
-    ]
-    return values, *verdicts, ", ".join(frequent)
+    counts = zip(
+        ("good", "care", "reject"),
+        (sum(each) for each in zip(*(product.verdicts for product in products), strict=True)),
+        strict=True,
+    )
+    frequent = ((name.lower(), count) for name, count in flags.most_common(_FEW_FLAGS))
+    return "; ".join(
+        ", ".join(f"{name} {count / max(values, 1):.0%}" for name, count in each)
+        for each in (counts, frequent)
+    )
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:

@@ -37,6 +37,7 @@ from lidarops.cli.app import (
     selection_of,
     show_findings,
     show_rows,
+    wrapped,
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
@@ -323,11 +324,12 @@ def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: 
     """Print scenes, those with equal lines together, until the screen is full."""
     printed = 0
     for place, (lines, group) in enumerate(alike.items()):
-        if printed and printed + len(lines) > _SCREEN:
+        height = 2 + sum(len(wrapped(line, "")) for line in lines[1:])
+        if printed and printed + height > _SCREEN:
             left = sum(len(more) for more in list(alike.values())[place:])
             say_wrapped(f"{counted(left, 'further scene')} with other lines (--all)", "")
             return
-        printed += len(lines) + 1
+        printed += height
         first, last = group[0].scene, group[-1].scene
         several = f"{first.id} to {last.id}: {counted(len(group), 'scene')}, "
         title = several if len(group) > 1 else f"{first.id}: "

@@ -84,7 +84,10 @@ def init(
         from lidarops.run.first_look import look_at_data
 
         with progress_bar("look at data", None, "instruments") as bar:
-            text = draft(looks=look_at_data(text, contents, str(root), bar.advance))
+            looks, failed = look_at_data(text, contents, str(root), bar.advance)
+        for key, reason in failed.items():
+            say(f"{key}: no look at data, drafted from headers alone: {reason}")
+        text = draft(looks=looks)
     base.mkdir(parents=True, exist_ok=True)
     (base / _SCHEMA).write_text(json.dumps(editor_schema(), indent=2) + "\n", encoding="utf-8")
     campaign.write_text(text, encoding="utf-8")

@@ -16,8 +16,8 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import IntEnum
@@ -58,7 +58,7 @@ _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 _WAVELENGTH = re.compile(r"(\d{1,5})[.,]([A-Za-z0-9])", re.ASCII)
 _DATE = r"(\d{1,2})/(\d{1,2})/(\d{4}) {1,8}(\d{1,2}):(\d{2}):(\d{2})"
 _DATES = re.compile(rf"(?<!\S){_DATE} {{1,8}}{_DATE}(?!\S)", re.ASCII)
-_NAMED = re.compile(r"[A-Za-z_]*(\d{2})([1-9A-C])(\d{2})(\d{2})\.(\d{2})(\d)(\d)?\d{0,3}", re.ASCII)
+_NAMED = re.compile(r"[A-Za-z_]+(\d{2})([1-9A-C])(\d{2})(\d{2})\.(\d{2})(\d)(\d)?\d{0,3}", re.ASCII)
 """Name as Licel writes it: year, month in hexadecimal, day and hour, then minute and second,
 or minute and tens of seconds (`licel2023`)."""
 _EMPTY_LINES: Final = (b"\r\n", b"\n")
@@ -615,12 +615,17 @@ def _parse_datasets(
     notes = [
         f"{d.name} has no shots: its values are undefined"
         for d in datasets
-        if d.active and d.shots == 0
+        if d.active and d.shots == 0 and d.kind is not DatasetKind.OTHER
     ]
     notes += [
         f"{d.name} is no signal by its type, and one by its device {d.device}"
         for d in datasets
         if d.active and d.mode is None and d.device.startswith(_SIGNAL_DEVICES)
+    ]
+    notes += [
+        f"dataset {d.device} cannot be a signal and is left out"
+        for d in datasets
+        if d.active and d.kind is DatasetKind.OTHER
     ]
     notes += [
         f"polarisation l of {d.name} is taken as parallel, as older files have it beside s"
@@ -659,9 +664,12 @@ def _parse_lines(block: bytes) -> list[Dataset]:
         except RawFormatError as error:
             error.field = f"dataset {len(datasets) + 1}, {error.field}"
             raise
-    letters = {dataset.polarisation for dataset in datasets if dataset.mode is not None}
-    if letters >= _OLD_LETTERS and not letters & _NEW_LETTERS:
-        datasets = [_with_new_letter(dataset) for dataset in datasets]
+    letters: dict[str, set[str]] = defaultdict(set)
+    for dataset in datasets:
+        letters[dataset.wavelength_label[:-1]].add(dataset.polarisation)
+    datasets = [
+        _with_new_letter(dataset, letters[dataset.wavelength_label[:-1]]) for dataset in datasets
+    ]
     uses: Counter[str] = Counter()
     # Active datasets get their names first: an inactive one must not take the plain name.
     for index in sorted(range(len(datasets)), key=lambda index: not datasets[index].active):
@@ -672,9 +680,13 @@ def _parse_lines(block: bytes) -> list[Dataset]:
     return datasets
 
 
-def _with_new_letter(dataset: Dataset) -> Dataset:
-    """Return a dataset of an older file, in which l is parallel, as newer ones state it."""
-    if dataset.polarisation != "l":
+def _with_new_letter(dataset: Dataset, letters: Set[str]) -> Dataset:
+    """Return a dataset of an older file, in which l is parallel, as newer ones state it.
+
+    `letters` are those of all datasets of its wavelength.
+    """
+    old = letters >= _OLD_LETTERS and not letters & _NEW_LETTERS
+    if not old or dataset.polarisation != "l":
         return dataset
     return replace(dataset, polarisation="p", name=f"{dataset.name[:-1]}p")
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +20,10 @@ from lidarops.campaign.model import Campaign, campaign_schema
 from lidarops.campaign.yaml_errors import with_plain_numbers
 from lidarops.catalog.draft import drafted_instruments
 from lidarops.catalog.folder import FirstLook, FolderContents, InstrumentHeaders
-from lidarops.errors import LidarOpsError
+from lidarops.errors import LidarOpsError, SceneError
 from lidarops.netcdf.read import open_product
 from lidarops.records import RunRecord, file_channels, is_glued
-from lidarops.run.archive import reprocess
+from lidarops.run.archive import bring_up_to_date
 
 _MOST_FILES: Final = 96
 """Files of a look: all of half an hour of minutes, or four of each hour of a day."""
@@ -46,8 +45,8 @@ Floats = NDArray[np.float64]
 
 def look_at_data(
     text: str, contents: FolderContents, root: str, progress: Callable[[int], object]
-) -> dict[str, FirstLook]:
-    """Return what the data of the instruments of a draft show, by their keys.
+) -> tuple[dict[str, FirstLook], dict[str, str]]:
+    """Return what the data of the instruments of a draft show, and why others give no look, by key.
 
     Of instruments for which `elastic` is drafted: a fixed beam that reaches clean air.
 
@@ -60,19 +59,24 @@ def look_at_data(
         Folder of the raw files.
     progress : callable
         Called with the number of instruments done.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the process is asked to stop.
     """
     drafted = with_plain_numbers(yaml.safe_load(text), campaign_schema)
-    looks = {}
+    looks: dict[str, FirstLook] = {}
+    failed: dict[str, str] = {}
     for key, headers in drafted_instruments(contents).items():
         if "elastic" in drafted["instruments"][key]["products"]:
-            # What fails, the plan says; the draft is then that of the headers.
-            with (
-                suppress(LidarOpsError),
-                tempfile.TemporaryDirectory(prefix="lidarops-") as folder,
-            ):
-                looks[key] = _Look(drafted, key, headers, Path(root), Path(folder)).result()
+            with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+                try:
+                    looks[key] = _Look(drafted, key, headers, Path(root), Path(folder)).result()
+                except LidarOpsError as error:
+                    failed[key] = str(error)
         progress(1)
-    return looks
+    return looks, failed
 
 
 class _Look:
@@ -135,7 +139,13 @@ class _Look:
                 "instruments": {self.key: {**instrument, "products": products}},
             }
         )
-        return reprocess(campaign)
+        result = bring_up_to_date(campaign)
+        if result.signal:
+            raise KeyboardInterrupt
+        errors = [scene.error for scene in result.scenes if scene.error]
+        if errors:
+            raise SceneError(errors[0])
+        return result.record
 
     def _made(self, record: RunRecord | None, kind: str) -> Iterator[tuple[str, Path]]:
         for scene in record.scenes if record else ():

@@ -28,6 +28,8 @@ _FREE: Final = frozenset({"name", "shots", "scale", "places", "mode", "wavelengt
 _COMPARED: Final = {
     item.name: item.name in _OF_VALUES for item in fields(RawChannel) if item.name not in _FREE
 }
+_SUMMER_TIME: Final = 3600.0
+"""s; names may be by local time, headers by UTC."""
 _JITTER: Final = 2
 """s; two times in whole seconds may make an interval so much longer than another one."""
 _REMEDY: Final = (
@@ -37,6 +39,8 @@ _REMEDY: Final = (
 
 ReadHeader = Callable[[Granule], RawHeader | None]
 """Header of a file; None where it cannot be read."""
+Ahead = Callable[[Granule], float]
+"""Clock of the instrument minus UTC at a file, s, which its start has not."""
 
 
 class Outlying(NamedTuple):
@@ -48,14 +52,14 @@ class Outlying(NamedTuple):
 
 
 def without_outlying(
-    granules: Sequence[Granule], days: Collection[int], read: ReadHeader
+    granules: Sequence[Granule], days: Collection[int], read: ReadHeader, ahead: Ahead
 ) -> tuple[list[Granule], list[Granule], list[tuple[Granule, str]]]:
     """Return granules without those whose headers cannot be used, these as refused ones, and notes.
 
     Headers that differ in what changes no value become notes, each given with its granule.
     Parameters as `outlying_headers`.
     """
-    outlying = outlying_headers(granules, days, read)
+    outlying = outlying_headers(granules, days, read, ahead)
     kept, refused, noted = [], [], []
     for granule in granules:
         stated = outlying.get(granule.path)
@@ -72,7 +76,7 @@ def without_outlying(
 
 
 def outlying_headers(
-    granules: Sequence[Granule], days: Collection[int], read: ReadHeader
+    granules: Sequence[Granule], days: Collection[int], read: ReadHeader, ahead: Ahead
 ) -> dict[str, Outlying]:
     """Return the files of some days whose headers differ from the mode of the files around them.
 
@@ -86,6 +90,7 @@ def outlying_headers(
     days : collection of int
         Days since 1970-01-01.
     read : callable
+    ahead : callable
 
     Returns
     -------
@@ -103,7 +108,7 @@ def outlying_headers(
         if len(around) <= FEWEST_ALIKE:
             continue
         statements = [*_setups(around, day, read), *_intervals(around, day, read)]
-        statements += _times(around, day)
+        statements += _times(around, day, ahead)
         if role is Role.SIGNAL:
             statements += _pointings(around, day)
         for place, stated in statements:
@@ -185,25 +190,28 @@ def _intervals(
             yield place, Outlying("", text)
 
 
-def _times(around: Sequence[Granule], day: int) -> Iterator[tuple[int, Outlying]]:
+def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[int, Outlying]]:
     """Yield places of files that start away from the time in their name as no other file does.
 
     Names tell start or stop, in any time zone: the other files show how far they are from it. A
-    clock that is set moves both.
+    clock that is set moves both, and summer time may move one of both by an hour.
     """
     away: dict[int, float] = {}
     longest = 0.0
     for place, granule in enumerate(around):
         named = raw_formats()[granule.format].named_time(granule.path.rpartition("/")[2])
         if named and granule.start and granule.stop:
-            away[place] = (granule.start - named).total_seconds()
+            away[place] = (granule.start - named).total_seconds() + ahead(granule)
             longest = max(longest, (granule.stop - granule.start).total_seconds())
     if len(away) <= FEWEST_ALIKE:
         return
     usual = median(away.values())
     for place, own in away.items():
         granule = around[place]
-        if any(abs(own - other) <= longest + _JITTER for at, other in away.items() if at != place):
+        room = longest + _JITTER
+        if abs(abs(own - usual) - _SUMMER_TIME) <= room or any(
+            abs(own - other) <= room for at, other in away.items() if at != place
+        ):
             continue
         if granule.start and day_of(granule.start) == day:
             text = (

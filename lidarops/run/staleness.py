@@ -338,7 +338,7 @@ class Judge(DayStates):
         stored = self.store.granules_of(first - NEAR_DAYS, last + NEAR_DAYS, dark_days=DARK_DAYS)
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
-        kept, refused, noted = without_outlying(granules, used, self._header)
+        kept, refused, noted = without_outlying(granules, used, self._header, self._ahead)
         aside = [granule for granule in refused if day_of(_moment(granule)) in days]
         cut = cut_scenes(
             self.campaign,
@@ -367,6 +367,10 @@ class Judge(DayStates):
                 if day_of(_moment(granule)) in days
             ),
         )
+
+    def _ahead(self, granule: Granule) -> float:
+        """Return the clock of the instrument minus UTC at a file, s."""
+        return self.campaign.instruments[granule.instrument].facts_at(_moment(granule)).clock_offset
 
     def _months(self, days: set[int]) -> Iterator[Scene]:
         """Yield the months that begin on some days, of which products are made."""
