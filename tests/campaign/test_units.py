@@ -35,6 +35,10 @@ from lidarops.units import parse_quantity, written
         ("4", "s", None),
         ("4 m", "s", None),
         ("4 ns and more", "s", None),
+        ("1e400 m", "m", None),
+        ("1e9999999999999999999 m", "m", None),
+        ("5 bins", "1", None),
+        ("5 bins", "bins", 5.0),
         ("estimate", "s", None),
     ],
 )

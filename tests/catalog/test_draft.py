@@ -343,10 +343,19 @@ def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path:
         ("DP_20260301_0000/+45", None),
         ("polcal/m45", None),
         ("telecover_north", None),
+        ("TC-N", None),
+        ("DP+45", None),
+        ("Delta-45deg", None),
+        ("pol-cal", None),
+        ("20170928-DC", Role.DARK),
+        ("bkg1", None),
         ("0755bACKGROUND", None),
         # Words that are parts of other ones.
         ("adcp", Role.SIGNAL),
         ("midpoint", Role.SIGNAL),
+        ("Darkhan", Role.SIGNAL),
+        ("depol", Role.SIGNAL),
+        ("2023-45", Role.SIGNAL),
     ],
 )
 def test_files_of_tests_and_calibrations_are_a_question_and_no_measurements(
@@ -389,3 +398,27 @@ def test_names_by_another_time_than_headers_are_a_question(
         write(tmp_path / f"raw/h26301{hour:02d}.{number:02d}0000", content(600.0 + number))
     _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert question in next(line for line in text.splitlines() if "clock_offset" in line)
+
+
+def test_the_letters_of_a_station_are_no_words(tmp_path: Path) -> None:
+    for number in range(3):
+        write(tmp_path / f"raw/dc26{number}", content(number, seed=number))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert {granule.role for granule in granules(campaign)} == {Role.SIGNAL}
+
+
+@pytest.mark.parametrize(
+    ("line", "elastic"), [(529, False), (530, False), (535, False), (540, True)]
+)
+def test_rotational_raman_lines_are_not_proposed_as_elastic(
+    tmp_path: Path, line: int, elastic: bool
+) -> None:
+    for number in range(2):
+        data = content(number, seed=number, zenith_angle=0.0)
+        # The analog record becomes that of the other line.
+        data = data.replace(b"00532.o 0 0 00 000 12", f"00{line}.o 0 0 00 000 12".encode())
+        write(tmp_path / f"raw/h{number}", data)
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    proposed = lidar.products.requested["elastic"].channels
+    assert ("photon_532o" in proposed, f"analog_{line}o" in proposed) == (True, elastic)

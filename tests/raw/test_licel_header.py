@@ -351,6 +351,11 @@ def test_the_letter_of_older_files_is_parallel_beside_perpendicular():
     assert "polarisation l of analog_532p is taken as parallel" in " ".join(header.notes)
     circular = parse(datasets=tuple(line.replace("532.s", "532.r") for line in lines))
     assert circular.channels[0].name == "analog_532l"
+    # Letters of another wavelength tell nothing.
+    of_355 = [line.replace("532.l", "355.l") for line in lines]
+    assert parse(datasets=tuple(of_355)).channels[0].name == "analog_355l"
+    beside = (*lines, ANALOG.replace("532", "355"))
+    assert parse(datasets=beside).channels[0].name == "analog_532p"
     alone = parse(datasets=tuple(lines[:2]))
     assert alone.channels[0].name == "analog_532l"
 

@@ -65,7 +65,7 @@ def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("name", "elastic", "least", "raman"),
     [
-        ("pilar", {"532p": 454, "53200o": 454, "355p": 454}, 0.6, set()),
+        ("pilar", {"532p": 510, "53200o": 510, "355p": 510}, 0.6, set()),
         ("saopaulo", {"532o": 975, "355o": 975}, 0.6, set()),
         ("manaus_raman", {"355o": 1600}, 0.6, {"photon_355o"}),
         ("public/manaus_20111017_day", {"355o": 1400}, 0.05, {"photon_355o"}),

@@ -260,6 +260,8 @@ def test_a_file_that_is_shorter_by_its_shots_is_no_damage(tmp_path: Path) -> Non
         ({2: "12"}, 6, ["poor/h2630104.020000"]),
         # A clock was set: names and headers are its own.
         ({3: "12", 4: "12"}, 0, []),
+        # Summer time of names or of headers.
+        ({3: "11"}, 0, []),
     ],
 )
 def test_a_start_that_its_name_and_all_around_it_contradict_is_refused(
@@ -281,6 +283,19 @@ def test_a_start_that_its_name_and_all_around_it_contradict_is_refused(
     )
 
 
+def test_a_clock_that_the_facts_state_contradicts_no_name(tmp_path: Path) -> None:
+    """One file before the clock was set by three hours, the others after it."""
+    archive = Archive(tmp_path, days=0)
+    edge = "2026-03-01T21:00:00Z"
+    facts = [{"clock_offset": 10_800, "valid_to": edge}, {"valid_from": edge}]
+    archive.tree["instruments"] = {"poor": {**archive.tree["instruments"]["poor"], "facts": facts}}
+    archive.raw("poor/h2630123.300000", 1410.0, seed=0)
+    for k in range(FILES):
+        archive.raw(f"poor/h2630202.{k:02d}0000", 1560.0 + k, seed=k + 1)
+    result, _ = _run(archive)
+    assert not result.set_aside
+
+
 @pytest.mark.parametrize("name", ["pilar", "saopaulo", "manaus", "savant"])
 def test_no_measured_file_lies_off_those_around_it(
     name: str, data_root: Path, tmp_path: Path
@@ -300,7 +315,7 @@ def test_no_measured_file_lies_off_those_around_it(
 
     days = {day_of(granule.start) for granule in granules if granule.start}
     assert len(granules) > 25
-    outlying = set(outlying_headers(granules, days, header).values())
+    outlying = set(outlying_headers(granules, days, header, lambda _: 0.0).values())
     # One file of the test archive stems from elsewhere.
     foreign = Outlying("", "site CHICAGO, the files around it U-C_VOL_")
     assert outlying == ({foreign} if name == "savant" else set())

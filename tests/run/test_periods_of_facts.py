@@ -53,7 +53,7 @@ def test_files_of_no_period_of_facts_are_refused(archive: Archive) -> None:
     assert result.exit_code == 1
     assert sorted(json.loads(result.stdout)["refused_files"]) == OF_SECOND
     reasons = refused(archive)
-    assert "2026-03-02 10:00 UTC, which is in no period of the facts" in reasons["rich/h10"]
+    assert "is of a time that no period of the facts holds" in reasons["rich/h10"]
     # The facts may be mistaken.
     assert products_of_second(archive) == before
 
@@ -86,3 +86,15 @@ def test_commands_name_invalid_files_and_succeed(archive: Archive, name: str) ->
     result = command(archive, name, "--json")
     assert result.exit_code == 0, result.output
     assert WHY in result.stdout
+
+
+def test_dark_files_are_used_whatever_period_they_are_of(archive: Archive) -> None:
+    """The only one is of the first day, at 11:40; it is subtracted on that day and the next."""
+    facts = archive.tree["instruments"]["rich"]["facts"]
+    noon = {"valid_from": "2026-03-01T11:00:00Z", "valid_to": "2026-03-01T12:00:00Z"}
+    later = {**facts[0], "valid_from": noon["valid_to"]}
+    facts[:1] = [{**facts[0], "valid_to": noon["valid_from"]}, {**noon, "invalid": WHY}, later]
+    planned = command(archive, "plan", "--all", "--instrument", "rich")
+    assert planned.exit_code == 0, planned.output
+    assert refused(archive) == {}
+    assert planned.output.count("1 dark") >= 2
