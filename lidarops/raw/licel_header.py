@@ -17,7 +17,7 @@ import hashlib
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import IntEnum
@@ -667,9 +667,11 @@ def _parse_lines(block: bytes) -> list[Dataset]:
     letters: dict[str, set[str]] = defaultdict(set)
     for dataset in datasets:
         letters[dataset.wavelength_label[:-1]].add(dataset.polarisation)
-    datasets = [
-        _with_new_letter(dataset, letters[dataset.wavelength_label[:-1]]) for dataset in datasets
-    ]
+    for place, dataset in enumerate(datasets):
+        beside = letters[dataset.wavelength_label[:-1]]
+        if dataset.polarisation == "l" and beside >= _OLD_LETTERS and not beside & _NEW_LETTERS:
+            name = f"{dataset.name[:-1]}p"
+            datasets[place] = replace(dataset, polarisation="p", name=name)
     uses: Counter[str] = Counter()
     # Active datasets get their names first: an inactive one must not take the plain name.
     for index in sorted(range(len(datasets)), key=lambda index: not datasets[index].active):
@@ -678,17 +680,6 @@ def _parse_lines(block: bytes) -> list[Dataset]:
         if uses[name] > 1:
             datasets[index] = replace(datasets[index], name=f"{name}_{uses[name]}")
     return datasets
-
-
-def _with_new_letter(dataset: Dataset, letters: Set[str]) -> Dataset:
-    """Return a dataset of an older file, in which l is parallel, as newer ones state it.
-
-    `letters` are those of all datasets of its wavelength.
-    """
-    old = letters >= _OLD_LETTERS and not letters & _NEW_LETTERS
-    if not old or dataset.polarisation != "l":
-        return dataset
-    return replace(dataset, polarisation="p", name=f"{dataset.name[:-1]}p")
 
 
 def parse_dataset(line: bytes) -> Dataset:
