@@ -79,7 +79,7 @@ def main(
     Accuracy compares errors with the least possible errors; throughput compares times with a floor
     measured in the same run; stability shows how often a wrong value
     has no flag, and fails with 1 where a target is missed. Its cases are homogeneous, signal,
-    elastic, multiangle, network, raman, flags and order, or the name of a table.
+    elastic, multiangle, network, raman, flags, light and order, or the name of a table.
 
     Example: python -m benchmarks accuracy --case homogeneous --quick --out bench
 

@@ -16,6 +16,7 @@ from benchmarks.stability import (
     random_dead_times,
     random_elastic,
     random_homogeneous,
+    random_light,
     random_networks,
     random_raman,
     random_scans,
@@ -40,6 +41,7 @@ LONGEST: Final = 1200.0
 """s, most CPU time of the whole benchmark."""
 COST: Final = "CPU time of the parts"
 FLAGS: Final = "Flags of few photon counts, and bits that decide alone"
+LIGHT: Final = "Profiles without light of the laser"
 REPRODUCIBLE: Final = "Order of profiles, machine and work"
 WHOLE: Final = "all parts"
 _NOTE: Final = (
@@ -157,6 +159,8 @@ DRAWS: Final = (
 OTHERS: Final = (
     Other("flags", "flags", FLAGS, lambda quick: flag_rates.flag_rates(2 if quick else 60),
           ("flag", "condition")),
+    Other("light", "light", LIGHT, lambda quick: random_light.light_scores(10 if quick else 200),
+          ("profiles", "condition")),
     Other("order and machine", "order", REPRODUCIBLE,
           lambda quick: reproducibility.measure_reproducibility(*((2, 1) if quick else (60, 6))),
           ("case", "figure")),

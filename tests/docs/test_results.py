@@ -113,7 +113,7 @@ def test_published_targets_are_those_of_the_code() -> None:
     """Rates of an older rule or with other columns are measured again."""
     tables = benchmark_results.read("stability")["tables"]
     titles = [draws.title for draws in study.DRAWS]
-    assert list(tables) == [*titles, study.FLAGS, study.REPRODUCIBLE, study.COST]
+    assert list(tables) == [*titles, study.FLAGS, study.LIGHT, study.REPRODUCIBLE, study.COST]
     judged = 0
     for title in titles:
         figures = {(row.case, row.method, row.quantity): row for row in tables[title]}

@@ -22,6 +22,7 @@ from benchmarks.harness.verdicts import Verdict
 from benchmarks.stability import (
     random_elastic,
     random_homogeneous,
+    random_light,
     random_networks,
     random_scans,
     random_signals,
@@ -385,6 +386,22 @@ def test_networks_have_the_same_values_each_time():
     first, second = (reproducibility.network_values(1) for _ in range(2))
     assert first.shape[0] == 2
     assert np.array_equal(first, second, equal_nan=True)
+
+
+def test_profiles_without_light_are_counted_where_they_are_missed(monkeypatch):
+    scores = random_light.light_scores(5)
+    judged = [one["target"] for one in scores.values() if one["target"] is not None]
+    assert len(judged) == len(scores) - 2
+    assert all(one.met for one in judged)
+    none = {"bright": np.zeros(200, dtype=bool), "weak": np.ones(200, dtype=bool)}
+    monkeypatch.setattr(
+        random_light,
+        "lightless",
+        lambda found, _: {name: none[name][: one.measured.size] for name, one in found.items()},
+    )
+    for (case, _), score in random_light.light_scores(2).items():
+        wrong = ("missed" in case) == ("bright" in case)
+        assert score["share"].value == float(wrong), case
 
 
 def test_the_cost_of_all_parts_is_a_target():
