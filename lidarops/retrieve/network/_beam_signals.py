@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -10,12 +11,15 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Codes, Indices
 from lidarops.retrieve.network import _condensed_signals
 from lidarops.retrieve.network._condensed_signals import (
     NOT_POSITIVE,
+    CleanBeam,
     CondensedSignals,
     FitLayout,
+    condense,
+    median,
 )
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -24,15 +28,21 @@ _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class BeamSignals:
-    """Condensed signals of the beams."""
+    """Clean signals of the beams."""
 
     layout: FitLayout
     exponent: Array
     """(beam,)."""
-    data: CondensedSignals
-    """Signals of the profiles."""
+    beams: list[CleanBeam]
+    """Those with passages."""
+    usable: Booleans
+    """(profile, passage)."""
+    status: Codes
+    """(profile, passage) why a beam ends before its last passage."""
+    bridged: Booleans
+    """(profile, passage) True where the beam has outlying bins."""
     block: Indices
     """(profile,) block numbers."""
     weak: Booleans
@@ -40,30 +50,37 @@ class BeamSignals:
     far noisier than most of it."""
     leading: tuple[int, ...]
     """Shape of the axes before beam and range."""
+    together: bool
+    """Whether the profiles of a block are one field."""
+
+    @cached_property
+    def data(self) -> CondensedSignals:
+        """Signals of each profile, condensed."""
+        data, _ = condense(self.beams, self.layout)
+        data.usable[~self.usable] = False
+        return data
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimates:
-    """What the blocks give, before flags are set; NaN where there is none."""
+    """What the profiles and blocks give, before flags are set; NaN where there is none."""
 
     extinction: Array
     """(profile, crossing) m-1."""
     variance: Array
     """(profile, crossing) m-2."""
-    prior_true_variance: Array
-    """(profile, crossing) m-2, without the errors that the block shows."""
-    prior_contradicted: Booleans
-    """(profile,) True where the beams contradict the prior but cannot replace it."""
     settled: Booleans
     """(profile,)."""
     left_out: Booleans
-    """(profile, beam) True where the covariance of a beam is singular or missing."""
+    """(profile, passage) True where the covariance of a beam is singular or missing."""
     chi_square: Array
-    """(profile, 2) of the beams alone, and of beams and prior together."""
+    """(profile, 3) of the beams alone, about the field of the block, and of its mean."""
     degrees_of_freedom: Array
-    """(profile, 2) of these."""
+    """(profile, 3) of these."""
     deviation: Array
     """(profile,) standard deviation of the prior; inf without one."""
+    overlap_error: Array
+    """(profile, crossing) m-1, part of the error by the default error of the overlap."""
     multiplier: Array
     """(profile, crossing)."""
     multiplier_error: Array
@@ -77,12 +94,10 @@ class Estimates:
         profiles = beams.block.size
         shape = (profiles, beams.layout.crossings)
         return cls(
-            np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
-            np.zeros(profiles, dtype=np.bool_), np.zeros(profiles, dtype=np.bool_),
-            np.zeros((profiles, beams.exponent.size), dtype=np.bool_),
-            np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan),
-            np.full(profiles, np.inf), np.full(shape, np.nan), np.zeros(shape),
-            np.zeros(shape[1], dtype=np.bool_),
+            np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(profiles, dtype=np.bool_),
+            np.zeros(beams.usable.shape, dtype=np.bool_), np.full((profiles, 3), np.nan),
+            np.full((profiles, 3), np.nan), np.full(profiles, np.inf), np.zeros(shape),
+            np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[1], dtype=np.bool_),
         )  # fmt: skip
 
 
@@ -96,9 +111,13 @@ def prepare_signals(
     full_overlap_range: npt.ArrayLike | None,
     exponent: npt.ArrayLike,
     blocks: npt.ArrayLike | None,
-    bins: int,
+    together: bool,
 ) -> BeamSignals:
-    """Validate and condense signals. Arguments are those of `extinction_field.retrieve_network`."""
+    """Validate and clean signals.
+
+    Arguments are those of `extinction_field.retrieve_network`, and whether the profiles of a block
+    are solved together.
+    """
     ranges = _ranges(range_, network.beams)
     signal = inputs.real_array(power, "power").astype(np.float64, copy=False)
     if signal.ndim < 2 or signal.shape[-2:] != ranges.shape:
@@ -119,18 +138,26 @@ def prepare_signals(
     )
     block = _blocks(blocks, leading)
     nearest, overlap_function = _overlap(overlap, full_overlap_range, ranges)
-    if not (isinstance(bins, int | np.integer) and 3 <= bins <= 99):
-        raise RetrievalInputError(f"is {bins}", field="bins", remedy="choose 3 to 99")
     exponents = _per_beam(exponent, network.beams, "exponent", *THRESHOLDS.exponents)
-    layout = _condensed_signals.lay_out_fits(network, ranges, overlap_function, nearest, int(bins))
+    bins = THRESHOLDS.fit_bins
+    layout = _condensed_signals.lay_out_fits(network, ranges, overlap_function, nearest, bins)
     signal = np.where(np.isnan(ranges), np.nan, signal)
-    data = _condensed_signals.condense(signal, variances, exponents, layout)
+    beams = _condensed_signals.clean(signal, variances, exponents, layout, together=together)
     with np.errstate(all="ignore"):
-        weak, negative = _weak_passages(signal, variances, layout, block)
+        weak, negative = _weak_passages(signal, variances, layout, block, together=together)
+    shape = weak.shape
+    status, usable = np.zeros(shape, dtype=np.uint8), np.zeros(shape, dtype=np.bool_)
+    bridged = np.zeros(shape, dtype=np.bool_)
+    for row in beams:
+        on_beam = slice(layout.first_passage[row.number], layout.first_passage[row.number + 1])
+        status[:, on_beam], bridged[:, on_beam] = row.status[:, None], row.bridged[:, None]
+        usable[:, on_beam] = layout.window[on_beam] + bins <= row.stops[:, None]
     # Missing signals already have a reason.
-    weak &= data.usable | (data.status == NOT_POSITIVE)[:, layout.passages.beam]
-    data.usable[weak | negative] = False
-    return BeamSignals(layout, exponents, data, block, weak, leading)
+    weak &= usable | (status == NOT_POSITIVE)
+    usable &= ~(weak | negative)
+    return BeamSignals(
+        layout, exponents, beams, usable, status, bridged, block, weak, leading, together
+    )
 
 
 def _ranges(values: npt.ArrayLike, beams: int) -> Array:
@@ -204,7 +231,7 @@ def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:
 
 
 def _weak_passages(
-    power: Array, variance: Array, layout: FitLayout, block: Indices
+    power: Array, variance: Array, layout: FitLayout, block: Indices, *, together: bool
 ) -> tuple[Booleans, Booleans]:
     """Return (profile, passage) where noise hides the signal, and where the signal is negative.
 
@@ -213,25 +240,24 @@ def _weak_passages(
     laser energy also raises the noise.
     """
     bins = layout.weights.shape[1]
-    level, spread = np.empty((2, len(power), layout.passages.beam.size))
-    for c, (beam, first) in enumerate(zip(layout.passages.beam, layout.window, strict=True)):
-        level[:, c] = power[:, beam, first : first + bins].sum(axis=1) / bins
-        spread[:, c] = variance[:, beam, first : first + bins].sum(axis=1) / bins
+    beam = layout.passages.beam[:, np.newaxis]
+    at = layout.window[:, np.newaxis] + np.arange(bins)
+    level, spread = (values[:, beam, at].mean(axis=2) for values in (power, variance))
     weak, negative = np.zeros(level.shape, np.bool_), np.zeros(level.shape, np.bool_)
     limit = THRESHOLDS.largest_bin_error**2
     for number in np.unique(block):
         rows = np.flatnonzero(block == number)
-        for c in range(level.shape[1]):
-            known = rows[np.isfinite(level[rows, c]) & np.isfinite(spread[rows, c])]
-            if known.size == 0:
-                continue
-            spreads = spread[known, c]
-            # Where noise rises, more than half of the profiles may be noisy.
-            counted = spreads <= THRESHOLDS.noisy_profile * np.median(spreads)
-            typical = np.median(level[known, c]), np.mean(spreads[counted])
-            error = np.sqrt(_MEDIAN_OVER_MEAN * typical[1] / (known.size * bins))
-            negative[rows, c] = typical[0] < -THRESHOLDS.negative * error
-            noisy = spread[rows, c] > THRESHOLDS.noisy_profile * typical[1]
-            noisy &= spread[rows, c] > limit * np.maximum(level[rows, c], 0.0) ** 2
-            weak[rows, c] = noisy | (typical[1] > limit * max(typical[0], 0.0) ** 2)
+        levels, spreads = level[rows], spread[rows]
+        known = np.isfinite(levels) & np.isfinite(spreads)
+        typical, middle = (median(values, known) for values in (levels, spreads))
+        # Where noise rises, more than half of the profiles may be noisy.
+        counted = known & (spreads <= THRESHOLDS.noisy_profile * middle)
+        mean = np.where(counted, spreads, 0.0).sum(axis=0) / counted.sum(axis=0)
+        profiles = known.sum(axis=0)
+        error = np.sqrt(_MEDIAN_OVER_MEAN * mean / (profiles * bins))
+        negative[rows] = typical < -THRESHOLDS.negative * error
+        noisy = spreads > THRESHOLDS.noisy_profile * mean
+        noisy &= spreads > limit * np.maximum(levels, 0.0) ** 2
+        averaged = profiles if together else 1.0
+        weak[rows] = noisy | (mean / averaged > limit * np.maximum(typical, 0.0) ** 2)
     return weak & ~negative, negative

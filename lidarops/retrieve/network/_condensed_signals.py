@@ -10,10 +10,12 @@ profile does not depend on the other profiles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Codes, Indices
 from lidarops.retrieve.network import outlying_bins
@@ -26,6 +28,10 @@ NOT_POSITIVE: Final = 2
 OUTLYING: Final = 3
 """Reasons why a beam ends before its last bin."""
 _SMALLEST_STEP: Final = 1e-12
+_NEIGHBOURS: Final = 7
+"""Bins whose mean is the level of a bin that is not positive."""
+_MEDIAN_OVER_MEAN: Final = np.pi / 2.0
+"""Variance of a median over the variance of a mean."""
 
 
 # Bins and weights --------------------------------------------------------------------------------
@@ -170,10 +176,6 @@ class CondensedSignals:
     variances known."""
     covariance: Array
     """(profile, packed) for each beam, covariance of its log values, then its integrals."""
-    status: Codes
-    """(profile, beam) MISSING, NOT_POSITIVE or OUTLYING."""
-    bridged: Booleans
-    """(profile, beam) True where a beam has outlying bins."""
     curvature_error: Array
     """(profile, passage, 2) difference of line and polynomial, and its variance by noise."""
 
@@ -183,13 +185,19 @@ class CondensedSignals:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Beam:
-    """Logarithms of the bins of one beam that are used, and of a margin."""
+class CleanBeam:
+    """Bins of one beam that are used, and of a margin, with single outlying bins bridged."""
 
+    number: int
     start: int
     """Number of the first bin."""
+    low: int
+    """Number of the first bin that a fit uses; those before it are a margin."""
+    power: Array
+    """(profile, bin) and its variance, as given."""
+    variance: Array
     logs: Array
-    """(profile, bin)."""
+    """(profile, bin) logarithms of the signal; 0 where it is not positive."""
     noise: Array
     """(profile, bin) their variances."""
     doubt: Array
@@ -198,7 +206,26 @@ class _Beam:
     """(profile, bin) codes of `outlying_bins`."""
     stops: Indices
     """(profile,) behind the last bin that can be used."""
+    status: Codes
+    """(profile,) why a beam ends before its last used bin."""
     exponent: float
+
+    @property
+    def bridged(self) -> Booleans:
+        """(profile,) True where a beam has outlying bins."""
+        return np.asarray(((self.codes == BRIDGED) | (self.codes == KEPT)).any(axis=1))
+
+    def take(self, profiles: Indices) -> CleanBeam:
+        """Return the selected profiles."""
+        arrays = ("power", "variance", "logs", "noise", "doubt", "codes", "stops", "status")
+        return replace(self, **{name: getattr(self, name)[profiles] for name in arrays})
+
+    def clear(self, layout: FitLayout) -> Booleans:
+        """Return (profile, passage) where noise does not hide the signal at a passage."""
+        passages = slice(*layout.first_passage[self.number : self.number + 2])
+        at = layout.window[passages, np.newaxis] + np.arange(layout.weights.shape[1]) - self.start
+        level, spread = (each[:, at].mean(axis=2) for each in (self.power, self.variance))
+        return np.asarray(spread <= (THRESHOLDS.largest_bin_error * np.maximum(level, 0.0)) ** 2)
 
     def values(self, bins: slice, weights: Array) -> tuple[Array, Array]:
         """Return sums of logarithms, corrected for their bias by noise, and their variances."""
@@ -210,8 +237,10 @@ class _Beam:
         return (weights * logs).sum(axis=1), (weights * weights * noise).sum(axis=1) + doubt**2
 
 
-def condense(power: Array, variance: Array, exponent: Array, layout: FitLayout) -> CondensedSignals:
-    """Condense power to values at crossings and integrals between them.
+def clean(
+    power: Array, variance: Array, exponent: Array, layout: FitLayout, *, together: bool
+) -> list[CleanBeam]:
+    """Return the beams that have passages, with outlying bins found.
 
     Parameters
     ----------
@@ -220,39 +249,50 @@ def condense(power: Array, variance: Array, exponent: Array, layout: FitLayout) 
     exponent : (beam,) float64
         m of backscatter ~ extinction^(1/m).
     layout : FitLayout
+    together : bool
+        Whether profiles are averaged, so that a bin which noise makes negative is no end of a beam.
     """
-    profiles, total = power.shape[0], layout.passages.beam.size
+    with np.errstate(all="ignore"):
+        beams = []
+        for beam in np.flatnonzero(np.diff(layout.first_passage)):
+            row = _take_logarithms(
+                int(beam), power[:, beam], variance[:, beam], float(exponent[beam]), layout,
+                together=together,
+            )  # fmt: skip
+            _bridge(row, layout.range[beam], layout.window[layout.first_passage[beam]])
+            beams.append(row)
+    return beams
+
+
+def condense(beams: Sequence[CleanBeam], layout: FitLayout) -> tuple[CondensedSignals, list[Array]]:
+    """Condense clean beams to values at crossings and integrals between them.
+
+    Returns
+    -------
+    CondensedSignals
+    list of (profile, 2 passage - 1, bin) float64
+        For each beam, derivatives of its values and integrals by the logarithms of its bins.
+    """
+    profiles, total = len(beams[0].logs) if beams else 0, layout.passages.beam.size
     out = CondensedSignals(
         np.full((profiles, total), np.nan),
         np.zeros((profiles, total)),
         np.zeros((profiles, total), dtype=np.bool_),
         np.zeros((profiles, int(layout.offset[-1]))),
-        np.zeros((profiles, power.shape[1]), dtype=np.uint8),
-        np.zeros((profiles, power.shape[1]), dtype=np.bool_),
         np.zeros((profiles, total, 2)),
     )
     # Signals out of bounds have no value.
     with np.errstate(all="ignore"):
-        for beam in range(exponent.size):
-            if layout.first_passage[beam] < layout.first_passage[beam + 1]:
-                _condense_beam(
-                    beam, power[:, beam], variance[:, beam], float(exponent[beam]), layout, out
-                )
-    return out
+        return out, [_condense_beam(row, layout, out) for row in beams]
 
 
-def _condense_beam(
-    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout,
-    out: CondensedSignals,
-) -> None:  # fmt: skip
+def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> Array:
+    """Fill the signals of a beam, and return their derivatives."""
+    beam = row.number
     on_beam = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
-    row, out.status[:, beam] = _take_logarithms(beam, power, variance, exponent, layout)
-    _bridge(row, layout.range[beam], out.status[:, beam], layout.window[on_beam.start])
-    outlying = (row.codes == BRIDGED) | (row.codes == KEPT)
-    out.bridged[:, beam] = outlying.any(axis=1)
     bins = layout.weights.shape[1]
     count = on_beam.stop - on_beam.start
-    derivatives = np.zeros((len(power), 2 * count - 1, row.logs.shape[1]))
+    derivatives = np.zeros((len(row.logs), 2 * count - 1, row.logs.shape[1]))
     for c in range(on_beam.start, on_beam.stop):
         window = slice(layout.window[c], layout.window[c] + bins)
         usable = window.stop <= row.stops
@@ -263,7 +303,8 @@ def _condense_beam(
         derivatives[:, c - on_beam.start, inside] = usable[:, np.newaxis] * layout.weights[c]
         for column, error in enumerate(row.values(window, layout.curvature_weights[c])):
             out.curvature_error[:, c, column] = np.where(usable, error, 0.0)
-    scale = out.log_value[:, on_beam.start].copy()
+    first = on_beam.start
+    scale = np.where(out.usable[:, first], out.log_value[:, first], 0.0)
     for c in range(on_beam.start, on_beam.stop - 1):
         usable = out.usable[:, c + 1]
         cells = slice(layout.cell[c] - row.start, layout.cell[c + 1] - row.start + 1)
@@ -271,7 +312,7 @@ def _condense_beam(
         steps = np.diff(layout.range[beam, layout.cell[c] : layout.cell[c + 1] + 2])
         logs = row.logs[:, cells.start : cells.stop + 1] - scale[:, np.newaxis]
         parts, centroid = _integrate_cells(logs, ends)
-        parts *= np.where(usable[:, np.newaxis], 2.0 * exponent * steps, 0.0)
+        parts *= np.where(usable[:, np.newaxis], 2.0 * row.exponent * steps, 0.0)
         parts = np.where(usable[:, np.newaxis], parts, 0.0)
         out.integral[:, c] = parts.sum(axis=1)
         derivative = derivatives[:, count + c - on_beam.start]
@@ -283,13 +324,15 @@ def _condense_beam(
     shift = (derivatives * row.doubt[:, np.newaxis]).sum(axis=2)
     covariance += shift[:, :, np.newaxis] * shift[:, np.newaxis]
     packed = slice(layout.offset[beam], layout.offset[beam + 1])
-    out.covariance[:, packed] = covariance.reshape(len(power), covariance.shape[1] ** 2)
+    out.covariance[:, packed] = covariance.reshape(len(covariance), covariance.shape[1] ** 2)
     out.log_value[:, on_beam] -= scale[:, np.newaxis]
+    return derivatives
 
 
 def _take_logarithms(
-    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout
-) -> tuple[_Beam, Codes]:
+    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout, *,
+    together: bool,
+) -> CleanBeam:  # fmt: skip
     """Return the logarithms of a beam, and why they end before its last used bin."""
     first, last = layout.first_passage[beam], layout.first_passage[beam + 1] - 1
     low, high = layout.window[first], layout.window[last] + layout.weights.shape[1]
@@ -301,17 +344,38 @@ def _take_logarithms(
     noise = exponent**2 * (variance / safe**2)
     known = positive & (noise < np.inf)
     logs = np.where(known, exponent * (np.log(safe) + layout.log_factor[beam, start:end]), 0.0)
-    lost = ~known[:, low - start : high - start]
+    used = slice(low - start, high - start)
+    lost = ~(known | _negative_by_noise(power, variance) if together else known)[:, used]
     stops = np.where(lost.any(axis=1), np.argmax(lost, axis=1) + low, high)
     at_stop = power[np.arange(len(power)), np.minimum(stops, end - 1) - start]
     reason = np.where((at_stop <= 0.0) & (at_stop > -HUGE), NOT_POSITIVE, MISSING)
     status = np.where(stops < high, reason, 0).astype(np.uint8)
     codes = np.where(known, GOOD, LOST).astype(np.uint8)
     noise = np.where(known, noise, 0.0)
-    return _Beam(start, logs, noise, np.zeros_like(noise), codes, stops, exponent), status
+    doubt = np.zeros_like(noise)
+    return CleanBeam(
+        beam, int(start), int(low), power, variance, logs, noise, doubt, codes, stops, status,
+        exponent,
+    )  # fmt: skip
 
 
-def _bridge(row: _Beam, grid: Array, status: Codes, low: int) -> None:
+def _negative_by_noise(power: Array, variance: Array) -> Booleans:
+    """Return (profile, bin) where a bin is not positive, but no outlier among its neighbours.
+
+    The beam as a whole has a signal.
+    """
+    negative = (power <= 0.0) & (variance < np.inf)
+    if negative.any():
+        known = np.isfinite(power) & np.isfinite(variance)
+        values, noise = (np.where(known, array, 0.0) for array in (power, variance))
+        level = uniform_filter1d(values, _NEIGHBOURS, axis=1, mode="nearest")
+        negative &= level - power < THRESHOLDS.outlier * np.sqrt(noise)
+        whole = values.sum(axis=1) > THRESHOLDS.outlier * np.sqrt(noise.sum(axis=1))
+        negative &= whole[:, np.newaxis]
+    return np.asarray(negative)
+
+
+def _bridge(row: CleanBeam, grid: Array, low: int) -> None:
     """Replace single outlying bins by what their neighbours predict, in place."""
     if not grid[low + 1] - grid[low] <= THRESHOLDS.widest_bin:
         return
@@ -320,7 +384,7 @@ def _bridge(row: _Beam, grid: Array, status: Codes, low: int) -> None:
     outlying_bins.search(
         row.logs, row.noise, row.exponent, grid, int(low) - row.start, ends, row.codes, row.doubt
     )
-    status[ends + row.start < row.stops] = OUTLYING
+    row.status[ends + row.start < row.stops] = OUTLYING
     row.stops[:] = ends + row.start
     profiles, bins, nodes, weights = _bridged_bins(row, grid)
     noise = row.noise[profiles[:, np.newaxis], nodes]
@@ -329,7 +393,7 @@ def _bridge(row: _Beam, grid: Array, status: Codes, low: int) -> None:
     row.noise[profiles, bins] = (weights * weights * noise).sum(axis=1)
 
 
-def _bridged_bins(row: _Beam, grid: Array) -> tuple[Indices, Indices, Indices, Array]:
+def _bridged_bins(row: CleanBeam, grid: Array) -> tuple[Indices, Indices, Indices, Array]:
     """Return profile and bin of each bridged bin, its neighbours and their weights."""
     profiles, bins = np.nonzero(row.codes == BRIDGED)
     nodes = np.zeros((bins.size, outlying_bins.NODES), dtype=np.intp)
@@ -338,7 +402,7 @@ def _bridged_bins(row: _Beam, grid: Array) -> tuple[Indices, Indices, Indices, A
     return profiles, bins, nodes, weights
 
 
-def _transfer_derivatives(derivatives: Array, row: _Beam, grid: Array) -> None:
+def _transfer_derivatives(derivatives: Array, row: CleanBeam, grid: Array) -> None:
     """Transfer the derivatives by bridged bins to the neighbours they come from, in place."""
     if np.any(row.codes == BRIDGED):
         grid = np.ascontiguousarray(grid[row.start : row.start + row.logs.shape[1]])
@@ -372,3 +436,58 @@ def _integrate_cells(logs: Array, ends: tuple[float, float]) -> tuple[Array, Arr
     square = (step * width) ** 2
     shift = step * width * (1.0 - square / 60.0 * (1.0 - square / 42.0)) / 12.0
     return whole, start + width * (0.5 + np.clip(shift, -0.5, 0.5))
+
+
+# Curved signals ----------------------------------------------------------------------------------
+
+
+def curvature_variance(curvature_error: Array, usable: Booleans, carried: Array) -> Array:
+    r"""Return (profile, crossing) variances from curved signals within a fit.
+
+    Where the logarithm f of the signal is curved along the beam, a line through equal weights of
+    bins is too high by about f'' (bins^2 - 1) step^2 / 24. A polynomial of degree 4 through the
+    same bins has almost none of this error, but twice the noise, so it is not a better value.
+    Their difference, carried to the solution, shows the error. The result is the largest of
+    three, each less the contribution of noise: the square of the shift by the median of the block,
+    the mean square of the shifts of its profiles (a layer may rise or sink), and the square of the
+    shift of the profile itself.
+
+    Parameters
+    ----------
+    curvature_error : (profile, passage, 2) float64
+        Difference of line and polynomial, and its variance by noise, in the profiles of a block.
+    usable : (profile, passage) bool
+    carried : (profile, crossing, passage) float64
+        Derivatives of ln extinction by the log values.
+    """
+    error, noise = np.moveaxis(curvature_error, -1, 0)
+    number = usable.sum(axis=0)
+    shared, shared_noise = (np.nan_to_num(median(values, usable)) for values in (error, noise))
+    # The median of one or two is their mean.
+    shared_noise *= np.where(number > 2, _MEDIAN_OVER_MEAN, 1.0) / np.maximum(number, 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = carried * carried
+        own_shift, own_noise = (
+            (values * of[:, np.newaxis]).sum(axis=2)
+            for values, of in ((carried, error), (squares, noise))
+        )
+        shared_shift = (carried * shared).sum(axis=2)
+        shared_excess = shared_shift**2 - THRESHOLDS.shared_noise * (squares * shared_noise).sum(2)
+        # A noisy profile would hide the shift of the others, or imitate one.
+        counted = own_noise > 0.0
+        counted &= own_noise <= THRESHOLDS.noisy_profile * np.median(own_noise, axis=0)
+        number = np.maximum(counted.sum(axis=0), 1)
+        by_chance = (1.0 + THRESHOLDS.chance * np.sqrt(2.0 / number)) * own_noise
+        excess = np.where(counted, own_shift**2 - by_chance, 0.0).sum(axis=0) / number
+        largest = np.fmax(shared_excess, own_shift**2 - THRESHOLDS.profile_noise * own_noise)
+        return np.asarray(np.fmax(np.fmax(largest, excess), 0.0))
+
+
+def median(values: Array, known: Booleans) -> Array:
+    """Return medians over profiles of the known values; NaN where there is none."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
+    number, columns = known.sum(axis=0), np.arange(values.shape[1])
+    ordered = np.sort(np.where(known, values, np.inf), axis=0)
+    low, high = (ordered[place, columns] for place in (np.maximum(number - 1, 0) // 2, number // 2))
+    return np.where(number > 0, 0.5 * (low + high), np.nan)

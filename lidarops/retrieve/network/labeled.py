@@ -67,7 +67,7 @@ class NetworkSettings:
     `extinction_field.retrieve_network`."""
     exponent_relative_error: float = 0.1
     """Relative error of the exponent m."""
-    lidar_ratio_relative_error: float = 0.02
+    lidar_ratio_relative_error: float = 0.07
     """Relative error of the constant between backscatter^m and extinction at one crossing, against
     the others."""
     overlap_relative_error: float = 0.003
@@ -311,7 +311,9 @@ class _Errors:
             np.nan_to_num(signals.background_error)[..., np.newaxis], shape
         )
         by_background = solver.extinction_changes(result, background)
-        random = root_sum_square([result.extinction_standard_error, *by_background])
+        # The declared error of the overlap replaces the default.
+        stated = result.extinction_standard_error**2 - result.overlap_error**2
+        random = root_sum_square([np.sqrt(np.maximum(stated, 0.0)), *by_background])
         overlap = THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
         overlap_change = root_sum_square(solver.extinction_changes(result, overlap))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -357,7 +359,8 @@ def _quality_flags(
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
         bits[:, crossing] |= signals.warnings[:, index]
     with np.errstate(invalid="ignore"):
-        uncertain = ~(np.hypot(errors.random, errors.systematic) < result.extinction)
+        error = np.hypot(errors.random, errors.systematic)
+        uncertain = ~(error < THRESHOLDS.largest_relative_error * result.extinction)
     background_doubt = shifts(errors.tail_signal, errors.random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(

@@ -38,6 +38,8 @@ _SMOOTH_SIDE: Final[int] = np.int64(4)  # type: ignore[assignment]
 _SMOOTH_DEGREE: Final = 3
 _ONE_SIDED_DEGREE: Final = 2
 _LARGEST_LOGARITHM: Final = 300.0
+_CLEAR: Final = 2.0
+"""Square of a deviation over its variance, below which a bin is not looked at closer."""
 
 
 @compiled
@@ -151,6 +153,26 @@ def _deviation(
 
 
 @compiled
+def _fits(row: tuple[Array, Array, float, Array, Array], codes: Codes, at: int) -> bool:
+    """Return whether a bin clearly agrees with its nearest neighbours, all of which are good.
+
+    Its `_deviation` is then below 2.5 standard errors.
+    """
+    logs, noise, exponent, _, plan = row
+    if at < _SIDE or at + _SIDE >= codes.size:
+        return False
+    gap, spread = logs[at], noise[at]
+    for i in range(_SIDE):
+        before, behind = at - 1 - i, at + 1 + i
+        if codes[before] != GOOD or codes[behind] != GOOD:
+            return False
+        first, second = plan[at, i], plan[at, _SIDE + i]
+        gap -= first * logs[before] + second * logs[behind]
+        spread += first * first * noise[before] + second * second * noise[behind]
+    return bool(gap * gap < min(_CLEAR * spread, (0.5 * exponent) ** 2))
+
+
+@compiled
 def _worst_bin(
     row: tuple[Array, Array, float, Array, Array],
     codes: Codes,
@@ -250,7 +272,7 @@ def _search_row(
     while True:
         for g in range(low, high):
             deviations[g] = 0.0
-            if codes[g] == GOOD:
+            if codes[g] == GOOD and not _fits(row, codes, g):
                 deviations[g] = _deviation(row, codes, g, _SIDE, work)
         # On most beams, no used bin is outlying.
         if number == 0 and not np.any(deviations[used[0] : used[1]] > THRESHOLDS.outlier):

@@ -68,6 +68,9 @@ class Thresholds(NamedTuple):
     curvature_degree: int = 4
     """Degree of the polynomial. A parabola leaves half of the error from a layer of 10 m over 35 m;
     calculated."""
+    curvature_left: float = 0.1
+    """Share of the error of a straight line that a polynomial may leave: 0.24 of a Gaussian layer
+    of 10 m, 0.05 of one of 15 m in bins of 5 m; calculated."""
     shared_noise: float = 4.0
     """Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08
     of one variance on average; normal distribution."""
@@ -76,33 +79,35 @@ class Thresholds(NamedTuple):
     chance: float = 3.0
     """Standard deviations by which a mean square of noise may be larger by chance; assumed."""
 
-    # The prior: ablation
-    gradient: float = 0.15
-    """Standard deviation of ln extinction over the crossings by a gradient; simulations."""
-    deviations: tuple[float, ...] = tuple(np.geomspace(0.01, 1.0, 9).tolist())
-    """Standard deviations of ln extinction at single crossings that are tried; assumed."""
-    strengths: tuple[float, ...] = (1.0, 2.0, 4.0)
-    """Factors of the standard deviations that are tried before the prior is dropped; assumed."""
-    likelihood_tolerance: float = 4.0
-    """Difference in -2 ln likelihood from the minimum: two standard errors."""
-    doubt: float = 2.0
-    """Factor of the prior's standard deviation by which the stated error lets a field deviate;
-    assumed."""
-    well_determined: float = 0.15
-    """Standard error of ln extinction below which beams alone determine a crossing; assumed."""
-    determined_share: float = 0.9
-    """Share of the profiles in which a crossing that contradicts a prior is determined; assumed."""
-    contradiction: float = 3.5
-    """Standard errors of the difference at which beams contradict a prior; assumed."""
-    harmless: float = 0.5
-    """Share of the stated error that a difference may reach without effect; assumed."""
-    testing_quantile: float = 0.75
-    """Quantile of the degrees of freedom that decides whether profiles test the prior; assumed."""
-    least_probability_of_mean: float = 1e-2
-    """Probability of the chi-square of the mean with the prior, below which the prior is rejected;
-    chosen."""
-    open_in_mean: float = 1.0
-    """Standard error of ln extinction beyond which the mean leaves a crossing open; assumed."""
+    # The field: ablation
+    stratified: tuple[float, float] = (2.0, 500.0)
+    """Standard deviation of ln extinction over height, and its length in m; simulations."""
+    deviations: tuple[float, ...] = (0.1, 0.3, 1.0)
+    """Standard deviations of ln extinction in single volumes of air that are tried; assumed."""
+    least_deviation: float = 0.03
+    """The same at single crossings, added; simulations."""
+    lengths: tuple[float, ...] = (100.0, 500.0, 2500.0)
+    """m, lengths of such volumes that are tried; assumed."""
+    changes: tuple[float, ...] = tuple(np.geomspace(0.01, 0.32, 7).tolist())
+    """Standard deviations of ln extinction by changes within a block that are tried. Larger ones
+    follow the noise of triangles: errors in a drifting plume grow by a fifth; simulations."""
+    correlations: tuple[float, ...] = (0.7, 0.95, 0.995)
+    """Correlations of changes from one profile to the next that are tried; assumed."""
+    least_change: float = 9.0
+    """Gain in -2 ln likelihood below which a field does not change: 3 standard errors."""
+    linear_change: float = 0.02
+    """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
+    its mean; simulations."""
+    running_change: float = 0.05
+    """The same in a running mean; simulations."""
+    running_profiles: tuple[int, ...] = (15, 7, 3, 1)
+    """Profiles of running means that are tried; assumed."""
+    largest_misfit: float = 9.0
+    """Chi-square of the mean over its degrees of freedom, beyond which a block is rejected; below,
+    it widens the stated errors; assumed."""
+    default_overlap_error: float = 0.005
+    """Relative error of the overlap at the nearest crossing of each beam, which those of others do
+    not show where it is alike; products replace it by the declared one. Simulations."""
 
     # The solution
     longest_step: float = 1.5
@@ -119,19 +124,6 @@ class Thresholds(NamedTuple):
     """Precision of ln extinction in place of a prior: a standard deviation of 10; assumed."""
     largest_variance: float = 4.0
     """Variance of ln extinction beyond which it is not determined; assumed."""
-
-    # Errors that the block shows: ablation
-    nonlinear_error: float = 0.1
-    """Typical relative error of a block, beyond which the error of a profile depends on its noise;
-    assumed."""
-    bend: float = 0.15
-    """Standard deviation of ln extinction over the crossings by the curvature of a field: that of a
-    gradient; the largest part of the errors of single profiles. With half of it and a `doubt` of
-    1.5, or with at most the deviation of the prior, fewer than 94 percent of the 95 percent
-    intervals of plumes hold the truth in blocks of 1 (``benchmarks stability``), and those of
-    homogeneous air are still too wide: what makes these right makes plumes false."""
-    largest_deviation: float = 8.0
-    """Limit of the deviation of a profile from the median, in median standard errors; assumed."""
 
     # Flags and systematic errors
     largest_relative_error: float = 1.0 / 3.0

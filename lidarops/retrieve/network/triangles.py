@@ -25,9 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
-from lidarops.retrieve.network import _block_errors
 from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
-from lidarops.retrieve.network._condensed_signals import FitLayout
+from lidarops.retrieve.network._condensed_signals import FitLayout, curvature_variance
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 
@@ -111,10 +110,10 @@ def solve_triangles(beams: BeamSignals, multiplier: Array | None) -> Estimates:
                 _solve_block(rows.take(members), triangle, given, out, carried, place)
     for block in np.unique(beams.block):
         members = np.flatnonzero(beams.block == block)
-        signals = beams.data.take(members)
-        out.variance[members] += _block_errors.curvature_variance(signals, carried[members])
+        out.variance[members] += curvature_variance(
+            beams.data.curvature_error[members], beams.usable[members], carried[members]
+        )
     out.variance[:] *= out.extinction**2
-    out.prior_true_variance[:] = out.variance
     return out
 
 

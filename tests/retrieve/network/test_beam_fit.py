@@ -1,0 +1,306 @@
+"""Fit of the beams of a network: its steps against numpy, scipy and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from scipy import integrate, optimize
+from support.oracles.network import (
+    at_crossings,
+    gradient,
+    grid,
+    homogeneous,
+    noisy,
+    signals,
+    three_by_two,
+    triangle,
+)
+
+from lidarops.retrieve.network import _beam_fit, _changing_field, _condensed_signals, outlying_bins
+from lidarops.retrieve.network._block_solution import mean_depth, reaches
+
+# Values at crossings and integrals between them ------------------------------------------------
+
+
+def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
+    r = grid(net, step)
+    layout = _condensed_signals.lay_out_fits(
+        net, np.tile(r, (net.beams, 1)), None, np.full(net.beams, 100.0), bins
+    )
+    power = np.atleast_3d(power).reshape(-1, net.beams, r.size)
+    with patch.object(outlying_bins, "search"):
+        beams = _condensed_signals.clean(
+            power, np.broadcast_to(variance, power.shape), np.full(net.beams, exponent), layout,
+            together=False,
+        )  # fmt: skip
+    data, _ = _condensed_signals.condense(beams, layout)
+    return layout, data
+
+
+def test_value_at_a_crossing_comes_from_a_line_through_logarithms():
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.02, 1)
+    layout, data = condensed(net, power, 1e-30 * variance)
+    for c, (beam, problem_arguments) in enumerate(
+        zip(layout.passages.beam, layout.passages.range, strict=True)
+    ):
+        near = np.argsort(np.abs(r - problem_arguments))[:7]
+        line = np.polyfit(
+            r[near] - problem_arguments, np.log(power[0, beam, near] * r[near] ** 2), 1
+        )
+        first = layout.first_passage[beam]
+        start = layout.passages.range[first]
+        near = np.argsort(np.abs(r - start))[:7]
+        base = np.polyfit(r[near] - start, np.log(power[0, beam, near] * r[near] ** 2), 1)
+        assert data.log_value[0, c] == pytest.approx(line[1] - base[1], abs=1e-10)
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.8])
+def test_integral_agrees_with_quadrature_of_the_interpolated_signal(exponent):
+    net = triangle()
+    r = grid(net, 10.0)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.05, 1)
+    layout, data = condensed(net, power, 1e-30 * variance, exponent, step=10.0)
+    for beam in range(3):
+        c = layout.first_passage[beam]
+        low, high = layout.passages.range[c : c + 2]
+        logs = exponent * np.log(power[0, beam] * r**2)
+        near = np.argsort(np.abs(r - low))[:7]
+        scale = np.polyfit(r[near] - low, logs[near], 1)[1]
+        inner = r[(r > low) & (r < high)]
+        expected = integrate.quad(
+            lambda x, logs=logs, scale=scale: np.exp(np.interp(x, r, logs) - scale),
+            low, high, points=inner, limit=200,
+        )[0]  # fmt: skip
+        assert data.integral[0, c] == pytest.approx(2 * exponent * expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.6])
+def test_covariance_agrees_with_finite_differences(exponent):
+    net = three_by_two()
+    r = grid(net, 8.0)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.03, 1)
+    layout, data = condensed(net, power, variance, exponent, step=8.0)
+    relative = variance / power[0] ** 2
+    step = 1e-6
+    for beam in (0, 5):
+        first, last = layout.first_passage[beam], layout.first_passage[beam + 1]
+        count = last - first
+        slopes = np.zeros((2 * count - 1, r.size))
+        quiet = np.zeros_like(variance)
+        shifted = np.repeat(power, 2 * r.size, axis=0)
+        for g in range(r.size):
+            shifted[2 * g, beam, g] *= 1 + step
+            shifted[2 * g + 1, beam, g] *= 1 - step
+        _, shift = condensed(net, shifted, quiet, exponent, step=8.0)
+        # Integrals are scaled to 1 at the first crossing: undo this.
+        scale = np.exp(first_value(layout, beam, shifted, r, exponent))
+        values = shift.log_value[:, first:last] + np.log(scale)[:, None]
+        sums = shift.integral[:, first : last - 1] * scale[:, None]
+        window = slice(layout.window[first], layout.window[first] + 7)
+        mend = 0.5 * exponent * relative[beam, window] @ layout.weights[first]
+        centre = np.exp(first_value(layout, beam, power, r, exponent) + mend)
+        slopes[:count] = (values[::2] - values[1::2]).T / (2 * step)
+        slopes[count:] = (sums[::2] - sums[1::2]).T / (2 * step) / centre
+        expected = (slopes * relative[beam]) @ slopes.T
+        packed = data.covariance[0, layout.offset[beam] : layout.offset[beam + 1]]
+        measured = packed.reshape(expected.shape)
+        size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(measured / size, expected / size, atol=1e-5)
+
+
+def first_value(layout, beam, power, r, exponent):
+    c = layout.first_passage[beam]
+    window = slice(layout.window[c], layout.window[c] + layout.weights.shape[1])
+    logs = exponent * np.log(power[:, beam, window] * r[window] ** 2)
+    return logs @ layout.weights[c]
+
+
+# Least squares ------------------------------------------------------------------------------
+
+
+class Oracle:
+    """Objective of a network in dense numpy, without elimination and packing."""
+
+    def __init__(self, layout, data, profile, net):
+        self.layout, self.net = layout, net
+        self.crossing = layout.passages.crossing
+        self.beam = layout.passages.beam
+        self.values = data.log_value[profile]
+        self.integrals = data.integral[profile]
+        self.packed = data.covariance[profile]
+        self.size = self.crossing.size
+
+    def beyond(self):
+        out = np.zeros(self.size)
+        for c in range(self.size - 2, -1, -1):
+            if self.beam[c] == self.beam[c + 1]:
+                out[c] = out[c + 1] + self.integrals[c]
+        return out
+
+    def residual(self, constants, logarithms):
+        weight = np.exp(constants[self.beam]) + self.beyond()
+        return self.values - np.log(weight) - logarithms[self.crossing]
+
+    def covariance(self, constants):
+        weight = np.exp(constants[self.beam]) + self.beyond()
+        out = np.zeros((self.size, self.size))
+        for beam in range(self.net.beams):
+            first, last = self.layout.first_passage[beam : beam + 2]
+            n = last - first
+            turn = np.zeros((n, 2 * n - 1))
+            turn[:, :n] = np.eye(n)
+            for i in range(n):
+                turn[i, n + i :] = -1.0 / weight[first + i]
+            packed = self.packed[self.layout.offset[beam] : self.layout.offset[beam + 1]]
+            out[first:last, first:last] = turn @ packed.reshape(2 * n - 1, -1) @ turn.T
+        return out
+
+
+def arranged(layout, data):
+    return _beam_fit.arrange(data, layout, reaches(data.usable, layout))
+
+
+def solved(layout, data, precision, exponent=1.0):
+    """Return the fit of the beams with a prior, from the constants of homogeneous air."""
+    beams = arranged(layout, data)
+    lengths = _beam_fit.optical_lengths(layout, np.full(layout.first_passage.size - 1, exponent))
+    return beams, _beam_fit.fit_beams(beams, precision, _beam_fit.start_constants(beams, lengths))
+
+
+def case(profiles=3, relative=0.01):
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), relative, profiles, additive=0.002)
+    return net, *condensed(net, power, variance)
+
+
+def prior_precision(net, deviation):
+    covariance = 0.3**2 * _changing_field.correlations(net.crossing)[1]
+    return _changing_field.precision(covariance + deviation**2 * np.eye(net.crossings))
+
+
+@pytest.mark.parametrize("deviation", [np.inf, 0.05])
+def test_solution_agrees_with_least_squares(deviation):
+    net, layout, data = case()
+    precision = np.zeros((net.crossings, net.crossings))
+    if np.isfinite(deviation):
+        precision = prior_precision(net, deviation)
+    beams, result = solved(layout, data, precision)
+    assert np.all(result.settled)
+    chi_square, freedom, _ = _beam_fit.compare(beams, result.linear, result.logarithm)
+    values, vectors = np.linalg.eigh(precision)
+    prior = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    for n in range(3):
+        oracle = Oracle(layout, data, n, net)
+        root = np.linalg.cholesky(oracle.covariance(result.constants[n]))
+
+        def objective(x, oracle=oracle, root=root, prior=prior):
+            gap = oracle.residual(x[: net.beams], x[net.beams :])
+            return np.concatenate([np.linalg.solve(root, gap), prior @ x[net.beams :]])
+
+        start = np.concatenate([result.constants[n] + 0.05, result.logarithm[n] - 0.02])
+        best = optimize.least_squares(objective, start, xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        # The fit adds a hundredth of information on the level.
+        np.testing.assert_allclose(best.x[net.beams :], result.logarithm[n], atol=2e-3)
+        covariance = np.linalg.inv(best.jac.T @ best.jac)[net.beams :, net.beams :]
+        np.testing.assert_allclose(np.diag(covariance), np.diag(result.covariance[n]), rtol=0.02)
+        if not np.isfinite(deviation):
+            assert 2 * best.cost == pytest.approx(chi_square[n, 0], rel=0.02)
+    assert freedom[0, 0] == layout.passages.beam.size - net.beams - net.crossings
+
+
+def test_errors_of_values_are_carried_as_a_new_solution_shows():
+    net = three_by_two()
+    r = grid(net)
+    # Without noise, because weights that follow the constant would change its residuals.
+    power = signals(net, r, gradient)
+    layout, data = condensed(net, power, (0.01 * power) ** 2)
+    error = np.random.default_rng(6).normal(0.0, 1e-4, layout.passages.beam.size)
+    # Values and integrals are relative to the first value of their beam.
+    first = error[layout.first_passage[layout.passages.beam]]
+    changed = replace(
+        data, log_value=data.log_value + error - first, integral=data.integral * np.exp(-first)
+    )
+    precision = prior_precision(net, 0.3)
+    beams, before = solved(layout, data, precision)
+    _, after = solved(layout, changed, precision)
+    carried = _beam_fit.carry(before.covariance, before.linear.information, beams.select)
+    beam, place = _beam_fit.places(layout)
+    np.testing.assert_allclose(
+        carried[0][:, beam, place] @ error, (after.logarithm - before.logarithm)[0], rtol=0.01,
+        atol=1e-5,
+    )  # fmt: skip
+
+
+def test_standard_errors_are_the_scatter_of_solutions():
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.005, 400, additive=5e-4)
+    layout, data = condensed(net, power, variance)
+    beams, result = solved(layout, data, np.zeros((net.crossings, net.crossings)))
+    truth = np.log(at_crossings(net, homogeneous()))
+    errors = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
+    score = (result.logarithm - truth) / errors
+    np.testing.assert_allclose(score[:, net.near_crossing].std(axis=0), 1.0, atol=0.15)
+    chi_square, freedom, _ = _beam_fit.compare(beams, result.linear, result.logarithm)
+    assert np.mean(chi_square[:, 0] / freedom[:, 0]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_solution_does_not_depend_on_the_other_profiles():
+    net, layout, data = case(7)
+    precision = prior_precision(net, 0.05)
+    _, whole = solved(layout, data, precision)
+    for selected in ([0], [3, 4], [6, 1]):
+        _, chunk = solved(layout, data.take(np.array(selected)), precision)
+        assert np.array_equal(chunk.logarithm, whole.logarithm[selected])
+        assert np.array_equal(chunk.covariance, whole.covariance[selected])
+
+
+@pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
+def test_a_beam_with_singular_covariance_is_left_out(bad):
+    net, layout, data = case(3)
+    without = data.take(np.arange(3))
+    without.usable[1, : layout.first_passage[1]] = 0
+    data.covariance[1, : layout.offset[1]] = bad
+    precision = prior_precision(net, 0.1)
+    (beams, result), (_, expected) = (solved(layout, entry, precision) for entry in (data, without))
+    assert beams.reach[1, 0] == 0
+    np.testing.assert_array_equal(result.logarithm, expected.logarithm)
+    np.testing.assert_array_equal(result.covariance, expected.covariance)
+
+
+def test_the_information_of_a_shorter_beam_is_that_of_its_passages():
+    """A passage that is not used only hides the constant behind the last one in use."""
+    net, layout, data = case(1)
+    beams, result = solved(layout, data, prior_precision(net, 0.1))
+    reach = beams.reach.copy()
+    reach[0, 0] -= 1
+    shorter = data.take(np.arange(1))
+    shorter.usable[0, layout.first_passage[1] - 1] = False
+    constants = result.constants.copy()
+    last = beams.integral[0, 0, reach[0, 0] - 1]
+    constants[0, 0] = np.log(np.exp(constants[0, 0]) + last)
+    ours = _beam_fit.linearise(beams, result.constants, reach)
+    alone = _beam_fit.linearise(arranged(layout, shorter), constants)
+    np.testing.assert_allclose(ours.information, alone.information, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(ours.value, alone.value, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("reach", "depth"),
+    [
+        ([3] * 50, 3),
+        ([3] * 45 + [2] * 5, 3),
+        ([3] * 9 + [2] * 41, 2),
+        ([3] * 7, 3),
+        ([1] * 50, 0),
+        ([], 0),
+    ],
+)
+def test_a_mean_extends_to_the_passage_with_most_values(reach, depth):
+    assert mean_depth(np.array(reach, dtype=np.intp)) == depth
