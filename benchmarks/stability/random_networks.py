@@ -14,6 +14,7 @@ from benchmarks.accuracy.network_cases import BLOCK, Air, LidarLine, Signals, si
 from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.errors import LidarOpsError
+from lidarops.products.visibility import VisibilityProductSettings
 from lidarops.retrieve.network import extinction_field, labeled
 from lidarops.retrieve.network.flags import NetworkQuality
 
@@ -220,9 +221,12 @@ def _solve_damaged(
 
 _LONG_WAVES: Final = (300.0, 3000.0)
 """m; lengths of the waves of the lidar ratio."""
-_VARIED: Final = 0.1
-"""Rms variation of the lidar ratio within a network."""
-_DECLARED: Final = (("2 %, the default, declared", 0.02), ("10 % declared", _VARIED))
+_DEFAULT: Final = VisibilityProductSettings.model_fields["lidar_ratio_relative_error"].default
+_VARIED: Final = (
+    ("varies by 7 %, the default declared", 0.07, _DEFAULT),
+    ("varies by 10 %, 10 % declared", 0.1, 0.1),
+)
+"""Words of a class, rms variation of the lidar ratio within a network, and what is declared."""
 _NOT_SHOWN: Final = "the signals do not show how the lidar ratio varies: the user declares it"
 
 
@@ -279,16 +283,16 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     wave = 2.0 * np.pi / np.exp(rng.uniform(np.log(_LONG_WAVES[0]), np.log(_LONG_WAVES[1]), 2))
     at = net.origin[:, :, np.newaxis] + net.direction[:, :, np.newaxis] * clean.range
     phase = wave[0] * at[:, 0] + wave[1] * at[:, 2] + rng.uniform(0.0, 2.0 * np.pi)
-    ratio = np.exp(_VARIED * np.sqrt(2.0) * np.sin(phase))
-    power, variance = replace(clean, power=clean.power / ratio).draw(
-        noise, profiles, int(rng.integers(2**31))
-    )
-    solver = _solver(clean, power, variance)
-    result = solver.solve(power)
-    of_ratio = labeled._lidar_ratio_error(solver, result, 1.0)  # noqa: SLF001 - as products state it
-    for words, declared in _DECLARED:
-        failure = Failure(f"lidar ratio varies by 10 %, {words}", unseen=_NOT_SHOWN)
-        yield scored(failure, result, clean.truth(profiles), declared * of_ratio)
+    seed = int(rng.integers(2**31))
+    for words, varied, declared in _VARIED:
+        ratio = np.exp(varied * np.sqrt(2.0) * np.sin(phase))
+        power, variance = replace(clean, power=clean.power / ratio).draw(noise, profiles, seed)
+        solver = _solver(clean, power, variance)
+        result = solver.solve(power)
+        # As products state it.
+        systematic = labeled._lidar_ratio_error(solver, result, declared)  # noqa: SLF001
+        failure = Failure(f"lidar ratio {words}", unseen=_NOT_SHOWN)
+        yield scored(failure, result, clean.truth(profiles), systematic)
 
 
 def _solver(clean: Signals, power: Array, variance: Array) -> Any:

@@ -61,7 +61,7 @@ def test_series_hold_values_errors_and_truth(made):
 
 
 def test_a_wrong_truth_gives_a_bias(made):
-    (crossing, *_) = read_crossings(made, truth(made, 1.1 * EXTINCTION), instruments=NAMES)
+    (crossing, *_) = read_crossings(made, truth(made, 1.2 * EXTINCTION), instruments=NAMES)
     comparison = compare(crossing, "total_extinction")
     assert comparison is not None
     assert comparison.bias < -3.0

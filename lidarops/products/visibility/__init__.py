@@ -70,7 +70,7 @@ class VisibilityProductSettings(NetworkProduct):
         0.1, unit="1", ge=0, le=0.5, description="relative error of the exponent"
     )
     lidar_ratio_relative_error: float = quantity(
-        0.02,
+        0.07,
         unit="1",
         ge=0,
         le=0.5,
