@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.network import _matrices
 from lidarops.retrieve.network._condensed_signals import CondensedSignals, FitLayout
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -37,13 +38,10 @@ class Beams(NamedTuple):
     """(profile, beam, 2 passage, 2 passage) of u, then of I."""
     reach: Indices
     """(profile, beam) number of usable passages; 0 where there is only one."""
-    select: Array
-    """(beam, passage, crossing) 1 where a passage is at a crossing."""
-
-    @property
-    def crossing(self) -> Indices:
-        """(beam, passage) number of the crossing."""
-        return np.asarray(self.select.argmax(axis=2), dtype=np.intp)
+    crossing: Indices
+    """(beam, passage) number of the crossing, of those that are measured; 0 where empty."""
+    crossings: int
+    """Number of measured crossings."""
 
 
 def places(layout: FitLayout) -> tuple[Indices, Indices]:
@@ -81,9 +79,9 @@ def arrange(data: CondensedSignals, layout: FitLayout, reach: Indices) -> Beams:
     reach = np.where(sound & (reach > 1), reach, 0)
     value[:, beam, place] = np.where(place < reach[:, beam], data.log_value, 0.0)
     integral[:, beam, place] = np.where(place < reach[:, beam] - 1, data.integral, 0.0)
-    select = np.zeros((*shape, int(np.sum(layout.measured))))
-    select[beam, place, (np.cumsum(layout.measured) - 1)[layout.passages.crossing]] = 1.0
-    return Beams(value, integral, covariance, reach, select)
+    crossing = np.zeros(shape, dtype=np.intp)
+    crossing[beam, place] = (np.cumsum(layout.measured) - 1)[layout.passages.crossing]
+    return Beams(value, integral, covariance, reach, crossing, int(np.sum(layout.measured)))
 
 
 class Linear(NamedTuple):
@@ -99,45 +97,47 @@ class Linear(NamedTuple):
     """(profile, beam, passage) W g / (g' W g), derivative of the constant by y."""
     slope: Array
     """(profile, beam) derivative g of ln w by the constant at the first passage."""
-    determinant: Array
-    """(profile,) ln determinant of the covariances and of the information on the constants."""
 
-    def normal(self, select: Array) -> tuple[Array, Array]:
+    def normal(self, beams: Beams) -> tuple[Array, Array]:
         """Return normal matrix sum A' M A, and right side sum A' M y, of each profile."""
-        return normal_matrix(self.information, select), normal_side(
-            self.information, self.value, select
+        return normal_matrix(self.information, beams), normal_side(
+            self.information, self.value, beams
         )
 
 
-def carry(covariance: Array, information: Array, select: Array) -> Array:
+def carry(covariance: Array, information: Array, beams: Beams) -> Array:
     """Return (profile, crossing, beam, passage) derivatives C A' M of the solution by y."""
-    by_beam = np.einsum("bpd,tbpq->tdbq", select, information)
-    flat = by_beam.reshape(len(covariance), select.shape[2], -1)
-    return np.asarray((covariance @ flat).reshape(by_beam.shape))
+    taken = covariance[:, :, beams.crossing].swapaxes(1, 2)
+    return _matrices.product(taken, information).swapaxes(1, 2)
 
 
-def normal_matrix(information: Array, select: Array) -> Array:
+def normal_matrix(information: Array, beams: Beams) -> Array:
     """Return (profile, crossing, crossing) sum A' M A."""
-    flat = select.reshape(-1, select.shape[2])
-    carried = (information @ select).reshape(len(information), *flat.shape)
-    return np.asarray(flat.T @ carried)
+    out = np.zeros((len(information), beams.crossings, beams.crossings))
+    _matrices.gather_squares(information, beams.crossing, out)
+    return out
 
 
-def normal_side(information: Array, value: Array, select: Array) -> Array:
+def normal_side(information: Array, value: Array, beams: Beams) -> Array:
     """Return (profile, crossing) sum A' M y."""
-    weighted = (information @ value[..., np.newaxis])[..., 0]
-    return np.asarray(weighted.reshape(len(weighted), -1) @ select.reshape(-1, select.shape[2]))
+    return gathered(_matrices.product(information, value[..., np.newaxis]), beams)[..., 0]
 
 
-def changed_sides(linear: Linear, select: Array, change: Array) -> Array:
+def gathered(values: Array, beams: Beams) -> Array:
+    """Return (profile, crossing, case) sums of (profile, beam, passage, case) values."""
+    out = np.zeros((len(values), beams.crossings, values.shape[3]))
+    place = beams.crossing.ravel()
+    _matrices.gather(np.ascontiguousarray(values.reshape(len(values), place.size, -1)), place, out)
+    return out
+
+
+def changed_sides(linear: Linear, beams: Beams, change: Array) -> Array:
     """Return (profile, crossing, case) changes of the right sides.
 
     `change` is the (case, beam, 2 passage) change of u and I in all profiles.
     """
-    turned = linear.turn @ change.transpose(1, 2, 0)
-    flat = select.reshape(-1, select.shape[2])
-    weighted = (linear.information @ turned).reshape(len(turned), len(flat), -1)
-    return np.asarray(flat.T @ weighted)
+    turned = _matrices.product(linear.turn, change.transpose(1, 2, 0))
+    return gathered(_matrices.product(linear.information, turned), beams)
 
 
 def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> Linear:
@@ -165,17 +165,17 @@ def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> L
     upper = np.triu(np.ones((most, most)))[:, : most - 1]
     turn[..., most:-1] = -upper * steps[..., np.newaxis, :] / weight[..., np.newaxis]
     turn *= inside[..., np.newaxis]
-    covariance = turn @ beams.covariance @ turn.swapaxes(-1, -2)
+    covariance = _matrices.product(_matrices.product(turn, beams.covariance), turn.swapaxes(-1, -2))
     scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     scale = np.where(inside & (scale > 0.0), scale, 1.0)
     correlation = covariance / scale[..., np.newaxis] / scale[..., np.newaxis, :]
     unused = np.where(inside, THRESHOLDS.smallest_pivot, 1.0)
     correlation = correlation + unused[..., np.newaxis] * np.eye(most)
-    inverse = np.linalg.inv(correlation) / scale[..., np.newaxis] / scale[..., np.newaxis, :]
+    inverse = _matrices.inverse(correlation) / scale[..., np.newaxis] / scale[..., np.newaxis, :]
     inverse *= inside[..., np.newaxis] & inside[..., np.newaxis, :]
     last = np.take_along_axis(weight, np.maximum(reach - 1, 0)[..., np.newaxis], axis=2)
     lever = np.where(inside, last / weight, 0.0)
-    gain = (inverse @ lever[..., np.newaxis])[..., 0]
+    gain = _matrices.product(inverse, lever[..., np.newaxis])[..., 0]
     known = (gain * lever).sum(axis=2)
     empty = reach < 2
     known = np.where(empty, 1.0, known)
@@ -184,14 +184,9 @@ def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> L
         - gain[..., np.newaxis] * gain[..., np.newaxis, :] / known[..., np.newaxis, np.newaxis]
     )
     information[np.broadcast_to(empty, shape[:2])] = 0.0
-    determinant = np.linalg.slogdet(correlation)[1] + 2.0 * np.log(scale).sum(axis=2)
-    determinant = np.where(empty, 0.0, determinant + np.log(known))
     value = np.where(inside, beams.value - np.log(weight), 0.0)
     gain = np.where(empty[..., np.newaxis], 0.0, gain / known[..., np.newaxis])
-    return Linear(
-        value, turn, information, gain,
-        lever[..., 0], determinant.sum(axis=1),
-    )  # fmt: skip
+    return Linear(value, turn, information, gain, lever[..., 0])
 
 
 def optical_lengths(layout: FitLayout, exponent: Array) -> Array:
@@ -248,7 +243,7 @@ def fit_beams(beams: Beams, precision: Array, constants: Array) -> Solution:
     constants : (profile, beam) float64
         Where to start.
     """
-    select, crossing = beams.select, beams.crossing
+    crossing = beams.crossing
     # Each crossing is drawn to the level of the profile a little, where nothing else determines it.
     level = THRESHOLDS.weak_precision
     precision = precision + level * np.eye(len(precision))
@@ -257,10 +252,11 @@ def fit_beams(beams: Beams, precision: Array, constants: Array) -> Solution:
     step = np.full(constants.shape, np.inf)
     for _ in range(_PASSES):
         linear = linearise(beams, constants)
-        normal, side = linear.normal(select)
+        normal, side = linear.normal(beams)
         mean = np.where(inside, linear.value, 0.0).sum(axis=(1, 2)) / number
-        covariance = np.linalg.inv(normal + precision)
-        x = (covariance @ (side + level * mean[:, np.newaxis])[..., np.newaxis])[..., 0]
+        covariance = _matrices.inverse(normal + precision)
+        pulled = side + level * mean[:, np.newaxis]
+        x = _matrices.product(covariance, pulled[..., np.newaxis])[..., 0]
         # A profile that has settled does not depend on how long the others take.
         going = np.abs(step).max(axis=1, initial=0.0) >= THRESHOLDS.converged_step**3
         if not going.any():
@@ -287,13 +283,13 @@ def compare(
     """
     reach = beams.reach if reach is None else reach
     inside = np.arange(beams.value.shape[2]) < reach[..., np.newaxis]
-    seen = np.einsum("tbp,bpc->tc", inside.astype(np.float64), beams.select) > 0.0
+    seen = gathered(inside[..., np.newaxis].astype(np.float64), beams)[..., 0] > 0.0
     residual = np.where(inside, linear.value - x[:, beams.crossing], 0.0)
-    weighted = (linear.information @ residual[..., np.newaxis])[..., 0]
+    weighted = _matrices.product(linear.information, residual[..., np.newaxis])[..., 0]
     about = (weighted * residual).sum(axis=(1, 2))
     alone = about - taken_up(
-        normal_matrix(linear.information, beams.select),
-        normal_side(linear.information, residual, beams.select),
+        normal_matrix(linear.information, beams),
+        normal_side(linear.information, residual, beams),
     )
     spare = reach.sum(axis=1) - (reach > 0).sum(axis=1)
     freedom = np.stack([spare - seen.sum(axis=1), spare], axis=1).astype(np.float64)
@@ -302,7 +298,8 @@ def compare(
 
 def taken_up(normal: Array, side: Array) -> Array:
     """Return side' normal+ side, the part of chi-square that a change of the field takes up."""
-    size, vector = np.linalg.eigh(normal)
-    part = (vector.swapaxes(1, 2) @ side[..., np.newaxis])[..., 0]
-    sound = size > _ROUNDING * size[:, -1:]
-    return np.asarray((part**2 * sound / np.where(sound, size, 1.0)).sum(axis=1))
+    # Directions that no beam determines have no side: a little information there does not count.
+    size = np.diagonal(normal, axis1=1, axis2=2).max(axis=1)[:, np.newaxis, np.newaxis]
+    little = np.where(size > 0.0, _ROUNDING * size, 1.0) * np.eye(normal.shape[1])
+    part = _matrices.product(_matrices.inverse(normal + little), side[..., np.newaxis])[..., 0]
+    return np.asarray((part * side).sum(axis=1))

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
+from lidarops.retrieve.network import _matrices
 from lidarops.retrieve.network._beam_fit import Beams, Solution
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -44,12 +44,16 @@ def correlations(position: Array) -> Array:
     return np.asarray(np.exp(-distance / lengths))
 
 
-def precision(covariance: Array) -> Array:
-    """Return (..., crossing, crossing) precisions of covariances, with a free level."""
-    inverse = np.linalg.inv(covariance)
+def precision(covariance: Array) -> tuple[Array, Array]:
+    """Return (..., crossing, crossing) precisions of covariances with a free level.
+
+    The second array is ln of their determinants in the other directions, without a constant.
+    """
+    inverse, determinant = _matrices.inverse_and_determinant(covariance)
     sums = inverse.sum(axis=-1)
-    total = sums.sum(axis=-1)[..., np.newaxis, np.newaxis]
-    return np.asarray(inverse - sums[..., np.newaxis] * sums[..., np.newaxis, :] / total)
+    total = sums.sum(axis=-1)
+    free = sums[..., np.newaxis] * sums[..., np.newaxis, :] / total[..., np.newaxis, np.newaxis]
+    return np.asarray(inverse - free), np.asarray(-determinant - np.log(total))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +64,8 @@ class MeanPriors:
     """(prior, crossing, crossing)."""
     precision: Array
     """(prior, crossing, crossing)."""
+    determinant: Array
+    """(prior,) ln of the determinants of the precisions, without the free level."""
     deviation: Array
     """(prior,) standard deviation over the crossings by single volumes of air."""
 
@@ -76,7 +82,7 @@ class MeanPriors:
         deviations = np.sqrt(
             np.trace(single, axis1=1, axis2=2) / len(height) - single.mean(axis=(1, 2))
         )
-        return cls(single + shared, precision(single + shared), deviations)
+        return cls(single + shared, *precision(single + shared), deviations)
 
     @property
     def widest(self) -> Array:
@@ -94,18 +100,12 @@ class MeanPriors:
             With the widest prior.
         """
         level = first.logarithm[0].mean()
-        (normal,), (side,) = first.linear.normal(beams.select)
+        (normal,), (side,) = first.linear.normal(beams)
         weak = THRESHOLDS.weak_precision * np.eye(len(normal))
-        matrices = normal + self.precision + weak
-        covariance = np.linalg.inv(matrices)
+        covariance, determinant = _matrices.inverse_and_determinant(normal + self.precision + weak)
         side = side - level * normal.sum(axis=1)
-        x = covariance @ side
-        # The level is free: the determinant of a precision is that of its other directions.
-        cost = (
-            np.linalg.slogdet(matrices)[1]
-            - np.log(np.linalg.eigvalsh(self.precision)[:, 1:]).sum(axis=1)
-            - x @ side
-        )
+        x = _matrices.product(covariance, side[:, np.newaxis])[..., 0]
+        cost = determinant - self.determinant - (x * side).sum(axis=1)
         weight = np.exp(-0.5 * (cost - cost.min()))
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         return MeanPosterior(weight / weight.sum(), x + level, variance)
@@ -123,7 +123,7 @@ class MeanPosterior(NamedTuple):
 
     def expected(self, priors: MeanPriors) -> Array:
         """Return the (crossing, crossing) precision of the expected covariance."""
-        return precision(np.tensordot(self.weight, priors.covariance, axes=1))
+        return precision(np.einsum("k,kcd->cd", self.weight, priors.covariance))[0]
 
     def deviation(self, priors: MeanPriors) -> float:
         """Return the deviation of the likeliest prior."""
@@ -133,7 +133,7 @@ class MeanPosterior(NamedTuple):
         """Return (crossing,) mean squares of the relative deviation of extinction from a field."""
         x, variance = self.logarithm - logarithm, self.variance
         square = np.exp(2.0 * (x + variance)) - 2.0 * np.exp(x + 0.5 * variance) + 1.0
-        return np.asarray(self.weight @ square)
+        return np.asarray(np.einsum("k,kc->c", self.weight, square))
 
 
 # Changes -----------------------------------------------------------------------------------------
@@ -148,17 +148,19 @@ class Change(NamedTuple):
     """From one profile to the next."""
 
 
-@lru_cache(maxsize=32)
-def _modes(profiles: int, correlation: float) -> tuple[Array, Array]:
+@lru_cache(maxsize=256)
+def _modes(places: tuple[int, ...], correlation: float) -> tuple[Array, Array]:
     """Return variances and (profile, mode) vectors of deviations from the mean of a block."""
-    place = np.arange(profiles)
+    place = np.array(places)
     matrix = correlation ** np.abs(place[:, np.newaxis] - place)
     centred = matrix - matrix.mean(axis=0) - matrix.mean(axis=1)[:, np.newaxis] + matrix.mean()
-    size, vector = np.linalg.eigh(centred)
+    size, vector = _matrices.eigenvectors(centred)
     return np.maximum(size, 0.0), vector
 
 
-def likeliest_change(normal: Array, side: Array, position: Array) -> Change | None:
+def likeliest_change(
+    normal: Array, side: Array, position: Array, places: tuple[int, ...]
+) -> Change | None:
     """Return the change of the largest marginal likelihood, None where it is no better than none.
 
     Parameters
@@ -169,23 +171,32 @@ def likeliest_change(normal: Array, side: Array, position: Array) -> Change | No
         Right sides less those of the mean field.
     position : (crossing, 3) float64
         m.
+    places : (profile,) int
+        Numbers of the profiles, in order of time.
     """
     unit = np.eye(len(position))
     amplitude = np.array(THRESHOLDS.changes)[:, np.newaxis, np.newaxis] ** 2
     best, least = None, -THRESHOLDS.least_change
-    for shape, rho in product(correlations(position), THRESHOLDS.correlations):
-        root = np.linalg.cholesky(shape + _ROUNDING * unit)
-        size, vector = np.linalg.eigh(root.T @ normal @ root)
-        variance, modes = _modes(len(side), rho)
-        square = (modes.T @ side @ root @ vector) ** 2
-        scaled = amplitude * variance[:, np.newaxis] * np.maximum(size, 0.0)
-        cost = np.log1p(scaled) - amplitude * variance[:, np.newaxis] * square / (1.0 + scaled)
-        costs = cost.sum(axis=(1, 2))
-        k = int(np.argmin(costs))
-        if costs[k] < least:
-            least = costs[k]
-            best = Change(float(amplitude[k, 0, 0]) * shape, rho)
+    for shape in correlations(position):
+        root = _matrices.lower_root(shape + _ROUNDING * unit)
+        size, vector = _matrices.eigenvectors(_turned(normal, root))
+        along = _matrices.product(_matrices.product(side, root), vector)
+        for rho in THRESHOLDS.correlations:
+            variance, modes = _modes(places, rho)
+            square = _matrices.product(modes.T, along) ** 2
+            each = amplitude * variance[:, np.newaxis]
+            scaled = each * np.maximum(size, 0.0)
+            costs = (np.log1p(scaled) - each * square / (1.0 + scaled)).sum(axis=(1, 2))
+            k = int(np.argmin(costs))
+            if costs[k] < least:
+                least = costs[k]
+                best = Change(float(amplitude[k, 0, 0]) * shape, rho)
     return best
+
+
+def _turned(matrices: Array, root: Array) -> Array:
+    """Return (..., crossing, crossing) matrices of the unknowns that a root makes those of x."""
+    return _matrices.product(_matrices.product(root.T, matrices), root)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,22 +219,21 @@ class ChangingField:
         pull : (crossing, case) float64
             Right side of the mean field by its prior.
         """
-        prior = self.prior + THRESHOLDS.weak_precision * np.eye(len(self.prior))
-        root = np.linalg.cholesky(
-            self.change.covariance
-            + _ROUNDING * np.trace(self.change.covariance) * np.eye(len(self.prior))
-        )
+        unit = np.eye(len(self.prior))
+        prior = self.prior + THRESHOLDS.weak_precision * unit
+        of_change = self.change.covariance
+        root = _matrices.lower_root(of_change + _ROUNDING * np.trace(of_change) * unit)
         cases = side.shape[2]
-        sides = root.T @ np.concatenate([side, self.normal], axis=2)
-        solved, spread = _solve_chain(root.T @ self.normal @ root, sides, self.change.correlation)
-        solved, spread = root @ solved, root @ spread @ root.T
-        by_side, by_mean = solved[..., :cases], solved[..., cases:]
-        left = np.eye(len(self.prior)) - by_mean
-        known = (self.normal @ left).sum(axis=0)
-        covariance = np.linalg.inv((known + known.T) / 2.0 + prior)
-        mean = covariance @ ((side - self.normal @ by_side).sum(axis=0) + pull)
-        field = by_side + left @ mean
-        return field, np.asarray(spread + left @ covariance @ left.swapaxes(1, 2))
+        sides = _matrices.product(root.T, np.concatenate([side, self.normal], axis=2))
+        solved, spread = _solve_chain(_turned(self.normal, root), sides, self.change.correlation)
+        solved, spread = _matrices.product(root, solved), _turned(spread, root.T)
+        by_side, left = solved[..., :cases], unit - solved[..., cases:]
+        known = _matrices.product(self.normal, left).sum(axis=0)
+        covariance = _matrices.inverse((known + known.T) / 2.0 + prior)
+        rest = (side - _matrices.product(self.normal, by_side)).sum(axis=0) + pull
+        field = by_side + _matrices.product(left, _matrices.product(covariance, rest))
+        of_mean = _matrices.product(_matrices.product(left, covariance), left.swapaxes(1, 2))
+        return field, np.asarray(spread + of_mean)
 
 
 def _solve_chain(normal: Array, side: Array, rho: float) -> tuple[Array, Array]:
@@ -236,13 +246,11 @@ def _solve_chain(normal: Array, side: Array, rho: float) -> tuple[Array, Array]:
     link = rho / (1.0 - rho**2)
     diagonal = np.full(profiles, (1.0 + rho**2) / (1.0 - rho**2))
     diagonal[[0, -1]] = 1.0 / (1.0 - rho**2)
-    if profiles == 1:
-        diagonal[0] = 1.0
     own = normal + diagonal[:, np.newaxis, np.newaxis] * np.eye(size)
     both, sides = np.stack([own, own[::-1]], axis=1), np.stack([side, side[::-1]], axis=1)
     for t in range(1, profiles):
-        before = np.linalg.inv(both[t - 1])
-        both[t] -= link**2 * before
-        sides[t] += link * before @ sides[t - 1]
-    covariance = np.linalg.inv(both[:, 0] + both[::-1, 1] - own)
-    return covariance @ (sides[:, 0] + sides[::-1, 1] - side), np.asarray(covariance)
+        before = link * _matrices.inverse(both[t - 1])
+        both[t] -= link * before
+        sides[t] += _matrices.product(before, sides[t - 1])
+    covariance = _matrices.inverse(both[:, 0] + both[::-1, 1] - own)
+    return _matrices.product(covariance, sides[:, 0] + sides[::-1, 1] - side), covariance

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Codes, Indices
-from lidarops.retrieve.network import outlying_bins
+from lidarops.retrieve.network import _matrices, outlying_bins
 from lidarops.retrieve.network.geometry import Network, Passages
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -179,10 +179,6 @@ class CondensedSignals:
     curvature_error: Array
     """(profile, passage, 2) difference of line and polynomial, and its variance by noise."""
 
-    def take(self, profiles: Indices) -> CondensedSignals:
-        """Return the selected profiles."""
-        return CondensedSignals(*(getattr(self, name)[profiles] for name in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanBeam:
@@ -319,7 +315,9 @@ def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> 
         derivative[:, cells] += parts * (1.0 - centroid)
         derivative[:, cells.start + 1 : cells.stop + 1] += parts * centroid
     _transfer_derivatives(derivatives, row, layout.range[beam])
-    covariance = (derivatives * row.noise[:, np.newaxis]) @ derivatives.transpose(0, 2, 1)
+    covariance = _matrices.product(
+        derivatives * row.noise[:, np.newaxis], derivatives.transpose(0, 2, 1)
+    )
     # The deviations of bins that stay are of one direction.
     shift = (derivatives * row.doubt[:, np.newaxis]).sum(axis=2)
     covariance += shift[:, :, np.newaxis] * shift[:, np.newaxis]

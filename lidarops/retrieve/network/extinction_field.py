@@ -136,7 +136,8 @@ def retrieve_network(
         m of backscatter ~ extinction^(1/m) along a beam.
     blocks : (...) int, optional
         Numbers of the blocks of profiles, in order of time, that are one field; by default, all.
-        Results of a block depend on its own profiles only.
+        Results of a block depend on its own profiles only. Profiles of a block are equally spaced
+        in time: give missing ones as NaN.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.
     multiplier : float or (..., crossing) float or "chosen", optional
@@ -196,6 +197,7 @@ def _solve_blocks(beams: BeamSignals, position: Array) -> Estimates:
         )  # fmt: skip
         solved = solve_block(block)
         if solved is None:
+            out.left_out[rows] = (reaches(beams.usable[rows], layout) > 1)[:, beam]
             continue
         here = np.ix_(rows, measured)
         extinction = np.exp(solved.logarithm)
@@ -227,7 +229,7 @@ def _solve_alone(beams: BeamSignals) -> Estimates:
     start = _beam_fit.start_constants(fits, _beam_fit.optical_lengths(layout, beams.exponent))
     nothing = np.zeros((measured.size, measured.size))
     solved = _beam_fit.fit_beams(fits, nothing, start)
-    carried = _beam_fit.carry(solved.covariance, solved.linear.information, fits.select)
+    carried = _beam_fit.carry(solved.covariance, solved.linear.information, fits)
     chi_square, freedom, seen = _beam_fit.compare(fits, solved.linear, solved.logarithm)
     variance = np.diagonal(solved.covariance, axis1=1, axis2=2)
     known = seen & (variance < THRESHOLDS.largest_variance)

@@ -125,7 +125,8 @@ def retrieve_network(
     """
     if len(beams) != network.beams:
         raise RetrievalInputError(f"are {len(beams)} for {network.beams} beams", field="beams")
-    intervals = np.unique(np.concatenate([beam.interval for beam in beams]))
+    given = np.unique(np.concatenate([beam.interval for beam in beams]))
+    intervals = _without_gaps(given, settings.block_intervals)
     signals = _gather_signals(beams, intervals, network)
     solver = _Solver(beams, network, settings, signals, intervals)
     result = solver.solve(signals.power)
@@ -141,7 +142,7 @@ def retrieve_network(
     multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
     if settings.multiplier is None:
         multiplier = {}
-    return xr.Dataset(
+    product = xr.Dataset(
         {
             **{name: (dimensions, values) for name, values in visibility.items()},
             "total_extinction": (dimensions, extinction),
@@ -160,6 +161,16 @@ def retrieve_network(
         coords=_coordinates(beams, intervals, network, near),
         attrs={"steps": _describe_steps(beams, network, settings)},
     )
+    return product.isel(time=np.isin(intervals, given))
+
+
+def _without_gaps(intervals: Integers, per_block: int) -> Integers:
+    """Return all intervals from the first to the last of each block: air changes in gaps too."""
+    block = intervals // per_block
+    last = np.flatnonzero(np.diff(block, append=block[-1:] + 1))
+    first = np.concatenate([[0], last[:-1] + 1])
+    runs = [np.arange(intervals[a], intervals[b] + 1) for a, b in zip(first, last, strict=True)]
+    return np.concatenate(runs)
 
 
 def _gather_signals(

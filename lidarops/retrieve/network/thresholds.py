@@ -98,10 +98,14 @@ class Thresholds(NamedTuple):
     linear_change: float = 0.02
     """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
     its mean; simulations."""
-    running_change: float = 0.05
-    """The same in a running mean; simulations."""
-    running_profiles: tuple[int, ...] = (15, 7, 3, 1)
-    """Profiles of running means that are tried; assumed."""
+    running_profiles: int = 7
+    """Profiles of a running mean; simulations."""
+    neighbours: int = 3
+    """Profiles before and after each one, with whose medians it is compared: one of three may be
+    unlike the others; assumed."""
+    least_neighbourly: float = 1e-9
+    """Probability of the chi-square of a beam about its neighbours, below which its profile is no
+    part of a block; chosen."""
     largest_misfit: float = 9.0
     """Chi-square of the mean over its degrees of freedom, beyond which a block is rejected; below,
     it widens the stated errors; assumed."""

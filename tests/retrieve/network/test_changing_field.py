@@ -1,13 +1,20 @@
-"""What is known of the field of a block before its beams are read."""
+"""A field that changes slowly: its priors and its solution, against dense normal equations."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
 
 from lidarops.retrieve.network import _changing_field
+from lidarops.retrieve.network._changing_field import Change, ChangingField
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 POSITION = np.array([[0.0, 0.0, 300.0], [200.0, 0.0, 500.0], [-100.0, 0.0, 900.0]])
+
+# The mean field -----------------------------------------------------------------------------------
 
 
 def test_a_prior_says_nothing_about_the_level():
@@ -23,6 +30,12 @@ def test_a_prior_says_nothing_about_the_level():
         )
 
 
+def test_the_determinant_of_a_prior_is_that_of_its_differences():
+    priors = _changing_field.MeanPriors.at(POSITION)
+    dense = np.log(np.linalg.eigvalsh(priors.precision)[:, 1:]).sum(axis=1)
+    np.testing.assert_allclose(priors.determinant - priors.determinant[0], dense - dense[0])
+
+
 def test_the_square_error_of_a_known_field_is_that_of_a_lognormal():
     variance = np.full((1, 2), 0.04)
     posterior = _changing_field.MeanPosterior(np.ones(1), np.zeros((1, 2)), variance)
@@ -30,3 +43,130 @@ def test_the_square_error_of_a_known_field_is_that_of_a_lognormal():
     np.testing.assert_allclose(
         posterior.square_error(np.zeros(2)), np.mean((draws - 1.0) ** 2), rtol=0.01
     )
+
+
+# Changes ------------------------------------------------------------------------------------------
+
+
+def informed(rng, profiles, *, missing=0):
+    """Return normal matrices and right sides of profiles, some of which know nothing."""
+    root = rng.standard_normal((profiles, 3, 4))
+    normal = np.exp(rng.uniform(-1.0, 5.0)) * root @ root.swapaxes(1, 2)
+    normal[rng.permutation(profiles)[:missing]] = 0.0
+    return normal, (normal @ rng.standard_normal((profiles, 3, 1)))[..., 0]
+
+
+def dense(normal, side, prior, change, pull):
+    """Return fields and covariances from the normal equations of all profiles and their mean."""
+    profiles, size = normal.shape[:2]
+    place = np.arange(profiles)
+    in_time = change.correlation ** np.abs(place[:, None] - place)
+    total = np.zeros(((profiles + 1) * size,) * 2)
+    total[size:, size:] = np.linalg.inv(np.kron(in_time, change.covariance))
+    total[:size, :size] = prior + THRESHOLDS.weak_precision * np.eye(size)
+    right = np.concatenate([pull, np.zeros(profiles * size)])
+    take = np.zeros((profiles, size, len(total)))
+    for t in range(profiles):
+        take[t, :, :size] = np.eye(size)
+        take[t, :, (t + 1) * size : (t + 2) * size] = np.eye(size)
+        total += take[t].T @ normal[t] @ take[t]
+        right += take[t].T @ side[t]
+    covariance = np.linalg.inv(total)
+    return take @ covariance @ right, take @ covariance @ take.swapaxes(1, 2)
+
+
+@given(
+    st.integers(0, 10_000), st.integers(2, 9), st.sampled_from(THRESHOLDS.correlations),
+    st.sampled_from(THRESHOLDS.changes), st.integers(0, 8),
+)  # fmt: skip
+@settings(deadline=None, max_examples=60)
+def test_a_changing_field_agrees_with_dense_normal_equations(seed, profiles, rho, size, missing):
+    rng = np.random.default_rng(seed)
+    normal, side = informed(rng, profiles, missing=min(missing, profiles - 1))
+    prior = _changing_field.MeanPriors.at(POSITION).precision[int(rng.integers(9))]
+    change = Change(size**2 * _changing_field.correlations(POSITION)[int(rng.integers(3))], rho)
+    pull = rng.standard_normal(3)
+    field, covariance = ChangingField(normal, prior, change).solve(side[..., None], pull[:, None])
+    expected, spread = dense(normal, side, prior, change, pull)
+    error = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    assert np.all(np.abs(field[..., 0] - expected) < 1e-4 * error + 1e-9 * np.abs(expected))
+    np.testing.assert_allclose(covariance, spread, rtol=1e-4, atol=1e-6 * spread.max())
+
+
+@pytest.mark.parametrize("gap", [1, 20])
+def test_a_gap_in_time_loosens_the_field(gap):
+    """Profiles that know nothing stand for time: what is before them says less of what follows."""
+    change = Change(0.3**2 * np.eye(1), 0.95)
+    normal = np.zeros((gap + 1, 1, 1))
+    normal[0] = 1e6
+    prior = np.full((1, 1), 1e6)
+    field, covariance = ChangingField(normal, prior, change).solve(1e6 * (normal > 0.0) * 0.1)
+    # The mean is 0 by its prior, and the first profile is known.
+    assert field[-1, 0, 0] == pytest.approx(field[0, 0, 0] * 0.95**gap, rel=1e-3)
+    assert covariance[-1, 0, 0] == pytest.approx(0.3**2 * (1.0 - 0.95 ** (2 * gap)), rel=1e-3)
+
+
+def marginal(normal, side, change, places):
+    """Return -2 ln likelihood of right sides about their mean, over that without a change."""
+    profiles, size = side.shape
+    place = np.array(places)
+    in_time = change.correlation ** np.abs(place[:, None] - place)
+    centre = np.eye(profiles) - 1.0 / profiles
+    # Right sides are N d + noise of the covariance N; their mean is taken out of both.
+    noise = np.kron(centre, normal)
+    signal = np.kron(centre @ in_time @ centre, normal @ change.covariance @ normal)
+
+    def cost(covariance):
+        return -2.0 * multivariate_normal(cov=covariance, allow_singular=True).logpdf(side.ravel())
+
+    assert side.shape == (profiles, size)
+    return cost(noise + signal) - cost(noise)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_likeliest_change_has_the_largest_dense_likelihood(seed):
+    rng = np.random.default_rng(seed)
+    places = tuple(int(n) for n in np.sort(rng.permutation(30)[:16]))
+    root = rng.standard_normal((3, 5))
+    normal = 300.0 * root @ root.T
+    true = Change(0.18**2 * _changing_field.correlations(POSITION)[seed % 3], 0.95)
+    in_time = true.correlation ** np.abs(np.subtract.outer(places, places))
+    deviation = np.linalg.cholesky(in_time) @ rng.standard_normal((16, 3))
+    deviation = deviation @ np.linalg.cholesky(true.covariance).T
+    noise = rng.standard_normal((16, 3)) @ np.linalg.cholesky(normal).T
+    side = deviation @ normal + noise
+    side = side - side.mean(axis=0)
+    found = _changing_field.likeliest_change(normal, side, POSITION, places)
+    assert found is not None
+    costs = {
+        (n, size, rho): marginal(normal, side, Change(size**2 * shape, rho), places)
+        for n, shape in enumerate(_changing_field.correlations(POSITION))
+        for size in THRESHOLDS.changes
+        for rho in THRESHOLDS.correlations
+    }
+    least = min(costs.values())
+    assert least < -THRESHOLDS.least_change
+    assert marginal(normal, side, found, places) == pytest.approx(least, abs=1e-3)
+
+
+def test_noise_alone_is_no_change():
+    rng = np.random.default_rng(4)
+    normal = np.diag([100.0, 300.0, 50.0])
+    found = 0
+    for _ in range(200):
+        side = rng.standard_normal((30, 3)) @ np.sqrt(normal)
+        side = side - side.mean(axis=0)
+        change = _changing_field.likeliest_change(normal, side, POSITION, tuple(range(30)))
+        found += change is not None
+    assert found <= 2
+
+
+def test_the_field_does_not_depend_on_the_direction_of_time():
+    rng = np.random.default_rng(7)
+    normal, side = informed(rng, 12, missing=3)
+    change = Change(0.1**2 * _changing_field.correlations(POSITION)[1], 0.95)
+    prior = _changing_field.MeanPriors.at(POSITION).precision[4]
+    forward, spread = ChangingField(normal, prior, change).solve(side[..., None])
+    backward, other = ChangingField(normal[::-1], prior, change).solve(side[::-1, :, None])
+    np.testing.assert_allclose(backward[::-1], forward, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(other[::-1], spread, rtol=1e-6)

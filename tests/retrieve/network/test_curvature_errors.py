@@ -42,14 +42,17 @@ def solved(net, field, relative, profiles, *, step=5.0, additive=0.0, seed=1, **
 
 
 def deviations(net, result, field):
-    """Return errors over stated ones, relative errors and stated ones, of unflagged values."""
+    """Return errors over stated ones, relative errors and stated ones, of unflagged values.
+
+    The last are without the default error of the overlap, which these signals do not have.
+    """
     truth = at_crossings(net, field)
     unflagged = np.isfinite(result.extinction) & ~result.flagged
     stated = result.extinction_standard_error
     return (
         (np.abs(result.extinction - truth) / stated)[unflagged],
         (np.abs(result.extinction / truth - 1.0))[unflagged],
-        (stated / truth)[unflagged],
+        (np.sqrt(stated**2 - result.overlap_error**2) / truth)[unflagged],
     )
 
 
@@ -117,8 +120,9 @@ def test_the_error_covers_a_layer_that_a_line_cannot_fit(
     errors, relative_errors, stated = (np.concatenate(chunk) for chunk in zip(*chunks, strict=True))
     assert errors.size > 20
     assert np.mean(errors > 4.0) < 0.005
-    # The stated errors are not much too large, where the polynomial leaves nearly none, too.
-    assert np.median(stated) < max(1.5 * np.median(relative_errors) + 3.0 * relative, 0.2)
+    # The stated errors are not much too large; a polynomial leaves a quarter of a layer of 10 m.
+    most = 0.2 if deep < 15.0 and prior == "block" else 0.0
+    assert np.median(stated) < max(1.5 * np.median(relative_errors) + 3.0 * relative, most)
 
 
 @pytest.mark.parametrize(("deep", "rise"), [(20.0, 40.0), (20.0, 100.0), (10.0, 100.0)])

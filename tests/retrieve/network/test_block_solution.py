@@ -1,0 +1,197 @@
+"""Blocks of profiles as one field: air that changes, and profiles that disagree."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from support.oracles.network import (
+    at_crossings,
+    gradient,
+    grid,
+    noisy,
+    plume,
+    signals,
+    three_by_two,
+    triangle,
+)
+
+from lidarops.retrieve.network import _block_solution
+from lidarops.retrieve.network.extinction_field import retrieve_network
+from lidarops.retrieve.network.flags import NetworkQuality
+
+PROFILES = 36
+
+
+def changing(net, factor, relative, seed=1):
+    """Return range, power, variance and truth of a gradient that grows to a multiple of itself."""
+    r = grid(net)
+    gain = factor ** (np.arange(PROFILES) / (PROFILES - 1) - 0.5)
+    drawn = []
+    for n, each in enumerate(gain):
+        clean = signals(net, r, lambda x, y, z, each=each: each * gradient(x, y, z))
+        drawn.append(noisy(net, r, clean, relative, 1, seed=(seed, n), additive=1e-3))
+    power = np.concatenate([power for power, _ in drawn])
+    variance = np.stack([variance for _, variance in drawn])
+    return r, power, variance, gain[:, None] * at_crossings(net, gradient)
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.5, 2.0, 10.0])
+@pytest.mark.parametrize("build", [triangle, three_by_two])
+def test_air_that_changes_everywhere_is_followed(build, factor):
+    net = build()
+    scores, errors = [], []
+    for seed in range(4):
+        r, power, variance, truth = changing(net, factor, 0.02, seed)
+        result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+        kept = ~result.flagged & np.isfinite(result.extinction)
+        assert kept[:, net.near_crossing].mean() > 0.95
+        scores.append(((result.extinction - truth) / result.extinction_standard_error)[kept])
+        errors.append((result.extinction / truth - 1.0)[kept])
+    score = np.concatenate(scores)
+    assert np.mean(np.abs(score) > 4.0) < 0.005
+    assert np.sqrt(np.mean(score**2)) < 1.3
+    # Three beams do not test each other.
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < (0.15 if net.beams == 3 else 0.05)
+
+
+def test_one_step_about_the_mean_does_not_follow_air_that_changes_much(monkeypatch):
+    net = triangle()
+    r, power, variance, truth = changing(net, 10.0, 0.02)
+    monkeypatch.setattr(_block_solution, "THRESHOLDS",
+                        _block_solution.THRESHOLDS._replace(linear_change=1e30))  # fmt: skip
+    result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+    score = (result.extinction - truth) / result.extinction_standard_error
+    assert np.nanmean(np.abs(score) > 4.0) > 0.05
+
+
+def damaged(net, r, power, kind):
+    """Return powers with one bad beam in profile 7."""
+    power, at = power.copy(), net.on_beam(0)[1].mean()
+    behind = 1.0 / (1.0 + np.exp((at - r) / 30.0))
+    cloud = np.exp(-0.5 * ((r - at) / 30.0) ** 2)
+    shapes = {
+        "x 1.3": 1.3**behind,
+        "x 5": 5.0**behind,
+        "cloud": (1.0 + 10.0 * cloud) * np.exp(-2.0 * behind),
+    }
+    power[7, 0] *= shapes[kind]
+    return power
+
+
+@pytest.mark.parametrize("kind", ["x 1.3", "x 5", "cloud"])
+@pytest.mark.parametrize("relative", [0.002, 0.02])
+@pytest.mark.parametrize("build", [triangle, three_by_two])
+def test_a_bad_profile_does_not_change_the_others(build, relative, kind):
+    """It once moved them by 39 errors, or widened their errors 13 times."""
+    net = build()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), relative, PROFILES, additive=1e-3)
+    settings = {"variance": variance, "full_overlap_range": 100.0}
+    clean = retrieve_network(power, r, net, **settings)
+    result = retrieve_network(damaged(net, r, power, kind), r, net, **settings)
+    near, others = net.near_crossing, np.arange(PROFILES) != 7
+    assert result.raised(NetworkQuality.POOR_FIT)[7].all()
+    np.testing.assert_array_equal(result.flagged[others], clean.flagged[others])
+    error = clean.extinction_standard_error[others][:, near]
+    shift = (result.extinction - clean.extinction)[others][:, near] / error
+    assert np.abs(shift).max() < 0.3
+    np.testing.assert_allclose(result.extinction_standard_error[others][:, near], error, rtol=0.1)
+
+
+def test_profiles_without_a_fault_agree_with_their_neighbours():
+    """In steady air, in a front, and at the turning points of a wave."""
+    net = three_by_two()
+    r = grid(net)
+    time = np.arange(PROFILES) / PROFILES
+    for course in (
+        0.0 * time,
+        np.sin(4.0 * np.pi * time),
+        1.0 / (1.0 + np.exp((0.5 - time) / 0.05)),
+    ):
+        power, variance = [], []
+        for n, each in enumerate(2.0**course):
+            clean = signals(net, r, lambda x, y, z, each=each: each * gradient(x, y, z))
+            drawn = noisy(net, r, clean, 0.005, 1, seed=n, additive=1e-3)
+            power.append(drawn[0][0])
+            variance.append(drawn[1])
+        result = retrieve_network(
+            np.array(power), r, net, variance=np.array(variance), full_overlap_range=100.0
+        )
+        assert not result.raised(NetworkQuality.POOR_FIT).any()
+
+
+def test_a_beam_without_noise_in_all_profiles_is_left_out_and_flagged():
+    net = triangle()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, plume), 0.01, 12)
+    variance = np.broadcast_to(variance, power.shape).copy()
+    for beams in ([0], [0, 1, 2]):
+        variance[:, beams] = 0.0
+        result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+        for beam in beams:
+            assert result.raised(NetworkQuality.LOW_LEVERAGE)[:, net.on_beam(beam)[0]].all()
+
+
+def test_missing_profiles_stand_for_time():
+    """In air that changes, profiles after a long gap are not those before it."""
+    net = three_by_two()
+    r, power, variance, _ = changing(net, 3.0, 0.02)
+    settings = {"full_overlap_range": 100.0}
+    gap = np.full((40, *power.shape[1:]), np.nan)
+    apart = retrieve_network(
+        np.concatenate([power[:18], gap, power[18:]]), r, net,
+        variance=np.concatenate([variance[:18], np.ones_like(gap), variance[18:]]), **settings,
+    )  # fmt: skip
+    joined = retrieve_network(power, r, net, variance=variance, **settings)
+    near = net.near_crossing
+    assert np.isnan(apart.extinction[18:58]).all()
+    given = np.r_[:18, 58:76]
+    # A neighbour in time says something about the profile at the edge of the gap.
+    ratio = apart.extinction_standard_error[given] / joined.extinction_standard_error
+    assert np.all(ratio[[17, 18]][:, near] > 1.02)
+    apart_by = (apart.extinction[given] - joined.extinction) / joined.extinction_standard_error
+    assert np.abs(apart_by[[0, -1]][:, near]).max() < 1.0
+
+
+THREADS = """
+import hashlib
+import numpy as np
+from support.oracles.network import fan, grid, noisy, plume, signals
+from lidarops.retrieve.network.extinction_field import retrieve_network
+
+places = np.linspace(-700.0, 700.0, 10)
+aims = ((-200.0, 500.0), (250.0, 800.0))
+net = fan(places, [[np.degrees(np.arctan2(z, x - at)) for x, z in aims] for at in places],
+          farthest=2500.0)
+r = grid(net)
+power, variance = [], []
+for n in range(6):
+    clean = signals(net, r, lambda x, y, z: 1.2**n * plume(x, y, z, east=-40.0 + 10.0 * n))
+    drawn = noisy(net, r, clean, 0.03, 1, seed=n)
+    power.append(drawn[0][0])
+    variance.append(drawn[1])
+result = retrieve_network(np.array(power), r, net, variance=np.array(variance),
+                          full_overlap_range=100.0)
+assert np.isfinite(result.extinction).mean() > 0.5
+values = result.extinction, result.extinction_standard_error, result.quality
+print(hashlib.sha256(b"".join(each.tobytes() for each in values)).hexdigest())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_bits_do_not_depend_on_the_number_of_threads():
+    """Libraries share the large matrices of twenty beams between threads."""
+    digests = [
+        subprocess.check_output(
+            [sys.executable, "-c", THREADS],
+            env=os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), number),
+            text=True,
+        )
+        for number in ("1", "2")
+    ]
+    assert digests[0] == digests[1]
