@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -325,25 +324,10 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     for words, varied, declared in _VARIED:
         ratio = np.exp(varied * np.sqrt(2.0) * np.sin(phase))
         power, variance = replace(clean, power=clean.power / ratio).draw(noise, profiles, seed)
-        solver = _solver(clean, power, variance)
-        result = solver.solve(power)
+        result = extinction_field.retrieve_network(
+            power, clean.range, net, variance=variance, full_overlap_range=_FULL_OVERLAP
+        )
         # As products state it.
-        systematic = labeled._lidar_ratio_error(solver, result, declared)  # noqa: SLF001
+        systematic = labeled.lidar_ratio_error(result, net, clean.range, declared)
         failure = Failure(f"lidar ratio {words}", unseen=_NOT_SHOWN)
         yield scored(failure, result, clean.truth(profiles), systematic)
-
-
-def _solver(clean: Signals, power: Array, variance: Array) -> Any:
-    """Return the solver of products, which states their systematic errors."""
-    net = clean.network
-    of_beams: Any = SimpleNamespace(
-        power=power, variance=variance, overlap=None,
-        range=np.broadcast_to(clean.range, (net.beams, clean.range.size)),
-    )  # fmt: skip
-    beams: Any = [
-        SimpleNamespace(exponent=1.0, instrument=beam, nearest=_FULL_OVERLAP)
-        for beam in range(net.beams)
-    ]
-    settings: Any = SimpleNamespace(prior="block", multiplier=None, block_intervals=len(power))
-    intervals = np.arange(len(power))
-    return labeled._Solver(beams, net, settings, of_beams, intervals)  # noqa: SLF001 - as above

@@ -43,7 +43,7 @@ RETRIEVAL = {
     },
     "visibility": {
         "beams_with_prior": "network/_block_solution:solve_block",
-        "beams_without_prior": "network/extinction_field:_solve_alone",
+        "beams_without_prior": "network/_block_solution:solve_alone",
         "triangles": "network/triangles:solve_triangles",
     },
 }

@@ -9,79 +9,219 @@ Each pass linearises y in the constant, with g = exp(k) / w and the inverse W of
 y. M = W - W g g' W / (g' W g) is the information of a beam with its constant eliminated. The
 crossings x follow from (sum A' M A + P) x = sum A' M y, where A selects the crossings of a beam
 and P is the precision of the prior; then k changes by g' W (y - A x) / (g' W g).
+
+Libraries share large products and factors between threads, with other last digits for each number
+of them. The loops for small matrices do not, and take less time than a call of a library for each.
 """
 
 from __future__ import annotations
 
-import itertools
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
-from lidarops.retrieve.network import _matrices
-from lidarops.retrieve.network._condensed_signals import CondensedSignals, FitLayout
+from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.network._condensed_signals import Beams
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _PASSES: Final = 24
 _ROUNDING: Final = 1e-9
+_SWEEPS: Final = 30
+_SMALLEST_ROTATION: Final = 1e-15
+"""Elements beside the diagonal over the sum of those on it, below which they are zero."""
 
 
-class Beams(NamedTuple):
-    """Condensed signals of beams with the same number of passages each; the last ones are empty."""
-
-    value: Array
-    """(profile, beam, passage) u."""
-    integral: Array
-    """(profile, beam, passage) I, 0 behind the last passage."""
-    covariance: Array
-    """(profile, beam, 2 passage, 2 passage) of u, then of I."""
-    reach: Indices
-    """(profile, beam) number of usable passages; 0 where there is only one."""
-    crossing: Indices
-    """(beam, passage) number of the crossing, of those that are measured; 0 where empty."""
-    crossings: int
-    """Number of measured crossings."""
+# Small matrices ----------------------------------------------------------------------------------
 
 
-def places(layout: FitLayout) -> tuple[Indices, Indices]:
-    """Return beam and place on the beam of each passage, with beams that have passages only."""
-    counts = np.diff(layout.first_passage)
-    beam = np.repeat(np.arange(np.sum(counts > 0)), counts[counts > 0])
-    place = np.arange(beam.size) - layout.first_passage[:-1][layout.passages.beam]
-    return beam, place
+def product(a: Array, b: Array) -> Array:
+    """Return products of (..., row, inner) and (..., inner, column) matrices."""
+    shape = a.shape[:-2]
+    if shape != b.shape[:-2]:
+        shape = np.broadcast_shapes(shape, b.shape[:-2])
+        a, b = (np.broadcast_to(each, (*shape, *each.shape[-2:])) for each in (a, b))
+    out = np.zeros((math.prod(shape), a.shape[-2], b.shape[-1]))
+    _multiply(
+        np.ascontiguousarray(a).reshape(-1, *a.shape[-2:]) if out.size else out,
+        np.ascontiguousarray(b).reshape(-1, *b.shape[-2:]) if out.size else out,
+        out,
+    )
+    return out.reshape(*shape, *out.shape[1:])
 
 
-def arrange(data: CondensedSignals, layout: FitLayout, reach: Indices) -> Beams:
-    """Return condensed signals in arrays of the same size for each beam.
+def inverse(matrices: Array) -> Array:
+    """Return inverses of (..., row, row) positive definite matrices; NaN of others."""
+    return inverse_and_determinant(matrices)[0]
 
-    `reach` is the (profile, beam) number of usable passages.
+
+def inverse_and_determinant(matrices: Array) -> tuple[Array, Array]:
+    """Return inverses of (..., row, row) positive definite matrices, and (...) ln determinants.
+
+    Both are NaN of other matrices.
     """
-    beam, place = places(layout)
-    shape = reach.shape[1], int(place.max(initial=0)) + 1
-    profiles, most = len(reach), shape[1]
-    value, integral = np.zeros((profiles, *shape)), np.zeros((profiles, *shape))
-    covariance = np.zeros((profiles, shape[0], 2 * most, 2 * most))
-    offsets = layout.offset[np.append(np.flatnonzero(np.diff(layout.first_passage)), -1)]
-    sound = np.ones(reach.shape, dtype=np.bool_)
-    for b, (first, last) in enumerate(itertools.pairwise(offsets)):
-        count = int(np.sum(beam == b))
-        into = np.r_[:count, most : most + count - 1]
-        square = data.covariance[:, first:last].reshape(profiles, 2 * count - 1, -1)
-        # A beam without noise, or of unknown noise, has no weight.
-        used = np.arange(2 * count - 1) % count < reach[:, b, np.newaxis]
-        variances = np.diagonal(square, axis1=1, axis2=2)
-        known = np.isfinite(variances) & ((variances > 0.0) | (np.arange(2 * count - 1) >= count))
-        sound[:, b] = (known | ~used).all(axis=1)
-        covariance[np.ix_(range(profiles), [b], into, into)] = np.where(
-            sound[:, b, np.newaxis, np.newaxis], square, 0.0
-        )[:, np.newaxis]
-    reach = np.where(sound & (reach > 1), reach, 0)
-    value[:, beam, place] = np.where(place < reach[:, beam], data.log_value, 0.0)
-    integral[:, beam, place] = np.where(place < reach[:, beam] - 1, data.integral, 0.0)
-    crossing = np.zeros(shape, dtype=np.intp)
-    crossing[beam, place] = (np.cumsum(layout.measured) - 1)[layout.passages.crossing]
-    return Beams(value, integral, covariance, reach, crossing, int(np.sum(layout.measured)))
+    flat = np.ascontiguousarray(matrices).reshape(-1, *matrices.shape[-2:])
+    out, logarithm = np.empty(flat.shape), np.empty(len(flat))
+    _invert_all(flat, out, logarithm)
+    return out.reshape(matrices.shape), logarithm.reshape(matrices.shape[:-2])
+
+
+def eigenvectors(matrices: Array) -> tuple[Array, Array]:
+    """Return (..., mode) eigenvalues and (..., row, mode) eigenvectors of symmetric matrices.
+
+    By Jacobi rotations, until all elements beside the diagonal are zero.
+    """
+    rotated = np.ascontiguousarray(matrices).reshape(-1, *matrices.shape[-2:]).copy()
+    vectors = np.zeros(rotated.shape)
+    _diagonalise(rotated, vectors)
+    size = np.diagonal(rotated, axis1=1, axis2=2).reshape(matrices.shape[:-1])
+    return size, vectors.reshape(matrices.shape)
+
+
+@compiled
+def add_product(factor: float, a: Array, b: Array, out: Array) -> None:
+    """Add a multiple of the product of two matrices."""
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            share = factor * a[i, k]
+            for j in range(b.shape[1]):
+                out[i, j] += share * b[k, j]
+
+
+@compiled
+def _multiply(a: Array, b: Array, out: Array) -> None:
+    for n in range(a.shape[0]):
+        add_product(1.0, a[n], b[n], out[n])
+
+
+@compiled
+def factorise(matrix: Array) -> float:
+    """Overwrite a lower triangle by its Cholesky factor; return ln determinant, NaN if none."""
+    logarithm = 0.0
+    for i in range(matrix.shape[0]):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i != j:
+                matrix[i, j] = total / matrix[j, j]
+            elif total > 0.0:
+                matrix[i, i] = math.sqrt(total)
+                logarithm += math.log(total)
+            else:
+                return math.nan
+    return logarithm
+
+
+@compiled
+def invert(matrix: Array, out: Array, work: Array) -> float:
+    """Fill the inverse of a positive definite matrix; return ln determinant. Both NaN if none."""
+    size = matrix.shape[0]
+    work[:], out[:] = matrix, 0.0
+    logarithm = factorise(work)
+    if math.isnan(logarithm):
+        out[:] = math.nan
+        return logarithm
+    for i in range(size):
+        # Below the diagonal, the triangle becomes its inverse.
+        for j in range(i):
+            share = 0.0
+            for k in range(j, i):
+                share += work[i, k] * work[k, j]
+            work[i, j] = -share / work[i, i]
+        work[i, i] = 1.0 / work[i, i]
+    for k in range(size):
+        for i in range(k + 1):
+            for j in range(i + 1):
+                out[i, j] += work[k, i] * work[k, j]
+    for i in range(size):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return logarithm
+
+
+@compiled
+def _invert_all(matrices: Array, out: Array, logarithm: Array) -> None:
+    work = np.empty(matrices.shape[1:])
+    for n in range(matrices.shape[0]):
+        logarithm[n] = invert(matrices[n], out[n], work)
+
+
+@compiled
+def _diagonalise(matrices: Array, vectors: Array) -> None:
+    """Diagonalise symmetric matrices by Jacobi rotations, in place."""
+    for n in range(matrices.shape[0]):
+        matrix, vector, limit = matrices[n], vectors[n], 0.0
+        size = matrix.shape[0]
+        for p in range(size):
+            vector[p, p] = 1.0
+            limit += _SMALLEST_ROTATION * abs(matrix[p, p])
+        for _ in range(_SWEEPS):
+            rotations = 0
+            for p in range(size - 1):
+                for q in range(p + 1, size):
+                    if abs(matrix[p, q]) > limit:
+                        _rotate(matrix, vector, p, q)
+                        rotations += 1
+            if rotations == 0:
+                break
+
+
+@compiled
+def _rotate(matrix: Array, vectors: Array, p: int, q: int) -> None:
+    """Make one element beside the diagonal zero."""
+    ratio = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
+    tangent = 1.0 / (abs(ratio) + math.sqrt(ratio * ratio + 1.0))
+    tangent = tangent if ratio >= 0.0 else -tangent
+    cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    for k in range(matrix.shape[0]):
+        for each in (matrix, vectors):
+            a, b = each[k, p], each[k, q]
+            each[k, p], each[k, q] = cosine * a - sine * b, sine * a + cosine * b
+    for k in range(matrix.shape[0]):
+        a, b = matrix[p, k], matrix[q, k]
+        matrix[p, k], matrix[q, k] = cosine * a - sine * b, sine * a + cosine * b
+    matrix[p, q] = matrix[q, p] = 0.0
+
+
+# Sums over the beams of a crossing ---------------------------------------------------------------
+
+
+def normal_matrix(information: Array, beams: Beams) -> Array:
+    """Return (profile, crossing, crossing) sum A' M A."""
+    out = np.zeros((len(information), beams.crossings, beams.crossings))
+    _gather_squares(information, beams.crossing, out)
+    return out
+
+
+def gathered(values: Array, beams: Beams) -> Array:
+    """Return (profile, crossing, case) sums of (profile, beam, passage, case) values."""
+    out = np.zeros((len(values), beams.crossings, values.shape[3]))
+    _gather(np.ascontiguousarray(values), beams.crossing, out)
+    return out
+
+
+@compiled
+def _gather(values: Array, place: Indices, out: Array) -> None:
+    for n in range(values.shape[0]):
+        for b in range(place.shape[0]):
+            for i in range(place.shape[1]):
+                for j in range(values.shape[3]):
+                    out[n, place[b, i], j] += values[n, b, i, j]
+
+
+@compiled
+def _gather_squares(matrices: Array, place: Indices, out: Array) -> None:
+    for n in range(matrices.shape[0]):
+        for b in range(place.shape[0]):
+            for i in range(place.shape[1]):
+                for j in range(place.shape[1]):
+                    out[n, place[b, i], place[b, j]] += matrices[n, b, i, j]
+
+
+# Beams about constants ---------------------------------------------------------------------------
 
 
 class Linear(NamedTuple):
@@ -95,49 +235,94 @@ class Linear(NamedTuple):
     """(profile, beam, passage, passage) M."""
     gain: Array
     """(profile, beam, passage) W g / (g' W g), derivative of the constant by y."""
-    slope: Array
-    """(profile, beam) derivative g of ln w by the constant at the first passage."""
+
+    @classmethod
+    def empty(cls, profiles: int, beams: int, most: int) -> Linear:
+        """Return arrays to fill."""
+        shape = profiles, beams, most
+        return cls(
+            np.zeros(shape), np.zeros((*shape, 2 * most)), np.zeros((*shape, most)), np.zeros(shape)
+        )
 
     def normal(self, beams: Beams) -> tuple[Array, Array]:
         """Return normal matrix sum A' M A, and right side sum A' M y, of each profile."""
-        return normal_matrix(self.information, beams), normal_side(
-            self.information, self.value, beams
-        )
+        side = product(self.information, self.value[..., np.newaxis])
+        return normal_matrix(self.information, beams), gathered(side, beams)[..., 0]
+
+    def sides(self, beams: Beams, change: Array) -> Array:
+        """Return (profile, crossing, case) changes of right sides.
+
+        `change` is the (profile, beam, 2 passage, case) change of u and I.
+        """
+        return gathered(product(self.information, product(self.turn, change)), beams)
 
 
-def carry(covariance: Array, information: Array, beams: Beams) -> Array:
-    """Return (profile, crossing, beam, passage) derivatives C A' M of the solution by y."""
-    taken = covariance[:, :, beams.crossing].swapaxes(1, 2)
-    return _matrices.product(taken, information).swapaxes(1, 2)
+@compiled
+def _linearise_beam(
+    signal: tuple[Array, Array, Array], constant: float, reach: int,
+    out: tuple[Array, Array, Array, Array], work: Array,
+) -> None:  # fmt: skip
+    """Fill y, its derivatives, M and the gain of one beam; 0 where it has no two passages."""
+    (u, integral, noise), (value, turn, information, gain) = signal, out
+    value[:], gain[:], turn[:], information[:] = 0.0, 0.0, 0.0, 0.0
+    if reach < 2:
+        return
+    most, weight = u.size, math.exp(constant)
+    lever, scale, carried = np.empty(reach), np.empty(reach), np.empty(2 * most)
+    for p in range(most - 1, -1, -1):
+        weight += integral[p]
+        if p >= reach:
+            continue
+        value[p] = u[p] - math.log(weight)
+        turn[p, p] = 1.0
+        # The integral behind the last passage in use is part of the constant.
+        turn[p, most + p : most + reach - 1] = -1.0 / weight
+        lever[p] = 1.0 / weight
+    lever /= lever[reach - 1]
+    correlation, inverse = work[0, :reach, :reach], work[1, :reach, :reach]
+    for p in range(reach):
+        carried[:] = noise[p]
+        for i in range(most + p, most + reach - 1):
+            carried += turn[p, i] * noise[i]
+        for q in range(p + 1):
+            correlation[p, q] = (carried * turn[q]).sum()
+        scale[p] = math.sqrt(correlation[p, p]) if correlation[p, p] > 0.0 else 1.0
+    for p in range(reach):
+        for q in range(p + 1):
+            correlation[p, q] /= scale[p] * scale[q]
+        correlation[p, p] += THRESHOLDS.smallest_pivot
+    invert(correlation, inverse, work[2, :reach, :reach])
+    known = 0.0
+    for p in range(reach):
+        for q in range(reach):
+            inverse[p, q] /= scale[p] * scale[q]
+            gain[p] += inverse[p, q] * lever[q]
+        known += lever[p] * gain[p]
+    for p in range(reach):
+        for q in range(reach):
+            information[p, q] = inverse[p, q] - gain[p] * gain[q] / known
+    gain[:reach] /= known
 
 
-def normal_matrix(information: Array, beams: Beams) -> Array:
-    """Return (profile, crossing, crossing) sum A' M A."""
-    out = np.zeros((len(information), beams.crossings, beams.crossings))
-    _matrices.gather_squares(information, beams.crossing, out)
-    return out
-
-
-def normal_side(information: Array, value: Array, beams: Beams) -> Array:
-    """Return (profile, crossing) sum A' M y."""
-    return gathered(_matrices.product(information, value[..., np.newaxis]), beams)[..., 0]
-
-
-def gathered(values: Array, beams: Beams) -> Array:
-    """Return (profile, crossing, case) sums of (profile, beam, passage, case) values."""
-    out = np.zeros((len(values), beams.crossings, values.shape[3]))
-    place = beams.crossing.ravel()
-    _matrices.gather(np.ascontiguousarray(values.reshape(len(values), place.size, -1)), place, out)
-    return out
-
-
-def changed_sides(linear: Linear, beams: Beams, change: Array) -> Array:
-    """Return (profile, crossing, case) changes of the right sides.
-
-    `change` is the (case, beam, 2 passage) change of u and I in all profiles.
-    """
-    turned = _matrices.product(linear.turn, change.transpose(1, 2, 0))
-    return gathered(_matrices.product(linear.information, turned), beams)
+@compiled
+def _linearise(
+    signals: tuple[Array, Array, Array], constants: Array, reach: Indices,
+    out: tuple[Array, Array, Array, Array],
+) -> None:  # fmt: skip
+    """Linearise beams about constants; signals and constants may be those of one mean."""
+    value, turn, information, gain = out
+    u, integral, noise = signals
+    work = np.empty((3, u.shape[2], u.shape[2]))
+    for t in range(reach.shape[0]):
+        n = t if u.shape[0] > 1 else 0
+        for b in range(reach.shape[1]):
+            filled = value[t, b], turn[t, b], information[t, b], gain[t, b]
+            if n < t and reach[t, b] == reach[t - 1, b]:
+                filled[0][:], filled[1][:] = value[t - 1, b], turn[t - 1, b]
+                filled[2][:], filled[3][:] = information[t - 1, b], gain[t - 1, b]
+            else:
+                signal = u[n, b], integral[n, b], noise[n, b]
+                _linearise_beam(signal, constants[n, b], reach[t, b], filled, work)
 
 
 def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> Linear:
@@ -146,55 +331,15 @@ def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> L
     Parameters
     ----------
     beams : Beams
-    constants : (profile, beam) float64
+        Of each profile, or of one mean.
+    constants : (profile or 1, beam) float64
         ln w at the last passage of each beam.
     reach : (profile, beam) intp, optional
         Number of passages in use, at most those of the beams.
     """
-    reach = beams.reach if reach is None else reach
-    shape = np.broadcast_shapes(beams.value.shape, (*reach.shape, 1))
-    most = shape[2]
-    end = np.exp(constants)[..., np.newaxis]
-    weight = end + np.cumsum(beams.integral[..., ::-1], axis=2)[..., ::-1]
-    weight = np.broadcast_to(weight, shape)
-    inside = np.broadcast_to(np.arange(most) < reach[..., np.newaxis], shape)
-    # The integral behind the last passage in use is part of the constant.
-    steps = np.arange(most - 1) < reach[..., np.newaxis] - 1
-    turn = np.zeros((*shape, 2 * most))
-    turn[..., :most] = np.eye(most)
-    upper = np.triu(np.ones((most, most)))[:, : most - 1]
-    turn[..., most:-1] = -upper * steps[..., np.newaxis, :] / weight[..., np.newaxis]
-    turn *= inside[..., np.newaxis]
-    covariance = _matrices.product(_matrices.product(turn, beams.covariance), turn.swapaxes(-1, -2))
-    scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    scale = np.where(inside & (scale > 0.0), scale, 1.0)
-    correlation = covariance / scale[..., np.newaxis] / scale[..., np.newaxis, :]
-    unused = np.where(inside, THRESHOLDS.smallest_pivot, 1.0)
-    correlation = correlation + unused[..., np.newaxis] * np.eye(most)
-    inverse = _matrices.inverse(correlation) / scale[..., np.newaxis] / scale[..., np.newaxis, :]
-    inverse *= inside[..., np.newaxis] & inside[..., np.newaxis, :]
-    last = np.take_along_axis(weight, np.maximum(reach - 1, 0)[..., np.newaxis], axis=2)
-    lever = np.where(inside, last / weight, 0.0)
-    gain = _matrices.product(inverse, lever[..., np.newaxis])[..., 0]
-    known = (gain * lever).sum(axis=2)
-    empty = reach < 2
-    known = np.where(empty, 1.0, known)
-    information = (
-        inverse
-        - gain[..., np.newaxis] * gain[..., np.newaxis, :] / known[..., np.newaxis, np.newaxis]
-    )
-    information[np.broadcast_to(empty, shape[:2])] = 0.0
-    value = np.where(inside, beams.value - np.log(weight), 0.0)
-    gain = np.where(empty[..., np.newaxis], 0.0, gain / known[..., np.newaxis])
-    return Linear(value, turn, information, gain, lever[..., 0])
-
-
-def optical_lengths(layout: FitLayout, exponent: Array) -> Array:
-    """Return (beam, passage) exponent times the distance from the first passage, in m."""
-    beam, place = places(layout)
-    ranges, number = layout.passages.range, layout.passages.beam
-    out = np.zeros((int(beam.max(initial=-1)) + 1, int(place.max(initial=0)) + 1))
-    out[beam, place] = (ranges - ranges[layout.first_passage[number]]) * exponent[number]
+    reach = beams.reach if reach is None else np.minimum(reach, beams.reach)
+    out = Linear.empty(len(reach), reach.shape[1], beams.value.shape[2])
+    _linearise(beams[:3], constants, reach, out[:])
     return out
 
 
@@ -202,14 +347,14 @@ def start_constants(beams: Beams, lengths: Array) -> Array:
     """Return (profile, beam) constants of homogeneous air.
 
     Along all beams of a profile, the fall of the signal over the integral is its extinction.
-    `lengths` are the `optical_lengths`.
+    `lengths` are the (beam, passage) exponents times distances from the first passage, in m.
     """
     place = np.maximum(beams.reach - 1, 0)[..., np.newaxis]
     usable = beams.reach > 1
     end = np.take_along_axis(beams.value, place, axis=2)[..., 0]
     fall = np.where(usable, -np.expm1(np.minimum(end, THRESHOLDS.thickest_beam)), 0.0)
-    total = beams.integral.sum(axis=2)
-    length = np.take_along_axis(np.broadcast_to(lengths, beams.value.shape), place, axis=2)[..., 0]
+    total = np.where(usable, beams.integral.sum(axis=2), 0.0)
+    length = lengths[np.arange(len(lengths)), place[..., 0]]
     with np.errstate(all="ignore"):
         extinction = fall.sum(axis=1, keepdims=True) / total.sum(axis=1, keepdims=True)
         depths = 2.0 * extinction * length
@@ -243,57 +388,93 @@ def fit_beams(beams: Beams, precision: Array, constants: Array) -> Solution:
     constants : (profile, beam) float64
         Where to start.
     """
-    crossing = beams.crossing
+    profiles, number = beams.reach.shape
+    constants, size = constants.copy(), beams.crossings
+    linear = Linear.empty(profiles, number, beams.value.shape[2])
+    x, covariance = np.empty((profiles, size)), np.empty((profiles, size, size))
+    step = np.empty(profiles)
     # Each crossing is drawn to the level of the profile a little, where nothing else determines it.
-    level = THRESHOLDS.weak_precision
-    precision = precision + level * np.eye(len(precision))
-    inside = np.arange(beams.value.shape[2]) < beams.reach[..., np.newaxis]
-    number = np.maximum(inside.sum(axis=(1, 2)), 1)
-    step = np.full(constants.shape, np.inf)
-    for _ in range(_PASSES):
-        linear = linearise(beams, constants)
-        normal, side = linear.normal(beams)
-        mean = np.where(inside, linear.value, 0.0).sum(axis=(1, 2)) / number
-        covariance = _matrices.inverse(normal + precision)
-        pulled = side + level * mean[:, np.newaxis]
-        x = _matrices.product(covariance, pulled[..., np.newaxis])[..., 0]
-        # A profile that has settled does not depend on how long the others take.
-        going = np.abs(step).max(axis=1, initial=0.0) >= THRESHOLDS.converged_step**3
-        if not going.any():
-            break
-        new = (linear.gain * (linear.value - x[:, crossing])).sum(axis=2)
-        new = np.clip(new, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
-        step = np.where(going[:, np.newaxis], new, step)
-        constants = constants + step * going[:, np.newaxis]
-    moved = np.abs(step * linear.slope).max(axis=1, initial=0.0)
-    return Solution(x, np.asarray(covariance), constants, linear, moved < THRESHOLDS.converged_step)
+    precision = precision + THRESHOLDS.weak_precision * np.eye(size)
+    _fit(beams[:5], precision, constants, linear[:], (x, covariance, step))
+    return Solution(x, covariance, constants, linear, step < THRESHOLDS.converged_step)
 
 
-def compare(
-    beams: Beams, linear: Linear, x: Array, reach: Indices | None = None
-) -> tuple[Array, Array, Booleans]:
-    """Return chi-squares, their degrees of freedom, and which crossings a profile sees.
+@compiled
+def _fit(
+    beams: tuple[Array, Array, Array, Indices, Indices], precision: Array, constants: Array,
+    linear: tuple[Array, Array, Array, Array], out: tuple[Array, Array, Array],
+) -> None:  # fmt: skip
+    """Solve each profile; `out` are ln extinction, its covariance, and the last step of ln w."""
+    (u, integral, noise, reach, crossing), (x, covariance, step) = beams, out
+    value, turn, information, gain = linear
+    most, size = u.shape[2], precision.shape[0]
+    work, factor = np.empty((3, most, most)), np.empty((size, size))
+    for n in range(u.shape[0]):
+        largest = math.inf
+        for _ in range(_PASSES):
+            normal, side, level, number = precision.copy(), np.zeros(size), 0.0, 0
+            for b in range(u.shape[1]):
+                signal = u[n, b], integral[n, b], noise[n, b]
+                filled = value[n, b], turn[n, b], information[n, b], gain[n, b]
+                _linearise_beam(signal, constants[n, b], reach[n, b], filled, work)
+                for p in range(reach[n, b]):
+                    level += value[n, b, p]
+                    number += 1
+                    for q in range(reach[n, b]):
+                        share = information[n, b, p, q]
+                        normal[crossing[b, p], crossing[b, q]] += share
+                        side[crossing[b, p]] += share * value[n, b, q]
+            side += THRESHOLDS.weak_precision * level / max(number, 1)
+            invert(normal, covariance[n], factor)
+            x[n] = 0.0
+            for c in range(size):
+                for d in range(size):
+                    x[n, c] += covariance[n, c, d] * side[d]
+            if largest < THRESHOLDS.converged_step**3:
+                break
+            largest = step[n] = 0.0
+            for b in range(u.shape[1]):
+                change, slope = 0.0, math.exp(constants[n, b] + value[n, b, 0] - u[n, b, 0])
+                for p in range(reach[n, b]):
+                    change += gain[n, b, p] * (value[n, b, p] - x[n, crossing[b, p]])
+                change = min(max(change, -THRESHOLDS.longest_step), THRESHOLDS.longest_step)
+                constants[n, b] += change
+                largest = max(largest, abs(change))
+                if not abs(change) * slope <= step[n]:
+                    step[n] = abs(change) * slope
+
+
+# Tests -------------------------------------------------------------------------------------------
+
+
+def compare(beams: Beams, linear: Linear, x: Array, reach: Indices) -> tuple[Array, Array]:
+    """Return chi-squares of profiles, and their degrees of freedom.
 
     Returns
     -------
     (profile, 2) float64
         Chi-square of the beams alone, at their own best field, and about a field.
     (profile, 2) float64
-    (profile, crossing) bool
     """
-    reach = beams.reach if reach is None else reach
-    inside = np.arange(beams.value.shape[2]) < reach[..., np.newaxis]
-    seen = gathered(inside[..., np.newaxis].astype(np.float64), beams)[..., 0] > 0.0
-    residual = np.where(inside, linear.value - x[:, beams.crossing], 0.0)
-    weighted = _matrices.product(linear.information, residual[..., np.newaxis])[..., 0]
-    about = (weighted * residual).sum(axis=(1, 2))
-    alone = about - taken_up(
-        normal_matrix(linear.information, beams),
-        normal_side(linear.information, residual, beams),
-    )
+    residual = residuals(beams, linear, x, reach)
+    weighted = product(linear.information, residual)
+    about = (weighted * residual).sum(axis=(1, 2, 3))
+    taken = taken_up(normal_matrix(linear.information, beams), gathered(weighted, beams)[..., 0])
     spare = reach.sum(axis=1) - (reach > 0).sum(axis=1)
-    freedom = np.stack([spare - seen.sum(axis=1), spare], axis=1).astype(np.float64)
-    return np.stack([alone, about], axis=1), freedom, seen
+    freedom = np.stack([spare - seen(beams, reach).sum(axis=1), spare], axis=1)
+    return np.stack([about - taken, about], axis=1), freedom.astype(np.float64)
+
+
+def residuals(beams: Beams, linear: Linear, x: Array, reach: Indices) -> Array:
+    """Return (profile, beam, passage, 1) y - A x of the passages in use."""
+    inside = np.arange(beams.value.shape[2]) < reach[..., np.newaxis]
+    return np.where(inside, linear.value - x[:, beams.crossing], 0.0)[..., np.newaxis]
+
+
+def seen(beams: Beams, reach: Indices) -> Booleans:
+    """Return (profile, crossing) whether a passage in use is there."""
+    inside = np.arange(beams.value.shape[2]) < reach[..., np.newaxis]
+    return np.asarray(gathered(inside[..., np.newaxis].astype(np.float64), beams)[..., 0] > 0.0)
 
 
 def taken_up(normal: Array, side: Array) -> Array:
@@ -301,5 +482,5 @@ def taken_up(normal: Array, side: Array) -> Array:
     # Directions that no beam determines have no side: a little information there does not count.
     size = np.diagonal(normal, axis1=1, axis2=2).max(axis=1)[:, np.newaxis, np.newaxis]
     little = np.where(size > 0.0, _ROUNDING * size, 1.0) * np.eye(normal.shape[1])
-    part = _matrices.product(_matrices.inverse(normal + little), side[..., np.newaxis])[..., 0]
+    part = product(inverse(normal + little), side[..., np.newaxis])[..., 0]
     return np.asarray((part * side).sum(axis=1))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Final
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,19 +14,88 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Codes, Indices
 from lidarops.retrieve.network import _condensed_signals
+from lidarops.retrieve.network._changing_field import Priors
 from lidarops.retrieve.network._condensed_signals import (
     NOT_POSITIVE,
     CleanBeam,
-    CondensedSignals,
     FitLayout,
-    condense,
     median,
+    places,
 )
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
 """Variance of a median over the variance of a mean."""
+
+
+class SignalChange(NamedTuple):
+    """A small change of the signals of a beam."""
+
+    power: Array | None = None
+    """(profile, bin) what is added, in the unit of the power."""
+    relative: Array | None = None
+    """(bin,) relative change of the power."""
+    exponent: float = 0.0
+    """Relative change of the exponent."""
+
+    def take(self, profiles: Indices) -> SignalChange:
+        """Return the selected profiles."""
+        return self._replace(power=None if self.power is None else self.power[profiles])
+
+    def of_power(self, bins: slice, power: Array) -> Array:
+        """Return (profile or 1, bin) relative changes of a (profile, bin) power."""
+        added = np.zeros((1, 1)) if self.power is None else self.power[:, bins] / power
+        return added if self.relative is None else added + self.relative[bins]
+
+
+Causes = Sequence[Mapping[int, SignalChange]]
+"""Changes by the number of the beam, each of which has one cause."""
+Response = Callable[[Causes], Array]
+"""From causes to (profile, crossing, cause) changes of ln extinction."""
+
+
+class Block(NamedTuple):
+    """Clean signals of the profiles of a block."""
+
+    beams: list[CleanBeam]
+    """Those with passages."""
+    layout: FitLayout
+    reach: Indices
+    """(profile, beam) number of usable passages."""
+    exponent: Array
+    """(beam,) of all beams."""
+    priors: Priors
+
+    @property
+    def lengths(self) -> Array:
+        """(beam, passage) exponent times the distance from the first passage, in m."""
+        beam, place = places(self.layout)
+        ranges, number = self.layout.passages.range, self.layout.passages.beam
+        out = np.zeros((len(self.beams), int(place.max(initial=0)) + 1))
+        first = ranges[self.layout.first_passage[number]]
+        out[beam, place] = (ranges - first) * self.exponent[number]
+        return out
+
+    def each_beam(self, reach: Indices) -> Iterator[tuple[CleanBeam, FitLayout, Indices]]:
+        """Yield each beam, and the (profile,) number of its passages in use."""
+        for b, beam in enumerate(self.beams):
+            yield beam, self.layout, reach[:, b]
+
+    def near_ends(self) -> Causes:
+        """Return relative changes of 1 at the first passage of a beam, and 0 at its last one."""
+        at, first = self.layout.passages.range, self.layout.first_passage
+        return [
+            {
+                beam.number: SignalChange(
+                    relative=np.interp(
+                        self.layout.range[beam.number],
+                        at[[first[beam.number], first[beam.number + 1] - 1]], [1.0, 0.0],
+                    )
+                )
+            }
+            for beam in self.beams
+        ]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +123,32 @@ class BeamSignals:
     together: bool
     """Whether the profiles of a block are one field."""
 
-    @cached_property
-    def data(self) -> CondensedSignals:
-        """Signals of each profile, condensed."""
-        data, _ = condense(self.beams, self.layout)
-        data.usable[~self.usable] = False
-        return data
+    def blocks(self, position: Array) -> Iterator[tuple[Indices, Block]]:
+        """Yield the numbers of the profiles of each block, and their signals.
+
+        `position` is the (crossing, 3) one in m.
+        """
+        ends = [(a, b) for a, b in itertools.pairwise(self.layout.first_passage) if b > a]
+        if not ends:
+            return
+        priors = Priors.at(position[self.layout.measured])
+        for number in np.unique(self.block):
+            rows = np.flatnonzero(self.block == number)
+            reach = [
+                np.logical_and.accumulate(self.usable[rows, a:b], axis=1).sum(axis=1)
+                for a, b in ends
+            ]
+            yield (
+                rows,
+                Block(
+                    [each.take(rows) for each in self.beams], self.layout,
+                    np.stack(reach, axis=1).astype(np.intp), self.exponent, priors,
+                ),
+            )  # fmt: skip
+
+
+def _no_response(causes: Causes) -> Array:
+    return np.zeros((1, 1, len(causes)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +169,8 @@ class Estimates:
     """(profile, 3) of these."""
     deviation: Array
     """(profile,) standard deviation of the prior; inf without one."""
+    overlap: Array
+    """(profile, crossing) change of ln extinction by overlap errors of 1 at the near ends."""
     overlap_error: Array
     """(profile, crossing) m-1, part of the error by the default error of the overlap."""
     multiplier: Array
@@ -86,19 +178,35 @@ class Estimates:
     multiplier_error: Array
     """(profile, crossing) m-1."""
     open: Booleans
-    """(crossing,) True where no triangle leads away, with a multiplier."""
+    """(profile, crossing) True where no triangle leads away, with a multiplier."""
+    respond: Response = _no_response
 
     @classmethod
-    def missing(cls, beams: BeamSignals) -> Estimates:
+    def missing(cls, profiles: int, layout: FitLayout) -> Estimates:
         """Return estimates without values, of all beams together; solvers fill the arrays."""
-        profiles = beams.block.size
-        shape = (profiles, beams.layout.crossings)
+        shape = (profiles, layout.crossings)
         return cls(
             np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(profiles, dtype=np.bool_),
-            np.zeros(beams.usable.shape, dtype=np.bool_), np.full((profiles, 3), np.nan),
-            np.full((profiles, 3), np.nan), np.full(profiles, np.inf), np.zeros(shape),
-            np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[1], dtype=np.bool_),
+            np.zeros((profiles, layout.passages.beam.size), dtype=np.bool_),
+            np.full((profiles, 3), np.nan), np.full((profiles, 3), np.nan),
+            np.full(profiles, np.inf), np.zeros(shape), np.zeros(shape), np.full(shape, np.nan),
+            np.zeros(shape), np.zeros(shape, dtype=np.bool_),
         )  # fmt: skip
+
+    @classmethod
+    def of_block(cls, block: Block) -> Estimates:
+        """Return estimates without values for the profiles of a block."""
+        return cls.missing(len(block.reach), block.layout)
+
+    def leave_out(self, block: Block, reach: Indices) -> None:
+        """State which beams have no weight, though they have usable passages."""
+        beam, _ = places(block.layout)
+        self.left_out[:] = ((reach == 0) & (block.reach > 1))[:, beam]
+
+    def with_response(self, block: Block, respond: Response) -> Estimates:
+        """Return the estimates with how they follow changes of the signals."""
+        overlap = np.sqrt((respond(block.near_ends()) ** 2).sum(axis=2))
+        return replace(self, respond=respond, overlap=overlap)
 
 
 def prepare_signals(

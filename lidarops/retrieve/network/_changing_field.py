@@ -15,18 +15,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
-from lidarops.retrieve.network import _matrices
-from lidarops.retrieve.network._beam_fit import Beams, Solution
+from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.network import _beam_fit
+from lidarops.retrieve.network._beam_fit import Solution, add_product, invert, product
+from lidarops.retrieve.network._condensed_signals import Beams
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-_ROUNDING: Final = 1e-9
-"""Relative size of a field below which it is rounding."""
-
 
 # The mean field ----------------------------------------------------------------------------------
 
@@ -49,7 +47,7 @@ def precision(covariance: Array) -> tuple[Array, Array]:
 
     The second array is ln of their determinants in the other directions, without a constant.
     """
-    inverse, determinant = _matrices.inverse_and_determinant(covariance)
+    inverse, determinant = _beam_fit.inverse_and_determinant(covariance)
     sums = inverse.sum(axis=-1)
     total = sums.sum(axis=-1)
     free = sums[..., np.newaxis] * sums[..., np.newaxis, :] / total[..., np.newaxis, np.newaxis]
@@ -57,8 +55,8 @@ def precision(covariance: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MeanPriors:
-    """Priors of the mean field that are tried: by size, then by length."""
+class Priors:
+    """Priors of the mean field that are tried, by size, then by length; and shapes of changes."""
 
     covariance: Array
     """(prior, crossing, crossing)."""
@@ -68,9 +66,11 @@ class MeanPriors:
     """(prior,) ln of the determinants of the precisions, without the free level."""
     deviation: Array
     """(prior,) standard deviation over the crossings by single volumes of air."""
+    roots: Array
+    """(length, crossing, crossing) matrices R, with the correlations R R' of changes."""
 
     @classmethod
-    def at(cls, position: Array) -> MeanPriors:
+    def at(cls, position: Array) -> Priors:
         """Return the priors of crossings at a (crossing, 3) position in m."""
         height = position[:, 2]
         deviation, depth = THRESHOLDS.stratified
@@ -82,14 +82,16 @@ class MeanPriors:
         deviations = np.sqrt(
             np.trace(single, axis1=1, axis2=2) / len(height) - single.mean(axis=(1, 2))
         )
-        return cls(single + shared, *precision(single + shared), deviations)
+        size, vectors = _beam_fit.eigenvectors(correlations(position))
+        roots = vectors * np.sqrt(np.maximum(size, 0.0))[:, np.newaxis]
+        return cls(single + shared, *precision(single + shared), deviations, roots)
 
     @property
     def widest(self) -> Array:
         """(crossing, crossing) precision of the largest size and the shortest length."""
         return np.asarray(self.precision[-len(THRESHOLDS.lengths)])
 
-    def posterior(self, beams: Beams, first: Solution) -> MeanPosterior:
+    def posterior(self, beams: Beams, first: Solution) -> Posterior:
         """Return the probabilities of the priors, given the mean of a block.
 
         Parameters
@@ -102,16 +104,16 @@ class MeanPriors:
         level = first.logarithm[0].mean()
         (normal,), (side,) = first.linear.normal(beams)
         weak = THRESHOLDS.weak_precision * np.eye(len(normal))
-        covariance, determinant = _matrices.inverse_and_determinant(normal + self.precision + weak)
+        covariance, determinant = _beam_fit.inverse_and_determinant(normal + self.precision + weak)
         side = side - level * normal.sum(axis=1)
-        x = _matrices.product(covariance, side[:, np.newaxis])[..., 0]
+        x = product(covariance, side[:, np.newaxis])[..., 0]
         cost = determinant - self.determinant - (x * side).sum(axis=1)
         weight = np.exp(-0.5 * (cost - cost.min()))
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        return MeanPosterior(weight / weight.sum(), x + level, variance)
+        return Posterior(weight / weight.sum(), x + level, variance)
 
 
-class MeanPosterior(NamedTuple):
+class Posterior(NamedTuple):
     """Mean fields with each prior, and their probabilities."""
 
     weight: Array
@@ -121,13 +123,9 @@ class MeanPosterior(NamedTuple):
     variance: Array
     """(prior, crossing)."""
 
-    def expected(self, priors: MeanPriors) -> Array:
+    def expected(self, priors: Priors) -> Array:
         """Return the (crossing, crossing) precision of the expected covariance."""
         return precision(np.einsum("k,kcd->cd", self.weight, priors.covariance))[0]
-
-    def deviation(self, priors: MeanPriors) -> float:
-        """Return the deviation of the likeliest prior."""
-        return float(priors.deviation[np.argmax(self.weight)])
 
     def square_error(self, logarithm: Array) -> Array:
         """Return (crossing,) mean squares of the relative deviation of extinction from a field."""
@@ -142,24 +140,28 @@ class MeanPosterior(NamedTuple):
 class Change(NamedTuple):
     """How a field changes with time."""
 
-    covariance: Array
-    """(crossing, crossing) of ln extinction."""
+    root: Array
+    """(crossing, crossing) R, with the covariance R R' of ln extinction."""
     correlation: float
     """From one profile to the next."""
 
 
-@lru_cache(maxsize=256)
-def _modes(places: tuple[int, ...], correlation: float) -> tuple[Array, Array]:
-    """Return variances and (profile, mode) vectors of deviations from the mean of a block."""
-    place = np.array(places)
-    matrix = correlation ** np.abs(place[:, np.newaxis] - place)
-    centred = matrix - matrix.mean(axis=0) - matrix.mean(axis=1)[:, np.newaxis] + matrix.mean()
-    size, vector = _matrices.eigenvectors(centred)
-    return np.maximum(size, 0.0), vector
+@lru_cache(maxsize=64)
+def _modes(places: tuple[int, ...], correlations: tuple[float, ...]) -> tuple[Array, Array]:
+    """Return (correlation, mode) variances and (correlation, mode, profile) vectors.
+
+    They are those of deviations from the mean of a block.
+    """
+    place, rho = np.array(places), np.array(correlations)[:, np.newaxis, np.newaxis]
+    matrix = rho ** np.abs(place[:, np.newaxis] - place)
+    mean = matrix.mean(axis=1, keepdims=True)
+    centred = matrix - mean - mean.swapaxes(1, 2) + mean.mean(axis=2, keepdims=True)
+    size, vectors = _beam_fit.eigenvectors(centred)
+    return np.maximum(size, 0.0), np.ascontiguousarray(vectors.swapaxes(1, 2))
 
 
 def likeliest_change(
-    normal: Array, side: Array, position: Array, places: tuple[int, ...]
+    normal: Array, side: Array, roots: Array, places: tuple[int, ...]
 ) -> Change | None:
     """Return the change of the largest marginal likelihood, None where it is no better than none.
 
@@ -169,88 +171,86 @@ def likeliest_change(
         Of a typical profile.
     side : (profile, crossing) float64
         Right sides less those of the mean field.
-    position : (crossing, 3) float64
-        m.
+    roots : (length, crossing, crossing) float64
+        `Priors.roots`.
     places : (profile,) int
         Numbers of the profiles, in order of time.
     """
-    unit = np.eye(len(position))
-    amplitude = np.array(THRESHOLDS.changes)[:, np.newaxis, np.newaxis] ** 2
-    best, least = None, -THRESHOLDS.least_change
-    for shape in correlations(position):
-        root = _matrices.lower_root(shape + _ROUNDING * unit)
-        size, vector = _matrices.eigenvectors(_turned(normal, root))
-        along = _matrices.product(_matrices.product(side, root), vector)
-        for rho in THRESHOLDS.correlations:
-            variance, modes = _modes(places, rho)
-            square = _matrices.product(modes.T, along) ** 2
-            each = amplitude * variance[:, np.newaxis]
-            scaled = each * np.maximum(size, 0.0)
-            costs = (np.log1p(scaled) - each * square / (1.0 + scaled)).sum(axis=(1, 2))
-            k = int(np.argmin(costs))
-            if costs[k] < least:
-                least = costs[k]
-                best = Change(float(amplitude[k, 0, 0]) * shape, rho)
-    return best
+    variance, modes = _modes(places, THRESHOLDS.correlations)
+    size, vectors = _beam_fit.eigenvectors(_turned(normal, roots))
+    along = product(side, product(roots, vectors))
+    square = product(modes, along[:, np.newaxis]) ** 2
+    amplitude = np.array(THRESHOLDS.changes)
+    each = amplitude[:, np.newaxis, np.newaxis, np.newaxis, np.newaxis] ** 2 * variance[..., None]
+    scaled = each * np.maximum(size, 0.0)[:, np.newaxis, np.newaxis]
+    costs = (np.log1p(scaled) - each * square / (1.0 + scaled)).sum(axis=(-2, -1))
+    k, length, rho = np.unravel_index(int(np.argmin(costs)), costs.shape)
+    if not costs[k, length, rho] < -THRESHOLDS.least_change:
+        return None
+    return Change(amplitude[k] * roots[length], THRESHOLDS.correlations[rho])
 
 
 def _turned(matrices: Array, root: Array) -> Array:
-    """Return (..., crossing, crossing) matrices of the unknowns that a root makes those of x."""
-    return _matrices.product(_matrices.product(root.T, matrices), root)
+    """Return (..., crossing, crossing) matrices R' N R of the unknowns that R makes those of x."""
+    return product(product(root.swapaxes(-1, -2), matrices), root)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChangingField:
-    """What all profiles of a block know about their field."""
+def solve_changing(
+    normal: Array, side: Array, prior: Array, change: Change, pull: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Return (profile, crossing, case) fields, and (profile, crossing, crossing) covariances.
 
-    normal: Array
-    """(profile, crossing, crossing) N_t."""
-    prior: Array
-    """(crossing, crossing) precision of the mean field."""
-    change: Change
-
-    def solve(self, side: Array, pull: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return (profile, crossing, case) fields, and (profile, crossing, crossing) covariances.
-
-        Parameters
-        ----------
-        side : (profile, crossing, case) float64
-            Right sides h_t, of several cases.
-        pull : (crossing, case) float64
-            Right side of the mean field by its prior.
-        """
-        unit = np.eye(len(self.prior))
-        prior = self.prior + THRESHOLDS.weak_precision * unit
-        of_change = self.change.covariance
-        root = _matrices.lower_root(of_change + _ROUNDING * np.trace(of_change) * unit)
-        cases = side.shape[2]
-        sides = _matrices.product(root.T, np.concatenate([side, self.normal], axis=2))
-        solved, spread = _solve_chain(_turned(self.normal, root), sides, self.change.correlation)
-        solved, spread = _matrices.product(root, solved), _turned(spread, root.T)
-        by_side, left = solved[..., :cases], unit - solved[..., cases:]
-        known = _matrices.product(self.normal, left).sum(axis=0)
-        covariance = _matrices.inverse((known + known.T) / 2.0 + prior)
-        rest = (side - _matrices.product(self.normal, by_side)).sum(axis=0) + pull
-        field = by_side + _matrices.product(left, _matrices.product(covariance, rest))
-        of_mean = _matrices.product(_matrices.product(left, covariance), left.swapaxes(1, 2))
-        return field, np.asarray(spread + of_mean)
+    Parameters
+    ----------
+    normal : (profile, crossing, crossing) float64
+        N_t.
+    side : (profile, crossing, case) float64
+        Right sides h_t, of several cases.
+    prior : (crossing, crossing) float64
+        Precision of the mean field.
+    change : Change
+    pull : (crossing, case) float64
+        Right side of the mean field by its prior.
+    """
+    root, unit, cases = change.root, np.eye(len(prior)), side.shape[2]
+    sides = product(root.T, np.concatenate([side, normal], axis=2))
+    chain, spread = _turned(normal, root), np.empty(normal.shape)
+    _solve_chain(chain, sides, change.correlation, spread)
+    solved, spread = product(root, sides), _turned(spread, root.T)
+    by_side, left = solved[..., :cases], unit - solved[..., cases:]
+    known = product(normal, left).sum(axis=0)
+    known = (known + known.T) / 2.0 + prior + THRESHOLDS.weak_precision * unit
+    covariance = _beam_fit.inverse(known)
+    rest = (side - product(normal, by_side)).sum(axis=0) + pull
+    field = by_side + product(left, product(covariance, rest))
+    return field, spread + _turned(covariance, left.swapaxes(1, 2))
 
 
-def _solve_chain(normal: Array, side: Array, rho: float) -> tuple[Array, Array]:
-    """Return deviations of unit variance in a chain of profiles, and their covariances.
+@compiled
+def _solve_chain(normal: Array, side: Array, rho: float, covariance: Array) -> None:
+    """Overwrite right sides by deviations of unit variance in a chain of profiles.
 
-    The precision of the chain is tridiagonal in time; elimination from both ends meets in each
-    profile.
+    The precision of the chain is tridiagonal in time: it is eliminated forwards, and solved
+    backwards. `normal` is overwritten; `covariance` is filled.
     """
     profiles, size = normal.shape[:2]
-    link = rho / (1.0 - rho**2)
-    diagonal = np.full(profiles, (1.0 + rho**2) / (1.0 - rho**2))
-    diagonal[[0, -1]] = 1.0 / (1.0 - rho**2)
-    own = normal + diagonal[:, np.newaxis, np.newaxis] * np.eye(size)
-    both, sides = np.stack([own, own[::-1]], axis=1), np.stack([side, side[::-1]], axis=1)
-    for t in range(1, profiles):
-        before = link * _matrices.inverse(both[t - 1])
-        both[t] -= link * before
-        sides[t] += _matrices.product(before, sides[t - 1])
-    covariance = _matrices.inverse(both[:, 0] + both[::-1, 1] - own)
-    return _matrices.product(covariance, sides[:, 0] + sides[::-1, 1] - side), covariance
+    link = rho / (1.0 - rho * rho)
+    work, carried = np.empty((size, size)), np.empty((size, size))
+    for t in range(profiles):
+        ends = (t == 0) + (t == profiles - 1)
+        for c in range(size):
+            normal[t, c, c] += (1.0 + (1 - ends) * rho * rho) / (1.0 - rho * rho)
+        if t > 0:
+            normal[t] -= link * link * covariance[t - 1]
+            add_product(link, covariance[t - 1], side[t - 1], side[t])
+        invert(normal[t], covariance[t], work)
+    for t in range(profiles - 1, -1, -1):
+        normal[t] = covariance[t]
+        if t < profiles - 1:
+            side[t] += link * side[t + 1]
+            carried[:] = 0.0
+            add_product(link, normal[t], covariance[t + 1], carried)
+            add_product(link, carried, normal[t], covariance[t])
+        carried_side = np.zeros(side.shape[1:])
+        add_product(1.0, normal[t], side[t], carried_side)
+        side[t] = carried_side

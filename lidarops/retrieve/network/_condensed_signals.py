@@ -10,15 +10,16 @@ profile does not depend on the other profiles.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Codes, Indices
-from lidarops.retrieve.network import _matrices, outlying_bins
+from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network.geometry import Network, Passages
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -30,8 +31,6 @@ OUTLYING: Final = 3
 _SMALLEST_STEP: Final = 1e-12
 _NEIGHBOURS: Final = 7
 """Bins whose mean is the level of a bin that is not positive."""
-_MEDIAN_OVER_MEAN: Final = np.pi / 2.0
-"""Variance of a median over the variance of a mean."""
 
 
 # Bins and weights --------------------------------------------------------------------------------
@@ -67,8 +66,6 @@ class FitLayout:
     """(beam, bin) m."""
     limits: Indices
     """(beam, 2) first usable bin, and the one behind the last."""
-    offset: Indices
-    """(beam + 1,) start of the packed covariance of each beam."""
 
 
 def lay_out_fits(
@@ -103,17 +100,14 @@ def lay_out_fits(
         net.passages.beam[keep], net.passages.crossing[keep], net.passages.range[keep]
     )
     first = np.searchsorted(measurable.beam, np.arange(net.beams + 1)).astype(np.intp)
-    count = np.diff(first)
     continues = np.zeros(net.crossings, dtype=np.bool_)
     continues[measurable.crossing[:-1][measurable.beam[:-1] == measurable.beam[1:]]] = True
     window, weights, cell, fraction = _fits(measurable, range_, limits, bins)
-    sizes = np.maximum(2 * count - 1, 0) ** 2
-    offset = np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
     bounds = np.array(limits, dtype=np.intp).reshape(-1, 2)
     return FitLayout(
         measurable, net.crossings, measured, continues, first, window, weights,
         _curvature_weights(measurable, range_, window, weights), cell, fraction,
-        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds, offset,
+        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds,
     )  # fmt: skip
 
 
@@ -160,24 +154,24 @@ def _curvature_weights(kept: Passages, range_: Array, window: Indices, weights: 
 # Signals -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CondensedSignals:
-    """Values at passages and integrals between them, for each profile.
+class Beams(NamedTuple):
+    """Condensed signals of beams with the same number of passages each; the last ones are empty.
 
     The signal is scaled to 1 at the first crossing of each beam.
     """
 
-    log_value: Array
-    """(profile, passage) logarithm of the signal."""
+    value: Array
+    """(profile, beam, passage) u."""
     integral: Array
-    """(profile, passage) m, 2 m times the integral from this to the next passage of the beam."""
-    usable: Booleans
-    """(profile, passage) True where all bins up to and around the passage are positive, and their
-    variances known."""
+    """(profile, beam, passage) I in m, 0 behind the last passage."""
     covariance: Array
-    """(profile, packed) for each beam, covariance of its log values, then its integrals."""
-    curvature_error: Array
-    """(profile, passage, 2) difference of line and polynomial, and its variance by noise."""
+    """(profile, beam, 2 passage, 2 passage) of u, then of I."""
+    reach: Indices
+    """(profile, beam) number of passages in use; 0 where there is only one, or no known noise."""
+    crossing: Indices
+    """(beam, passage) number of the crossing, of those that are measured; 0 where empty."""
+    crossings: int
+    """Number of measured crossings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,21 +210,13 @@ class CleanBeam:
         arrays = ("power", "variance", "logs", "noise", "doubt", "codes", "stops", "status")
         return replace(self, **{name: getattr(self, name)[profiles] for name in arrays})
 
-    def clear(self, layout: FitLayout) -> Booleans:
-        """Return (profile, passage) where noise does not hide the signal at a passage."""
+    def clear(self, layout: FitLayout) -> Indices:
+        """Return (profile,) numbers of passages before the first one that noise hides."""
         passages = slice(*layout.first_passage[self.number : self.number + 2])
         at = layout.window[passages, np.newaxis] + np.arange(layout.weights.shape[1]) - self.start
         level, spread = (each[:, at].mean(axis=2) for each in (self.power, self.variance))
-        return np.asarray(spread <= (THRESHOLDS.largest_bin_error * np.maximum(level, 0.0)) ** 2)
-
-    def values(self, bins: slice, weights: Array) -> tuple[Array, Array]:
-        """Return sums of logarithms, corrected for their bias by noise, and their variances."""
-        inside = slice(bins.start - self.start, bins.stop - self.start)
-        noise = self.noise[:, inside]
-        # E ln(1 + e) = -e^2 / 2; the noise contains the square of the exponent.
-        logs = self.logs[:, inside] + 0.5 * noise / self.exponent
-        doubt = (weights * self.doubt[:, inside]).sum(axis=1)
-        return (weights * logs).sum(axis=1), (weights * weights * noise).sum(axis=1) + doubt**2
+        clear = spread <= (THRESHOLDS.largest_bin_error * np.maximum(level, 0.0)) ** 2
+        return np.asarray(np.logical_and.accumulate(clear, axis=1).sum(axis=1))
 
 
 def clean(
@@ -260,71 +246,144 @@ def clean(
     return beams
 
 
-def condense(beams: Sequence[CleanBeam], layout: FitLayout) -> tuple[CondensedSignals, list[Array]]:
+class Condensed(NamedTuple):
+    """Condensed signals, and how they follow their bins."""
+
+    beams: Beams
+    derivatives: list[Array]
+    """For each beam, (profile, 2 passage, bin) derivatives of u and I by the logarithms."""
+    curvature: Array
+    """(profile, beam, passage, 2) difference of line and polynomial, and its variance by noise."""
+
+
+def condense(beams: list[CleanBeam], layout: FitLayout, reach: Indices | None = None) -> Condensed:
     """Condense clean beams to values at crossings and integrals between them.
 
-    Returns
-    -------
-    CondensedSignals
-    list of (profile, 2 passage - 1, bin) float64
-        For each beam, derivatives of its values and integrals by the logarithms of its bins.
+    Parameters
+    ----------
+    beams : list of CleanBeam
+        Those with passages.
+    layout : FitLayout
+    reach : (profile, beam) intp, optional
+        Most passages that are used.
     """
-    profiles, total = len(beams[0].logs) if beams else 0, layout.passages.beam.size
-    out = CondensedSignals(
-        np.full((profiles, total), np.nan),
-        np.zeros((profiles, total)),
-        np.zeros((profiles, total), dtype=np.bool_),
-        np.zeros((profiles, int(layout.offset[-1]))),
-        np.zeros((profiles, total, 2)),
+    beam, place = places(layout)
+    shape = len(beams[0].logs), len(beams), int(place.max(initial=0)) + 1
+    most = shape[2]
+    value, integral, curvature = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
+    covariance = np.zeros((*shape[:2], 2 * most, 2 * most))
+    reach, derivatives = np.full(shape[:2], most) if reach is None else reach.copy(), []
+    for b, row in enumerate(beams):
+        on_beam = slice(*layout.first_passage[row.number : row.number + 2])
+        ends = layout.window[on_beam] + layout.weights.shape[1]
+        usable = (ends[:, np.newaxis] <= row.stops).sum(axis=0)
+        reach[:, b] = np.minimum(reach[:, b], usable)
+        derivative = np.zeros((len(reach), 2 * most, row.logs.shape[1]))
+        steps = np.diff(layout.range[row.number, row.start : row.start + row.logs.shape[1]])
+        _condense_beam(
+            (row.logs, row.noise, row.doubt, row.exponent),
+            (layout.window[on_beam] - row.start, layout.weights[on_beam],
+             layout.curvature_weights[on_beam]),
+            (layout.cell[on_beam] - row.start, layout.fraction[on_beam], steps),
+            reach[:, b],
+            (value[:, b], integral[:, b], derivative, curvature[:, b]),
+        )  # fmt: skip
+        _transfer_derivatives(derivative, row, layout.range[row.number])
+        sound = np.zeros(len(reach), dtype=np.bool_)
+        _spread(derivative, row.noise, row.doubt, reach[:, b], covariance[:, b], sound)
+        reach[:, b] = np.where(sound, reach[:, b], 0)
+        derivatives.append(derivative)
+    crossing = np.zeros(shape[1:], dtype=np.intp)
+    crossing[beam, place] = (np.cumsum(layout.measured) - 1)[layout.passages.crossing]
+    measured = int(np.sum(layout.measured))
+    return Condensed(
+        Beams(value, integral, covariance, reach, crossing, measured), derivatives, curvature
     )
-    # Signals out of bounds have no value.
-    with np.errstate(all="ignore"):
-        return out, [_condense_beam(row, layout, out) for row in beams]
 
 
-def _condense_beam(row: CleanBeam, layout: FitLayout, out: CondensedSignals) -> Array:
-    """Fill the signals of a beam, and return their derivatives."""
-    beam = row.number
-    on_beam = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
-    bins = layout.weights.shape[1]
-    count = on_beam.stop - on_beam.start
-    derivatives = np.zeros((len(row.logs), 2 * count - 1, row.logs.shape[1]))
-    for c in range(on_beam.start, on_beam.stop):
-        window = slice(layout.window[c], layout.window[c] + bins)
-        usable = window.stop <= row.stops
-        value, _ = row.values(window, layout.weights[c])
-        out.log_value[:, c] = np.where(usable, value, np.nan)
-        out.usable[:, c] = usable
-        inside = slice(window.start - row.start, window.stop - row.start)
-        derivatives[:, c - on_beam.start, inside] = usable[:, np.newaxis] * layout.weights[c]
-        for column, error in enumerate(row.values(window, layout.curvature_weights[c])):
-            out.curvature_error[:, c, column] = np.where(usable, error, 0.0)
-    first = on_beam.start
-    scale = np.where(out.usable[:, first], out.log_value[:, first], 0.0)
-    for c in range(on_beam.start, on_beam.stop - 1):
-        usable = out.usable[:, c + 1]
-        cells = slice(layout.cell[c] - row.start, layout.cell[c + 1] - row.start + 1)
-        ends = layout.fraction[c], layout.fraction[c + 1]
-        steps = np.diff(layout.range[beam, layout.cell[c] : layout.cell[c + 1] + 2])
-        logs = row.logs[:, cells.start : cells.stop + 1] - scale[:, np.newaxis]
-        parts, centroid = _integrate_cells(logs, ends)
-        parts *= np.where(usable[:, np.newaxis], 2.0 * row.exponent * steps, 0.0)
-        parts = np.where(usable[:, np.newaxis], parts, 0.0)
-        out.integral[:, c] = parts.sum(axis=1)
-        derivative = derivatives[:, count + c - on_beam.start]
-        derivative[:, cells] += parts * (1.0 - centroid)
-        derivative[:, cells.start + 1 : cells.stop + 1] += parts * centroid
-    _transfer_derivatives(derivatives, row, layout.range[beam])
-    covariance = _matrices.product(
-        derivatives * row.noise[:, np.newaxis], derivatives.transpose(0, 2, 1)
-    )
-    # The deviations of bins that stay are of one direction.
-    shift = (derivatives * row.doubt[:, np.newaxis]).sum(axis=2)
-    covariance += shift[:, :, np.newaxis] * shift[:, np.newaxis]
-    packed = slice(layout.offset[beam], layout.offset[beam + 1])
-    out.covariance[:, packed] = covariance.reshape(len(covariance), covariance.shape[1] ** 2)
-    out.log_value[:, on_beam] -= scale[:, np.newaxis]
-    return derivatives
+def places(layout: FitLayout) -> tuple[Indices, Indices]:
+    """Return beam and place on the beam of each passage, with beams that have passages only."""
+    counts = np.diff(layout.first_passage)
+    beam = np.repeat(np.arange(np.sum(counts > 0)), counts[counts > 0])
+    place = np.arange(beam.size) - layout.first_passage[:-1][layout.passages.beam]
+    return beam, place
+
+
+@compiled
+def _condense_beam(
+    signal: tuple[Array, Array, Array, float],
+    fits: tuple[Indices, Array, Array],
+    cells: tuple[Indices, Array, Array],
+    reach: Indices,
+    out: tuple[Array, Array, Array, Array],
+) -> None:
+    """Fill u, I, their derivatives and the errors by curvature of one beam.
+
+    The signal is exponential within a cell, so that the integral is exact in homogeneous air. The
+    centroid of a cell is a series in the step, x / 12 - x^3 / 720 + x^5 / 30240 from the middle. It
+    only divides derivatives between the ends of a cell.
+    """
+    (logs, noise, doubt, exponent), (window, weights, curved) = signal, fits
+    (cell, fraction, steps), (value, integral, derivative, curvature) = cells, out
+    most = value.shape[1]
+    for t in range(reach.size):
+        for p in range(reach[t]):
+            shift = 0.0
+            for k in range(weights.shape[1]):
+                g = window[p] + k
+                # E ln(1 + e) = -e^2 / 2; the noise contains the square of the exponent.
+                log = logs[t, g] + 0.5 * noise[t, g] / exponent
+                value[t, p] += weights[p, k] * log
+                derivative[t, p, g] = weights[p, k]
+                curvature[t, p, 0] += curved[p, k] * log
+                curvature[t, p, 1] += curved[p, k] * curved[p, k] * noise[t, g]
+                shift += curved[p, k] * doubt[t, g]
+            curvature[t, p, 1] += shift * shift
+        scale = value[t, 0]
+        for p in range(reach[t]):
+            value[t, p] -= scale
+        for p in range(reach[t] - 1):
+            for g in range(cell[p], cell[p + 1] + 1):
+                start = fraction[p] if g == cell[p] else 0.0
+                width = (fraction[p + 1] if g == cell[p + 1] else 1.0) - start
+                step = logs[t, g + 1] - logs[t, g]
+                step = step if abs(step) >= _SMALLEST_STEP else _SMALLEST_STEP
+                part = math.exp(logs[t, g] - scale + step * start) * math.expm1(step * width) / step
+                part *= 2.0 * exponent * steps[g]
+                square = (step * width) ** 2
+                shift = step * width * (1.0 - square / 60.0 * (1.0 - square / 42.0)) / 12.0
+                centroid = start + width * (0.5 + min(max(shift, -0.5), 0.5))
+                integral[t, p] += part
+                derivative[t, most + p, g] += part * (1.0 - centroid)
+                derivative[t, most + p, g + 1] += part * centroid
+
+
+@compiled
+def _spread(
+    derivative: Array, noise: Array, doubt: Array, reach: Indices, covariance: Array,
+    sound: Booleans,
+) -> None:  # fmt: skip
+    """Fill the covariance of u and I, and whether it is known and there is noise."""
+    rows, bins = derivative.shape[1:]
+    shift = np.zeros(rows)
+    for t in range(reach.size):
+        sound[t] = reach[t] > 1
+        for i in range(rows):
+            if i % (rows // 2) >= reach[t] - i // (rows // 2):
+                continue
+            # The deviations of bins that stay are of one direction.
+            shift[i] = (derivative[t, i] * doubt[t]).sum()
+            for j in range(i + 1):
+                if j % (rows // 2) >= reach[t] - j // (rows // 2):
+                    continue
+                total = shift[i] * shift[j]
+                for g in range(bins):
+                    total += derivative[t, i, g] * noise[t, g] * derivative[t, j, g]
+                covariance[t, i, j] = covariance[t, j, i] = total
+            spread = covariance[t, i, i]
+            sound[t] &= spread < math.inf and (spread > 0.0 or i >= rows // 2)
+        if not sound[t]:
+            covariance[t] = 0.0
 
 
 def _take_logarithms(
@@ -409,76 +468,6 @@ def _transfer_derivatives(derivatives: Array, row: CleanBeam, grid: Array) -> No
         by_bin = derivatives.transpose(0, 2, 1)
         np.add.at(by_bin, (profiles[:, np.newaxis], nodes), weights[..., np.newaxis] * own)
         by_bin[profiles, bins] = 0.0
-
-
-def _integrate_cells(logs: Array, ends: tuple[float, float]) -> tuple[Array, Array]:
-    """Return integrals over cells, in cells, and the places of their centroids, from 0 to 1.
-
-    The signal is exponential within a cell, so that the integral is exact in homogeneous air. The
-    centroid is a series in the step, x / 12 - x^3 / 720 + x^5 / 30240 from the middle. It only
-    divides derivatives between the ends of a cell.
-
-    Parameters
-    ----------
-    logs : (profile, cell + 1) float64
-        Logarithms of the signal at the ends of the cells.
-    ends : two float
-        Where the integral starts in the first cell, and stops in the last one.
-    """
-    step = np.diff(logs, axis=1)
-    step = np.where(np.abs(step) < _SMALLEST_STEP, _SMALLEST_STEP, step)
-    start, stop = np.zeros(step.shape[1]), np.ones(step.shape[1])
-    start[0], stop[-1] = ends
-    width = stop - start
-    whole = np.exp(logs[:, :-1] + step * start) * np.expm1(step * width) / step
-    square = (step * width) ** 2
-    shift = step * width * (1.0 - square / 60.0 * (1.0 - square / 42.0)) / 12.0
-    return whole, start + width * (0.5 + np.clip(shift, -0.5, 0.5))
-
-
-# Curved signals ----------------------------------------------------------------------------------
-
-
-def curvature_variance(curvature_error: Array, usable: Booleans, carried: Array) -> Array:
-    r"""Return (profile, crossing) variances from curved signals within a fit.
-
-    Where the logarithm f of the signal is curved along the beam, a line through equal weights of
-    bins is too high by about f'' (bins^2 - 1) step^2 / 24. A polynomial of degree 4 through the
-    same bins has almost none of this error, but twice the noise, so it is not a better value.
-    Their difference, carried to the solution, shows the error. The result is the largest of
-    three, each less the contribution of noise: the square of the shift by the median of the block,
-    the mean square of the shifts of its profiles (a layer may rise or sink), and the square of the
-    shift of the profile itself.
-
-    Parameters
-    ----------
-    curvature_error : (profile, passage, 2) float64
-        Difference of line and polynomial, and its variance by noise, in the profiles of a block.
-    usable : (profile, passage) bool
-    carried : (profile, crossing, passage) float64
-        Derivatives of ln extinction by the log values.
-    """
-    error, noise = np.moveaxis(curvature_error, -1, 0)
-    number = usable.sum(axis=0)
-    shared, shared_noise = (np.nan_to_num(median(values, usable)) for values in (error, noise))
-    # The median of one or two is their mean.
-    shared_noise *= np.where(number > 2, _MEDIAN_OVER_MEAN, 1.0) / np.maximum(number, 1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        squares = carried * carried
-        own_shift, own_noise = (
-            (values * of[:, np.newaxis]).sum(axis=2)
-            for values, of in ((carried, error), (squares, noise))
-        )
-        shared_shift = (carried * shared).sum(axis=2)
-        shared_excess = shared_shift**2 - THRESHOLDS.shared_noise * (squares * shared_noise).sum(2)
-        # A noisy profile would hide the shift of the others, or imitate one.
-        counted = own_noise > 0.0
-        counted &= own_noise <= THRESHOLDS.noisy_profile * np.median(own_noise, axis=0)
-        number = np.maximum(counted.sum(axis=0), 1)
-        by_chance = (1.0 + THRESHOLDS.chance * np.sqrt(2.0 / number)) * own_noise
-        excess = np.where(counted, own_shift**2 - by_chance, 0.0).sum(axis=0) / number
-        largest = np.fmax(shared_excess, own_shift**2 - THRESHOLDS.profile_noise * own_noise)
-        return np.asarray(np.fmax(np.fmax(largest, excess), 0.0))
 
 
 def median(values: Array, known: Booleans) -> Array:

@@ -19,7 +19,7 @@ what the prior allows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Final, Literal
 
@@ -32,17 +32,10 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
-from lidarops.retrieve.network import _beam_fit, _beam_signals
-from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
-from lidarops.retrieve.network._block_solution import Block, reaches, solve_block
-from lidarops.retrieve.network._changing_field import MeanPriors
-from lidarops.retrieve.network._condensed_signals import (
-    MISSING,
-    NOT_POSITIVE,
-    OUTLYING,
-    curvature_variance,
-    median,
-)
+from lidarops.retrieve.network import _beam_signals
+from lidarops.retrieve.network._beam_signals import BeamSignals, Causes, Estimates, Response
+from lidarops.retrieve.network._block_solution import solve_alone, solve_block
+from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING, median
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -83,11 +76,17 @@ class NetworkResult:
     """(...) standard deviation of ln extinction about smooth fields; inf without prior."""
     overlap_error: Array
     """(..., crossing) m-1, part of the standard error by `default_overlap_error` of the beams."""
+    overlap_response: Array
+    """(..., crossing) relative change of extinction by relative errors of 1 of the overlap at the
+    near ends of beams, which fall to 0 at their far ends."""
     multiplier: Array
     """(..., crossing) of the rows of triangles; NaN where all beams are solved together."""
     multiplier_error: Array
     """(..., crossing) m-1, systematic: what the multiplier adds to extinction in homogeneous air;
     0 where all beams are solved together."""
+    respond: Response
+    """From small changes of signals to linear changes of extinction, (profile, crossing, cause) in
+    m-1. Weights, priors and flags stay, so that no value is lost near a threshold."""
 
     def raised(self, bits: int) -> Booleans:
         """Return where any of the bits is raised."""
@@ -171,80 +170,35 @@ def retrieve_network(
         full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, together=together,
     )  # fmt: skip
     with np.errstate(all="ignore"):
-        if multiplier is not None:
-            estimate = solve_triangles(beams, _multipliers(multiplier, beams))
-        elif together:
-            estimate = _solve_blocks(beams, network.crossing)
-        else:
-            estimate = _solve_alone(beams)
+        estimate = _solve_blocks(beams, network.crossing, multiplier)
     return _flag_result(beams, estimate)
 
 
-def _solve_blocks(beams: BeamSignals, position: Array) -> Estimates:
-    """Solve each block as one field, and return its values with all their errors."""
-    layout, out = beams.layout, Estimates.missing(beams)
-    if not layout.measured.any():
-        return out
-    measured = np.flatnonzero(layout.measured)
-    priors = MeanPriors.at(position[measured])
-    beam, _ = _beam_fit.places(layout)
-    lengths = _beam_fit.optical_lengths(layout, beams.exponent)
-    for number in np.unique(beams.block):
-        rows = np.flatnonzero(beams.block == number)
-        block = Block(
-            [each.take(rows) for each in beams.beams], layout, beams.usable[rows], lengths,
-            position[measured], priors,
-        )  # fmt: skip
-        solved = solve_block(block)
-        if solved is None:
-            out.left_out[rows] = (reaches(beams.usable[rows], layout) > 1)[:, beam]
-            continue
-        here = np.ix_(rows, measured)
-        extinction = np.exp(solved.logarithm)
-        chi_square, freedom = solved.misfit
-        scale = max(chi_square / freedom, 1.0) if freedom > 0 else 1.0
-        overlap = THRESHOLDS.default_overlap_error * solved.overlap
-        variance = scale * solved.variance + solved.further + overlap**2
-        out.extinction[here] = extinction
-        out.variance[here] = extinction**2 * variance
-        out.overlap_error[here] = extinction * overlap
-        out.settled[rows] = solved.settled
-        out.left_out[rows] = solved.left_out[:, beam]
-        out.chi_square[rows] = np.column_stack([solved.chi_square, np.full(rows.size, chi_square)])
-        out.degrees_of_freedom[rows, :2] = solved.freedom
-        out.degrees_of_freedom[rows, 2] = freedom
-        out.deviation[rows] = solved.deviation
-    return out
+def _solve_blocks(
+    beams: BeamSignals, position: Array, multiplier: npt.ArrayLike | str | None
+) -> Estimates:
+    """Solve each block, and return the values of all."""
+    out = Estimates.missing(beams.block.size, beams.layout)
+    given = None if multiplier is None else _multipliers(multiplier, beams)
+    responses = []
+    for rows, block in beams.blocks(position):
+        if multiplier is not None:
+            part = solve_triangles(block, None if given is None else given[rows])
+        else:
+            part = solve_block(block) if beams.together else solve_alone(block)
+        responses.append((rows, part.respond))
+        for field in fields(Estimates):
+            if field.name != "respond":
+                getattr(out, field.name)[rows] = getattr(part, field.name)
 
+    def respond(causes: Causes) -> Array:
+        change = np.zeros((*out.extinction.shape, len(causes)))
+        for rows, each in responses:
+            of_block = [{k: one.take(rows) for k, one in cause.items()} for cause in causes]
+            change[rows] = each(of_block)
+        return change * out.extinction[..., np.newaxis]
 
-def _solve_alone(beams: BeamSignals) -> Estimates:
-    """Solve each profile without a prior."""
-    layout, out = beams.layout, Estimates.missing(beams)
-    if not layout.measured.any() or not beams.block.size:
-        return out
-    measured = np.flatnonzero(layout.measured)
-    beam, place = _beam_fit.places(layout)
-    reach = reaches(beams.usable, layout)
-    fits = _beam_fit.arrange(beams.data, layout, reach)
-    start = _beam_fit.start_constants(fits, _beam_fit.optical_lengths(layout, beams.exponent))
-    nothing = np.zeros((measured.size, measured.size))
-    solved = _beam_fit.fit_beams(fits, nothing, start)
-    carried = _beam_fit.carry(solved.covariance, solved.linear.information, fits)
-    chi_square, freedom, seen = _beam_fit.compare(fits, solved.linear, solved.logarithm)
-    variance = np.diagonal(solved.covariance, axis1=1, axis2=2)
-    known = seen & (variance < THRESHOLDS.largest_variance)
-    extinction = np.where(known, np.exp(solved.logarithm), np.nan)
-    out.extinction[:, measured] = extinction
-    for number in np.unique(beams.block):
-        rows = np.flatnonzero(beams.block == number)
-        curvature = curvature_variance(
-            beams.data.curvature_error[rows], beams.usable[rows], carried[rows][..., beam, place]
-        )
-        out.variance[np.ix_(rows, measured)] = extinction[rows] ** 2 * (variance[rows] + curvature)
-    out.settled[:] = solved.settled & (fits.reach > 0).any(axis=1)
-    out.left_out[:] = ((fits.reach == 0) & (reach > 1))[:, beam]
-    out.chi_square[:, :2], out.degrees_of_freedom[:, :2] = chi_square, freedom
-    return out
+    return replace(out, respond=respond)
 
 
 def _multipliers(multiplier: npt.ArrayLike | str, beams: BeamSignals) -> Array | None:
@@ -291,7 +245,7 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
         # Where so many bins deviate that the beam is left out, the stated noise is wrong.
         (NetworkQuality.POOR_FIT, _lost_signal(beams, OUTLYING)),
         (NetworkQuality.POOR_FIT, (poor | ~converged)[:, np.newaxis]),
-        (Quality.INPUT_MISSING, ~beams.layout.measured | estimate.open),
+        (Quality.INPUT_MISSING, estimate.open | ~beams.layout.measured),
     ):
         quality |= np.where(where, np.int32(bit), np.int32(0))
     crossings = (*beams.leading, shape[1])
@@ -308,8 +262,10 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
         freedom.reshape(beams.leading),
         estimate.deviation.reshape(beams.leading),
         np.where(finite & near, estimate.overlap_error, np.nan).reshape(crossings),
+        estimate.overlap.reshape(crossings),
         np.where(near, estimate.multiplier, np.nan).reshape(crossings),
         np.where(finite & near, estimate.multiplier_error, np.nan).reshape(crossings),
+        estimate.respond,
     )
 
 

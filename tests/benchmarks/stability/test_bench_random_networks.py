@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.stability import random_networks
 from benchmarks.stability.random_networks import score_networks
-from lidarops.retrieve.network import _block_solution, _changing_field, extinction_field
+from lidarops.retrieve.network import _block_solution, _changing_field
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 pytestmark = pytest.mark.slow
@@ -46,7 +46,7 @@ def test_networks_with_once_too_small_errors_state_them(
     if kept.sum() > 50:
         # The stated errors are not much too large, without the error of an overlap that is right.
         known = THRESHOLDS._replace(default_overlap_error=0.0)
-        monkeypatch.setattr(extinction_field, "THRESHOLDS", known)
+        monkeypatch.setattr(_block_solution, "THRESHOLDS", known)
         scored = scored_values()
         assert np.median((scored.random / np.abs(scored.error))[kept]) < 2.0
 
@@ -102,8 +102,6 @@ def test_a_running_mean_ends_where_its_noise_hides_the_signal(monkeypatch):
     monkeypatch.setattr(
         _block_solution.CleanBeam,
         "clear",
-        lambda beam, layout: np.ones(
-            (len(beam.logs), np.diff(layout.first_passage)[beam.number]), bool
-        ),
+        lambda beam, layout: np.full(len(beam.logs), np.diff(layout.first_passage)[beam.number]),
     )
     assert false() > 1e-2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -20,7 +19,47 @@ from support.oracles.network import (
 )
 
 from lidarops.retrieve.network import _beam_fit, _changing_field, _condensed_signals, outlying_bins
-from lidarops.retrieve.network._block_solution import mean_depth, reaches
+from lidarops.retrieve.network._beam_signals import Block
+from lidarops.retrieve.network._block_solution import mean_depth
+
+# Small matrices ----------------------------------------------------------------------------------
+
+
+def definite(rng, *shape):
+    root = rng.standard_normal((*shape, shape[-1] + 2))
+    return root @ root.swapaxes(-1, -2)
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 40])
+def test_products_and_inverses_agree_with_numpy(size):
+    rng = np.random.default_rng(size)
+    a, b = rng.standard_normal((3, 1, size, 5)), rng.standard_normal((4, 5, 2))
+    np.testing.assert_allclose(_beam_fit.product(a, b), a @ b, rtol=1e-12, atol=1e-12)
+    matrices = definite(rng, 2, 3, size)
+    inverse, determinant = _beam_fit.inverse_and_determinant(matrices)
+    np.testing.assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(determinant, np.linalg.slogdet(matrices)[1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan])
+def test_a_matrix_that_is_not_positive_definite_has_no_inverse(bad):
+    matrices = definite(np.random.default_rng(1), 2, 3)
+    matrices[1, 2, 2] = bad
+    inverse, determinant = _beam_fit.inverse_and_determinant(matrices)
+    assert np.isnan(inverse[1]).all()
+    assert np.isnan(determinant[1])
+    np.testing.assert_allclose(inverse[0], np.linalg.inv(matrices[0]))
+
+
+@pytest.mark.parametrize("rank", [1, 3, 12])
+def test_eigenvectors_diagonalise(rank):
+    root = np.random.default_rng(rank).standard_normal((12, rank))
+    matrix = root @ root.T
+    size, vectors = _beam_fit.eigenvectors(matrix)
+    np.testing.assert_allclose((vectors * size) @ vectors.T, matrix, atol=1e-12 * size.max())
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(12), atol=1e-12)
+    np.testing.assert_allclose(np.sort(size), np.linalg.eigvalsh(matrix), atol=1e-12 * size.max())
+
 
 # Values at crossings and integrals between them ------------------------------------------------
 
@@ -36,8 +75,7 @@ def condensed(net, power, variance, exponent=1.0, bins=7, step=5.0):
             power, np.broadcast_to(variance, power.shape), np.full(net.beams, exponent), layout,
             together=False,
         )  # fmt: skip
-    data, _ = _condensed_signals.condense(beams, layout)
-    return layout, data
+    return layout, _condensed_signals.condense(beams, layout).beams
 
 
 def test_value_at_a_crossing_comes_from_a_line_through_logarithms():
@@ -56,7 +94,7 @@ def test_value_at_a_crossing_comes_from_a_line_through_logarithms():
         start = layout.passages.range[first]
         near = np.argsort(np.abs(r - start))[:7]
         base = np.polyfit(r[near] - start, np.log(power[0, beam, near] * r[near] ** 2), 1)
-        assert data.log_value[0, c] == pytest.approx(line[1] - base[1], abs=1e-10)
+        assert data.value[0, beam, c - first] == pytest.approx(line[1] - base[1], abs=1e-10)
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.8])
@@ -76,7 +114,7 @@ def test_integral_agrees_with_quadrature_of_the_interpolated_signal(exponent):
             lambda x, logs=logs, scale=scale: np.exp(np.interp(x, r, logs) - scale),
             low, high, points=inner, limit=200,
         )[0]  # fmt: skip
-        assert data.integral[0, c] == pytest.approx(2 * exponent * expected, rel=1e-9)
+        assert data.integral[0, beam, 0] == pytest.approx(2 * exponent * expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.6])
@@ -99,18 +137,23 @@ def test_covariance_agrees_with_finite_differences(exponent):
         _, shift = condensed(net, shifted, quiet, exponent, step=8.0)
         # Integrals are scaled to 1 at the first crossing: undo this.
         scale = np.exp(first_value(layout, beam, shifted, r, exponent))
-        values = shift.log_value[:, first:last] + np.log(scale)[:, None]
-        sums = shift.integral[:, first : last - 1] * scale[:, None]
+        values = shift.value[:, beam, :count] + np.log(scale)[:, None]
+        sums = shift.integral[:, beam, : count - 1] * scale[:, None]
         window = slice(layout.window[first], layout.window[first] + 7)
         mend = 0.5 * exponent * relative[beam, window] @ layout.weights[first]
         centre = np.exp(first_value(layout, beam, power, r, exponent) + mend)
         slopes[:count] = (values[::2] - values[1::2]).T / (2 * step)
         slopes[count:] = (sums[::2] - sums[1::2]).T / (2 * step) / centre
         expected = (slopes * relative[beam]) @ slopes.T
-        packed = data.covariance[0, layout.offset[beam] : layout.offset[beam + 1]]
-        measured = packed.reshape(expected.shape)
+        measured = dense(data, beam, count)
         size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(measured / size, expected / size, atol=1e-5)
+
+
+def dense(data, beam, count, profile=0):
+    """Return the covariance of the values and integrals of a beam."""
+    into = np.r_[:count, data.value.shape[2] : data.value.shape[2] + count - 1]
+    return data.covariance[profile, beam][np.ix_(into, into)]
 
 
 def first_value(layout, beam, power, r, exponent):
@@ -130,9 +173,10 @@ class Oracle:
         self.layout, self.net = layout, net
         self.crossing = layout.passages.crossing
         self.beam = layout.passages.beam
-        self.values = data.log_value[profile]
-        self.integrals = data.integral[profile]
-        self.packed = data.covariance[profile]
+        place = np.arange(self.beam.size) - layout.first_passage[self.beam]
+        self.values = data.value[profile, self.beam, place]
+        self.integrals = data.integral[profile, self.beam, place]
+        self.data, self.profile = data, profile
         self.size = self.crossing.size
 
     def beyond(self):
@@ -156,25 +200,22 @@ class Oracle:
             turn[:, :n] = np.eye(n)
             for i in range(n):
                 turn[i, n + i :] = -1.0 / weight[first + i]
-            packed = self.packed[self.layout.offset[beam] : self.layout.offset[beam + 1]]
-            out[first:last, first:last] = turn @ packed.reshape(2 * n - 1, -1) @ turn.T
+            covariance = dense(self.data, beam, n, self.profile)
+            out[first:last, first:last] = turn @ covariance @ turn.T
         return out
-
-
-def arranged(layout, data):
-    return _beam_fit.arrange(data, layout, reaches(data.usable, layout))
 
 
 def solved(layout, data, precision, exponent=1.0):
     """Return the fit of the beams with a prior, from the constants of homogeneous air."""
-    beams = arranged(layout, data)
-    lengths = _beam_fit.optical_lengths(layout, np.full(layout.first_passage.size - 1, exponent))
-    return beams, _beam_fit.fit_beams(beams, precision, _beam_fit.start_constants(beams, lengths))
+    exponents = np.full(layout.first_passage.size - 1, exponent)
+    block = Block([None] * len(exponents), layout, data.reach, exponents, None)
+    start = _beam_fit.start_constants(data, block.lengths)
+    return _beam_fit.fit_beams(data, precision, start)
 
 
 def taken(data, profiles):
     """Return a copy of some profiles."""
-    return replace(data, **{name: getattr(data, name)[profiles] for name in data.__slots__})
+    return data._replace(**{name: getattr(data, name)[profiles] for name in data._fields[:4]})
 
 
 def case(profiles=3, relative=0.01):
@@ -195,9 +236,9 @@ def test_solution_agrees_with_least_squares(deviation):
     precision = np.zeros((net.crossings, net.crossings))
     if np.isfinite(deviation):
         precision = prior_precision(net, deviation)
-    beams, result = solved(layout, data, precision)
+    result = solved(layout, data, precision)
     assert np.all(result.settled)
-    chi_square, freedom, _ = _beam_fit.compare(beams, result.linear, result.logarithm)
+    chi_square, freedom = _beam_fit.compare(data, result.linear, result.logarithm, data.reach)
     values, vectors = np.linalg.eigh(precision)
     prior = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     for n in range(3):
@@ -219,49 +260,26 @@ def test_solution_agrees_with_least_squares(deviation):
     assert freedom[0, 0] == layout.passages.beam.size - net.beams - net.crossings
 
 
-def test_errors_of_values_are_carried_as_a_new_solution_shows():
-    net = three_by_two()
-    r = grid(net)
-    # Without noise, because weights that follow the constant would change its residuals.
-    power = signals(net, r, gradient)
-    layout, data = condensed(net, power, (0.01 * power) ** 2)
-    error = np.random.default_rng(6).normal(0.0, 1e-4, layout.passages.beam.size)
-    # Values and integrals are relative to the first value of their beam.
-    first = error[layout.first_passage[layout.passages.beam]]
-    changed = replace(
-        data, log_value=data.log_value + error - first, integral=data.integral * np.exp(-first)
-    )
-    precision = prior_precision(net, 0.3)
-    beams, before = solved(layout, data, precision)
-    _, after = solved(layout, changed, precision)
-    carried = _beam_fit.carry(before.covariance, before.linear.information, beams)
-    beam, place = _beam_fit.places(layout)
-    np.testing.assert_allclose(
-        carried[0][:, beam, place] @ error, (after.logarithm - before.logarithm)[0], rtol=0.01,
-        atol=1e-5,
-    )  # fmt: skip
-
-
 def test_standard_errors_are_the_scatter_of_solutions():
     net = three_by_two()
     r = grid(net)
     power, variance = noisy(net, r, signals(net, r, homogeneous()), 0.005, 400, additive=5e-4)
     layout, data = condensed(net, power, variance)
-    beams, result = solved(layout, data, np.zeros((net.crossings, net.crossings)))
+    result = solved(layout, data, np.zeros((net.crossings, net.crossings)))
     truth = np.log(at_crossings(net, homogeneous()))
     errors = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
     score = (result.logarithm - truth) / errors
     np.testing.assert_allclose(score[:, net.near_crossing].std(axis=0), 1.0, atol=0.15)
-    chi_square, freedom, _ = _beam_fit.compare(beams, result.linear, result.logarithm)
+    chi_square, freedom = _beam_fit.compare(data, result.linear, result.logarithm, data.reach)
     assert np.mean(chi_square[:, 0] / freedom[:, 0]) == pytest.approx(1.0, abs=0.15)
 
 
 def test_solution_does_not_depend_on_the_other_profiles():
     net, layout, data = case(7)
     precision = prior_precision(net, 0.05)
-    _, whole = solved(layout, data, precision)
+    whole = solved(layout, data, precision)
     for selected in ([0], [3, 4], [6, 1]):
-        _, chunk = solved(layout, taken(data, selected), precision)
+        chunk = solved(layout, taken(data, selected), precision)
         assert np.array_equal(chunk.logarithm, whole.logarithm[selected])
         assert np.array_equal(chunk.covariance, whole.covariance[selected])
 
@@ -270,11 +288,17 @@ def test_solution_does_not_depend_on_the_other_profiles():
 def test_a_beam_with_singular_covariance_is_left_out(bad):
     net, layout, data = case(3)
     without = taken(data, [0, 1, 2])
-    without.usable[1, : layout.first_passage[1]] = 0
-    data.covariance[1, : layout.offset[1]] = bad
-    precision = prior_precision(net, 0.1)
-    (beams, result), (_, expected) = (solved(layout, entry, precision) for entry in (data, without))
-    assert beams.reach[1, 0] == 0
+    without.reach[1, 0] = 0
+    net = three_by_two()
+    r = grid(net)
+    power, variance = noisy(net, r, signals(net, r, gradient), 0.01, 3, additive=0.002)
+    variance = np.broadcast_to(variance, power.shape).copy()
+    variance[1, 0] = bad
+    layout, damaged = condensed(net, power, variance)
+    assert damaged.reach[1, 0] == 0
+    result, expected = (
+        solved(layout, entry, prior_precision(net, 0.1)) for entry in (damaged, without)
+    )
     np.testing.assert_array_equal(result.logarithm, expected.logarithm)
     np.testing.assert_array_equal(result.covariance, expected.covariance)
 
@@ -282,16 +306,16 @@ def test_a_beam_with_singular_covariance_is_left_out(bad):
 def test_the_information_of_a_shorter_beam_is_that_of_its_passages():
     """A passage that is not used only hides the constant behind the last one in use."""
     net, layout, data = case(1)
-    beams, result = solved(layout, data, prior_precision(net, 0.1))
-    reach = beams.reach.copy()
-    reach[0, 0] -= 1
+    result = solved(layout, data, prior_precision(net, 0.1))
     shorter = taken(data, [0])
-    shorter.usable[0, layout.first_passage[1] - 1] = False
+    shorter.reach[0, 0] -= 1
+    reach = shorter.reach.copy()
     constants = result.constants.copy()
-    last = beams.integral[0, 0, reach[0, 0] - 1]
+    last = data.integral[0, 0, reach[0, 0] - 1]
     constants[0, 0] = np.log(np.exp(constants[0, 0]) + last)
-    ours = _beam_fit.linearise(beams, result.constants, reach)
-    alone = _beam_fit.linearise(arranged(layout, shorter), constants)
+    shorter.integral[0, 0, reach[0, 0] - 1 :] = 0.0
+    ours = _beam_fit.linearise(data, result.constants, reach)
+    alone = _beam_fit.linearise(shorter, constants)
     np.testing.assert_allclose(ours.information, alone.information, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(ours.value, alone.value, rtol=1e-9)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from lidarops.retrieve.network import _changing_field
-from lidarops.retrieve.network._changing_field import Change, ChangingField
+from lidarops.retrieve.network._changing_field import Change, Priors, solve_changing
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 POSITION = np.array([[0.0, 0.0, 300.0], [200.0, 0.0, 500.0], [-100.0, 0.0, 900.0]])
@@ -18,7 +18,7 @@ POSITION = np.array([[0.0, 0.0, 300.0], [200.0, 0.0, 500.0], [-100.0, 0.0, 900.0
 
 
 def test_a_prior_says_nothing_about_the_level():
-    priors = _changing_field.MeanPriors.at(POSITION)
+    priors = Priors.at(POSITION)
     assert len(priors.precision) == len(THRESHOLDS.deviations) * len(THRESHOLDS.lengths)
     np.testing.assert_allclose(priors.precision.sum(axis=-1), 0.0, atol=1e-9)
     contrast = np.array([1.0, -1.0, 0.0])
@@ -31,18 +31,29 @@ def test_a_prior_says_nothing_about_the_level():
 
 
 def test_the_determinant_of_a_prior_is_that_of_its_differences():
-    priors = _changing_field.MeanPriors.at(POSITION)
+    priors = Priors.at(POSITION)
     dense = np.log(np.linalg.eigvalsh(priors.precision)[:, 1:]).sum(axis=1)
     np.testing.assert_allclose(priors.determinant - priors.determinant[0], dense - dense[0])
 
 
 def test_the_square_error_of_a_known_field_is_that_of_a_lognormal():
     variance = np.full((1, 2), 0.04)
-    posterior = _changing_field.MeanPosterior(np.ones(1), np.zeros((1, 2)), variance)
+    posterior = _changing_field.Posterior(np.ones(1), np.zeros((1, 2)), variance)
     draws = np.exp(0.2 * np.random.default_rng(1).standard_normal(400_000))
     np.testing.assert_allclose(
         posterior.square_error(np.zeros(2)), np.mean((draws - 1.0) ** 2), rtol=0.01
     )
+
+
+def changed(size, length, rho):
+    """Return a change of a size, with one of the lengths."""
+    return Change(size * Priors.at(POSITION).roots[length], rho)
+
+
+def test_the_roots_are_those_of_the_correlations():
+    roots = Priors.at(POSITION).roots
+    expected = _changing_field.correlations(POSITION)
+    np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), expected, atol=1e-12)
 
 
 # Changes ------------------------------------------------------------------------------------------
@@ -62,7 +73,8 @@ def dense(normal, side, prior, change, pull):
     place = np.arange(profiles)
     in_time = change.correlation ** np.abs(place[:, None] - place)
     total = np.zeros(((profiles + 1) * size,) * 2)
-    total[size:, size:] = np.linalg.inv(np.kron(in_time, change.covariance))
+    covariance = change.root @ change.root.T
+    total[size:, size:] = np.linalg.inv(np.kron(in_time, covariance))
     total[:size, :size] = prior + THRESHOLDS.weak_precision * np.eye(size)
     right = np.concatenate([pull, np.zeros(profiles * size)])
     take = np.zeros((profiles, size, len(total)))
@@ -83,10 +95,10 @@ def dense(normal, side, prior, change, pull):
 def test_a_changing_field_agrees_with_dense_normal_equations(seed, profiles, rho, size, missing):
     rng = np.random.default_rng(seed)
     normal, side = informed(rng, profiles, missing=min(missing, profiles - 1))
-    prior = _changing_field.MeanPriors.at(POSITION).precision[int(rng.integers(9))]
-    change = Change(size**2 * _changing_field.correlations(POSITION)[int(rng.integers(3))], rho)
+    prior = Priors.at(POSITION).precision[int(rng.integers(9))]
+    change = changed(size, int(rng.integers(3)), rho)
     pull = rng.standard_normal(3)
-    field, covariance = ChangingField(normal, prior, change).solve(side[..., None], pull[:, None])
+    field, covariance = solve_changing(normal, side[..., None], prior, change, pull[:, None])
     expected, spread = dense(normal, side, prior, change, pull)
     error = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
     assert np.all(np.abs(field[..., 0] - expected) < 1e-4 * error + 1e-9 * np.abs(expected))
@@ -96,11 +108,11 @@ def test_a_changing_field_agrees_with_dense_normal_equations(seed, profiles, rho
 @pytest.mark.parametrize("gap", [1, 20])
 def test_a_gap_in_time_loosens_the_field(gap):
     """Profiles that know nothing stand for time: what is before them says less of what follows."""
-    change = Change(0.3**2 * np.eye(1), 0.95)
+    change = Change(0.3 * np.eye(1), 0.95)
     normal = np.zeros((gap + 1, 1, 1))
     normal[0] = 1e6
     prior = np.full((1, 1), 1e6)
-    field, covariance = ChangingField(normal, prior, change).solve(1e6 * (normal > 0.0) * 0.1)
+    field, covariance = solve_changing(normal, 1e5 * (normal > 0.0), prior, change)
     # The mean is 0 by its prior, and the first profile is known.
     assert field[-1, 0, 0] == pytest.approx(field[0, 0, 0] * 0.95**gap, rel=1e-3)
     assert covariance[-1, 0, 0] == pytest.approx(0.3**2 * (1.0 - 0.95 ** (2 * gap)), rel=1e-3)
@@ -114,7 +126,7 @@ def marginal(normal, side, change, places):
     centre = np.eye(profiles) - 1.0 / profiles
     # Right sides are N d + noise of the covariance N; their mean is taken out of both.
     noise = np.kron(centre, normal)
-    signal = np.kron(centre @ in_time @ centre, normal @ change.covariance @ normal)
+    signal = np.kron(centre @ in_time @ centre, normal @ change.root @ change.root.T @ normal)
 
     def cost(covariance):
         return -2.0 * multivariate_normal(cov=covariance, allow_singular=True).logpdf(side.ravel())
@@ -129,18 +141,18 @@ def test_the_likeliest_change_has_the_largest_dense_likelihood(seed):
     places = tuple(int(n) for n in np.sort(rng.permutation(30)[:16]))
     root = rng.standard_normal((3, 5))
     normal = 300.0 * root @ root.T
-    true = Change(0.18**2 * _changing_field.correlations(POSITION)[seed % 3], 0.95)
+    true = changed(0.18, seed % 3, 0.95)
     in_time = true.correlation ** np.abs(np.subtract.outer(places, places))
     deviation = np.linalg.cholesky(in_time) @ rng.standard_normal((16, 3))
-    deviation = deviation @ np.linalg.cholesky(true.covariance).T
+    deviation = deviation @ true.root.T
     noise = rng.standard_normal((16, 3)) @ np.linalg.cholesky(normal).T
     side = deviation @ normal + noise
     side = side - side.mean(axis=0)
-    found = _changing_field.likeliest_change(normal, side, POSITION, places)
+    found = _changing_field.likeliest_change(normal, side, Priors.at(POSITION).roots, places)
     assert found is not None
     costs = {
-        (n, size, rho): marginal(normal, side, Change(size**2 * shape, rho), places)
-        for n, shape in enumerate(_changing_field.correlations(POSITION))
+        (n, size, rho): marginal(normal, side, changed(size, n, rho), places)
+        for n in range(len(THRESHOLDS.lengths))
         for size in THRESHOLDS.changes
         for rho in THRESHOLDS.correlations
     }
@@ -156,7 +168,9 @@ def test_noise_alone_is_no_change():
     for _ in range(200):
         side = rng.standard_normal((30, 3)) @ np.sqrt(normal)
         side = side - side.mean(axis=0)
-        change = _changing_field.likeliest_change(normal, side, POSITION, tuple(range(30)))
+        change = _changing_field.likeliest_change(
+            normal, side, Priors.at(POSITION).roots, tuple(range(30))
+        )
         found += change is not None
     assert found <= 2
 
@@ -164,9 +178,9 @@ def test_noise_alone_is_no_change():
 def test_the_field_does_not_depend_on_the_direction_of_time():
     rng = np.random.default_rng(7)
     normal, side = informed(rng, 12, missing=3)
-    change = Change(0.1**2 * _changing_field.correlations(POSITION)[1], 0.95)
-    prior = _changing_field.MeanPriors.at(POSITION).precision[4]
-    forward, spread = ChangingField(normal, prior, change).solve(side[..., None])
-    backward, other = ChangingField(normal[::-1], prior, change).solve(side[::-1, :, None])
+    change = changed(0.1, 1, 0.95)
+    prior = Priors.at(POSITION).precision[4]
+    forward, spread = solve_changing(normal, side[..., None], prior, change)
+    backward, other = solve_changing(normal[::-1], side[::-1, :, None], prior, change)
     np.testing.assert_allclose(backward[::-1], forward, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(other[::-1], spread, rtol=1e-6)

@@ -52,7 +52,7 @@ class Condensed:
     """Condensed signals with what is known about each beam."""
 
     def __init__(self, data, beams):
-        self.__dict__.update({name: getattr(data, name) for name in data.__slots__})
+        self.log_value, self.integral, self.covariance, self.reach = data.beams[:4]
         self.bridged = np.stack([beam.bridged for beam in beams], axis=1)
         self.status = np.stack([beam.status for beam in beams], axis=1)
 
@@ -66,8 +66,7 @@ def condensed(net, r, power, variance, *, screened=True, nearest=100.0):
         beams = _condensed_signals.clean(
             power, variances, np.ones(net.beams), layout, together=False
         )
-    data, _ = _condensed_signals.condense(beams, layout)
-    return Condensed(data, beams), layout
+    return Condensed(_condensed_signals.condense(beams, layout), beams), layout
 
 
 def hit(power, variance, profile, beam, index, size):
@@ -99,7 +98,7 @@ def test_air_and_noise_do_not_change_at_all(name, step):
         screened, _ = condensed(net, r, power, variance)
         unscreened, _ = condensed(net, r, power, variance, screened=False)
         assert not screened.bridged.any()
-        for quantity in ("log_value", "integral", "usable", "covariance", "status"):
+        for quantity in ("log_value", "integral", "reach", "covariance", "status"):
             np.testing.assert_array_equal(
                 getattr(screened, quantity), getattr(unscreened, quantity)
             )
@@ -163,7 +162,7 @@ def test_adjacent_spikes_are_flagged_and_left_in_place(sizes):
     result, _ = condensed(net, r, damaged, variance)
     unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     assert result.bridged[:, 0].mean() > 0.95
-    left = np.all(result.log_value == unscreened.log_value, axis=1)
+    left = np.all(result.log_value == unscreened.log_value, axis=(1, 2))
     assert left.mean() > 0.95
 
 
@@ -317,19 +316,17 @@ def test_variances_of_bridged_beams_agree_with_their_scatter(where, relative):
     data, layout = condensed(net, r, damaged, variance)
     unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     assert data.bridged[:, 0].all()
-    left = np.all(data.integral == unscreened.integral, axis=1)
+    left = np.all(data.integral == unscreened.integral, axis=(1, 2))
     assert left.mean() < 0.1
-    first, last = layout.first_passage[:2]
-    count = last - first
-    size = 2 * count - 1
-    stated = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
-    good = (data.usable[:, first:last] == 1).all(axis=1) & ~left
+    count = layout.first_passage[1]
+    stated = data.covariance[:, 0]
+    good = (data.reach[:, 0] == count) & ~left
     truth, _ = condensed(
         net, r, signals(net, r, ALL["homogeneous"])[None], variance, screened=False
     )
     for c in range(1, count):
         # The far value and the integral, relative to the near value.
-        difference = data.log_value[good, first + c] - truth.log_value[0, first + c]
+        difference = data.log_value[good, 0, c] - truth.log_value[0, 0, c]
         spread = stated[good, c, c] + stated[good, 0, 0] - 2 * stated[good, 0, c]
         assert np.std(difference / np.sqrt(spread)) == pytest.approx(1.0, abs=0.08)
         assert (
@@ -400,20 +397,16 @@ def test_one_percent_of_outlying_bins_leaves_values_within_their_errors(exponent
 def test_spikes_left_in_place_are_part_of_the_standard_error(sizes):
     net, r, power, variance = scene(relative=0.02)
     damaged = spiked(net, r, power, variance, sizes)
-    result, layout = condensed(net, r, damaged, variance)
+    result, _ = condensed(net, r, damaged, variance)
     unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
-    size = 2 * int(layout.first_passage[1]) - 1
-    reported, own = (
-        entry.covariance[:, : layout.offset[1]].reshape(-1, size, size)
-        for entry in (result, unscreened)
-    )
-    left = (result.bridged[:, 0] == 1) & np.all(result.log_value == unscreened.log_value, axis=1)
+    reported, own = result.covariance[:, 0], unscreened.covariance[:, 0]
+    left = result.bridged[:, 0] & np.all(result.log_value == unscreened.log_value, axis=(1, 2))
     assert left.all()
     added = (reported - own)[left]
     # One direction, by the shift of the beam through the spikes, except for noise.
     assert np.all(np.linalg.matrix_rank(added, tol=1e-9 * np.abs(added).max()) == 1)
-    shift = (unscreened.log_value - clean.log_value)[left, 1]
+    shift = (unscreened.log_value - clean.log_value)[left, 0, 1]
     stated = np.sqrt(added[:, 0, 0] + added[:, 1, 1] - 2.0 * added[:, 0, 1])
     np.testing.assert_allclose(stated, np.abs(shift), rtol=0.3)
     assert not np.allclose(reported[left], own[left], rtol=0.1)
