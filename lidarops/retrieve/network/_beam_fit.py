@@ -27,6 +27,7 @@ from lidarops.retrieve.network._condensed_signals import Beams
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _PASSES: Final = 24
+_CONSTANT_PASSES: Final = 3
 _ROUNDING: Final = 1e-9
 _SWEEPS: Final = 30
 _SMALLEST_ROTATION: Final = 1e-15
@@ -361,6 +362,17 @@ def start_constants(beams: Beams, lengths: Array) -> Array:
         depths = np.fmin(np.fmax(depths, THRESHOLDS.thinnest_beam), THRESHOLDS.thickest_beam)
         constants = np.log(total / np.expm1(depths))
     return np.where(usable & np.isfinite(constants), constants, 0.0)
+
+
+def constants_of(beams: Beams, x: Array) -> Array:
+    """Return (profile, beam) constants that agree best with (profile, crossing) ln extinction."""
+    along, last = x[:, beams.crossing], np.maximum(beams.reach - 1, 0)[..., np.newaxis]
+    constants = np.take_along_axis(beams.value - along, last, axis=2)[..., 0]
+    for _ in range(_CONSTANT_PASSES):
+        linear = linearise(beams, constants)
+        step = (linear.gain * (linear.value - along)).sum(axis=2)
+        constants = constants + np.clip(step, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
+    return constants
 
 
 class Solution(NamedTuple):

@@ -37,7 +37,6 @@ from lidarops.retrieve.network._condensed_signals import (
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
-_CONSTANT_PASSES: Final = 6
 _FIELD_PASSES: Final = 6
 
 
@@ -61,18 +60,16 @@ class ScaledBeam:
     """(profile, bin) 0 where left out."""
     kept: Booleans
     """(profile, bin) False where left out."""
-    gain: Array
-    """(profile, bin) change by the field of a profile, which the powers are without."""
     weight: Array
     """(profile, 1) of a mean; 0 where a profile is no part of it."""
 
     def mean(self, half: int | None = None) -> CleanBeam:
         """Return the mean as a profile of a beam, or running means of 2 half + 1 profiles."""
-        weight, source, gain = self.weight, self.source, 1.0 if half is None else self.gain
+        weight, source = self.weight, self.source
         kept = self.kept.astype(np.float64)
         total = running_sums(weight * kept, half)
-        power = gain * running_sums(weight * self.power, half) / total
-        variance = gain**2 * running_sums(weight**2 * self.variance, half) / total**2
+        power = running_sums(weight * self.power, half) / total
+        variance = running_sums(weight**2 * self.variance, half) / total**2
         known = (power > 0.0) & np.isfinite(variance)
         logs = np.where(known, source.exponent * (np.log(power) + self.factor), 0.0)
         noise = np.where(known, source.exponent**2 * variance / power**2, 0.0)
@@ -91,14 +88,14 @@ class ScaledBeam:
     def deviations(self, mean: CleanBeam) -> Array:
         """Return (profile, bin) deviations of logarithms from one mean, or one for each profile."""
         known = self.kept & (mean.codes == GOOD)
-        ratio = self.gain * self.power / np.where(mean.codes == GOOD, mean.power, 1.0)
+        ratio = self.power / np.where(mean.codes == GOOD, mean.power, 1.0)
         return np.where(known, self.source.exponent * (ratio - 1.0), 0.0)
 
     def noise_ratio(self, mean: CleanBeam) -> Array:
         """Return (profile,) variances of noise over those of a mean, for the bins of each."""
         place = np.arange(self.source.start, self.source.start + self.power.shape[1])
         inside = (place >= self.source.low) & (place < self.source.stops[:, np.newaxis])
-        own = (self.gain**2 * self.variance * inside).sum(axis=1)
+        own = (self.variance * inside).sum(axis=1)
         ratio = own / np.where(inside & self.kept, mean.variance, 0.0).sum(axis=1)
         return np.where(np.isfinite(ratio) & (ratio > 0.0), ratio, np.inf)
 
@@ -121,9 +118,7 @@ def _sum_up(values: Array, half: int, out: Array) -> None:
                 out[m, item] += values[t, item]
 
 
-def _scale(
-    beam: CleanBeam, layout: FitLayout, reach: Indices, shape: Array | None = None
-) -> ScaledBeam:
+def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:
     """Return the powers of a beam over their energies, with weights for means.
 
     Parameters
@@ -132,8 +127,6 @@ def _scale(
     layout : FitLayout
     reach : (profile,) intp
         Number of passages in use.
-    shape : (profile, bin) float64, optional
-        Logarithmic change of the power by the field of each profile; 0 where not given.
     """
     depth = mean_depth(reach)
     complete = (reach >= depth) & (depth > 0)
@@ -146,13 +139,12 @@ def _scale(
         line = np.exp(beam.logs / beam.exponent - factor)
         power = np.where(bridged, line, power)
         variance = np.where(bridged, beam.noise * (line / beam.exponent) ** 2, variance)
-    gain = np.ones((1, 1)) if shape is None else np.exp(shape)
     before = np.arange(power.shape[1]) < (beam.stops - beam.start)[:, np.newaxis]
     known = (beam.codes != LOST) | (before & (power <= 0.0))
     kept = known & (beam.codes != KEPT)
     if not kept[complete].all():
         kept |= known & (2 * kept[complete].sum(axis=0) < complete.sum())
-    power, variance = np.where(kept, power / gain, 0.0), np.where(kept, variance / gain**2, 0.0)
+    power, variance = np.where(kept, power, 0.0), np.where(kept, variance, 0.0)
     used = slice(beam.low - beam.start, stop - beam.start)
     inside = (before & kept)[:, used]
     part = power[:, used] * inside
@@ -169,7 +161,7 @@ def _scale(
     if able.any():
         able &= noise <= THRESHOLDS.noisy_profile * np.median(noise[able])
     weight = np.where(able, 1.0 / np.where(able, noise, 1.0), 0.0)[:, np.newaxis]
-    return ScaledBeam(beam, factor, stop, energy, power, variance, kept, gain, weight)
+    return ScaledBeam(beam, factor, stop, energy, power, variance, kept, weight)
 
 
 def mean_depth(reach: Indices) -> int:
@@ -186,18 +178,51 @@ def mean_depth(reach: Indices) -> int:
     return int(depths[np.argmax(values)]) if values else 0
 
 
-def _condense_means(means: list[CleanBeam], layout: FitLayout) -> tuple[Condensed, Array]:
-    """Return means of powers, condensed, and what curvature adds to the variance of a value.
+class _Means(NamedTuple):
+    """Means of the powers of a block: one, or running means for each profile."""
 
-    Where a signal is curved beyond noise, the polynomial replaces the straight line. A mean ends
-    where its own noise hides the signal.
-    """
-    clear = np.stack([mean.clear(layout) for mean in means], axis=1)
-    condensed = condense(means, layout, clear)
-    error, noise = np.moveaxis(condensed.curvature, -1, 0)
-    curved = error**2 > THRESHOLDS.profile_noise * noise
-    condensed.beams.value[:] -= np.where(curved, error, 0.0)
-    return condensed, np.where(curved, noise + (THRESHOLDS.curvature_left * error) ** 2, 0.0)
+    scaled: list[ScaledBeam]
+    beams: list[CleanBeam]
+    condensed: Condensed
+    curvature: Array
+    """(mean, beam, passage) what curved signals within a fit add to the variance of u."""
+
+    @classmethod
+    def of(cls, scaled: list[ScaledBeam], layout: FitLayout, half: int | None = None) -> _Means:
+        """Return the mean of all profiles, or those of up to `half` before and after each.
+
+        Where a signal is curved beyond noise, the polynomial replaces the straight line. A mean
+        ends where its own noise hides the signal.
+        """
+        means = [each.mean(half) for each in scaled]
+        clear = np.stack([mean.clear(layout) for mean in means], axis=1)
+        condensed = condense(means, layout, clear)
+        error, noise = np.moveaxis(condensed.curvature, -1, 0)
+        curved = error**2 > THRESHOLDS.profile_noise * noise
+        condensed.beams.value[:] -= np.where(curved, error, 0.0)
+        left = noise + (THRESHOLDS.curvature_left * error) ** 2
+        return cls(scaled, means, condensed, np.where(curved, left, 0.0))
+
+    def signals(self, constants: Array, reach: Indices) -> _Signals:
+        """Return the signals of all profiles, linear about the means with these constants."""
+        condensed, beams = self.condensed, self.condensed.beams
+        change = np.zeros((*reach.shape, 2 * beams.value.shape[2]))
+        ratio = np.zeros(reach.shape)
+        for b, (each, mean) in enumerate(zip(self.scaled, self.beams, strict=True)):
+            deviations = each.deviations(mean)[..., np.newaxis]
+            change[:, b] = product(condensed.derivatives[b], deviations)[..., 0]
+            ratio[:, b] = each.noise_ratio(mean)
+        finite = np.isfinite(ratio)
+        reach = np.where(finite, np.minimum(reach, beams.reach), 0)
+        typical = np.where(finite, ratio, 1.0)
+        if len(beams.value) == 1:
+            typical = np.nan_to_num(median(ratio, finite), nan=1.0)[np.newaxis]
+        noisy = _with_curvature(beams, self.curvature, typical)
+        linear = _beam_fit.linearise(noisy, constants, reach)
+        linear.value[:] += product(linear.turn, change[..., np.newaxis])[..., 0]
+        linear.information[:] *= (typical / ratio)[..., np.newaxis, np.newaxis]
+        bins = Bins(len(reach), condensed, self.beams, [each.energy for each in self.scaled])
+        return _Signals(bins, beams, self.curvature, linear, reach, change)
 
 
 def _with_curvature(beams: Beams, curvature: Array, ratio: Array | None = None) -> Beams:
@@ -267,6 +292,8 @@ class _Signals(NamedTuple):
     """Of each profile."""
     reach: Indices
     """(profile, beam)."""
+    change: Array
+    """(profile, beam, 2 passage) deviations of u and I from the means."""
 
     def about_mean(self, mean: Array) -> tuple[Array, Array]:
         """Return normal matrices, and right sides less those of a mean field."""
@@ -305,10 +332,10 @@ def condense_alone(block: Block) -> Condensed:
     """Return the signals of each profile, with the curvature that the mean of the block shows."""
     condensed = condense(block.beams, block.layout, block.reach)
     scaled = [_scale(*each) for each in block.each_beam(block.reach)]
-    with_curvature, curvature = _condense_means([each.mean() for each in scaled], block.layout)
-    shift = np.where(curvature > 0.0, with_curvature.curvature[..., 0], 0.0)
+    means = _Means.of(scaled, block.layout)
+    shift = np.where(means.curvature > 0.0, means.condensed.curvature[..., 0], 0.0)
     condensed.beams.value[:] -= shift
-    return condensed._replace(beams=_with_curvature(condensed.beams, curvature))
+    return condensed._replace(beams=_with_curvature(condensed.beams, means.curvature))
 
 
 def bins_alone(block: Block, condensed: Condensed) -> Bins:
@@ -323,7 +350,7 @@ def solve_block(block: Block) -> Estimates:
         out = Estimates.of_block(block)
         out.leave_out(block, np.zeros_like(block.reach))
         return out
-    odd = _disagreeing(mean)
+    odd = _disagreeing(mean.signals)
     if odd.any():
         mean = _solve_mean(block, np.where(odd[:, np.newaxis], 0, block.reach)) or mean
     signals, field = _solve_profiles(block, mean)
@@ -336,69 +363,38 @@ def solve_block(block: Block) -> Estimates:
 class _Mean(NamedTuple):
     """The mean field of a block, and the profiles about it."""
 
-    scaled: list[ScaledBeam]
+    of_powers: _Means
     solution: Solution
     posterior: Posterior
     prior: Array
     """(crossing, crossing) precision of ln extinction."""
     signals: _Signals
-    change: Array
-    """(profile, beam, 2 passage) deviations of u and I from the mean."""
 
 
 def _solve_mean(block: Block, reach: Indices) -> _Mean | None:
     """Return the mean field of the profiles with a reach; None where no beam has two passages."""
     scaled = [_scale(*each) for each in block.each_beam(reach)]
-    means = [each.mean() for each in scaled]
-    condensed, curvature = _condense_means(means, block.layout)
-    if not condensed.beams.reach.any():
+    means = _Means.of(scaled, block.layout)
+    if not means.condensed.beams.reach.any():
         return None
-    curved = _with_curvature(condensed.beams, curvature)
+    curved = _with_curvature(means.condensed.beams, means.curvature)
     constants = _beam_fit.start_constants(curved, block.lengths)
     first = _beam_fit.fit_beams(curved, block.priors.widest, constants)
     posterior = block.priors.posterior(curved, first)
     prior = posterior.expected(block.priors)
     solution = _beam_fit.fit_beams(curved, prior, first.constants)
-    signals, change = _about(condensed, curvature, solution.constants, reach, scaled, means)
-    return _Mean(scaled, solution, posterior, prior, signals, change)
+    return _Mean(means, solution, posterior, prior, means.signals(solution.constants, reach))
 
 
-def _about(
-    condensed: Condensed, curvature: Array, constants: Array, reach: Indices,
-    scaled: list[ScaledBeam], means: list[CleanBeam],
-) -> tuple[_Signals, Array]:  # fmt: skip
-    """Return the signals of all profiles about means, and their deviations from these."""
-    beams = condensed.beams
-    profiles, number = reach.shape
-    change = np.zeros((profiles, number, 2 * beams.value.shape[2]))
-    ratio = np.zeros((profiles, number))
-    for b, (each, mean) in enumerate(zip(scaled, means, strict=True)):
-        deviations, by_bin = each.deviations(mean), condensed.derivatives[b]
-        change[:, b] = product(by_bin, deviations[..., np.newaxis])[..., 0]
-        ratio[:, b] = each.noise_ratio(mean)
-    finite = np.isfinite(ratio)
-    reach = np.where(finite, np.minimum(reach, beams.reach), 0)
-    if len(beams.value) == 1:
-        typical = np.nan_to_num(median(ratio, finite), nan=1.0)[np.newaxis]
-    else:
-        typical = np.where(finite, ratio, 1.0)
-    linear = _beam_fit.linearise(_with_curvature(beams, curvature, typical), constants, reach)
-    linear.value[:] += product(linear.turn, change[..., np.newaxis])[..., 0]
-    linear.information[:] *= (typical / ratio)[..., np.newaxis, np.newaxis]
-    energies = [each.energy for each in scaled]
-    bins = Bins(profiles, condensed, means, energies)
-    return _Signals(bins, beams, curvature, linear, reach), change
-
-
-def _disagreeing(mean: _Mean) -> Booleans:
+def _disagreeing(signals: _Signals) -> Booleans:
     """Return (profile,) whether a beam is unlike those of the profiles before and after it.
 
     Signals may be anywhere between those before and after, or on the way that either of them goes.
     What is left is compared with noise, and with what typically changes from profile to profile.
     """
-    signals, most = mean.signals, mean.change.shape[2] // 2
-    known = np.arange(2 * most) % most < mean.signals.reach[..., np.newaxis]
-    change = np.where(known, mean.change, np.nan)
+    most = signals.change.shape[2] // 2
+    known = np.arange(2 * most) % most < signals.reach[..., np.newaxis]
+    change = np.where(known, signals.change, np.nan)
     before, onward = _neighbours(change)
     after, back = (each[::-1] for each in _neighbours(change[::-1]))
     segments = (before, after), (before, onward), (after, back)
@@ -442,9 +438,15 @@ def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field]:
     field = _changing(block, signals, mean, middle)
     if _difference(field.x, field.x.mean(axis=0)) < THRESHOLDS.linear_change:
         return signals, field
-    x = _start(block, mean)
+    half = THRESHOLDS.running_profiles // 2
+    means = _Means.of(mean.of_powers.scaled, block.layout, half)
+    beams = _with_curvature(means.condensed.beams, means.curvature)
+    start = _beam_fit.start_constants(beams, block.lengths)
+    x = _beam_fit.fit_beams(beams, mean.prior, start).logarithm
+    x, number = np.where(np.isfinite(x), x, middle), running_sums(np.ones_like(x), half)
     for _ in range(_FIELD_PASSES):
-        signals, before = _about_fields(block, mean, x), x
+        constants = _beam_fit.constants_of(beams, running_sums(x, half) / number)
+        before, signals = x, means.signals(constants, mean.signals.reach)
         field = _changing(block, signals, mean, x.mean(axis=0), field.change)
         x = field.x
         if not _difference(x, before) >= THRESHOLDS.linear_change:
@@ -510,7 +512,7 @@ def _steady(mean: _Mean, profiles: int) -> _Field:
     """Return the field of the mean for all profiles."""
     solution, beams = mean.solution, mean.signals.beams
     shape = profiles, beams.crossings
-    weight = np.stack([each.weight[:, 0] for each in mean.scaled], axis=1)
+    weight = np.stack([each.weight[:, 0] for each in mean.of_powers.scaled], axis=1)
     share = (weight / np.maximum(weight.sum(axis=0), 1e-300))[..., np.newaxis, np.newaxis]
 
     def respond(change: Array) -> Array:
@@ -523,64 +525,6 @@ def _steady(mean: _Mean, profiles: int) -> _Field:
         np.broadcast_to(solution.logarithm, shape),
         np.broadcast_to(solution.covariance, (*shape, shape[1])), respond,
     )  # fmt: skip
-
-
-def _start(block: Block, mean: _Mean) -> Array:
-    """Return (profile, crossing) fields of running means, each solved alone."""
-    half = THRESHOLDS.running_profiles // 2
-    condensed, curvature = _condense_means([each.mean(half) for each in mean.scaled], block.layout)
-    beams = _with_curvature(condensed.beams, curvature)
-    x = _beam_fit.fit_beams(
-        beams, mean.prior, _beam_fit.start_constants(beams, block.lengths)
-    ).logarithm
-    return np.where(np.isfinite(x), x, mean.solution.logarithm)
-
-
-def _smoothed(x: Array) -> Array:
-    """Return running means of fields."""
-    half = THRESHOLDS.running_profiles // 2
-    return running_sums(x, half) / running_sums(np.ones((len(x), 1)), half)
-
-
-def _about_fields(block: Block, mean: _Mean, x: Array) -> _Signals:
-    """Return the signals of all profiles, each about a running mean changed to its field."""
-    reach, smooth = mean.signals.reach, _smoothed(x)
-    crossing = mean.signals.beams.crossing
-    scaled = [
-        _scale(beam, layout, depth, _shape(block, crossing[b], beam, smooth))
-        for b, (beam, layout, depth) in enumerate(block.each_beam(reach))
-    ]
-    means = [each.mean(THRESHOLDS.running_profiles // 2) for each in scaled]
-    condensed, curvature = _condense_means(means, block.layout)
-    beams = condensed.beams
-    last = np.maximum(beams.reach - 1, 0)[..., np.newaxis]
-    along = (smooth + _smoothed(x - smooth))[:, crossing]
-    constants = np.take_along_axis(beams.value - along, last, axis=2)[..., 0]
-    for _ in range(_CONSTANT_PASSES):
-        linear = _beam_fit.linearise(beams, constants)
-        step = (linear.gain * (linear.value - along)).sum(axis=2)
-        constants = constants + np.clip(step, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
-    return _about(condensed, curvature, constants, reach, scaled, means)[0]
-
-
-def _shape(block: Block, crossing: Indices, beam: CleanBeam, x: Array) -> Array:
-    """Return (profile, bin) logarithmic changes of the power of a beam by fields about their mean.
-
-    ln extinction is linear between crossings, and constant beyond.
-    """
-    layout = block.layout
-    at = layout.passages.range[slice(*layout.first_passage[beam.number : beam.number + 2])]
-    ranges = layout.range[beam.number, beam.start : beam.start + beam.logs.shape[1]]
-    weights = np.stack([np.interp(ranges, at, unit) for unit in np.eye(at.size)])
-    fields = np.concatenate([x, x.mean(axis=0, keepdims=True)])[:, crossing[: at.size]]
-    logarithm = product(fields, weights)
-    extinction = np.exp(logarithm)
-    cells = 0.5 * (extinction[:, 1:] + extinction[:, :-1]) * np.diff(ranges)
-    whole = logarithm / beam.exponent
-    whole[:, 1:] -= 2.0 * np.cumsum(cells, axis=1)
-    change = whole[:-1] - whole[-1]
-    limit = THRESHOLDS.thickest_beam
-    return np.asarray(np.clip(change - change[:, :1], -limit, limit))
 
 
 def _assess(block: Block, signals: _Signals, field: _Field, mean: _Mean) -> Estimates:

@@ -98,7 +98,7 @@ class Thresholds(NamedTuple):
     linear_change: float = 0.02
     """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
     its mean; simulations."""
-    running_profiles: int = 7
+    running_profiles: int = 5
     """Profiles of a running mean; simulations."""
     neighbours: int = 3
     """Profiles before and after each one, with whose medians it is compared: one of three may be
