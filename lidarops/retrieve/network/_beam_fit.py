@@ -27,7 +27,6 @@ from lidarops.retrieve.network._condensed_signals import Beams
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _PASSES: Final = 24
-_CONSTANT_PASSES: Final = 3
 _ROUNDING: Final = 1e-9
 _SWEEPS: Final = 30
 _SMALLEST_ROTATION: Final = 1e-15
@@ -237,14 +236,6 @@ class Linear(NamedTuple):
     gain: Array
     """(profile, beam, passage) W g / (g' W g), derivative of the constant by y."""
 
-    @classmethod
-    def empty(cls, profiles: int, beams: int, most: int) -> Linear:
-        """Return arrays to fill."""
-        shape = profiles, beams, most
-        return cls(
-            np.zeros(shape), np.zeros((*shape, 2 * most)), np.zeros((*shape, most)), np.zeros(shape)
-        )
-
     def normal(self, beams: Beams) -> tuple[Array, Array]:
         """Return normal matrix sum A' M A, and right side sum A' M y, of each profile."""
         side = product(self.information, self.value[..., np.newaxis])
@@ -261,69 +252,35 @@ class Linear(NamedTuple):
 @compiled
 def _linearise_beam(
     signal: tuple[Array, Array, Array], constant: float, reach: int,
-    out: tuple[Array, Array, Array, Array], work: Array,
+    out: tuple[Array, Array, Array, Array],
 ) -> None:  # fmt: skip
     """Fill y, its derivatives, M and the gain of one beam; 0 where it has no two passages."""
     (u, integral, noise), (value, turn, information, gain) = signal, out
     value[:], gain[:], turn[:], information[:] = 0.0, 0.0, 0.0, 0.0
     if reach < 2:
         return
-    most, weight = u.size, math.exp(constant)
-    lever, scale, carried = np.empty(reach), np.empty(reach), np.empty(2 * most)
+    most, weight, lever = u.size, math.exp(constant), np.empty(reach)
     for p in range(most - 1, -1, -1):
         weight += integral[p]
-        if p >= reach:
-            continue
-        value[p] = u[p] - math.log(weight)
-        turn[p, p] = 1.0
-        # The integral behind the last passage in use is part of the constant.
-        turn[p, most + p : most + reach - 1] = -1.0 / weight
-        lever[p] = 1.0 / weight
+        if p < reach:
+            value[p] = u[p] - math.log(weight)
+            turn[p, p], lever[p] = 1.0, 1.0 / weight
+            # The integral behind the last passage in use is part of the constant.
+            turn[p, most + p : most + reach - 1] = -1.0 / weight
     lever /= lever[reach - 1]
-    correlation, inverse = work[0, :reach, :reach], work[1, :reach, :reach]
+    carried, covariance = np.zeros((reach, 2 * most)), np.zeros((reach, reach))
+    add_product(1.0, turn[:reach], noise, carried)
+    add_product(1.0, carried, turn[:reach].T, covariance)
     for p in range(reach):
-        carried[:] = noise[p]
-        for i in range(most + p, most + reach - 1):
-            carried += turn[p, i] * noise[i]
-        for q in range(p + 1):
-            correlation[p, q] = (carried * turn[q]).sum()
-        scale[p] = math.sqrt(correlation[p, p]) if correlation[p, p] > 0.0 else 1.0
+        covariance[p, p] *= 1.0 + THRESHOLDS.smallest_pivot
+    inverse = np.empty((reach, reach))
+    invert(covariance, inverse, np.empty((reach, reach)))
     for p in range(reach):
-        for q in range(p + 1):
-            correlation[p, q] /= scale[p] * scale[q]
-        correlation[p, p] += THRESHOLDS.smallest_pivot
-    invert(correlation, inverse, work[2, :reach, :reach])
-    known = 0.0
+        gain[p] = (inverse[p] * lever).sum()
+    known = (lever * gain[:reach]).sum()
     for p in range(reach):
-        for q in range(reach):
-            inverse[p, q] /= scale[p] * scale[q]
-            gain[p] += inverse[p, q] * lever[q]
-        known += lever[p] * gain[p]
-    for p in range(reach):
-        for q in range(reach):
-            information[p, q] = inverse[p, q] - gain[p] * gain[q] / known
+        information[p, :reach] = inverse[p] - gain[p] * gain[:reach] / known
     gain[:reach] /= known
-
-
-@compiled
-def _linearise(
-    signals: tuple[Array, Array, Array], constants: Array, reach: Indices,
-    out: tuple[Array, Array, Array, Array],
-) -> None:  # fmt: skip
-    """Linearise beams about constants; signals and constants may be those of one mean."""
-    value, turn, information, gain = out
-    u, integral, noise = signals
-    work = np.empty((3, u.shape[2], u.shape[2]))
-    for t in range(reach.shape[0]):
-        n = t if u.shape[0] > 1 else 0
-        for b in range(reach.shape[1]):
-            filled = value[t, b], turn[t, b], information[t, b], gain[t, b]
-            if n < t and reach[t, b] == reach[t - 1, b]:
-                filled[0][:], filled[1][:] = value[t - 1, b], turn[t - 1, b]
-                filled[2][:], filled[3][:] = information[t - 1, b], gain[t - 1, b]
-            else:
-                signal = u[n, b], integral[n, b], noise[n, b]
-                _linearise_beam(signal, constants[n, b], reach[t, b], filled, work)
 
 
 def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> Linear:
@@ -339,9 +296,12 @@ def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> L
         Number of passages in use, at most those of the beams.
     """
     reach = beams.reach if reach is None else np.minimum(reach, beams.reach)
-    out = Linear.empty(len(reach), reach.shape[1], beams.value.shape[2])
-    _linearise(beams[:3], constants, reach, out[:])
-    return out
+    value, integral, noise = (
+        np.broadcast_to(part, (len(reach), *part.shape[1:])) for part in beams[:3]
+    )
+    each = Beams(value, integral, noise, reach, beams.crossing, beams.crossings)
+    x = np.zeros((len(reach), beams.crossings))
+    return fit_beams(each, None, np.broadcast_to(constants, reach.shape), x, passes=0).linear
 
 
 def start_constants(beams: Beams, lengths: Array) -> Array:
@@ -364,17 +324,6 @@ def start_constants(beams: Beams, lengths: Array) -> Array:
     return np.where(usable & np.isfinite(constants), constants, 0.0)
 
 
-def constants_of(beams: Beams, x: Array) -> Array:
-    """Return (profile, beam) constants that agree best with (profile, crossing) ln extinction."""
-    along, last = x[:, beams.crossing], np.maximum(beams.reach - 1, 0)[..., np.newaxis]
-    constants = np.take_along_axis(beams.value - along, last, axis=2)[..., 0]
-    for _ in range(_CONSTANT_PASSES):
-        linear = linearise(beams, constants)
-        step = (linear.gain * (linear.value - along)).sum(axis=2)
-        constants = constants + np.clip(step, -THRESHOLDS.longest_step, THRESHOLDS.longest_step)
-    return constants
-
-
 class Solution(NamedTuple):
     """Logarithms of extinction of profiles that are solved each alone."""
 
@@ -389,71 +338,104 @@ class Solution(NamedTuple):
     """(profile,) True where the last pass changed no logarithm of w."""
 
 
-def fit_beams(beams: Beams, precision: Array, constants: Array) -> Solution:
+def fit_beams(
+    beams: Beams, precision: Array | None, constants: Array, x: Array | None = None,
+    passes: int = _PASSES,
+) -> Solution:  # fmt: skip
     """Solve each profile by Gauss-Newton steps of its constants.
 
     Parameters
     ----------
     beams : Beams
-    precision : (crossing, crossing) float64
+    precision : (crossing, crossing) float64, optional
         Of the prior of ln extinction.
     constants : (profile, beam) float64
         Where to start.
+    x : (profile, crossing) float64, optional
+        ln extinction where it is known, and only constants are fitted.
+    passes : int
+        Most steps.
     """
-    profiles, number = beams.reach.shape
-    constants, size = constants.copy(), beams.crossings
-    linear = Linear.empty(profiles, number, beams.value.shape[2])
-    x, covariance = np.empty((profiles, size)), np.empty((profiles, size, size))
-    step = np.empty(profiles)
+    (profiles, number), size = beams.reach.shape, beams.crossings
+    shape = profiles, number, beams.value.shape[2]
+    linear = Linear(
+        np.zeros(shape), np.zeros((*shape, 2 * shape[2])), np.zeros((*shape, shape[2])),
+        np.zeros(shape),
+    )  # fmt: skip
+    constants, moved = np.array(constants), np.zeros(profiles)
+    covariance = np.zeros((0 if precision is None else profiles, size, size))
     # Each crossing is drawn to the level of the profile a little, where nothing else determines it.
-    precision = precision + THRESHOLDS.weak_precision * np.eye(size)
-    _fit(beams[:5], precision, constants, linear[:], (x, covariance, step))
-    return Solution(x, covariance, constants, linear, step < THRESHOLDS.converged_step)
+    precision = (0.0 if precision is None else precision) + THRESHOLDS.weak_precision * np.eye(size)
+    x = np.empty((profiles, size)) if x is None else x
+    value, integral, noise = (np.ascontiguousarray(part) for part in beams[:3])
+    signals = value, integral, noise, beams.reach, beams.crossing
+    _fit(signals, precision, constants, linear[:], (x, covariance, moved), passes)
+    return Solution(x, covariance, constants, linear, moved < THRESHOLDS.converged_step)
 
 
 @compiled
 def _fit(
     beams: tuple[Array, Array, Array, Indices, Indices], precision: Array, constants: Array,
-    linear: tuple[Array, Array, Array, Array], out: tuple[Array, Array, Array],
+    linear: tuple[Array, Array, Array, Array], out: tuple[Array, Array, Array], passes: int,
 ) -> None:  # fmt: skip
-    """Solve each profile; `out` are ln extinction, its covariance, and the last step of ln w."""
-    (u, integral, noise, reach, crossing), (x, covariance, step) = beams, out
-    value, turn, information, gain = linear
-    most, size = u.shape[2], precision.shape[0]
-    work, factor = np.empty((3, most, most)), np.empty((size, size))
-    for n in range(u.shape[0]):
-        largest = math.inf
-        for _ in range(_PASSES):
-            normal, side, level, number = precision.copy(), np.zeros(size), 0.0, 0
-            for b in range(u.shape[1]):
-                signal = u[n, b], integral[n, b], noise[n, b]
-                filled = value[n, b], turn[n, b], information[n, b], gain[n, b]
-                _linearise_beam(signal, constants[n, b], reach[n, b], filled, work)
-                for p in range(reach[n, b]):
-                    level += value[n, b, p]
-                    number += 1
-                    for q in range(reach[n, b]):
-                        share = information[n, b, p, q]
-                        normal[crossing[b, p], crossing[b, q]] += share
-                        side[crossing[b, p]] += share * value[n, b, q]
-            side += THRESHOLDS.weak_precision * level / max(number, 1)
-            invert(normal, covariance[n], factor)
-            x[n] = 0.0
-            for c in range(size):
-                for d in range(size):
-                    x[n, c] += covariance[n, c, d] * side[d]
-            if largest < THRESHOLDS.converged_step**3:
+    """Fit each profile; `out` are ln extinction, its covariance, and the last step of ln w.
+
+    Without profiles of covariances, ln extinction is known.
+    """
+    x, covariance, moved = out
+    for n in range(x.shape[0]):
+        step = math.inf
+        for k in range(passes + 1):
+            normal = precision.copy()
+            side = _add_up(n, beams, constants, linear, normal)
+            if covariance.shape[0] > 0:
+                invert(normal, covariance[n], np.empty(normal.shape))
+                for c in range(side.size):
+                    x[n, c] = (covariance[n, c] * side).sum()
+            if k == passes or step < THRESHOLDS.converged_step**3:
                 break
-            largest = step[n] = 0.0
-            for b in range(u.shape[1]):
-                change, slope = 0.0, math.exp(constants[n, b] + value[n, b, 0] - u[n, b, 0])
-                for p in range(reach[n, b]):
-                    change += gain[n, b, p] * (value[n, b, p] - x[n, crossing[b, p]])
-                change = min(max(change, -THRESHOLDS.longest_step), THRESHOLDS.longest_step)
-                constants[n, b] += change
-                largest = max(largest, abs(change))
-                if not abs(change) * slope <= step[n]:
-                    step[n] = abs(change) * slope
+            step, moved[n] = _step(n, beams, constants, linear, x[n])
+
+
+@compiled
+def _add_up(
+    n: int, beams: tuple[Array, Array, Array, Indices, Indices], constants: Array,
+    linear: tuple[Array, Array, Array, Array], normal: Array,
+) -> Array:  # fmt: skip
+    """Linearise a profile, add its information to a normal matrix, and return the right side."""
+    (u, integral, noise, reach, crossing), (value, turn, information, gain) = beams, linear
+    side, level, number = np.zeros(normal.shape[0]), 0.0, 0
+    for b in range(u.shape[1]):
+        filled = value[n, b], turn[n, b], information[n, b], gain[n, b]
+        signal = u[n, b], integral[n, b], noise[n, b]
+        _linearise_beam(signal, constants[n, b], reach[n, b], filled)
+        for p in range(reach[n, b]):
+            level += value[n, b, p]
+            number += 1
+            side[crossing[b, p]] += (information[n, b, p] * value[n, b]).sum()
+            for q in range(reach[n, b]):
+                normal[crossing[b, p], crossing[b, q]] += information[n, b, p, q]
+    return side + THRESHOLDS.weak_precision * level / max(number, 1)
+
+
+@compiled
+def _step(
+    n: int, beams: tuple[Array, Array, Array, Indices, Indices], constants: Array,
+    linear: tuple[Array, Array, Array, Array], x: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Change the constants of a profile; return the largest step, and the largest one of ln w."""
+    (u, _, _, reach, crossing), (value, _, _, gain) = beams, linear
+    largest = moved = 0.0
+    for b in range(u.shape[1]):
+        change, slope = 0.0, math.exp(constants[n, b] + value[n, b, 0] - u[n, b, 0])
+        for p in range(reach[n, b]):
+            change += gain[n, b, p] * (value[n, b, p] - x[crossing[b, p]])
+        change = min(max(change, -THRESHOLDS.longest_step), THRESHOLDS.longest_step)
+        constants[n, b] += change
+        largest = max(largest, abs(change))
+        if not abs(change) * slope <= moved:
+            moved = abs(change) * slope
+    return largest, moved
 
 
 # Tests -------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _FIELD_PASSES: Final = 6
+_CONSTANT_PASSES: Final = 3
 
 
 # Means of powers ---------------------------------------------------------------------------------
@@ -222,7 +223,7 @@ class _Means(NamedTuple):
         linear.value[:] += product(linear.turn, change[..., np.newaxis])[..., 0]
         linear.information[:] *= (typical / ratio)[..., np.newaxis, np.newaxis]
         bins = Bins(len(reach), condensed, self.beams, [each.energy for each in self.scaled])
-        return _Signals(bins, beams, self.curvature, linear, reach, change)
+        return _Signals(bins, beams, self.curvature, linear, reach)
 
 
 def _with_curvature(beams: Beams, curvature: Array, ratio: Array | None = None) -> Beams:
@@ -292,8 +293,6 @@ class _Signals(NamedTuple):
     """Of each profile."""
     reach: Indices
     """(profile, beam)."""
-    change: Array
-    """(profile, beam, 2 passage) deviations of u and I from the means."""
 
     def about_mean(self, mean: Array) -> tuple[Array, Array]:
         """Return normal matrices, and right sides less those of a mean field."""
@@ -353,8 +352,8 @@ def solve_block(block: Block) -> Estimates:
     odd = _disagreeing(mean.signals)
     if odd.any():
         mean = _solve_mean(block, np.where(odd[:, np.newaxis], 0, block.reach)) or mean
-    signals, field = _solve_profiles(block, mean)
-    out = _assess(block, signals, field, mean)
+    signals, field, misfit = _solve_profiles(block, mean)
+    out = _assess(block, signals, field, mean, misfit)
     out.left_out[odd] = False
     out.settled[:] = mean.solution.settled[0] & np.isfinite(field.x).all(axis=1) & ~odd
     return out
@@ -364,6 +363,8 @@ class _Mean(NamedTuple):
     """The mean field of a block, and the profiles about it."""
 
     of_powers: _Means
+    beams: Beams
+    """Of the mean, with curved signals as noise."""
     solution: Solution
     posterior: Posterior
     prior: Array
@@ -383,7 +384,9 @@ def _solve_mean(block: Block, reach: Indices) -> _Mean | None:
     posterior = block.priors.posterior(curved, first)
     prior = posterior.expected(block.priors)
     solution = _beam_fit.fit_beams(curved, prior, first.constants)
-    return _Mean(means, solution, posterior, prior, means.signals(solution.constants, reach))
+    return _Mean(
+        means, curved, solution, posterior, prior, means.signals(solution.constants, reach)
+    )
 
 
 def _disagreeing(signals: _Signals) -> Booleans:
@@ -392,66 +395,72 @@ def _disagreeing(signals: _Signals) -> Booleans:
     Signals may be anywhere between those before and after, or on the way that either of them goes.
     What is left is compared with noise, and with what typically changes from profile to profile.
     """
-    most = signals.change.shape[2] // 2
-    known = np.arange(2 * most) % most < signals.reach[..., np.newaxis]
-    change = np.where(known, signals.change, np.nan)
-    before, onward = _neighbours(change)
-    after, back = (each[::-1] for each in _neighbours(change[::-1]))
+    inside = np.arange(signals.linear.value.shape[2]) < signals.reach[..., np.newaxis]
+    value = np.where(inside, signals.linear.value, np.nan)
+    before, onward = _neighbours(value)
+    after, back = (each[::-1] for each in _neighbours(value[::-1]))
     segments = (before, after), (before, onward), (after, back)
-    square = np.fmin.reduce([_apart(signals, change, *ends) for ends in segments])
+    information = signals.linear.information
+    square = np.fmin.reduce([_apart(information, value, *ends) for ends in segments])
     freedom = np.maximum(signals.reach - 1, 1)
-    last = np.concatenate([np.full_like(change[:1], np.nan), change[:-1]])
-    step = 0.5 * _apart(signals, change, last, last) / freedom
+    last = np.concatenate([np.full_like(value[:1], np.nan), value[:-1]])
+    step = 0.5 * _apart(information, value, last, last) / freedom
     typical = np.nan_to_num(median(step, np.isfinite(step) & (signals.reach > 1)))
     limit = special.chdtri(freedom, THRESHOLDS.least_neighbourly)
     return np.asarray((square > limit * np.maximum(typical, 1.0)).any(axis=1))
 
 
-def _neighbours(change: Array) -> tuple[Array, Array]:
+def _neighbours(value: Array) -> tuple[Array, Array]:
     """Return medians of the profiles before each one, and these continued; NaN without any."""
-    number, profiles = THRESHOLDS.neighbours, len(change)
-    padded = np.concatenate([np.full((2 * number, *change.shape[1:]), np.nan), change])
+    number, profiles = THRESHOLDS.neighbours, len(value)
+    padded = np.concatenate([np.full((2 * number, *value.shape[1:]), np.nan), value])
     earlier = np.stack([padded[k : k + number + profiles] for k in range(number)])
     medians = median(earlier.reshape(number, -1), np.isfinite(earlier).reshape(number, -1))
-    far, near = (medians.reshape(-1, *change.shape[1:])[k : k + profiles] for k in (0, number))
+    far, near = (medians.reshape(-1, *value.shape[1:])[k : k + profiles] for k in (0, number))
     return near, np.where(np.isfinite(far), 2.0 * near - far, near)
 
 
-def _apart(signals: _Signals, change: Array, start: Array, stop: Array) -> Array:
-    """Return (profile, beam) chi-squares about the nearest point between two changes."""
-    rest, step = (
-        product(signals.linear.turn, np.nan_to_num(each)[..., np.newaxis])
-        for each in (change - start, stop - start)
-    )
-    information = signals.linear.information
-    weighted = product(information, step)
-    length, along = ((each * weighted).sum(axis=(2, 3)) for each in (step, rest))
+def _apart(information: Array, value: Array, start: Array, stop: Array) -> Array:
+    """Return (profile, beam) chi-squares about the nearest point between two fields."""
+    rest, step = np.nan_to_num(value - start), np.nan_to_num(stop - start)
+    weighted = product(information, step[..., np.newaxis])[..., 0]
+    length, along = ((each * weighted).sum(axis=2) for each in (step, rest))
     share = np.clip(along / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
-    rest = rest - share[..., np.newaxis, np.newaxis] * step
+    rest = rest - share[..., np.newaxis] * step
     known = np.isfinite(start[..., 0]) & np.isfinite(stop[..., 0])
-    return np.where(known, (rest * product(information, rest)).sum(axis=(2, 3)), np.nan)
+    square = (rest * product(information, rest[..., np.newaxis])[..., 0]).sum(axis=2)
+    return np.where(known, square, np.nan)
 
 
-def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field]:
-    """Return the field of each profile, and the signals that it follows."""
+def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, tuple[float, float]]:
+    """Return the field of each profile, the signals that it follows, and the misfit of means."""
     signals, middle = mean.signals, mean.solution.logarithm[0]
     field = _changing(block, signals, mean, middle)
     if _difference(field.x, field.x.mean(axis=0)) < THRESHOLDS.linear_change:
-        return signals, field
+        return signals, field, _misfit(mean.beams, mean.solution, 1)
     half = THRESHOLDS.running_profiles // 2
     means = _Means.of(mean.of_powers.scaled, block.layout, half)
     beams = _with_curvature(means.condensed.beams, means.curvature)
-    start = _beam_fit.start_constants(beams, block.lengths)
-    x = _beam_fit.fit_beams(beams, mean.prior, start).logarithm
-    x, number = np.where(np.isfinite(x), x, middle), running_sums(np.ones_like(x), half)
+    alone = _beam_fit.fit_beams(beams, mean.prior, _beam_fit.start_constants(beams, block.lengths))
+    x, number = alone.logarithm, running_sums(np.ones_like(alone.logarithm), half)
+    x, constants = np.where(np.isfinite(x), x, middle), np.nan_to_num(alone.constants)
     for _ in range(_FIELD_PASSES):
-        constants = _beam_fit.constants_of(beams, running_sums(x, half) / number)
-        before, signals = x, means.signals(constants, mean.signals.reach)
+        before, smooth = x, running_sums(x, half) / number
+        constants = _beam_fit.fit_beams(beams, None, constants, smooth, _CONSTANT_PASSES).constants
+        signals = means.signals(constants, mean.signals.reach)
         field = _changing(block, signals, mean, x.mean(axis=0), field.change)
         x = field.x
         if not _difference(x, before) >= THRESHOLDS.linear_change:
             break
-    return signals, field
+    return signals, field, _misfit(beams, alone, THRESHOLDS.running_profiles)
+
+
+def _misfit(beams: Beams, solution: Solution, profiles: int) -> tuple[float, float]:
+    """Return the chi-square of means of so many profiles, and its degrees of freedom."""
+    parts = _beam_fit.compare(beams, solution.linear, solution.logarithm, beams.reach)
+    chi_square, freedom = (part[:, 0] for part in parts)
+    chi_square, freedom = (each[freedom > 0].sum() / profiles for each in (chi_square, freedom))
+    return float(chi_square), float(freedom)
 
 
 def _difference(x: Array, other: Array) -> float:
@@ -527,7 +536,9 @@ def _steady(mean: _Mean, profiles: int) -> _Field:
     )  # fmt: skip
 
 
-def _assess(block: Block, signals: _Signals, field: _Field, mean: _Mean) -> Estimates:
+def _assess(
+    block: Block, signals: _Signals, field: _Field, mean: _Mean, misfit: tuple[float, float]
+) -> Estimates:
     """Return the solution with its errors and tests."""
     out, measured = Estimates.of_block(block), block.layout.measured
     beams, x, reach = signals.beams, field.x, signals.reach
@@ -539,7 +550,7 @@ def _assess(block: Block, signals: _Signals, field: _Field, mean: _Mean) -> Esti
     extinction = np.exp(x)
     extinction[~(seen & (variance < THRESHOLDS.largest_variance))] = np.nan
     out.extinction[:, measured] = extinction
-    chi_square, freedom = _misfit(signals, x, seen)
+    chi_square, freedom = misfit
     scale = max(chi_square / freedom, 1.0) if freedom > 0 else 1.0
     relative = scale * variance + missing + _curvature(signals, field)
     out.variance[:, measured] = extinction**2 * relative
@@ -554,26 +565,6 @@ def _assess(block: Block, signals: _Signals, field: _Field, mean: _Mean) -> Esti
     out.overlap_error[:] = np.where(np.isfinite(out.extinction), out.extinction * overlap, np.nan)
     out.variance[:] += out.overlap_error**2
     return out
-
-
-def _misfit(signals: _Signals, x: Array, seen: Booleans) -> tuple[float, float]:
-    """Return the chi-square of the residuals of all profiles together, and its freedom."""
-    beams, information = signals.beams, signals.linear.information
-    residual = _beam_fit.residuals(beams, signals.linear, x, signals.reach)
-    pooled = product(information, residual).sum(axis=0)
-    informed = np.maximum(signals.reach.max(axis=0) - 1, 0)
-    # The constants take up what is left, which changes with the field.
-    size, vectors = _beam_fit.eigenvectors(information.sum(axis=0))
-    order = np.argsort(np.argsort(size, axis=1), axis=1)
-    kept = order >= size.shape[1] - informed[:, np.newaxis]
-    along = product(vectors.swapaxes(1, 2), pooled)[..., 0] * kept
-    misfit = float((along**2 / np.where(kept, size, 1.0)).sum())
-    kept_vectors = vectors * kept[:, np.newaxis]
-    whole = product(kept_vectors * size[:, np.newaxis], kept_vectors.swapaxes(1, 2))
-    left = _beam_fit.gathered(product(vectors, along[..., np.newaxis])[np.newaxis], beams)[..., 0]
-    normal = _beam_fit.normal_matrix(whole[np.newaxis], beams)
-    misfit -= float(_beam_fit.taken_up(normal, left)[0])
-    return misfit, float(informed.sum() - np.sum(seen.any(axis=0)))
 
 
 def _curvature(signals: _Signals, field: _Field) -> Array | float:

@@ -38,7 +38,7 @@ _SMOOTH_SIDE: Final[int] = np.int64(4)  # type: ignore[assignment]
 _SMOOTH_DEGREE: Final = 3
 _ONE_SIDED_DEGREE: Final = 2
 _LARGEST_LOGARITHM: Final = 300.0
-_CLEAR: Final = 2.0
+_CLEAR: Final = 9.0
 """Square of a deviation over its variance, below which a bin is not looked at closer."""
 
 
@@ -156,7 +156,7 @@ def _deviation(
 def _fits(row: tuple[Array, Array, float, Array, Array], codes: Codes, at: int) -> bool:
     """Return whether a bin clearly agrees with its nearest neighbours, all of which are good.
 
-    Its `_deviation` is then below 2.5 standard errors.
+    Its `_deviation` is then below 4 standard errors, which no decision looks at.
     """
     logs, noise, exponent, _, plan = row
     if at < _SIDE or at + _SIDE >= codes.size:
