@@ -283,27 +283,6 @@ def _linearise_beam(
     gain[:reach] /= known
 
 
-def linearise(beams: Beams, constants: Array, reach: Indices | None = None) -> Linear:
-    """Linearise beams about constants.
-
-    Parameters
-    ----------
-    beams : Beams
-        Of each profile, or of one mean.
-    constants : (profile or 1, beam) float64
-        ln w at the last passage of each beam.
-    reach : (profile, beam) intp, optional
-        Number of passages in use, at most those of the beams.
-    """
-    reach = beams.reach if reach is None else np.minimum(reach, beams.reach)
-    value, integral, noise = (
-        np.broadcast_to(part, (len(reach), *part.shape[1:])) for part in beams[:3]
-    )
-    each = Beams(value, integral, noise, reach, beams.crossing, beams.crossings)
-    x = np.zeros((len(reach), beams.crossings))
-    return fit_beams(each, None, np.broadcast_to(constants, reach.shape), x, passes=0).linear
-
-
 def start_constants(beams: Beams, lengths: Array) -> Array:
     """Return (profile, beam) constants of homogeneous air.
 
@@ -436,6 +415,32 @@ def _step(
         if not abs(change) * slope <= moved:
             moved = abs(change) * slope
     return largest, moved
+
+
+def linearise(
+    beams: Beams, constants: Array, reach: Indices | None = None, x: Array | None = None
+) -> Solution:
+    """Linearise beams about constants, or about those nearer to ln extinction by a step.
+
+    Parameters
+    ----------
+    beams : Beams
+        Of each profile, or of one mean.
+    constants : (profile or 1, beam) float64
+        ln w at the last passage of each beam.
+    reach : (profile, beam) intp, optional
+        Number of passages in use, at most those of the beams.
+    x : (profile, crossing) float64, optional
+        Ln extinction.
+    """
+    reach = beams.reach if reach is None else np.minimum(reach, beams.reach)
+    value, integral, noise = (
+        np.broadcast_to(part, (len(reach), *part.shape[1:])) for part in beams[:3]
+    )
+    each = Beams(value, integral, noise, reach, beams.crossing, beams.crossings)
+    field = np.zeros((len(reach), beams.crossings)) if x is None else x
+    constants = np.broadcast_to(constants, reach.shape)
+    return fit_beams(each, None, constants, field, passes=0 if x is None else 1)
 
 
 # Tests -------------------------------------------------------------------------------------------

@@ -38,7 +38,6 @@ from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _FIELD_PASSES: Final = 6
-_CONSTANT_PASSES: Final = 3
 
 
 # Means of powers ---------------------------------------------------------------------------------
@@ -187,6 +186,10 @@ class _Means(NamedTuple):
     condensed: Condensed
     curvature: Array
     """(mean, beam, passage) what curved signals within a fit add to the variance of u."""
+    change: Array
+    """(profile, beam, 2 passage) deviations of u and I of profiles from the means."""
+    ratio: Array
+    """(profile, beam) variance of noise over that of the mean; inf where unknown."""
 
     @classmethod
     def of(cls, scaled: list[ScaledBeam], layout: FitLayout, half: int | None = None) -> _Means:
@@ -202,28 +205,35 @@ class _Means(NamedTuple):
         curved = error**2 > THRESHOLDS.profile_noise * noise
         condensed.beams.value[:] -= np.where(curved, error, 0.0)
         left = noise + (THRESHOLDS.curvature_left * error) ** 2
-        return cls(scaled, means, condensed, np.where(curved, left, 0.0))
-
-    def signals(self, constants: Array, reach: Indices) -> _Signals:
-        """Return the signals of all profiles, linear about the means with these constants."""
-        condensed, beams = self.condensed, self.condensed.beams
-        change = np.zeros((*reach.shape, 2 * beams.value.shape[2]))
-        ratio = np.zeros(reach.shape)
-        for b, (each, mean) in enumerate(zip(self.scaled, self.beams, strict=True)):
+        profiles = len(scaled[0].power)
+        change = np.zeros((profiles, *condensed.beams.covariance.shape[1:3]))
+        for b, (each, mean) in enumerate(zip(scaled, means, strict=True)):
             deviations = each.deviations(mean)[..., np.newaxis]
             change[:, b] = product(condensed.derivatives[b], deviations)[..., 0]
-            ratio[:, b] = each.noise_ratio(mean)
+        ratios = [each.noise_ratio(mean) for each, mean in zip(scaled, means, strict=True)]
+        curvature = np.where(curved, left, 0.0)
+        return cls(scaled, means, condensed, curvature, change, np.stack(ratios, axis=1))
+
+    def signals(
+        self, constants: Array, reach: Indices, x: Array | None = None
+    ) -> tuple[_Signals, Array]:
+        """Return the signals of all profiles, linear about constants, and these.
+
+        The constants are those given, or nearer to (profile, crossing) ln extinction.
+        """
+        beams, ratio = self.condensed.beams, self.ratio
         finite = np.isfinite(ratio)
         reach = np.where(finite, np.minimum(reach, beams.reach), 0)
         typical = np.where(finite, ratio, 1.0)
         if len(beams.value) == 1:
             typical = np.nan_to_num(median(ratio, finite), nan=1.0)[np.newaxis]
         noisy = _with_curvature(beams, self.curvature, typical)
-        linear = _beam_fit.linearise(noisy, constants, reach)
-        linear.value[:] += product(linear.turn, change[..., np.newaxis])[..., 0]
+        *_, constants, linear, _ = _beam_fit.linearise(noisy, constants, reach, x)
+        linear.value[:] += product(linear.turn, self.change[..., np.newaxis])[..., 0]
         linear.information[:] *= (typical / ratio)[..., np.newaxis, np.newaxis]
-        bins = Bins(len(reach), condensed, self.beams, [each.energy for each in self.scaled])
-        return _Signals(bins, beams, self.curvature, linear, reach)
+        energies = [each.energy for each in self.scaled]
+        bins = Bins(len(reach), self.condensed, self.beams, energies)
+        return _Signals(bins, beams, self.curvature, linear, reach), constants
 
 
 def _with_curvature(beams: Beams, curvature: Array, ratio: Array | None = None) -> Beams:
@@ -384,9 +394,8 @@ def _solve_mean(block: Block, reach: Indices) -> _Mean | None:
     posterior = block.priors.posterior(curved, first)
     prior = posterior.expected(block.priors)
     solution = _beam_fit.fit_beams(curved, prior, first.constants)
-    return _Mean(
-        means, curved, solution, posterior, prior, means.signals(solution.constants, reach)
-    )
+    signals, _ = means.signals(solution.constants, reach)
+    return _Mean(means, curved, solution, posterior, prior, signals)
 
 
 def _disagreeing(signals: _Signals) -> Booleans:
@@ -446,8 +455,7 @@ def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, tuple[
     x, constants = np.where(np.isfinite(x), x, middle), np.nan_to_num(alone.constants)
     for _ in range(_FIELD_PASSES):
         before, smooth = x, running_sums(x, half) / number
-        constants = _beam_fit.fit_beams(beams, None, constants, smooth, _CONSTANT_PASSES).constants
-        signals = means.signals(constants, mean.signals.reach)
+        signals, constants = means.signals(constants, mean.signals.reach, smooth)
         field = _changing(block, signals, mean, x.mean(axis=0), field.change)
         x = field.x
         if not _difference(x, before) >= THRESHOLDS.linear_change:
