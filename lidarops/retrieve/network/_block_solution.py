@@ -195,12 +195,10 @@ class _Means(NamedTuple):
     def of(cls, scaled: list[ScaledBeam], layout: FitLayout, half: int | None = None) -> _Means:
         """Return the mean of all profiles, or those of up to `half` before and after each.
 
-        Where a signal is curved beyond noise, the polynomial replaces the straight line. A mean
-        ends where its own noise hides the signal.
+        Where a signal is curved beyond noise, the polynomial replaces the straight line.
         """
         means = [each.mean(half) for each in scaled]
-        clear = np.stack([mean.clear(layout) for mean in means], axis=1)
-        condensed = condense(means, layout, clear)
+        condensed = condense(means, layout)
         error, noise = np.moveaxis(condensed.curvature, -1, 0)
         curved = error**2 > THRESHOLDS.profile_noise * noise
         condensed.beams.value[:] -= np.where(curved, error, 0.0)
@@ -233,7 +231,7 @@ class _Means(NamedTuple):
         linear.information[:] *= (typical / ratio)[..., np.newaxis, np.newaxis]
         energies = [each.energy for each in self.scaled]
         bins = Bins(len(reach), self.condensed, self.beams, energies)
-        return _Signals(bins, beams, self.curvature, linear, reach), constants
+        return _Signals(bins, beams, linear, reach), constants
 
 
 def _with_curvature(beams: Beams, curvature: Array, ratio: Array | None = None) -> Beams:
@@ -297,8 +295,6 @@ class _Signals(NamedTuple):
     bins: Bins
     beams: Beams
     """Of the means."""
-    curvature: Array
-    """(mean, beam, passage) variance of u by curved signals within a fit."""
     linear: Linear
     """Of each profile."""
     reach: Indices
@@ -487,8 +483,6 @@ class _Field(NamedTuple):
     """From a (profile or 1, beam, 2 passage, case) change of u and I to a (profile, crossing, case)
     one of x."""
     change: Change | None = None
-    curved: float = 0.0
-    """Share of the errors of curved signals that the covariance leaves out."""
 
 
 def _changing(
@@ -509,9 +503,7 @@ def _changing(
         sides = signals.linear.sides(signals.beams, changed)
         return _changing_field.solve_changing(normal, sides, mean.prior, change)[0]
 
-    # Curved signals are alike in all profiles, which count them as noise.
-    curved = 1.0 - 1.0 / max(seen.size, 1)
-    return _Field(middle + x[..., 0], covariance, respond, change, curved)
+    return _Field(middle + x[..., 0], covariance, respond, change)
 
 
 def _likeliest_change(
@@ -560,7 +552,7 @@ def _assess(
     out.extinction[:, measured] = extinction
     chi_square, freedom = misfit
     scale = max(chi_square / freedom, 1.0) if freedom > 0 else 1.0
-    relative = scale * variance + missing + _curvature(signals, field)
+    relative = scale * variance + missing
     out.variance[:, measured] = extinction**2 * relative
     out.leave_out(block, reach)
     out.chi_square[:, :2], out.degrees_of_freedom[:, :2] = _beam_fit.compare(
@@ -573,14 +565,3 @@ def _assess(
     out.overlap_error[:] = np.where(np.isfinite(out.extinction), out.extinction * overlap, np.nan)
     out.variance[:] += out.overlap_error**2
     return out
-
-
-def _curvature(signals: _Signals, field: _Field) -> Array | float:
-    """Return (profile, crossing) variances by curved signals that the covariance leaves out."""
-    beam, place = np.nonzero(signals.curvature.any(axis=0))
-    if field.curved == 0.0 or not beam.size:
-        return 0.0
-    change = np.zeros((1, *signals.linear.turn.shape[1::2], beam.size))
-    change[0, beam, place, np.arange(beam.size)] = 1.0
-    squares = field.respond(change) ** 2 * signals.curvature[:, np.newaxis, beam, place]
-    return np.asarray(field.curved * squares.sum(axis=2))

@@ -210,14 +210,6 @@ class CleanBeam:
         arrays = ("power", "variance", "logs", "noise", "doubt", "codes", "stops", "status")
         return replace(self, **{name: getattr(self, name)[profiles] for name in arrays})
 
-    def clear(self, layout: FitLayout) -> Indices:
-        """Return (profile,) numbers of passages before the first one that noise hides."""
-        passages = slice(*layout.first_passage[self.number : self.number + 2])
-        at = layout.window[passages, np.newaxis] + np.arange(layout.weights.shape[1]) - self.start
-        level, spread = (each[:, at].mean(axis=2) for each in (self.power, self.variance))
-        clear = spread <= (THRESHOLDS.largest_bin_error * np.maximum(level, 0.0)) ** 2
-        return np.asarray(np.logical_and.accumulate(clear, axis=1).sum(axis=1))
-
 
 def clean(
     power: Array, variance: Array, exponent: Array, layout: FitLayout, *, together: bool

@@ -83,25 +83,3 @@ def test_the_errors_of_stratified_air_are_right(cluster, monkeypatch):
     changed = THRESHOLDS._replace(stratified=(0.1, 400.0))
     monkeypatch.setattr(_changing_field, "THRESHOLDS", changed)
     assert covered() < 0.85
-
-
-def test_a_running_mean_ends_where_its_noise_hides_the_signal(monkeypatch):
-    """One profile with a bin near zero once changed the field of its neighbours by 50 percent."""
-
-    def false():
-        drifting = next(
-            values
-            for values in random_networks.score_networks(37, 50)
-            if values.failure.name == "plume that drifts within a block"
-        )
-        kept = np.isfinite(drifting.error) & (drifting.bits == 0)
-        assert kept.mean() > 0.5
-        return np.mean((np.abs(drifting.error) > 4.0 * drifting.random)[kept])
-
-    assert false() < 1e-3
-    monkeypatch.setattr(
-        _block_solution.CleanBeam,
-        "clear",
-        lambda beam, layout: np.full(len(beam.logs), np.diff(layout.first_passage)[beam.number]),
-    )
-    assert false() > 1e-2
