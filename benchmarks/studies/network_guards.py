@@ -55,6 +55,7 @@ OWN = {
     "noisy profiles": RISING,
     "curvature errors": "layer of a few bins",
     "stratified air": STEEP,
+    "profiles that disagree": "one bad profile",
 }
 """Class of scenes that a guard is for."""
 PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/network.md"
@@ -68,6 +69,7 @@ GUARDS: Final = (
     Guard("stratified air", off=_at(_changing_field, stratified=(0.1, 400.0))),
     Guard("changes in time", off=_at(_changing_field, least_change=1e30)),
     Guard("running means", off=_at(_block_solution, linear_change=1e30)),
+    Guard("profiles that disagree", off=_at(_block_solution, least_neighbourly=0.0)),
     Guard("misfit of the mean", off=_at(extinction_field, largest_misfit=1e30)),
     Guard("default overlap error", off=_at(_block_solution, default_overlap_error=0.0)),
     Guard("curvature errors", off=_at(_block_solution, profile_noise=1e30)),
