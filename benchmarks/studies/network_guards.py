@@ -75,15 +75,7 @@ GUARDS: Final = (
     Guard("curvature errors", off=_at(_block_solution, profile_noise=1e30)),
     Guard("outlying bins", off=without((outlying_bins, "search", lambda *_: None))),
     Guard("weak signals", off=_at(_beam_signals, largest_bin_error=1e6)),
-    Guard(
-        "noisy profiles",
-        off=without(
-            *(
-                (module, "THRESHOLDS", THRESHOLDS._replace(noisy_profile=1e30))
-                for module in (_beam_signals, _block_solution)
-            )
-        ),
-    ),
+    Guard("noisy profiles", off=_at(_beam_signals, noisy_profile=1e30)),
 )
 
 

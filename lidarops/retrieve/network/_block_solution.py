@@ -158,8 +158,6 @@ def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:
     power, variance = power / energy, variance / energy**2
     noise = (variance[:, used] * inside).sum(axis=1)
     able = complete & np.isfinite(noise) & (noise > 0.0)
-    if able.any():
-        able &= noise <= THRESHOLDS.noisy_profile * np.median(noise[able])
     weight = np.where(able, 1.0 / np.where(able, noise, 1.0), 0.0)[:, np.newaxis]
     return ScaledBeam(beam, factor, stop, energy, power, variance, kept, weight)
 
