@@ -129,18 +129,14 @@ class Thresholds(NamedTuple):
     largest_variance: float = 4.0
     """Variance of ln extinction beyond which it is not determined; assumed."""
 
-    # Flags and systematic errors
+    # Flags
     largest_relative_error: float = 1.0 / 3.0
     """Relative standard error beyond which a linear error does not describe a value: it is flagged;
     assumed."""
     least_probability: float = 1e-4
     """Probability of a chi-square below which a fit is poor; chosen."""
-    relative_change: float = 1e-2
-    """Relative change of signals for sensitivities; assumed."""
     bins_beyond: int = 200
     """Bins kept beyond the farthest crossing: over twice the widest window of a bin."""
-    most_separate_beams: int = 16
-    """Number of beams up to which their errors are computed one by one; assumed, for run time."""
 
 
 THRESHOLDS: Final = Thresholds()
