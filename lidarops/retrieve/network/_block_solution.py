@@ -19,9 +19,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import special
+from scipy.ndimage import convolve1d
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
-from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.network import _beam_fit, _changing_field
 from lidarops.retrieve.network._beam_fit import Linear, Solution, product
 from lidarops.retrieve.network._beam_signals import Block, Causes, Estimates, Response
@@ -101,21 +101,10 @@ class ScaledBeam:
 
 
 def running_sums(values: Array, half: int | None) -> Array:
-    """Return (1, item) sums of all profiles, or (profile, item) ones of those up to `half` away.
-
-    Their bits do not depend on the number of threads.
-    """
-    out = np.zeros((1 if half is None else len(values), values.shape[1]))
-    _sum_up(values, len(values) if half is None else half, out)
-    return out
-
-
-@compiled
-def _sum_up(values: Array, half: int, out: Array) -> None:
-    for m in range(out.shape[0]):
-        for t in range(max(0, m - half), min(values.shape[0], m + half + 1)):
-            for item in range(values.shape[1]):
-                out[m, item] += values[t, item]
+    """Return (1, item) sums of all profiles, or (profile, item) ones of those up to `half` away."""
+    if half is None:
+        return np.asarray(values.sum(axis=0, keepdims=True))
+    return np.asarray(convolve1d(values, np.ones(2 * half + 1), axis=0, mode="constant"))
 
 
 def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:

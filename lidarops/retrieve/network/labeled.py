@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -135,7 +135,7 @@ def retrieve_network(
         exponent=[beam.exponent for beam in beams], prior=settings.prior,
         blocks=intervals // settings.block_intervals, multiplier=settings.multiplier,
     )  # fmt: skip
-    errors = _Errors.estimate(result, signals, network, settings)
+    errors = _errors(result, signals, network, settings)
     near = np.flatnonzero(network.near_crossing)
     extinction = result.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
@@ -230,46 +230,42 @@ def _bins_used(grid: Array, network: Network) -> int:
     return max(reached) + THRESHOLDS.bins_beyond
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Errors:
+class _Errors(NamedTuple):
     """(interval, crossing) errors of extinction, m-1; NaN where there is no value."""
 
     random: Array
+    """From noise and background."""
     systematic: Array
     tail_signal: Array
     """Part of the systematic error from signal in the background."""
 
-    @staticmethod
-    def estimate(
-        result: NetworkResult, signals: _Signals, network: Network, settings: NetworkSettings
-    ) -> _Errors:
-        """Return the errors from noise and background, and from the systematic effects."""
-        shape = signals.power.shape
 
-        def of_each_beam(error: Array) -> Array:
-            added = np.broadcast_to(np.nan_to_num(error), shape)
-            beams = np.flatnonzero(added.any(axis=(0, 2)))
-            causes: list[dict[int, SignalChange]] = [
-                {int(beam): SignalChange(power=added[:, beam])} for beam in beams
-            ]
-            return np.asarray(np.sqrt((result.respond(causes) ** 2).sum(axis=2)))
-
-        # The declared error of the overlap replaces the default.
-        stated = result.extinction_standard_error**2 - result.overlap_error**2
-        by_background = of_each_beam(signals.background_error[..., np.newaxis])
-        random = root_sum_square([np.sqrt(np.maximum(stated, 0.0)), by_background])
-        tail_signal = of_each_beam(signals.tail_signal[..., np.newaxis])
-        exponent = SignalChange(exponent=settings.exponent_relative_error)
-        by_exponent = result.respond([dict.fromkeys(range(network.beams), exponent)])[..., 0]
-        contributions = [
-            by_exponent,
-            lidar_ratio_error(result, network, signals.range, settings.lidar_ratio_relative_error),
-            tail_signal,
-            of_each_beam(signals.baseline),
-            result.overlap_response * result.extinction * settings.overlap_relative_error,
-            result.multiplier_error,
+def _errors(
+    result: NetworkResult, signals: _Signals, network: Network, settings: NetworkSettings
+) -> _Errors:
+    def of_each_beam(error: Array) -> Array:
+        added = np.broadcast_to(np.nan_to_num(error), signals.power.shape)
+        beams = np.flatnonzero(added.any(axis=(0, 2)))
+        causes: list[dict[int, SignalChange]] = [
+            {int(beam): SignalChange(power=added[:, beam])} for beam in beams
         ]
-        return _Errors(random, root_sum_square(contributions), tail_signal)
+        return np.asarray(np.sqrt((result.respond(causes) ** 2).sum(axis=2)))
+
+    # The declared error of the overlap replaces the default.
+    stated = result.extinction_standard_error**2 - result.overlap_error**2
+    by_background = of_each_beam(signals.background_error[..., np.newaxis])
+    tail_signal = of_each_beam(signals.tail_signal[..., np.newaxis])
+    exponent = SignalChange(exponent=settings.exponent_relative_error)
+    contributions = [
+        result.respond([dict.fromkeys(range(network.beams), exponent)])[..., 0],
+        lidar_ratio_error(result, network, signals.range, settings.lidar_ratio_relative_error),
+        tail_signal,
+        of_each_beam(signals.baseline),
+        result.overlap_response * result.extinction * settings.overlap_relative_error,
+        result.multiplier_error,
+    ]
+    random = root_sum_square([np.sqrt(np.maximum(stated, 0.0)), by_background])
+    return _Errors(random, root_sum_square(contributions), tail_signal)
 
 
 def lidar_ratio_error(
