@@ -171,8 +171,10 @@ class _Means(NamedTuple):
     scaled: list[ScaledBeam]
     beams: list[CleanBeam]
     condensed: Condensed
+    shift: Array
+    """(mean, beam, passage) errors of u by lines through curved signals."""
     curvature: Array
-    """(mean, beam, passage) what curved signals within a fit add to the variance of u."""
+    """(mean, beam, passage) what these leave in the variance of u."""
     change: Array
     """(profile, beam, 2 passage) deviations of u and I of profiles from the means."""
     ratio: Array
@@ -188,16 +190,16 @@ class _Means(NamedTuple):
         condensed = condense(means, layout)
         error, noise = np.moveaxis(condensed.curvature, -1, 0)
         curved = error**2 > THRESHOLDS.profile_noise * noise
-        condensed.beams.value[:] -= np.where(curved, error, 0.0)
         left = noise + (THRESHOLDS.curvature_left * error) ** 2
+        shift, curvature = np.where(curved, error, 0.0), np.where(curved, left, 0.0)
+        _straighten(condensed.beams, shift, curvature)
         profiles = len(scaled[0].power)
         change = np.zeros((profiles, *condensed.beams.covariance.shape[1:3]))
         for b, (each, mean) in enumerate(zip(scaled, means, strict=True)):
             deviations = each.deviations(mean)[..., np.newaxis]
             change[:, b] = product(condensed.derivatives[b], deviations)[..., 0]
         ratios = [each.noise_ratio(mean) for each, mean in zip(scaled, means, strict=True)]
-        curvature = np.where(curved, left, 0.0)
-        return cls(scaled, means, condensed, curvature, change, np.stack(ratios, axis=1))
+        return cls(scaled, means, condensed, shift, curvature, change, np.stack(ratios, axis=1))
 
     def signals(
         self, constants: Array, reach: Indices, x: Array | None = None
@@ -206,31 +208,22 @@ class _Means(NamedTuple):
 
         The constants are those given, or nearer to (profile, crossing) ln extinction.
         """
-        beams, ratio = self.condensed.beams, self.ratio
-        finite = np.isfinite(ratio)
-        reach = np.where(finite, np.minimum(reach, beams.reach), 0)
-        typical = np.where(finite, ratio, 1.0)
-        if len(beams.value) == 1:
-            typical = np.nan_to_num(median(ratio, finite), nan=1.0)[np.newaxis]
-        noisy = _with_curvature(beams, self.curvature, typical)
-        *_, constants, linear, _ = _beam_fit.linearise(noisy, constants, reach, x)
+        beams = self.condensed.beams
+        reach = np.where(np.isfinite(self.ratio), np.minimum(reach, beams.reach), 0)
+        *_, constants, linear, _ = _beam_fit.linearise(beams, constants, reach, x)
         linear.value[:] += product(linear.turn, self.change[..., np.newaxis])[..., 0]
-        linear.information[:] *= (typical / ratio)[..., np.newaxis, np.newaxis]
+        # Errors by curvature are those of the mean, and count as its noise does.
+        linear.information[:] /= self.ratio[..., np.newaxis, np.newaxis]
         energies = [each.energy for each in self.scaled]
         bins = Bins(len(reach), self.condensed, self.beams, energies)
         return _Signals(bins, beams, linear, reach), constants
 
 
-def _with_curvature(beams: Beams, curvature: Array, ratio: Array | None = None) -> Beams:
-    """Return signals with a multiple of their noise, and curved signals as noise."""
-    if ratio is None and not curvature.any():
-        return beams
-    covariance = beams.covariance.copy()
-    if ratio is not None:
-        covariance *= ratio[..., np.newaxis, np.newaxis]
+def _straighten(beams: Beams, shift: Array, curvature: Array) -> None:
+    """Correct values of curved signals in place, and add what is left of these to the noise."""
+    beams.value[:] -= shift
     place = np.arange(curvature.shape[2])
-    covariance[..., place, place] += curvature
-    return beams._replace(covariance=covariance)
+    beams.covariance[..., place, place] += curvature
 
 
 # Linear signals ----------------------------------------------------------------------------------
@@ -325,9 +318,8 @@ def condense_alone(block: Block) -> Condensed:
     condensed = condense(block.beams, block.layout, block.reach)
     scaled = [_scale(*each) for each in block.each_beam(block.reach)]
     means = _Means.of(scaled, block.layout)
-    shift = np.where(means.curvature > 0.0, means.condensed.curvature[..., 0], 0.0)
-    condensed.beams.value[:] -= shift
-    return condensed._replace(beams=_with_curvature(condensed.beams, means.curvature))
+    _straighten(condensed.beams, means.shift, means.curvature)
+    return condensed
 
 
 def bins_alone(block: Block, condensed: Condensed) -> Bins:
@@ -356,8 +348,6 @@ class _Mean(NamedTuple):
     """The mean field of a block, and the profiles about it."""
 
     of_powers: _Means
-    beams: Beams
-    """Of the mean, with curved signals as noise."""
     solution: Solution
     posterior: Posterior
     prior: Array
@@ -371,14 +361,14 @@ def _solve_mean(block: Block, reach: Indices) -> _Mean | None:
     means = _Means.of(scaled, block.layout)
     if not means.condensed.beams.reach.any():
         return None
-    curved = _with_curvature(means.condensed.beams, means.curvature)
-    constants = _beam_fit.start_constants(curved, block.lengths)
-    first = _beam_fit.fit_beams(curved, block.priors.widest, constants)
-    posterior = block.priors.posterior(curved, first)
+    beams = means.condensed.beams
+    constants = _beam_fit.start_constants(beams, block.lengths)
+    first = _beam_fit.fit_beams(beams, block.priors.widest, constants)
+    posterior = block.priors.posterior(beams, first)
     prior = posterior.expected(block.priors)
-    solution = _beam_fit.fit_beams(curved, prior, first.constants)
+    solution = _beam_fit.fit_beams(beams, prior, first.constants)
     signals, _ = means.signals(solution.constants, reach)
-    return _Mean(means, curved, solution, posterior, prior, signals)
+    return _Mean(means, solution, posterior, prior, signals)
 
 
 def _disagreeing(signals: _Signals) -> Booleans:
@@ -429,10 +419,10 @@ def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, tuple[
     signals, middle = mean.signals, mean.solution.logarithm[0]
     field = _changing(block, signals, mean, middle)
     if _difference(field.x, field.x.mean(axis=0)) < THRESHOLDS.linear_change:
-        return signals, field, _misfit(mean.beams, mean.solution, 1)
+        return signals, field, _misfit(signals.beams, mean.solution, 1)
     half = THRESHOLDS.running_profiles // 2
     means = _Means.of(mean.of_powers.scaled, block.layout, half)
-    beams = _with_curvature(means.condensed.beams, means.curvature)
+    beams = means.condensed.beams
     alone = _beam_fit.fit_beams(beams, mean.prior, _beam_fit.start_constants(beams, block.lengths))
     x, number = alone.logarithm, running_sums(np.ones_like(alone.logarithm), half)
     x, constants = np.where(np.isfinite(x), x, middle), np.nan_to_num(alone.constants)
