@@ -70,7 +70,6 @@ GUARDS: Final = (
     Guard("changes in time", off=_at(_changing_field, least_change=1e30)),
     Guard("running means", off=_at(_block_solution, linear_change=1e30)),
     Guard("profiles that disagree", off=_at(_block_solution, least_neighbourly=0.0)),
-    Guard("misfit of the mean", off=_at(extinction_field, largest_misfit=1e30)),
     Guard("default overlap error", off=_at(_block_solution, default_overlap_error=0.0)),
     Guard("curvature errors", off=_at(_block_solution, profile_noise=1e30)),
     Guard("outlying bins", off=without((outlying_bins, "search", lambda *_: None))),

@@ -164,9 +164,9 @@ class Estimates:
     left_out: Booleans
     """(profile, passage) True where the covariance of a beam is singular or missing."""
     chi_square: Array
-    """(profile, 3) of the beams alone, about the field of the block, and of its mean."""
+    """(profile, 2) of the beams alone, and about the field of the block."""
     degrees_of_freedom: Array
-    """(profile, 3) of these."""
+    """(profile, 2) of these."""
     deviation: Array
     """(profile,) standard deviation of the prior; inf without one."""
     overlap: Array
@@ -188,7 +188,7 @@ class Estimates:
         return cls(
             np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(profiles, dtype=np.bool_),
             np.zeros((profiles, layout.passages.beam.size), dtype=np.bool_),
-            np.full((profiles, 3), np.nan), np.full((profiles, 3), np.nan),
+            np.full((profiles, 2), np.nan), np.full((profiles, 2), np.nan),
             np.full(profiles, np.inf), np.zeros(shape), np.zeros(shape), np.full(shape, np.nan),
             np.zeros(shape), np.zeros(shape, dtype=np.bool_),
         )  # fmt: skip

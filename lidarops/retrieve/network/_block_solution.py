@@ -305,7 +305,7 @@ def solve_alone(block: Block) -> Estimates:
     out.settled[:] = solved.settled & (beams.reach > 0).any(axis=1)
     out.leave_out(block, beams.reach)
     chi_square, freedom = _beam_fit.compare(beams, solved.linear, solved.logarithm, beams.reach)
-    out.chi_square[:, :2], out.degrees_of_freedom[:, :2] = chi_square, freedom
+    out.chi_square[:], out.degrees_of_freedom[:] = chi_square, freedom
 
     def respond(change: Array) -> Array:
         return product(solved.covariance, solved.linear.sides(beams, change))
@@ -337,10 +337,10 @@ def solve_block(block: Block) -> Estimates:
     odd = _disagreeing(mean.signals)
     if odd.any():
         mean = _solve_mean(block, np.where(odd[:, np.newaxis], 0, block.reach)) or mean
-    signals, field, misfit = _solve_profiles(block, mean)
-    out = _assess(block, signals, field, mean, misfit)
+    signals, field, alone = _solve_profiles(block, mean)
+    out = _assess(block, signals, field, mean, alone)
     out.left_out[odd] = False
-    out.settled[:] = mean.solution.settled[0] & np.isfinite(field.x).all(axis=1) & ~odd
+    out.settled[:] = alone.settled & np.isfinite(field.x).all(axis=1) & ~odd
     return out
 
 
@@ -414,12 +414,12 @@ def _apart(information: Array, value: Array, start: Array, stop: Array) -> Array
     return np.where(known, square, np.nan)
 
 
-def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, tuple[float, float]]:
-    """Return the field of each profile, the signals that it follows, and the misfit of means."""
+def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, Solution]:
+    """Return the field of each profile, its signals, and the fit of the means of these alone."""
     signals, middle = mean.signals, mean.solution.logarithm[0]
     field = _changing(block, signals, mean, middle)
     if _difference(field.x, field.x.mean(axis=0)) < THRESHOLDS.linear_change:
-        return signals, field, _misfit(signals.beams, mean.solution, 1)
+        return signals, field, mean.solution
     half = THRESHOLDS.running_profiles // 2
     means = _Means.of(mean.of_powers.scaled, block.layout, half)
     beams = means.condensed.beams
@@ -433,15 +433,15 @@ def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, tuple[
         x = field.x
         if not _difference(x, before) >= THRESHOLDS.linear_change:
             break
-    return signals, field, _misfit(beams, alone, THRESHOLDS.running_profiles)
+    return signals, field, alone
 
 
-def _misfit(beams: Beams, solution: Solution, profiles: int) -> tuple[float, float]:
-    """Return the chi-square of means of so many profiles, and its degrees of freedom."""
-    parts = _beam_fit.compare(beams, solution.linear, solution.logarithm, beams.reach)
+def _misfit(beams: Beams, alone: Solution) -> float:
+    """Return the chi-square of means over its degrees of freedom, at least 1."""
+    parts = _beam_fit.compare(beams, alone.linear, alone.logarithm, beams.reach)
     chi_square, freedom = (part[:, 0] for part in parts)
-    chi_square, freedom = (each[freedom > 0].sum() / profiles for each in (chi_square, freedom))
-    return float(chi_square), float(freedom)
+    tested = freedom > 0
+    return max(float(chi_square[tested].sum() / max(freedom[tested].sum(), 1.0)), 1.0)
 
 
 def _difference(x: Array, other: Array) -> float:
@@ -514,7 +514,7 @@ def _steady(mean: _Mean, profiles: int) -> _Field:
 
 
 def _assess(
-    block: Block, signals: _Signals, field: _Field, mean: _Mean, misfit: tuple[float, float]
+    block: Block, signals: _Signals, field: _Field, mean: _Mean, alone: Solution
 ) -> Estimates:
     """Return the solution with its errors and tests."""
     out, measured = Estimates.of_block(block), block.layout.measured
@@ -527,15 +527,11 @@ def _assess(
     extinction = np.exp(x)
     extinction[~(seen & (variance < THRESHOLDS.largest_variance))] = np.nan
     out.extinction[:, measured] = extinction
-    chi_square, freedom = misfit
-    scale = max(chi_square / freedom, 1.0) if freedom > 0 else 1.0
-    relative = scale * variance + missing
+    relative = _misfit(signals.beams, alone) * variance + missing
     out.variance[:, measured] = extinction**2 * relative
     out.leave_out(block, reach)
-    out.chi_square[:, :2], out.degrees_of_freedom[:, :2] = _beam_fit.compare(
-        beams, signals.linear, x, reach
-    )
-    out.chi_square[:, 2], out.degrees_of_freedom[:, 2] = chi_square, freedom
+    parts = _beam_fit.compare(beams, signals.linear, x, reach)
+    out.chi_square[:], out.degrees_of_freedom[:] = parts
     out.deviation[:] = block.priors.deviation[np.argmax(mean.posterior.weight)]
     out = out.with_response(block, signals.bins.response(block.layout, field.respond))
     overlap = THRESHOLDS.default_overlap_error * out.overlap

@@ -229,10 +229,7 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
     # The error of a block is that of its field, which noise hides in a profile alone.
     doubted = uncertain if beams.together else _poorly_determined(estimate, beams.block)
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
-    improbable = _improbable(chi_square, freedom)
-    # A small misfit of the mean widens the stated errors instead.
-    improbable[:, 2] &= chi_square[:, 2] > THRESHOLDS.largest_misfit * freedom[:, 2]
-    poor = improbable.any(axis=1)
+    poor = _improbable(chi_square, freedom).any(axis=1)
     converged = estimate.settled | ~np.isfinite(estimate.chi_square[:, 1])
     too_weak = beams.weak | (estimate.left_out & beams.usable)
     quality = np.zeros(shape, dtype=np.int32)

@@ -106,9 +106,6 @@ class Thresholds(NamedTuple):
     least_neighbourly: float = 1e-9
     """Probability of the chi-square of a beam about its neighbours, below which its profile is no
     part of a block; chosen."""
-    largest_misfit: float = 9.0
-    """Chi-square of the mean over its degrees of freedom, beyond which a block is rejected; below,
-    it widens the stated errors; assumed."""
     default_overlap_error: float = 0.005
     """Relative error of the overlap at the nearest crossing of each beam, which those of others do
     not show where it is alike; products replace it by the declared one. Simulations."""
