@@ -340,7 +340,9 @@ def solve_block(block: Block) -> Estimates:
     signals, field, alone = _solve_profiles(block, mean)
     out = _assess(block, signals, field, mean, alone)
     out.left_out[odd] = False
-    out.settled[:] = alone.settled & np.isfinite(field.x).all(axis=1) & ~odd
+    # Where air moves, means only start the solution.
+    settled = alone.settled | (signals is not mean.signals)
+    out.settled[:] = settled & np.isfinite(field.x).all(axis=1) & ~odd
     return out
 
 
@@ -440,7 +442,7 @@ def _misfit(beams: Beams, alone: Solution) -> float:
     """Return the chi-square of means over its degrees of freedom, at least 1."""
     parts = _beam_fit.compare(beams, alone.linear, alone.logarithm, beams.reach)
     chi_square, freedom = (part[:, 0] for part in parts)
-    tested = freedom > 0
+    tested = alone.settled & (freedom > 0)
     return max(float(chi_square[tested].sum() / max(freedom[tested].sum(), 1.0)), 1.0)
 
 
