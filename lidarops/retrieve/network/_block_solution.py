@@ -377,7 +377,7 @@ def _disagreeing(signals: _Signals) -> Booleans:
     """Return (profile,) whether a beam is unlike those of the profiles before and after it.
 
     Signals may be anywhere between those before and after, or on the way that either of them goes.
-    What is left is compared with noise, and with what typically changes from profile to profile.
+    What is left is compared with noise, and with what typically changes between other profiles.
     """
     inside = np.arange(signals.linear.value.shape[2]) < signals.reach[..., np.newaxis]
     value = np.where(inside, signals.linear.value, np.nan)
@@ -389,9 +389,15 @@ def _disagreeing(signals: _Signals) -> Booleans:
     freedom = np.maximum(signals.reach - 1, 1)
     last = np.concatenate([np.full_like(value[:1], np.nan), value[:-1]])
     step = 0.5 * _apart(information, value, last, last) / freedom
-    typical = np.nan_to_num(median(step, np.isfinite(step) & (signals.reach > 1)))
-    limit = special.chdtri(freedom, THRESHOLDS.least_neighbourly)
-    return np.asarray((square > limit * np.maximum(typical, 1.0)).any(axis=1))
+    known = np.isfinite(step) & (signals.reach > 1)
+    above = square / special.chdtri(freedom, THRESHOLDS.least_neighbourly)
+    odd = np.asarray((above > 1.0).any(axis=1))
+    for n in np.flatnonzero(odd):
+        # In a short block, the steps to and from a bad profile would be typical.
+        others = known.copy()
+        others[n : n + 2] = False
+        odd[n] = (above[n] > np.fmax(median(step, others), 1.0)).any()
+    return odd
 
 
 def _neighbours(value: Array) -> tuple[Array, Array]:

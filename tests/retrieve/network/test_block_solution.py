@@ -68,17 +68,18 @@ def test_one_step_about_the_mean_does_not_follow_air_that_changes_much(monkeypat
     assert np.nanmean(np.abs(score) > 4.0) > 0.05
 
 
-def damaged(net, r, power, kind):
-    """Return powers with one bad beam in profile 7."""
+def damaged(net, r, power, kind, profile=7):
+    """Return powers with one bad beam in one profile."""
     power, at = power.copy(), net.on_beam(0)[1].mean()
     behind = 1.0 / (1.0 + np.exp((at - r) / 30.0))
     cloud = np.exp(-0.5 * ((r - at) / 30.0) ** 2)
     shapes = {
         "x 1.3": 1.3**behind,
+        "x 2": 2.0**behind,
         "x 5": 5.0**behind,
         "cloud": (1.0 + 10.0 * cloud) * np.exp(-2.0 * behind),
     }
-    power[7, 0] *= shapes[kind]
+    power[profile, 0] *= shapes[kind]
     return power
 
 
@@ -100,6 +101,27 @@ def test_a_bad_profile_does_not_change_the_others(build, relative, kind):
     shift = (result.extinction - clean.extinction)[others][:, near] / error
     assert np.abs(shift).max() < 0.3
     np.testing.assert_allclose(result.extinction_standard_error[others][:, near], error, rtol=0.1)
+
+
+@pytest.mark.parametrize("profiles", [2, 3, 4, 6])
+@pytest.mark.parametrize("build", [triangle, three_by_two])
+def test_a_bad_profile_makes_no_other_one_of_a_short_block_false(build, profiles):
+    """Its own two steps are most of those that are typical there."""
+    net = build()
+    r, near = grid(net), net.near_crossing
+    truth, clean = at_crossings(net, plume)[near], signals(net, r, plume)
+    scores = []
+    for bad in (0, profiles // 2, profiles - 1):
+        for seed in range(5):
+            power, variance = noisy(net, r, clean, 0.05, profiles, seed=seed, additive=1e-3)
+            power = damaged(net, r, power, "x 2", bad)
+            result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+            # Of two profiles that disagree, either may be the bad one.
+            lost = (np.arange(profiles) == bad) | (profiles == 2)
+            np.testing.assert_array_equal(result.flagged[:, near].all(axis=1), lost)
+            score = (result.extinction[:, near] - truth) / result.extinction_standard_error[:, near]
+            scores.append(score[~lost])
+    assert np.all(np.abs(np.concatenate(scores)) < 4.0)
 
 
 def test_profiles_without_a_fault_agree_with_their_neighbours():
