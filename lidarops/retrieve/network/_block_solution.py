@@ -37,7 +37,7 @@ from lidarops.retrieve.network._condensed_signals import (
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
-_FIELD_PASSES: Final = 6
+_FIELD_PASSES: Final = 16
 
 
 # Means of powers ---------------------------------------------------------------------------------
@@ -337,11 +337,9 @@ def solve_block(block: Block) -> Estimates:
     odd = _disagreeing(mean.signals)
     if odd.any():
         mean = _solve_mean(block, np.where(odd[:, np.newaxis], 0, block.reach)) or mean
-    signals, field, alone = _solve_profiles(block, mean)
+    signals, field, alone, settled = _solve_profiles(block, mean)
     out = _assess(block, signals, field, mean, alone)
     out.left_out[odd] = False
-    # Where air moves, means only start the solution.
-    settled = alone.settled | (signals is not mean.signals)
     out.settled[:] = settled & np.isfinite(field.x).all(axis=1) & ~odd
     return out
 
@@ -422,26 +420,34 @@ def _apart(information: Array, value: Array, start: Array, stop: Array) -> Array
     return np.where(known, square, np.nan)
 
 
-def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, Solution]:
-    """Return the field of each profile, its signals, and the fit of the means of these alone."""
+def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, Solution, Booleans]:
+    """Return the signals and the field of each profile, and the fit of the means of these alone.
+
+    The last array tells for which (profile or 1,) profiles the solution converged.
+    """
     signals, middle = mean.signals, mean.solution.logarithm[0]
     field = _changing(block, signals, mean, middle)
     if _difference(field.x, field.x.mean(axis=0)) < THRESHOLDS.linear_change:
-        return signals, field, mean.solution
+        return signals, field, mean.solution, mean.solution.settled
     half = THRESHOLDS.running_profiles // 2
     means = _Means.of(mean.of_powers.scaled, block.layout, half)
     beams = means.condensed.beams
     alone = _beam_fit.fit_beams(beams, mean.prior, _beam_fit.start_constants(beams, block.lengths))
     x, number = alone.logarithm, running_sums(np.ones_like(alone.logarithm), half)
     x, constants = np.where(np.isfinite(x), x, middle), np.nan_to_num(alone.constants)
+    share, left = 1.0, np.inf
     for _ in range(_FIELD_PASSES):
-        before, smooth = x, running_sums(x, half) / number
+        smooth = running_sums(x, half) / number
         signals, constants = means.signals(constants, mean.signals.reach, smooth)
         field = _changing(block, signals, mean, x.mean(axis=0), field.change)
-        x = field.x
-        if not _difference(x, before) >= THRESHOLDS.linear_change:
-            break
-    return signals, field, alone
+        last, left = left, _difference(field.x, x)
+        settled = np.sqrt(np.mean((field.x - x) ** 2, axis=1)) < THRESHOLDS.linear_change
+        if left < THRESHOLDS.linear_change:
+            return signals, field, alone, np.ones_like(settled)
+        # A front may be missed in turns on either side.
+        share *= 0.5 if left >= last else 1.0
+        x = x + share * (field.x - x)
+    return signals, field, alone, settled
 
 
 def _misfit(beams: Beams, alone: Solution) -> float:

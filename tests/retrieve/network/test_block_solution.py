@@ -58,6 +58,29 @@ def test_air_that_changes_everywhere_is_followed(build, factor):
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < (0.15 if net.beams == 3 else 0.05)
 
 
+@pytest.mark.parametrize("factor", [3.0, 4.0])
+def test_a_front_that_is_not_followed_is_flagged(factor):
+    """The profiles at a front go from side to side with each pass; some never settle."""
+    net = triangle()
+    r, near = grid(net), net.near_crossing
+    thin, dense = signals(net, r, plume), signals(net, r, lambda *at: factor * plume(*at))
+    truth = np.repeat([1.0, factor], 18)[:, None] * at_crossings(net, plume)
+    scores = []
+    for seed in range(8):
+        before = noisy(net, r, thin, 0.002, 18, seed=(seed, 0), additive=1e-3)
+        after = noisy(net, r, dense, 0.002, 18, seed=(seed, 1), additive=1e-3)
+        power = np.concatenate([before[0], after[0]])
+        variance = np.repeat([before[1], after[1]], 18, axis=0)
+        result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
+        score = (result.extinction - truth)[:, near] / result.extinction_standard_error[:, near]
+        kept = ~result.flagged[:, near]
+        scores.append(score[kept])
+        assert result.raised(NetworkQuality.POOR_FIT)[:, near][~kept].all()
+        # The air is steady up to the front.
+        assert kept[:14].all()
+    assert np.mean(np.abs(np.concatenate(scores)) > 4.0) < 0.01
+
+
 def test_one_step_about_the_mean_does_not_follow_air_that_changes_much(monkeypatch):
     net = triangle()
     r, power, variance, truth = changing(net, 10.0, 0.02)
