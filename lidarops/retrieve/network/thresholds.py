@@ -91,7 +91,7 @@ class Thresholds(NamedTuple):
     changes: tuple[float, ...] = tuple(np.geomspace(0.01, 0.32, 7).tolist())
     """Standard deviations of ln extinction by changes within a block that are tried. Larger ones
     follow the noise of triangles: errors in a drifting plume grow by a fifth; simulations."""
-    correlations: tuple[float, ...] = (0.7, 0.95, 0.995)
+    correlations: tuple[float, ...] = (0.3, 0.7, 0.95, 0.995)
     """Correlations of changes from one profile to the next that are tried; assumed."""
     least_change: float = 9.0
     """Gain in -2 ln likelihood below which a field does not change: 3 standard errors."""
