@@ -5,7 +5,7 @@
    that do not depend on their noise.
 3. All profiles together give the field of each (`_changing_field`).
 4. Where air moves, the mean of a block is too far from its profiles: each profile is linear about
-   a running mean of the powers, each changed to the field of the profile, until the field stays.
+   its own powers, or about a running mean where these are noisy, until the field stays.
 
 A profile that disagrees with its neighbours before and after it is no part of steps 1 to 4. The
 solution is linear in small changes of the signals, and states how it follows them.
@@ -429,7 +429,7 @@ def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, Soluti
     field = _changing(block, signals, mean, middle)
     if _difference(field.x, field.x.mean(axis=0)) < THRESHOLDS.linear_change:
         return signals, field, mean.solution, mean.solution.settled
-    half = THRESHOLDS.running_profiles // 2
+    half = _profiles_beside(mean.of_powers)
     means = _Means.of(mean.of_powers.scaled, block.layout, half)
     beams = means.condensed.beams
     alone = _beam_fit.fit_beams(beams, mean.prior, _beam_fit.start_constants(beams, block.lengths))
@@ -443,11 +443,25 @@ def _solve_profiles(block: Block, mean: _Mean) -> tuple[_Signals, _Field, Soluti
         last, left = left, _difference(field.x, x)
         settled = np.sqrt(np.mean((field.x - x) ** 2, axis=1)) < THRESHOLDS.linear_change
         if left < THRESHOLDS.linear_change:
-            return signals, field, alone, np.ones_like(settled)
+            settled[:] = True
+            break
         # A front may be missed in turns on either side.
         share *= 0.5 if left >= last else 1.0
         x = x + share * (field.x - x)
     return signals, field, alone, settled
+
+
+def _profiles_beside(means: _Means) -> int:
+    """Return the number of profiles before and after each one that its running mean holds.
+
+    Air that changes fast is not linear about a mean; noise is not linear about a profile alone.
+    """
+    beams, ratio = means.condensed.beams, means.ratio
+    inside = np.arange(beams.value.shape[2]) < beams.reach[0][:, np.newaxis]
+    noise = np.diagonal(beams.covariance[0], axis1=1, axis2=2)[:, : inside.shape[1]]
+    noise = (noise - means.curvature[0]) * median(ratio, np.isfinite(ratio))[:, np.newaxis]
+    alone = noise[inside].mean() < THRESHOLDS.linear_noise**2
+    return 0 if alone else THRESHOLDS.running_profiles // 2
 
 
 def _misfit(beams: Beams, alone: Solution) -> float:

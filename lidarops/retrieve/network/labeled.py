@@ -60,7 +60,7 @@ class NetworkSettings:
     """Settings of the retrieval, and relative errors for its systematic errors."""
 
     block_intervals: int
-    """Number of clock intervals that share a prior."""
+    """Number of clock intervals that are one field."""
     visibility: VisibilityDefinition
     prior: str = "block"
     multiplier: float | Literal["chosen"] | None = None

@@ -71,13 +71,9 @@ class Thresholds(NamedTuple):
     curvature_left: float = 0.1
     """Share of the error of a straight line that a polynomial may leave: 0.24 of a Gaussian layer
     of 10 m, 0.05 of one of 15 m in bins of 5 m; calculated."""
-    shared_noise: float = 4.0
-    """Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08
-    of one variance on average; normal distribution."""
     profile_noise: float = 9.0
-    """The same for a single profile, which leaves 0.005 of one variance; normal distribution."""
-    chance: float = 3.0
-    """Standard deviations by which a mean square of noise may be larger by chance; assumed."""
+    """Square of the difference of polynomial and line over its noise variance, beyond which a mean
+    signal is curved: 3 standard errors."""
 
     # The field: ablation
     stratified: tuple[float, float] = (2.0, 500.0)
@@ -98,8 +94,11 @@ class Thresholds(NamedTuple):
     linear_change: float = 0.02
     """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
     its mean; simulations."""
-    running_profiles: int = 5
+    running_profiles: int = 3
     """Profiles of a running mean; simulations."""
+    linear_noise: float = 0.015
+    """Standard deviation by noise of the logarithm of a signal at a crossing, below which a profile
+    needs no running mean; simulations."""
     neighbours: int = 3
     """Profiles before and after each one, with whose medians it is compared: one of three may be
     unlike the others; assumed."""

@@ -58,27 +58,49 @@ def test_air_that_changes_everywhere_is_followed(build, factor):
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < (0.15 if net.beams == 3 else 0.05)
 
 
-@pytest.mark.parametrize("factor", [3.0, 4.0])
-def test_a_front_that_is_not_followed_is_flagged(factor):
-    """The profiles at a front go from side to side with each pass; some never settle."""
+def unflagged_scores(air, gains, relative, seeds=8):
+    """Return errors over stated ones of unflagged values of a triangle, and the share of these."""
     net = triangle()
     r, near = grid(net), net.near_crossing
-    thin, dense = signals(net, r, plume), signals(net, r, lambda *at: factor * plume(*at))
-    truth = np.repeat([1.0, factor], 18)[:, None] * at_crossings(net, plume)
+    clean = {each: signals(net, r, lambda *at, each=each: each * air(*at)) for each in set(gains)}
+    truth = np.array(gains)[:, None] * at_crossings(net, air)[near]
     scores = []
-    for seed in range(8):
-        before = noisy(net, r, thin, 0.002, 18, seed=(seed, 0), additive=1e-3)
-        after = noisy(net, r, dense, 0.002, 18, seed=(seed, 1), additive=1e-3)
-        power = np.concatenate([before[0], after[0]])
-        variance = np.repeat([before[1], after[1]], 18, axis=0)
+    for seed in range(seeds):
+        drawn = [
+            noisy(net, r, clean[each], relative, 1, seed=(seed, n), additive=1e-3)
+            for n, each in enumerate(gains)
+        ]
+        power, variance = np.concatenate([p for p, _ in drawn]), np.array([v for _, v in drawn])
         result = retrieve_network(power, r, net, variance=variance, full_overlap_range=100.0)
-        score = (result.extinction - truth)[:, near] / result.extinction_standard_error[:, near]
-        kept = ~result.flagged[:, near]
-        scores.append(score[kept])
-        assert result.raised(NetworkQuality.POOR_FIT)[:, near][~kept].all()
-        # The air is steady up to the front.
-        assert kept[:14].all()
-    assert np.mean(np.abs(np.concatenate(scores)) > 4.0) < 0.01
+        score = (result.extinction[:, near] - truth) / result.extinction_standard_error[:, near]
+        scores.append(score[~result.flagged[:, near]])
+    found = np.concatenate(scores)
+    return found, found.size / (seeds * truth.size)
+
+
+@pytest.mark.parametrize("factor", [3.0, 4.0])
+@pytest.mark.parametrize("relative", [0.002, 0.005])
+def test_a_front_is_followed_where_noise_is_low(factor, relative):
+    """About running means, it went from side to side with each pass, and 4 percent were false."""
+    score, share = unflagged_scores(plume, [1.0] * 18 + [factor] * 18, relative)
+    assert share > 0.95
+    assert np.mean(np.abs(score) > 4.0) < 0.01
+
+
+def test_a_solution_that_does_not_converge_is_flagged(monkeypatch):
+    """One pass is too few at a front."""
+    monkeypatch.setattr(_block_solution, "_FIELD_PASSES", 1)
+    score, share = unflagged_scores(plume, [1.0] * 18 + [4.0] * 18, 0.005)
+    assert share < 0.9
+    assert np.mean(np.abs(score) > 4.0) < 0.01
+
+
+@pytest.mark.parametrize("relative", [0.01, 0.05])
+def test_air_that_changes_from_profile_to_profile_is_followed(relative):
+    gains = np.exp(0.5 * np.sin(1.3 * np.arange(PROFILES))).tolist()
+    score, share = unflagged_scores(plume, gains, relative)
+    assert share > 0.9
+    assert np.mean(np.abs(score) > 4.0) < 0.005
 
 
 def test_one_step_about_the_mean_does_not_follow_air_that_changes_much(monkeypatch):
