@@ -29,6 +29,7 @@ _CLOUDS: Final = "clouds"
 _WEAK: Final = "weak light"
 _CLASSES: Final = ("steady light", _VARIES, _CLOUDS, _WEAK)
 _MISSED: Final = "without light, missed"
+_FLAGGED: Final = "with light, flagged"
 
 
 def _light(rng: Random, profiles: int, condition: str) -> Array:
@@ -53,27 +54,31 @@ def _counts(rng: Random, light: Array, *, analog: bool, level: float) -> npt.NDA
 def scores_of_scene(cluster: int, condition: str) -> Iterator[tuple[str, float, int]]:
     """Yield what was told wrongly, how often, and among how many profiles, of a random scene.
 
-    A bright channel and one of the same laser with a thousandth of its light. From a seventh to
-    most of the profiles hold light.
+    It holds a bright channel and one of the same laser with a thousandth of its light, of which
+    either may be wrong. From a seventh to most of the profiles hold light; a tenth are gaps.
     """
     rng = np.random.default_rng((84, cluster, _CLASSES.index(condition)))
     analog = bool(rng.integers(2))
     profiles = int(rng.integers(20, 120))
     dark = rng.permutation(profiles) >= np.ceil(profiles * rng.uniform(0.15, 0.95))
+    gap = rng.random(profiles) < 0.1
     level = 10.0 ** (rng.uniform(1.0, 2.0) if analog else rng.uniform(-2.0, 2.0))
     weakest = 10.0 ** (rng.uniform(2.5, 3.5) if condition == _WEAK else rng.uniform(4.0, 5.0))
     light = weakest * _light(rng, profiles, condition)
     light[dark] = 0.0
-    channels = {
-        "bright": _counts(rng, light, analog=analog, level=level),
-        "weak": _counts(rng, 1e-3 * light, analog=False, level=0.1),
+    channels = (
+        _counts(rng, light, analog=analog, level=level),
+        _counts(rng, 1e-3 * light, analog=False, level=0.1),
+    )
+    found = {
+        str(number): light_of(*excess_over_far(np.where(gap[:, np.newaxis], 0, counts)), ~gap)
+        for number, counts in enumerate(channels)
     }
-    measured = np.ones(profiles, dtype=bool)
-    found = {name: light_of(*excess_over_far(one), measured) for name, one in channels.items()}
-    for name, told in lightless(found, dict.fromkeys(channels, "1")).items():
-        missed, wrong = np.count_nonzero(dark & ~told), np.count_nonzero(~dark & told)
-        yield f"{_MISSED}: {name} channel", float(missed), int(dark.sum())
-        yield f"with light, flagged: {name} channel", float(wrong), int((~dark).sum())
+    told = np.array(list(lightless(found, dict.fromkeys(found, "1")).values()))
+    cases = {_MISSED: dark & ~gap, _FLAGGED: ~dark & ~gap, "gaps, flagged": gap}
+    for case, those in cases.items():
+        wrong = ~told.all(axis=0) if case == _MISSED else told.any(axis=0)
+        yield case, float(np.count_nonzero(wrong & those)), int(np.count_nonzero(those))
 
 
 def light_scores(clusters: int) -> Scores:
@@ -93,9 +98,7 @@ def light_scores(clusters: int) -> Scores:
         scores[case, condition] = {
             "profiles": int(group["trials"].sum()),
             SHARE: share,
-            # Weak light shows in the sum of profiles, and does not tell of each.
-            TARGET: None
-            if condition == _WEAK and case.startswith(_MISSED)
-            else _MOST.judged(share),
+            # Channels of weak light tell nothing, which the documentation states.
+            TARGET: None if (case, condition) == (_MISSED, _WEAK) else _MOST.judged(share),
         }
     return scores

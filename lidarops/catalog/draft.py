@@ -253,6 +253,11 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield f"      - clock_offset: 0  # ? s, clock of the files minus UTC; {_clock(headers.main)}"
     yield from (f"        {line}" for line in _pointing(headers))
     yield f"        {_full_overlap(headers.look)}"
+    if headers.look is not None and headers.look.late_light is not None:
+        yield (
+            f"        # ? light begins at {headers.look.late_light:.0f} m: does the record begin"
+            " before the pulse? Ranges are too large by that, and range_offset takes at most 500 m"
+        )
     if headers.pairs:
         yield f"        # pairs that can be joined: {', '.join(headers.pairs)}"
     if len({group.layout for group in headers.signal}) > 1:

@@ -138,6 +138,8 @@ class FirstLook:
     """Elastic channels of which a Raman product has usable values."""
     full_overlap: float | None
     """m; None where signals do not show it."""
+    late_light: float | None = None
+    """m, where the light of all channels begins if that is farther than of any telescope."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,13 @@ _FALL: Final = 200.0
 """m; a signal that no longer rises stays below its maximum so long."""
 _STEP: Final = 10.0
 """m; multiples of which a full overlap is given as."""
+_LATEST: Final = 1000.0
+"""m; light of the nearest telescope begins before, unless a record begins before the pulse. Of one
+that sees only far air it begins at 750 m."""
+_LIGHT: Final = 10.0
+"""Standard errors of a bin by which three bins in a row show light."""
+_NORMAL: Final = 0.6745
+"""Median of the absolute value of a standard normal number."""
 
 Floats = NDArray[np.float64]
 
@@ -100,9 +107,13 @@ class _Look:
                 link.symlink_to((root / path).resolve())
 
     def result(self) -> FirstLook:
-        full_overlap = self._full_overlap()
+        full_overlap, begins = self._ranges()
         candidates = [name for names in self.headers.candidates for name in names]
         nitrogen = self.headers.nitrogen_channels
+        if begins is not None and begins > _LATEST:
+            reason = f"light begins at {begins:.0f} m"
+            reasons = dict.fromkeys(candidates, reason)
+            return FirstLook(len(self.files), {}, reasons, frozenset(), None, begins)
         products: dict[str, Any] = {
             "elastic": {**self.drafted["instruments"][self.key]["products"]["elastic"]}
         }
@@ -166,24 +177,31 @@ class _Look:
         frequent = [name.lower() for name, _ in flags.most_common(2)]
         return ", ".join(frequent) or next(iter(left_out), "no product")
 
-    def _full_overlap(self) -> float | None:
-        """Return the range from which no signal rises any more; None where they do not show it."""
+    def _ranges(self) -> tuple[float | None, float | None]:
+        """Return from where no signal rises any more, and where light begins, m.
+
+        None where signals do not show it.
+        """
         # The last one is analog where there is such a record, which counts no pile-up.
         channels = [names[-1] for names in self.headers.candidates]
         record = self._processed({"signal": {"channels": channels}}, 0.0)
         ends: dict[str, list[float]] = defaultdict(list)
+        begins: list[float] = []
         for channel, path in self._made(record, "signal"):
             with open_product(path, ("signal", "range")) as product:
                 known = np.isfinite(product["signal"].values)
                 total = np.where(known, product["signal"].values, 0.0).sum(axis=0)
                 mean = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
-                end = rise_ends(np.asarray(product["range"].values, float), mean)
-            if end is not None:
+                ranges = np.asarray(product["range"].values, float)
+            if (end := rise_ends(ranges, mean)) is not None:
                 ends[channel].append(end)
+            if (begin := light_begins(ranges, mean)) is not None:
+                begins.append(begin)
+        earliest = min(begins, default=None)
         if not ends:
-            return None
+            return None, earliest
         farthest = max(float(np.median(found)) for found in ends.values())
-        return float(np.ceil(farthest / _STEP) * _STEP)
+        return float(np.ceil(farthest / _STEP) * _STEP), earliest
 
 
 def _sample(headers: InstrumentHeaders) -> list[str]:
@@ -229,6 +247,27 @@ def rise_ends(ranges: Floats, signal: Floats) -> float | None:
         if np.isfinite(smooth[k]) and smooth[k] > 0.0 and beyond.size and smooth[k] >= beyond.max():
             return float(place[k])
     return None
+
+
+def light_begins(ranges: Floats, signal: Floats) -> float | None:
+    """Return from where a range-corrected signal shows light, m; None where it shows none.
+
+    Parameters
+    ----------
+    ranges : (range,) float
+        m.
+    signal : (range,) float
+        NaN where missing or saturated, which is light.
+    """
+    power = signal / np.square(ranges)
+    far = power[-power.size // 4 :]
+    far = far[np.isfinite(far)]
+    if not far.size:
+        return None
+    noise = np.median(np.abs(np.diff(far))) / (_NORMAL * np.sqrt(2.0))
+    light = ~(power <= np.median(far) + _LIGHT * noise)
+    first = np.flatnonzero(light[:-2] & light[1:-1] & light[2:])
+    return float(ranges[first[0]]) if first.size else None
 
 
 def _usable_share(path: Path) -> float:

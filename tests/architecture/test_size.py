@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_407,
-    "lines of code alone": 45_995,
+    "lines": 70_443,
+    "lines of code alone": 46_018,
     "modules": 279,
     "dataclasses": 250,
-    "lines of dataclasses": 6_686,
+    "lines of dataclasses": 6_688,
     "tuning numbers": 220,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 5_789,
+    "lines of the largest package": 5_828,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 61, "functions": 589, "changes": 215},

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
 from lidarops.run.archive import reprocess
-from lidarops.run.first_look import rise_ends
+from lidarops.run.first_look import light_begins, rise_ends
 
 
 def drafted(folder: Path, campaign: Path) -> tuple[Campaign, str]:
@@ -49,6 +49,38 @@ def test_a_signal_that_rises_to_the_end_shows_no_overlap() -> None:
     ranges = np.arange(3.75, 12_000.0, 7.5)
     assert rise_ends(ranges, ranges**2) is None
     assert rise_ends(ranges, np.full(ranges.size, np.nan)) is None
+
+
+@given(
+    pulse=st.floats(0.0, 3000.0),
+    blind=st.floats(0.0, 800.0),
+    brightest=st.floats(3.0, 6.0),
+    seed=st.integers(0, 100),
+)
+def test_light_begins_after_the_pulse_and_the_blind_range(
+    pulse: float, blind: float, brightest: float, seed: int
+) -> None:
+    ranges = np.arange(3.75, 12_000.0, 7.5)
+    true = ranges - pulse - blind
+    light = np.where(true > 0.0, (300.0 / np.maximum(ranges - pulse, 300.0)) ** 2, 0.0)
+    noise = np.random.default_rng(seed).standard_normal(ranges.size)
+    begin = light_begins(ranges, ranges**2 * (10.0**brightest * light + noise))
+    assert begin is not None
+    assert abs(begin - pulse - blind) <= 15.0
+    assert light_begins(ranges, ranges**2 * noise) is None
+
+
+def test_nothing_is_proposed_of_records_that_begin_before_the_pulse(
+    data_root: Path, tmp_path: Path
+) -> None:
+    """The pulse is 1875 m after their start."""
+    case = data_root / "cases/pre_trigger"
+    if not case.is_dir():
+        pytest.skip("no records that begin before the pulse")
+    campaign, text = drafted(case, tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert lidar.products.model_dump(exclude_none=True).keys() == {"signal"}
+    assert "? light begins at 1967 m: does the record begin before the pulse?" in text
 
 
 def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ class NetworkSettings:
     `extinction_field.retrieve_network`."""
     exponent_relative_error: float = 0.1
     """Relative error of the exponent m."""
-    lidar_ratio_relative_error: float = 0.02
+    lidar_ratio_relative_error: float = 0.07
     """Relative error of the constant between backscatter^m and extinction at one crossing, against
     the others."""
     overlap_relative_error: float = 0.003

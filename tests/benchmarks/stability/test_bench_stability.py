@@ -388,20 +388,18 @@ def test_networks_have_the_same_values_each_time():
     assert np.array_equal(first, second, equal_nan=True)
 
 
-def test_profiles_without_light_are_counted_where_they_are_missed(monkeypatch):
-    scores = random_light.light_scores(5)
-    judged = [one["target"] for one in scores.values() if one["target"] is not None]
-    assert len(judged) == len(scores) - 2
-    assert all(one.met for one in judged)
-    none = {"bright": np.zeros(200, dtype=bool), "weak": np.ones(200, dtype=bool)}
-    monkeypatch.setattr(
-        random_light,
-        "lightless",
-        lambda found, _: {name: none[name][: one.measured.size] for name, one in found.items()},
-    )
+@pytest.mark.parametrize("told", [False, True])
+def test_profiles_without_light_are_counted_where_they_are_missed(monkeypatch, told):
+    right = random_light.light_scores(5)
+    assert [score["target"] is None for score in right.values()].count(True) == 1
+    assert {score["share"].value for score in right.values() if score["target"]} == {0.0}
+
+    def all_alike(found, _):
+        return {name: np.full_like(one.measured, told) for name, one in found.items()}
+
+    monkeypatch.setattr(random_light, "lightless", all_alike)
     for (case, _), score in random_light.light_scores(2).items():
-        wrong = ("missed" in case) == ("bright" in case)
-        assert score["share"].value == float(wrong), case
+        assert score["share"].value == float(told == ("flagged" in case)), case
 
 
 def test_the_cost_of_all_parts_is_a_target():
