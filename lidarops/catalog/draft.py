@@ -26,7 +26,7 @@ from lidarops.catalog.folder import (
 from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
-from lidarops.raw.formats import raw_formats
+from lidarops.raw.formats import time_in_path
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
 from lidarops.records import ChannelLayout, DetectionMode, file_channels, is_glued
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
@@ -290,7 +290,7 @@ def _clock(group: FileGroup) -> str:
     away = [
         (header.start - named).total_seconds()
         for path, header in zip(group.files, group.headers, strict=True)
-        if (named := raw_formats()[header.format].named_time(path.rpartition("/")[2]))
+        if (named := time_in_path(path, header.format))
     ]
     hours = round(median(away) / 1800.0) / 2.0 if away else 0.0
     if not hours:

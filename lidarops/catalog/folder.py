@@ -60,7 +60,7 @@ _WORDS: Final = {
     Purpose.POLARISATION: r"dp|(depol|pol) ?cal|calibration|cal|plus ?45|minus ?45|[pm]45|45[pm]",
     Purpose.BACKGROUND: r"background|bkg",
 }
-"""Words of folders, digits may follow; those of two letters are words of folders only."""
+"""Words that state a purpose: in folders, and in the letters of file names if longer than two."""
 _TURNED: Final = re.compile(r"(?<!\d)[+-]45(?!\d)")
 """Angle of a polariser or plate, as in ``DP+45``."""
 

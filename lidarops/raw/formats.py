@@ -171,6 +171,11 @@ def raw_formats() -> Mapping[str, RawFormat]:
     return MappingProxyType(Registry((known for _, known in formats), noun, RawFormatError))
 
 
+def time_in_path(path: str, known: str) -> datetime | None:
+    """Return the time that the name of a file of a known format tells, by its clock; or None."""
+    return raw_formats()[known].named_time(path.rpartition("/")[2])
+
+
 def parse_raw_header(head: bytes, *, file: str, size: int, known: str = "") -> RawHeader:
     """Return the header at the start of `head`.
 

@@ -23,6 +23,7 @@ from lidarops.catalog.folder import FirstLook, FolderContents, InstrumentHeaders
 from lidarops.errors import LidarOpsError, SceneError
 from lidarops.netcdf.read import open_product
 from lidarops.records import RunRecord, file_channels, is_glued
+from lidarops.retrieve.signal.light import MEDIAN_OF_NORMAL
 from lidarops.run.archive import bring_up_to_date
 
 _MOST_FILES: Final = 96
@@ -44,8 +45,6 @@ _LATEST: Final = 1000.0
 that sees only far air it begins at 750 m."""
 _LIGHT: Final = 10.0
 """Standard errors of a bin by which three bins in a row show light."""
-_NORMAL: Final = 0.6745
-"""Median of the absolute value of a standard normal number."""
 
 Floats = NDArray[np.float64]
 
@@ -208,17 +207,13 @@ def _sample(headers: InstrumentHeaders) -> list[str]:
     """Return some signal files of the day with most hours, equally many of each hour."""
     hours: dict[datetime, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
     group = headers.main
-    for path, header in sorted(zip(group.files, group.headers, strict=True), key=_start):
+    files = zip(group.files, group.headers, strict=True)
+    for path, header in sorted(files, key=lambda one: one[1].start):
         midnight = header.start.replace(hour=0, minute=0, second=0, microsecond=0)
         hours[midnight][header.start.hour].append(path)
     of_day = max(hours.values(), key=lambda day: (len(day), sum(map(len, day.values()))))
     each = max(_MOST_FILES // len(of_day), 1)
     return [path for paths in of_day.values() for path in paths[:each]]
-
-
-def _start(pair: tuple[str, Any]) -> datetime:
-    start: datetime = pair[1].start
-    return start
 
 
 def rise_ends(ranges: Floats, signal: Floats) -> float | None:
@@ -264,7 +259,7 @@ def light_begins(ranges: Floats, signal: Floats) -> float | None:
     far = far[np.isfinite(far)]
     if not far.size:
         return None
-    noise = np.median(np.abs(np.diff(far))) / (_NORMAL * np.sqrt(2.0))
+    noise = np.median(np.abs(np.diff(far))) / (MEDIAN_OF_NORMAL * np.sqrt(2.0))
     light = ~(power <= np.median(far) + _LIGHT * noise)
     first = np.flatnonzero(light[:-2] & light[1:-1] & light[2:])
     return float(ranges[first[0]]) if first.size else None

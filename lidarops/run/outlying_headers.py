@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 from statistics import median
 from typing import Any, Final, NamedTuple
 
-from lidarops.raw.formats import raw_formats
+from lidarops.raw.formats import time_in_path
 from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import FEWEST_ALIKE, Granule, Role, Status, day_of
 
@@ -199,7 +199,7 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[
     away: dict[int, float] = {}
     longest = 0.0
     for place, granule in enumerate(around):
-        named = raw_formats()[granule.format].named_time(granule.path.rpartition("/")[2])
+        named = time_in_path(granule.path, granule.format)
         if named and granule.start and granule.stop:
             away[place] = (granule.start - named).total_seconds() + ahead(granule)
             longest = max(longest, (granule.stop - granule.start).total_seconds())

@@ -28,7 +28,7 @@ MOST = {
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 5_828,
+    "lines of the largest package": 5_823,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 61, "functions": 589, "changes": 215},

@@ -17,6 +17,9 @@ from lidarops.cli import app
 from lidarops.run.archive import reprocess
 from lidarops.run.first_look import light_begins, rise_ends
 
+RANGES = np.arange(3.75, 12_000.0, 7.5)
+"""m."""
+
 
 def drafted(folder: Path, campaign: Path) -> tuple[Campaign, str]:
     shown = CliRunner().invoke(app, ["init", str(folder), str(campaign)])
@@ -34,21 +37,19 @@ def test_a_signal_stops_rising_where_overlap_gains_less_than_air_takes(
     full: float, extinction: float, power: float, noise: float
 ) -> None:
     """At full overlap, or before it where the logarithm of r^p falls with the air."""
-    ranges = np.arange(3.75, 12_000.0, 7.5)
-    overlap = np.minimum(ranges / full, 1.0) ** power
-    signal = overlap * np.exp(-(ranges / 8000.0) - 2.0 * extinction * ranges)
-    signal += noise * np.random.default_rng(1).standard_normal(ranges.size)
-    signal[ranges < 50.0] = np.nan
-    end = rise_ends(ranges, signal)
+    overlap = np.minimum(RANGES / full, 1.0) ** power
+    signal = overlap * np.exp(-(RANGES / 8000.0) - 2.0 * extinction * RANGES)
+    signal += noise * np.random.default_rng(1).standard_normal(RANGES.size)
+    signal[RANGES < 50.0] = np.nan
+    end = rise_ends(RANGES, signal)
     assert end is not None
     expected = min(full, power / (1.0 / 8000.0 + 2.0 * extinction))
     assert 0.8 * expected - 70.0 <= end <= 1.1 * expected + 100.0
 
 
 def test_a_signal_that_rises_to_the_end_shows_no_overlap() -> None:
-    ranges = np.arange(3.75, 12_000.0, 7.5)
-    assert rise_ends(ranges, ranges**2) is None
-    assert rise_ends(ranges, np.full(ranges.size, np.nan)) is None
+    assert rise_ends(RANGES, RANGES**2) is None
+    assert rise_ends(RANGES, np.full(RANGES.size, np.nan)) is None
 
 
 @given(
@@ -60,14 +61,13 @@ def test_a_signal_that_rises_to_the_end_shows_no_overlap() -> None:
 def test_light_begins_after_the_pulse_and_the_blind_range(
     pulse: float, blind: float, brightest: float, seed: int
 ) -> None:
-    ranges = np.arange(3.75, 12_000.0, 7.5)
-    true = ranges - pulse - blind
-    light = np.where(true > 0.0, (300.0 / np.maximum(ranges - pulse, 300.0)) ** 2, 0.0)
-    noise = np.random.default_rng(seed).standard_normal(ranges.size)
-    begin = light_begins(ranges, ranges**2 * (10.0**brightest * light + noise))
+    true = RANGES - pulse - blind
+    light = np.where(true > 0.0, (300.0 / np.maximum(RANGES - pulse, 300.0)) ** 2, 0.0)
+    noise = np.random.default_rng(seed).standard_normal(RANGES.size)
+    begin = light_begins(RANGES, RANGES**2 * (10.0**brightest * light + noise))
     assert begin is not None
     assert abs(begin - pulse - blind) <= 15.0
-    assert light_begins(ranges, ranges**2 * noise) is None
+    assert light_begins(RANGES, RANGES**2 * noise) is None
 
 
 def test_nothing_is_proposed_of_records_that_begin_before_the_pulse(

@@ -1,7 +1,7 @@
-"""Which profiles hold no light of the laser, told by all channels that the files hold.
+"""Profiles without laser light, found from all channels of the files.
 
-A channel tells where its profiles show light by far: one that shows none then has none. Noise of a
-weak channel alone tells nothing, and would reject its profiles one by one.
+Where most profiles of a channel show strong light, one that shows none has none. A weak channel
+cannot decide this by itself: its noise would reject single profiles.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _WINDOWS: Final = 40
 """Windows of equal length into which the bins are cut, the last of which are the far range."""
 _FAR: Final = 8
 """Windows of the far range, whose median is the level without light: a target in it is light."""
-_NORMAL: Final = 0.6745
+MEDIAN_OF_NORMAL: Final = 0.6745
 """Median of the absolute value of a standard normal number."""
 _OF_MEDIAN: Final = 1.5
 """Variance of the median of the far windows over that of their mean."""
@@ -110,7 +110,7 @@ def excess_over_far(counts: npt.NDArray[Any]) -> tuple[Array, Array, Booleans]:
     noise[(used == used[:, :1]).all(axis=1) & ~blank] = np.nan
     excess = used.reshape(number, _WINDOWS, length).sum(axis=2) - length * level
     halves = far[:, : 2 * _FAR * (length // 2)].reshape(number, 2 * _FAR, -1)
-    away = np.median(np.abs(halves.mean(axis=2) - level), axis=1, keepdims=True) / _NORMAL
+    away = np.median(np.abs(halves.mean(axis=2) - level), axis=1, keepdims=True) / MEDIAN_OF_NORMAL
     # Of white noise, one in ten thousand medians of sixteen is so large.
     slow = np.square(away) * halves.shape[2] > _SLOW**2 * noise
     of_sum = np.where(slow, np.square(length * away), noise * length)
