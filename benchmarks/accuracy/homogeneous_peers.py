@@ -18,7 +18,7 @@ from benchmarks.accuracy.homogeneous_cases import Estimates, PathSolver, Scenari
 from benchmarks.harness.figure import Array
 
 KILOMETRE: Final = 1e3
-JIT: Final = "LM, numba"
+_UNKNOWNS: Final = 3
 PROJECTION: Final = "variable projection, numba"
 CURVE_FIT: Final = "scipy curve_fit"
 SLOW: Final = frozenset({CURVE_FIT})
@@ -30,7 +30,7 @@ _START_EXTINCTIONS: Final = np.geomspace(3e-3, 10.0, 40)
 
 def iterative_peers() -> dict[str, PathSolver]:
     """Return the iterative solvers by name."""
-    return {JIT: _by_levenberg_marquardt, PROJECTION: _by_projection, CURVE_FIT: _by_scipy}
+    return {PROJECTION: _by_projection, CURVE_FIT: _by_scipy}
 
 
 def start(power: Any, scenario: Scenario) -> Array:
@@ -44,15 +44,6 @@ def start(power: Any, scenario: Scenario) -> Array:
     extinction = float(_START_EXTINCTIONS[np.argmax(explained)])
     unknowns, _ = _project(mean[np.newaxis], (ratio, depth), extinction)
     return np.asarray(unknowns[0])
-
-
-def _by_levenberg_marquardt(power: Any, scenario: Scenario) -> Estimates:
-    """Solve by `fit_levenberg_marquardt`."""
-    ratio, depth = _geometry(scenario)
-    unknowns = np.empty((len(power), _UNKNOWNS))
-    covariance = np.empty((len(power), _UNKNOWNS, _UNKNOWNS))
-    fit_levenberg_marquardt(power, ratio, depth, start(power, scenario), unknowns, covariance)
-    return _estimates(unknowns, covariance)
 
 
 def _by_projection(power: Any, scenario: Scenario) -> Estimates:
@@ -107,105 +98,6 @@ def _estimates(unknowns: Array, covariance: Array) -> Estimates:
         flagged=failed,
         rejected=failed,
     )
-
-
-# A Levenberg-Marquardt fit, one profile at a time: the usual fast solver ----------------------
-
-_UNKNOWNS: Final = 3
-_MOST: Final = 200
-"""Most steps of a fit."""
-_TOLERANCE: Final = 1e-10
-"""Relative decrease of the sum of squares below which a fit has converged."""
-_DAMPING: Final = 1e-3
-_LARGEST_DAMPING: Final = 1e12
-
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_compiled
-def _normal_equations(
-    power: Any, ratio: Array, depth: Array, unknowns: Array, matrix: Array, side: Array
-) -> float:
-    """Fill the normal equations at these unknowns, and return the sum of squares."""
-    s1 = s2 = s3 = s4 = s5 = r0 = r1 = r2 = squares = 0.0
-    for i in range(depth.size):
-        first = ratio[i] * np.exp(-2.0 * unknowns[2] * depth[i])
-        second = -2.0 * unknowns[1] * depth[i] * first
-        residual = power[i] - unknowns[0] - unknowns[1] * first
-        s1 += first
-        s2 += second
-        s3 += first * first
-        s4 += first * second
-        s5 += second * second
-        r0 += residual
-        r1 += first * residual
-        r2 += second * residual
-        squares += residual * residual
-    matrix[0, 0], matrix[1, 1], matrix[2, 2] = depth.size, s3, s5
-    matrix[0, 1] = matrix[1, 0] = s1
-    matrix[0, 2] = matrix[2, 0] = s2
-    matrix[1, 2] = matrix[2, 1] = s4
-    side[0], side[1], side[2] = r0, r1, r2
-    return squares
-
-
-@_compiled
-def _inverse(matrix: Array, damping: float, inverse: Array) -> None:
-    """Invert the damped symmetric matrix by its cofactors."""
-    grown = 1.0 + damping
-    a, d, f = matrix[0, 0] * grown, matrix[1, 1] * grown, matrix[2, 2] * grown
-    b, c, e = matrix[0, 1], matrix[0, 2], matrix[1, 2]
-    inverse[0, 0] = d * f - e * e
-    inverse[0, 1] = inverse[1, 0] = c * e - b * f
-    inverse[0, 2] = inverse[2, 0] = b * e - c * d
-    inverse[1, 1] = a * f - c * c
-    inverse[1, 2] = inverse[2, 1] = b * c - a * e
-    inverse[2, 2] = a * d - b * b
-    inverse /= a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
-
-
-@_compiled
-def fit_levenberg_marquardt(
-    power: Any, ratio: Array, depth: Array, start: Array, unknowns: Array, covariance: Array
-) -> None:
-    """Fit background, signal at the start and extinction to profiles of unit variance.
-
-    Parameters
-    ----------
-    power : (profile, range) float
-    ratio : (range,) float64
-        Square of the first range over the range.
-    depth : (range,) float64
-        Range less the first range, in the inverse unit of the extinction.
-    start : (3,) float64
-        Start values of every fit.
-    unknowns : (profile, 3) float64
-        Filled; NaN where a bin is not finite.
-    covariance : (profile, 3, 3) float64
-        Filled with the inverse normal matrix at the solution.
-    """
-    matrix, side = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    trial_matrix, trial_side = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    for k in range(power.shape[0]):
-        solution, inverse = unknowns[k], covariance[k]
-        solution[:] = start
-        squares = _normal_equations(power[k], ratio, depth, solution, matrix, side)
-        damping, steps, done = _DAMPING, 0, not np.isfinite(squares)
-        while not done and steps < _MOST and damping <= _LARGEST_DAMPING:
-            _inverse(matrix, damping, inverse)
-            trial = solution + inverse @ side
-            new = _normal_equations(power[k], ratio, depth, trial, trial_matrix, trial_side)
-            steps += 1
-            if new <= squares:
-                done = squares - new <= _TOLERANCE * squares
-                damping, squares = 0.1 * damping, new
-                solution[:], matrix[:], side[:] = trial, trial_matrix, trial_side
-            else:
-                damping *= 10.0
-        _inverse(matrix, 0.0, inverse)
-        if not np.isfinite(squares):
-            solution[:] = np.nan
 
 
 # Variable projection: the strongest simple peer ----------------------------------------------
@@ -278,7 +170,7 @@ def _sums(power: Any, ratio: Array, depth: Array, sigma: float, shape: Array) ->
     return f, d, ff, fd, dd, yf, yd
 
 
-@_compiled
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_variable_projection(
     power: Any, ratio: Array, depth: Array, start: float, unknowns: Array, covariance: Array
 ) -> None:

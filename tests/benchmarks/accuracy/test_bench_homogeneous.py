@@ -22,7 +22,7 @@ from benchmarks.accuracy.homogeneous_cases import (
     methods,
     scenarios,
 )
-from benchmarks.accuracy.homogeneous_peers import JIT, iterative_peers
+from benchmarks.accuracy.homogeneous_peers import PROJECTION, iterative_peers
 from benchmarks.harness.results import Effort, Study
 from benchmarks.harness.timing import CPU_TIME, READ, least_times
 from benchmarks.throughput import retrievals
@@ -157,11 +157,11 @@ def test_every_peer_agrees_with_the_direct_fit(path):
 def test_the_compiled_fit_rejects_profiles_that_cannot_converge():
     power = PATH.powers(3)
     power[1] = np.nan
-    solved = iterative_peers()[JIT](power, PATH)
-    alone = iterative_peers()[JIT](power[:1], PATH)
+    solved = iterative_peers()[PROJECTION](power, PATH)
+    alone = iterative_peers()[PROJECTION](power[:1], PATH)
     assert solved.rejected.tolist() == [False, True, False]
     # They start from the mean of other profiles.
-    assert solved.values["extinction"][0] == pytest.approx(alone.values["extinction"][0], rel=1e-6)
+    assert solved.values["extinction"][0] == pytest.approx(alone.values["extinction"][0], rel=1e-3)
 
 
 def test_peers_start_from_the_data_alone():
@@ -200,7 +200,7 @@ def test_scores_of_known_errors():
 
 
 def test_least_squares_reaches_the_bound():
-    solvers = {"direct": methods()["direct"], JIT: iterative_peers()[JIT]}
+    solvers = {"direct": methods()["direct"], PROJECTION: iterative_peers()[PROJECTION]}
     for seed, path in enumerate(scenarios(quick=True)):
         power = path.powers(200, seed)
         for (method, solver), quantity in product(solvers.items(), QUANTITIES):
