@@ -9,10 +9,13 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import math
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +26,7 @@ from lidarops.records import InputRecord, Role
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.errors import BACKSCATTER_CAUSES, EXTINCTION_CAUSES, RANDOM
 from lidarops.retrieve.raman.flags import RamanQuality
+from lidarops.system.files import opened_regular
 
 Array = npt.NDArray[np.float64]
 
@@ -88,7 +92,9 @@ _WIDEST: Final = 5000.0
 """m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
 _LARGEST: Final = 100_000_000
-"""Bytes; largest file that is read."""
+"""Bytes; largest file, and largest variable in memory, that is read."""
+# Not annotated by xarray. Unlike a dataset, it reads nothing of coordinates when it opens a file.
+_STORE: Final[Any] = xr.backends.NetCDF4DataStore
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,9 +415,10 @@ def _read(folder: Path, name: str) -> bytes:
     path = folder / name
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
-        small = inside and path.stat().st_size <= _LARGEST
-        if small:
-            return path.read_bytes()
+        if inside:
+            with opened_regular(path) as stream:
+                if os.fstat(stream.fileno()).st_size <= _LARGEST:
+                    return stream.read()
     # RuntimeError: a loop of links; ValueError: an invalid file name.
     except (OSError, RuntimeError, ValueError) as error:
         raise AncillaryError(
@@ -531,11 +538,22 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
 
 def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
     try:
-        with xr.open_dataset(path, decode_times=False) as opened:
+        with closing(_STORE.open(path)) as store:
+            stored, attributes = store.load()
+            variables, *_ = xr.conventions.decode_cf_variables(
+                stored, attributes, decode_times=False
+            )
+            numbers = {str(n): one for n, one in variables.items() if one.dtype.kind in "iuf"}
+            for name, one in numbers.items():
+                # HDF5 reads whole chunks.
+                chunk = math.prod(one.encoding.get("chunksizes") or ())
+                if one.dtype.itemsize * max(one.size, chunk) > _LARGEST:
+                    raise AncillaryError("is larger than any profile", file=file, field=name)
             return {
-                str(name): (str(variable.attrs.get("units", "")), variable.values.astype(float))
-                for name, variable in opened.variables.items()
-                if variable.dtype.kind in "iuf"
+                name: (str(one.attrs.get("units", "")), one.values.astype(float))
+                for name, one in numbers.items()
             }
+    except AncillaryError:
+        raise
     except (OSError, ValueError, RuntimeError, TypeError) as error:
         raise AncillaryError("cannot be read as NetCDF", file=file) from error

@@ -10,6 +10,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import IO, Final
 
@@ -23,8 +24,9 @@ COPIES: Final = "files"
 """Folder of the site with copies of the products."""
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file.
+@contextmanager
+def opened_regular(path: Path) -> Iterator[BufferedReader]:
+    """Open a file to read it.
 
     Raises
     ------
@@ -35,6 +37,12 @@ def sha256_of(path: Path) -> str:
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as stream:
         if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
             raise OSError(errno.EINVAL, "is no regular file")
+        yield stream
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a regular file; raise OSError as `opened_regular` does."""
+    with opened_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

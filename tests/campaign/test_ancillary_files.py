@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -359,6 +360,25 @@ def _two_dimensions(folder: Path) -> str:
     return "o.nc"
 
 
+def _pipe(folder: Path) -> str:
+    os.mkfifo(folder / "o.csv")
+    return "o.csv"
+
+
+def _bomb(chunk: int, values: int) -> Callable[[Path], str]:
+    """Return the function that writes a file of some kB whose variable is huge in memory."""
+
+    def write(folder: Path) -> str:
+        with netCDF4.Dataset(folder / "o.nc", "w") as file:
+            file.createDimension("range", None)
+            file.createVariable("range", "f8", "range", chunksizes=[2])[values - 1] = 1.0
+            file.createVariable("overlap", "f8", "range", chunksizes=[chunk])
+        assert (folder / "o.nc").stat().st_size < 10_000
+        return "o.nc"
+
+    return write
+
+
 _GARBAGE = np.random.default_rng(0).bytes(5000)
 REFUSED = [
     pytest.param(lambda _: "none.csv", "none.csv: cannot be read", id="absent"),
@@ -366,6 +386,9 @@ REFUSED = [
     pytest.param(_escape, "lies outside", id="dots"),
     pytest.param(_link, "lies outside", id="link"),
     pytest.param(_loop, "o.csv", id="loop"),
+    pytest.param(_pipe, "is no regular file", id="pipe"),
+    pytest.param(_bomb(2, 10**10), "range: is larger than any", id="bomb"),
+    pytest.param(_bomb(10**8, 2), "overlap: is larger than any", id="bomb of a chunk"),
     pytest.param(lambda _: "a\0b", "cannot be read", id="nul"),
     pytest.param(_text(_GARBAGE), "not text", id="garbage"),
     pytest.param(_text(_GARBAGE, "o.nc"), "cannot be read as NetCDF", id="garbage.nc"),
