@@ -536,6 +536,15 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
     }
 
 
+def _column(stored: xr.Variable, file: str, name: str) -> tuple[str, Array]:
+    """Return the unit and the values of a variable."""
+    # HDF5 reads whole chunks.
+    chunk = math.prod(stored.encoding.get("chunksizes") or ())
+    if stored.dtype.itemsize * max(stored.size, chunk) > _LARGEST:
+        raise AncillaryError("is larger than any profile", file=file, field=name)
+    return str(stored.attrs.get("units", "")), stored.values.astype(float)
+
+
 def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
     try:
         with closing(_STORE.open(path)) as store:
@@ -544,15 +553,7 @@ def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
                 stored, attributes, decode_times=False
             )
             numbers = {str(n): one for n, one in variables.items() if one.dtype.kind in "iuf"}
-            for name, one in numbers.items():
-                # HDF5 reads whole chunks.
-                chunk = math.prod(one.encoding.get("chunksizes") or ())
-                if one.dtype.itemsize * max(one.size, chunk) > _LARGEST:
-                    raise AncillaryError("is larger than any profile", file=file, field=name)
-            return {
-                name: (str(one.attrs.get("units", "")), one.values.astype(float))
-                for name, one in numbers.items()
-            }
+            return {name: _column(one, file, name) for name, one in numbers.items()}
     except AncillaryError:
         raise
     except (OSError, ValueError, RuntimeError, TypeError) as error:

@@ -7,6 +7,7 @@ import re
 import shutil
 import sqlite3
 import tempfile
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from datetime import UTC, datetime
@@ -238,6 +239,12 @@ _SECRET: Final = re.compile("passw|secret")
 """Names of passwords in the query of a URL: password, passwd, sslpassword, oauth_client_secret."""
 WITHOUT_PASSWORD: Final = rf"^(?![^:]*://[^/:]*:[^@]+@)(?!.*[?&][^=&]*(?:{_SECRET.pattern})[^=&]*=)"
 """Regular expression of URLs without password, for JSON schemas."""
+_LOCK_SCHEMA: Final = "SELECT pg_advisory_xact_lock(7235106412)"
+"""The number is arbitrary."""
+_PATIENCE: Final = 30
+"""s, for which SQLite waits for another process."""
+_PAUSE: Final = 0.02
+"""s."""
 _BROKEN: Final = ("malformed", "not a database", "decode")
 """Words in the messages of SQLite about a damaged file."""
 
@@ -436,16 +443,18 @@ class Database:
         return self._url.set(database=file.absolute().as_uri(), query={"uri": "true", **query})
 
     def _settle_schema(self, connection: sa.Connection) -> None:
-        newest = sa.select(sa.func.max(SCHEMA.c.version))
-        known = sa.inspect(connection).has_table(SCHEMA.name)
-        version = connection.scalar(newest) if known else None
-        # Also where a process was killed before it had written the version.
+        version = _version(connection)
         if version is None:
             if not self._create:
                 raise self._absent()
+            # Waits for a process that is making it, and ends with the transaction.
+            connection.exec_driver_sql("BEGIN IMMEDIATE" if self._sqlite else _LOCK_SCHEMA)
+            version = _version(connection)
+        # Also where a process was killed before it had written the version.
+        if version is None:
             METADATA.create_all(connection)
-            connection.execute(self.upsert(SCHEMA, replacing=False), {"version": SCHEMA_VERSION})
-            version = connection.scalar(newest)
+            version = SCHEMA_VERSION
+            connection.execute(sa.insert(SCHEMA), {"version": version})
         if version != SCHEMA_VERSION:
             raise CatalogError(
                 f"is a catalog of schema version {version}; this lidarops needs {SCHEMA_VERSION}",
@@ -526,6 +535,14 @@ def holds_password(url: str) -> bool:
     return bool(parsed.password) or any(map(_SECRET.search, parsed.query))
 
 
+def _version(connection: sa.Connection) -> int | None:
+    """Return the version of the schema; None where there is none yet."""
+    if not sa.inspect(connection).has_table(SCHEMA.name):
+        return None
+    version: int | None = connection.scalar(sa.select(sa.func.max(SCHEMA.c.version)))
+    return version
+
+
 def _without_passwords(url: sa.URL) -> str:
     """Return a URL without its passwords."""
     secrets = filter(_SECRET.search, url.query)
@@ -565,10 +582,17 @@ def _engine(url: sa.URL) -> sa.Engine:
 
 def _tune_sqlite(connection: Any, _record: Any) -> None:
     cursor = connection.cursor()
+    cursor.execute(f"PRAGMA busy_timeout={1000 * _PATIENCE}")
+    end = time.monotonic() + _PATIENCE
     # Query first, because setting it writes.
-    if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
-        cursor.execute("PRAGMA journal_mode=WAL")
+    while cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+        try:
+            cursor.execute("PRAGMA journal_mode=WAL")
+        except sqlite3.OperationalError as error:
+            # Two processes that set it at once would wait for each other: SQLite waits for neither.
+            if "locked" not in str(error) or time.monotonic() > end:
+                raise
+            time.sleep(_PAUSE)
     cursor.execute("PRAGMA synchronous=NORMAL")
     cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.execute("PRAGMA busy_timeout=30000")
     cursor.close()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 import sqlalchemy as sa
@@ -146,3 +148,17 @@ def test_opening_an_existing_catalog_writes_nothing(url: str, tmp_path: Path) ->
         assert store.runs() == []
         assert store.verdicts() == {}
     assert (tmp_path / "catalog.sqlite").read_bytes() == before
+
+
+def test_several_users_start_on_a_catalog_that_does_not_exist(tmp_path: Path) -> None:
+    """Each of them makes it, or waits for the one that does."""
+    for number in range(5):
+        start, url = Barrier(4), f"sqlite:///{tmp_path}/{number}/catalog.sqlite"
+        with ThreadPoolExecutor(4) as pool:
+
+            def use(start: Barrier = start, url: str = url) -> list[str]:
+                start.wait()
+                with Store(url, "test") as store:
+                    return [run.id for run in store.runs()]
+
+            assert [user.result() for user in [pool.submit(use) for _ in range(4)]] == [[]] * 4
