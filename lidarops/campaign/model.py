@@ -468,6 +468,11 @@ class Scenes(SettingsModel):
     window: Literal["day"] | Interval = Field(
         default="day", description="length of a scene, which divides a day; at least 1 min"
     )
+    time_limit: Interval | None = Field(
+        default=None,
+        description="after which a worker is ended with its scene, which another one tries again"
+        " once; by default 10 min and 2 s for each MB of the files",
+    )
 
     @model_validator(mode="after")
     def _divides_day(self) -> Self:

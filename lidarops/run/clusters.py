@@ -46,6 +46,8 @@ MALLOC_TRIM_VARIABLE: Final = "MALLOC_TRIM_THRESHOLD_"
 _DASK: Final = {
     # This module counts the deaths of workers, per scene.
     "distributed.scheduler.allowed-failures": 0,
+    # A worker that gives no sign of life, such as a stopped process, is replaced.
+    "distributed.scheduler.worker-ttl": f"{WORKER_TIMEOUT:g}s",
     # Profiling would wake every process 100 times a second, and the tick 50 times, for a dashboard
     # that is not served.
     "distributed.worker.profile.enabled": False,

@@ -5,6 +5,7 @@ No scene stops the others, neither by an error nor by the death of its worker.
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import math
 import pickle
@@ -43,6 +44,10 @@ START_DELAY: Final = 1.0
 nanny, which polls every few hundredths of a second, has seen it running."""
 GRACE_PERIOD: Final = 20.0
 """s that running scenes get to end on a cluster after a request to stop."""
+LEAST_TIME: Final = 600.0
+"""s that a scene may take on a cluster; assumed."""
+TIME_OF_A_BYTE: Final = 2e-6
+"""s more for each byte of its files: hundreds of times what is measured."""
 MOST_TRIES: Final = 3
 """A scene that kills its worker this often is refused."""
 USABLE: Final = 0.9
@@ -235,12 +240,33 @@ def _attempt(job: Job, memory: int | None) -> tuple[SceneOutcome, bool, bool]:
     return *attempt(fit), False
 
 
+def time_limit(job: Job) -> float:
+    """Return after how many s a worker is ended with the scene of a job."""
+    stated = job.campaign.scenes.time_limit
+    if stated is not None:
+        return stated.total_seconds()
+    files = (*job.scene.granules, *job.scene.dark)
+    return LEAST_TIME + TIME_OF_A_BYTE * sum(file.size for file in files)
+
+
 def _submit(client: Client, job: Job) -> Future:
     # As bytes: the scheduler would unpickle and pickle a job.
-    return client.submit(_on_worker, pickle.dumps(job), joint_code_version(), pure=False)
+    arguments = (pickle.dumps(job), joint_code_version(), time_limit(job))
+    return client.submit(_on_worker, *arguments, pure=False)
 
 
-def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool, bool] | str:
+@contextmanager
+def _process_ended_after(seconds: float) -> Iterator[None]:
+    """End this process where the body takes longer, with the tracebacks of its threads."""
+    # Not by a thread of Python, which would wait for a library that holds the interpreter.
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _on_worker(pickled: bytes, code: str, seconds: float) -> tuple[SceneOutcome, bool, bool] | str:
     """Process a scene; return how it ended, or why it was not tried."""
     from distributed import get_worker  # noqa: PLC0415 - takes a second to import
 
@@ -248,7 +274,8 @@ def _on_worker(pickled: bytes, code: str) -> tuple[SceneOutcome, bool, bool] | s
     if joint_code_version() != code:
         return f"the worker has other code of lidarops: {joint_code_version()}, not {code}"
     job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
-    return _attempt(job, get_worker().memory_manager.memory_limit)
+    with _process_ended_after(seconds):
+        return _attempt(job, get_worker().memory_manager.memory_limit)
 
 
 class _Workers:
@@ -319,18 +346,31 @@ class _ClusterQueue:
 
     def one_by_one(self, jobs: Iterable[Job]) -> Iterator[EndedScene]:
         for job in jobs:
-            for tries in range(MOST_TRIES):
-                self._workers.ready(self._stop)
-                if self._stop:
-                    return
-                ended = list(self._ended(iter([job])))
-                if ended:
-                    yield replace(ended[0], lost_worker=tries > 0)
-                    break
-            else:
-                reason = f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
-                failed = EndedScene.failed(Failure(reason), job.scene, job.plan)
-                yield replace(failed, lost_worker=True)
+            ended = self._alone(job)
+            if ended is None:
+                return
+            yield ended
+
+    def _alone(self, job: Job) -> EndedScene | None:
+        """Return how a scene ends that no other may disturb; None where a stop was requested."""
+        limit = time_limit(job)
+        for tries in range(MOST_TRIES):
+            self._workers.ready(self._stop)
+            begin = time.monotonic()
+            ended = [] if self._stop else list(self._ended(iter([job])))
+            if ended:
+                return replace(ended[0], lost_worker=tries > 0)
+            if self._stop:
+                return None
+            if time.monotonic() - begin >= limit:
+                words = f"takes longer than {limit:.0f} s, the time_limit of scenes"
+                failure = Failure(words, final=False)
+                break
+        else:
+            failure = Failure(
+                f"its worker died {MOST_TRIES} times: too little memory, or a damaged file"
+            )
+        return replace(EndedScene.failed(failure, job.scene, job.plan), lost_worker=True)
 
     def _ended(self, source: Iterator[Job]) -> Iterator[EndedScene]:
         self._fill(source)

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from distributed.core import Status
 from distributed.deploy.spec import SpecCluster
 from support.archives.scene_jobs import scene_jobs
 from support.archives.small_archive import Archive
-from support.poison import HALF, Poison
+from support.poison import HALF, Poison, Sleep
 
 from lidarops.catalog.store import RunStatus, Store
 from lidarops.errors import SceneError
@@ -111,6 +112,28 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
     forced = Selection(instruments=("rich",))
     healed = bring_up_to_date(campaign, selection=forced, options=Options(force=True))
     assert not healed.failures
+
+
+@pytest.mark.slow
+def test_a_scene_that_hangs_is_ended_and_tried_once_more(archive: Archive) -> None:
+    archive.tree["scenes"] = {"time_limit": "8 s"}
+    campaign = archive.write()
+    scene = "rich_20260302T000000"
+    with local_client(2) as client:
+        client.register_plugin(Sleep(scene))
+        begin = time.monotonic()
+        result = bring_up_to_date(campaign, client=client)
+        assert time.monotonic() - begin < 60.0
+    assert set(result.failures) == {scene}
+    assert "takes longer than 8 s" in result.failures[scene]
+    assert sum(not outcome.error for outcome in result.record.scenes) == 3
+    assert not bring_up_to_date(campaign).failures
+
+
+def test_the_time_limit_of_a_scene_grows_with_its_files(archive: Archive) -> None:
+    job = scene_jobs(archive.write())[0]
+    size = sum(file.size for file in (*job.scene.granules, *job.scene.dark))
+    assert executor.time_limit(job) == pytest.approx(600.0 + 2e-6 * size)
 
 
 @pytest.mark.parametrize(

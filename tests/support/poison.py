@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from typing import Any
 
 from distributed import WorkerPlugin
@@ -32,6 +33,22 @@ class Poison(WorkerPlugin):
                 half.parent.mkdir(parents=True, exist_ok=True)
                 half.write_bytes(b"half of a product")
                 os.kill(os.getpid(), signal.SIGKILL)
+            return _attempt(job)
+
+        executor.attempt = attempt
+
+
+class Sleep(Poison):
+    """Makes one scene hang."""
+
+    name = "sleep"
+
+    def setup(self, worker: Any) -> None:
+        """Replace the processing of scenes on a worker."""
+
+        def attempt(job: Any) -> Any:
+            if job.scene.id == self.scene:
+                time.sleep(3600.0)
             return _attempt(job)
 
         executor.attempt = attempt
