@@ -23,7 +23,7 @@ from pydantic import AfterValidator, Field
 
 from lidarops.campaign.model import CATALOG_VARIABLE
 from lidarops.catalog.database import WITHOUT_PASSWORD, holds_password
-from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.errors import WRONG_USE, CatalogError, LidarOpsError
 from lidarops.system.stores import WITHOUT_KEYS, is_url, refuse_keys
 
 _PREFECT_MODULES: Final = ("flows.", "prefect.")
@@ -33,19 +33,16 @@ _START: Final = "_run_uvicorn_command"
 _LOG = logging.getLogger(__name__)
 _watchers: list[subprocess.Popen[bytes]] = []
 
-_WRONG_USE = 2
-_REFUSED = 1
-
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Show an error as one line and exit with code 2 for wrong use, else with 1."""
+    """Show an error as one line and exit with its code."""
     try:
         yield
     except (LidarOpsError, ParameterTypeError) as error:
         typer.echo(f"error: {error}", err=True)
-        wrong_use = not isinstance(error, LidarOpsError) or error.wrong_use
-        raise typer.Exit(_WRONG_USE if wrong_use else _REFUSED) from error
+        code = error.exit_code if isinstance(error, LidarOpsError) else WRONG_USE
+        raise typer.Exit(code) from error
 
 
 def _without_keys(location: str) -> str:

@@ -8,8 +8,14 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
+REFUSED: Final = 1
+"""Exit code: something was refused, failed or is empty."""
+WRONG_USE: Final = 2
+"""Exit code: the request is invalid."""
+UNAVAILABLE: Final = 3
+"""Exit code: a database, a disk, a store or a cluster does not serve."""
 NO_FILE: Final = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 """What `open` raises for a path that is not that of a file."""
 
@@ -33,6 +39,8 @@ class LidarOpsError(Exception):
     """
 
     wrong_use: bool = False
+    unavailable: ClassVar[bool] = False
+    """Whether something that lidarops needs does not serve, so that a later try may succeed."""
 
     def __init__(
         self,
@@ -50,6 +58,11 @@ class LidarOpsError(Exception):
         if wrong_use is not None:
             self.wrong_use = wrong_use
         super().__init__(str(self))
+
+    @property
+    def exit_code(self) -> int:
+        """Of a command that it ends."""
+        return WRONG_USE if self.wrong_use else UNAVAILABLE if self.unavailable else REFUSED
 
     def __str__(self) -> str:
         where = ": ".join(place for place in (self.file, self.field) if place)
@@ -82,6 +95,8 @@ class AncillaryError(LidarOpsError, ValueError):
 
 class CatalogError(LidarOpsError):
     """A catalog or archive that cannot be opened, read or written."""
+
+    unavailable = True
 
 
 class SceneError(LidarOpsError):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ from lidarops.aggregate.facts import (
     list_products,
     read_product_facts,
 )
-from lidarops.aggregate.index import write_index
+from lidarops.aggregate.index import KnownFacts, write_index
 from lidarops.aggregate.means import MeansFile, write_means
 from lidarops.aggregate.means_variables import Period, Weights
 from lidarops.aggregate.stac import write_stac
@@ -123,12 +123,16 @@ def make_aggregates(
 def _products(
     root: Path, selection: ProductSelection, made: AggregateResult, progress: Progress
 ) -> list[Facts]:
-    products = []
+    products, known = [], KnownFacts(root)
     for path in list_products(root):
-        for facts in read_product_facts(root, [path], selection):
+        former = known.of(path)
+        found: Iterable[Facts | Refused] = (
+            read_product_facts(root, [path], selection) if former is None else [former]
+        )
+        for facts in found:
             if isinstance(facts, Refused):
                 made.refused.append(facts)
-            else:
+            elif former is None or selection.admits(facts.names, facts.start, facts.stop):
                 products.append(facts)
         progress(1)
     return products

@@ -149,6 +149,11 @@ class Header:
     """What digitised its channels; empty where the raw files name none. Part of the grid."""
 
     @property
+    def names(self) -> dict[str, str]:
+        """Values of `NAMES`."""
+        return {name: getattr(self, name) for name in NAMES}
+
+    @property
     def counting(self) -> DetectionMode:
         """How the signal is stated: glued ones as counted."""
         return mode_of_signal(self.channel, self.mode)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
@@ -21,13 +22,18 @@ from lidarops.aggregate import need
 from lidarops.aggregate.facts import EVERYTHING, FOLDER, Facts, ProductSelection, parse_selection
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.kinds import flags_of, kinds
-from lidarops.system.files import write_atomically
+from lidarops.system.code_version import module_version
+from lidarops.system.files import sha256_of, write_atomically
 
 INDEX: Final = "products.parquet"
 FORMAT: Final = b"3"
 """Raised with every change of the columns."""
 _KEY: Final = b"lidarops_index"
+_READ_BY: Final = b"lidarops_facts"
+"""Key of the version of the code that read the facts."""
 _PREFIX_BYTES: Final = 16
+_FLAG: Final = "flag_"
+"""Beginning of the columns of counts of quality bits."""
 _LEVEL: Final = 15
 _ENCODINGS: Final = {
     # Neighbouring paths have equal beginnings.
@@ -89,8 +95,9 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     # Those of older products last.
     for name in dict.fromkeys([*known, *(name for facts in rows for name in facts.flagged)]):
         counts = [facts.flagged.get(name, 0) for facts in rows]
-        arrays[f"flag_{name.lower()}"] = arrow.array(counts, arrow.int64())
-    table = arrow.table(arrays).replace_schema_metadata({_KEY: FORMAT})
+        arrays[f"{_FLAG}{name.lower()}"] = arrow.array(counts, arrow.int64())
+    stated = {_KEY: FORMAT, _READ_BY: _facts_version()}
+    table = arrow.table(arrays).replace_schema_metadata(stated)
     stream = io.BytesIO()
     parquet.write_table(
         table,
@@ -115,6 +122,54 @@ def _cells(facts: Facts) -> dict[str, Any]:
         "id": UUID(facts.id).bytes,
         "sha256_prefix": bytes.fromhex(facts.sha256)[:_PREFIX_BYTES],
     }
+
+
+def _facts_version() -> bytes:
+    return module_version(Facts.__module__).encode()
+
+
+class KnownFacts:
+    """Facts of the products of a folder as its index states them.
+
+    Parameters
+    ----------
+    root : path
+        Nothing is known where it has no index, or one that other code wrote.
+    """
+
+    def __init__(self, root: Path) -> None:
+        index = root / FOLDER / INDEX
+        self._root = root
+        self._rows: dict[str, dict[str, Any]] = {}
+        with suppress(*NO_FILE, LidarOpsError):
+            table = _read(index, EVERYTHING, None)
+            if table.schema.metadata.get(_READ_BY) == _facts_version():
+                self._rows = {row["path"]: row for row in table.to_pylist()}
+
+    def of(self, path: str) -> Facts | None:
+        """Return the facts of a product that has not changed since; None where it may have."""
+        row = self._rows.get(path)
+        file = self._root / path
+        if row is None or file.lstat().st_size != row["size"]:
+            return None
+        with suppress(OSError):
+            sha256 = sha256_of(file)
+            if bytes.fromhex(sha256).startswith(row["sha256_prefix"]):
+                return _facts(row, sha256)
+        return None
+
+
+def _facts(row: dict[str, Any], sha256: str) -> Facts:
+    """Return the facts that `_cells` turned into a row."""
+    stated = {item.name: row[item.name] for item in fields(Facts) if item.name in row}
+    counts = {name: n for name, n in row.items() if name.startswith(_FLAG) and n}
+    return Facts(
+        **stated | {"id": str(UUID(bytes=row["id"]))},
+        sha256=sha256,
+        usable=row["good"] + row["care"],
+        unflagged=row["good"],
+        flagged={name.removeprefix(_FLAG).upper(): count for name, count in counts.items()},
+    )
 
 
 def _types(arrow: Any) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, ParamSpec
 
 import typer
 
-from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.errors import REFUSED, UNAVAILABLE, CatalogError, LidarOpsError
 from lidarops.figures.wording import visible
 from lidarops.kinds import kinds
 
@@ -117,9 +117,6 @@ _EXTRA_FIELDS: Final = frozenset(
     {"run", "scene", "granule", "granules", "product", "products", "seconds", "reason"}
 )
 
-WRONG_USE = 2
-REFUSED = 1
-
 
 def show_error(error: LidarOpsError) -> None:
     """Show an error on standard error."""
@@ -143,7 +140,7 @@ def command(
                 function(*args, **kwargs)
             except LidarOpsError as error:
                 show_error(error)
-                raise typer.Exit(WRONG_USE if error.wrong_use else REFUSED) from error
+                raise typer.Exit(error.exit_code) from error
             except OSError as error:
                 # Typer ends quietly where the reader of a pipe has gone.
                 if error.errno == errno.EPIPE:
@@ -155,7 +152,7 @@ def command(
                     remedy="check permissions, space and connection, then run the command again",
                 )
                 show_error(problem)
-                raise typer.Exit(REFUSED) from error
+                raise typer.Exit(UNAVAILABLE) from error
 
         return program.command(name, help=_paragraphs(function.__doc__ or ""), **options)(wrapped)
 

@@ -44,7 +44,7 @@ from lidarops.cli.app import (
     show_findings,
     show_rows,
 )
-from lidarops.errors import LidarOpsError
+from lidarops.errors import UNAVAILABLE, LidarOpsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -227,10 +227,12 @@ def reprocess(
 ) -> None:
     """Update the catalog, make all stale products, and write a report.
 
-    Writes nothing if there is nothing to do. Exit code 1 if anything was refused or failed.
+    Writes nothing if there is nothing to do. Exit code 1 if anything was refused or failed, 3 if
+    products could not be written, or a database, a store or a cluster does not serve.
 
     Example: lidarops reprocess catalogs/demo.yaml --workers 2
     """
+    from lidarops.catalog.store import RunStatus
     from lidarops.run import archive as pipeline
     from lidarops.run.options import missing_report, selects_no_scene
 
@@ -284,6 +286,8 @@ def reprocess(
         _show_orphans(result, removed, None if everything else _FEW_ROWS)
     if result.signal:
         raise typer.Exit(128 + result.signal)
+    if result.status is RunStatus.STOPPED:
+        raise typer.Exit(UNAVAILABLE)
     left = result if removed is None else replace(result, orphans=())
     exit_with_status(failed=left.has_failures or (result.record is not None and page is None))
 

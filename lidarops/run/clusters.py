@@ -33,7 +33,7 @@ from pydantic import (
 )
 
 from lidarops.campaign.yaml_errors import Loader, duplicate_keys
-from lidarops.errors import LidarOpsError, SceneError
+from lidarops.errors import LidarOpsError
 from lidarops.system.processes import keep_memory, start_method
 
 if TYPE_CHECKING:
@@ -87,7 +87,9 @@ _ENVIRONMENT = (
 
 
 class ClusterError(LidarOpsError):
-    """A cluster is described wrongly, or cannot be started or reached."""
+    """A cluster is described wrongly, cannot be started or reached, or is lost."""
+
+    unavailable = True
 
 
 class _Model(BaseModel):
@@ -448,7 +450,7 @@ def _await_workers(client: Client, workers: int) -> None:
     except TimeoutError as error:
         started = len(client.nthreads())
         if not started:
-            raise SceneError(
+            raise ClusterError(
                 f"no worker started within {WORKER_TIMEOUT:.0f} s",
                 remedy="give each worker more memory, or start fewer",
             ) from error

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from lidarops.errors import SceneError
 from lidarops.records import Plan, Scene, SceneOutcome
-from lidarops.run.clusters import WORKER_TIMEOUT
+from lidarops.run.clusters import WORKER_TIMEOUT, ClusterError
 from lidarops.scene.job import Failure, Job, guarded
 from lidarops.scene.memory import scene_memory
 from lidarops.system.code_version import joint_code_version
@@ -319,7 +319,7 @@ class _Workers:
             from distributed import LocalCluster  # noqa: PLC0415 - takes a second to import
 
             if isinstance(self._client.cluster, LocalCluster):
-                raise SceneError(
+                raise ClusterError(
                     "the workers on this machine are gone, and none replaces them",
                     remedy="find out what ended them, and run again: finished scenes are kept",
                 )
@@ -435,8 +435,8 @@ def _outcome_of(future: Future, job: Job) -> EndedScene | None:
     return EndedScene.failed(failure, job.scene, job.plan)
 
 
-def _scheduler_lost() -> SceneError:
-    return SceneError(
+def _scheduler_lost() -> ClusterError:
+    return ClusterError(
         "the dask scheduler is gone, and with it the running scenes",
         remedy="run again: finished scenes are kept",
     )

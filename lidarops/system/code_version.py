@@ -128,6 +128,11 @@ def reading_version() -> str:
     return _installed().digest((_CATALOGUES, *_formats()))
 
 
+def module_version(name: str) -> str:
+    """Return a digest of the source of a module and of what it imports, 16 hexadecimal digits."""
+    return _installed().digest((name,))
+
+
 def pages_version(sources: Sources | None = None) -> str:
     """Return a digest of the sources that decide what the pages of products hold.
 

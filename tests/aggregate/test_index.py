@@ -14,7 +14,13 @@ from support.archives.aggregate_archive import add_day, facts_of
 
 from lidarops.aggregate import index as indices
 from lidarops.aggregate.facts import Facts, ProductSelection
-from lidarops.aggregate.index import INDEX, find_in_index, find_products, write_index
+from lidarops.aggregate.index import (
+    INDEX,
+    KnownFacts,
+    find_in_index,
+    find_products,
+    write_index,
+)
 from lidarops.errors import ProductError, RetrievalInputError
 
 pytest.importorskip("pyarrow")
@@ -148,6 +154,29 @@ def test_the_index_of_real_files_can_be_queried(tmp_path: Path):
     root, paths = find_in_index(index, selection)
     assert root == tmp_path.resolve()
     assert [path[-11:-3] for path in paths] == ["2T000000", "3T000000"]
+
+
+def test_facts_of_products_that_have_not_changed_come_from_the_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for day in range(3):
+        add_day(tmp_path, day)
+    read = facts_of(tmp_path)
+    first, *others = [facts.path for facts in read]
+    write_index(tmp_path, read)
+    assert [KnownFacts(tmp_path).of(facts.path) for facts in read] == read
+    assert KnownFacts(tmp_path).of("products/other.nc") is None
+    # Of another content of equal size.
+    content = bytearray((tmp_path / first).read_bytes())
+    content[-1] ^= 1
+    (tmp_path / first).write_bytes(content)
+    assert [KnownFacts(tmp_path).of(path) is None for path in (first, *others)] == [
+        True,
+        False,
+        False,
+    ]
+    monkeypatch.setattr(indices, "module_version", lambda _: "of other code")
+    assert all(KnownFacts(tmp_path).of(path) is None for path in others)
 
 
 def test_an_unknown_wavelength_is_missing(tmp_path: Path):

@@ -21,10 +21,9 @@ from support.archives.small_archive import Archive
 from support.poison import HALF, Poison, Sleep
 
 from lidarops.catalog.store import RunStatus, Store
-from lidarops.errors import SceneError
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
-from lidarops.run.clusters import local_client
+from lidarops.run.clusters import ClusterError, local_client
 from lidarops.run.executor import (
     EndedScene,
     StopRequest,
@@ -209,9 +208,9 @@ def test_lost_local_workers_are_not_waited_for(
         monkeypatch.setattr(executor, "WORKER_TIMEOUT", 1.0)
         monkeypatch.setattr(executor, "RECOUNT_INTERVAL", 0.5)
         client.retire_workers()
-        with pytest.raises(SceneError, match="workers on this machine are gone"):
+        with pytest.raises(ClusterError, match="workers on this machine are gone"):
             list(process_jobs(jobs, client=client))
-        with pytest.raises(SceneError, match="workers on this machine are gone"):
+        with pytest.raises(ClusterError, match="workers on this machine are gone"):
             list(process_jobs(jobs, client=client, alone=True))
 
 
