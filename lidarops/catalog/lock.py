@@ -47,6 +47,7 @@ class Holder:
     process: int
     process_started: str
     acquired: float
+    heartbeat: float
     silent: float
     """s since the last heartbeat, by the clock of the database."""
 
@@ -83,6 +84,8 @@ class Lock(AbstractContextManager["Lock"]):
         self._thread: threading.Thread | None = None
         self.token = secrets.token_hex(16)
         self.held = False
+        self._last_beat: tuple[str, float] | None = None
+        self._since = 0.0
         self._row = (_L.campaign == database.campaign, _L.token == self.token)
 
     @staticmethod
@@ -169,11 +172,11 @@ class Lock(AbstractContextManager["Lock"]):
         silent = (self._database.clock() - _L.heartbeat).label("silent")
         query = sa.select(LOCK, silent).where((_L.campaign != self._database.campaign) == others)
         rows = self._database.read(query, tuple)
-        return [Holder(*(*known, silent)) for _campaign, *known, _heartbeat, silent in rows]
+        return [Holder(*known) for _campaign, *known in rows]
 
     def _try(self) -> bool:
         current = self.holder()
-        if current is not None and not current.dead:
+        if current is not None and not (current.dead or self._is_still(current)):
             return False
         database = self._database
         clock = database.clock()
@@ -198,6 +201,16 @@ class Lock(AbstractContextManager["Lock"]):
             own = sa.select(sa.func.count()).select_from(LOCK).where(*self._row)
             return bool(connection.scalar(own))
 
+    def _is_still(self, holder: Holder) -> bool:
+        """Return whether a holder has sent no heartbeat for `SILENCE` while this one waited.
+
+        The clock of a holder on another machine may be ahead.
+        """
+        beat = holder.token, holder.heartbeat
+        if beat != self._last_beat:
+            self._last_beat, self._since = beat, time.monotonic()
+        return time.monotonic() - self._since > SILENCE
+
     def _beat(self) -> None:
         while not self._stop.wait(HEARTBEAT):
             try:
@@ -219,7 +232,8 @@ class Lock(AbstractContextManager["Lock"]):
         return CatalogError(
             problem,
             file=self._database.place,
-            remedy="wait for it with --wait SECONDS, or stop it",
+            remedy=f"stop it, or wait for it with --wait SECONDS: after {SILENCE:.0f} s without a"
+            " sign of life it is overtaken",
         )
 
 

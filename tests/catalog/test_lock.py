@@ -76,6 +76,22 @@ def test_a_silent_holder_on_another_machine_is_dead_and_may_not_write(
             store.forget_products([], taken.token)
 
 
+def test_a_dead_holder_whose_clock_was_ahead_is_overtaken(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store(url, "test") as store, Lock(store) as lost:
+        lost.acquire()
+        lost._stop.set()
+        with store.transaction() as connection:
+            ahead = {"machine": "elsewhere", "heartbeat": LOCK.c.heartbeat + 86_400.0}
+            connection.execute(sa.update(LOCK).values(ahead))
+        with pytest.raises(CatalogError, match="held by"):
+            Lock(store, wait=1.0).acquire()
+        monkeypatch.setattr(lock_module, "SILENCE", 1.0)
+        with Lock(store, wait=20.0) as lock:
+            assert lock.acquire() is True
+
+
 def test_a_holder_gives_signs_of_life(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock_module, "HEARTBEAT", 0.05)
     with Store(url, "test") as store, Lock(store) as lock:
