@@ -242,7 +242,7 @@ WITHOUT_PASSWORD: Final = rf"^(?![^:]*://[^/:]*:[^@]+@)(?!.*[?&][^=&]*(?:{_SECRE
 _LOCK_SCHEMA: Final = "SELECT pg_advisory_xact_lock(7235106412)"
 """The number is arbitrary."""
 _PATIENCE: Final = 30
-"""s, for which SQLite waits for another process."""
+"""s, for which SQLite waits for another process, and a connection for a server."""
 _PAUSE: Final = 0.02
 """s."""
 _BROKEN: Final = ("malformed", "not a database", "decode")
@@ -473,7 +473,9 @@ class Database:
             remedy = "make space on the disk, then run again: finished scenes are kept"
         elif "readonly" in cause or "read-only" in cause:
             remedy = "make the folder writable, or choose another with --out or LIDAROPS_CATALOG"
-        elif self._sqlite and any(word in cause for word in _BROKEN):
+        elif not self._sqlite:
+            remedy = "check that the server runs, and host, user, password and name in the URL"
+        elif any(word in cause for word in _BROKEN):
             remedy = _MOVE_AWAY
         else:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
@@ -563,6 +565,9 @@ def _parsed(url: str) -> sa.URL:
 
 
 def _engine(url: sa.URL) -> sa.Engine:
+    # A host that does not answer would hold a run for ever.
+    if url.get_backend_name() == "postgresql" and "connect_timeout" not in url.query:
+        url = url.update_query_dict({"connect_timeout": str(_PATIENCE)})
     try:
         return sa.create_engine(url)
     except sa.exc.NoSuchModuleError as error:

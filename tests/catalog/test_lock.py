@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from threading import Barrier
 import pytest
 import sqlalchemy as sa
 
+from lidarops.catalog import database
 from lidarops.catalog import lock as lock_module
 from lidarops.catalog.database import LOCK, PRODUCT_INPUT, SCHEMA_VERSION
 from lidarops.catalog.lock import Lock
@@ -150,6 +152,14 @@ def test_a_catalog_is_not_made_where_it_is_only_read(tmp_path: Path) -> None:
     (tmp_path / "other.sqlite").touch()
     with pytest.raises(CatalogError, match="there is no catalog yet"):
         Store(f"sqlite:///{tmp_path}/other.sqlite", "test", create=False)
+
+
+def test_a_server_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "_PATIENCE", 2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"postgresql+psycopg://me@127.0.0.1:{silent.getsockname()[1]}/catalog"
+        with pytest.raises(CatalogError, match=r"timeout expired.*check that the server runs"):
+            Store(url, "test")
 
 
 def test_an_invalid_url_is_refused() -> None:
