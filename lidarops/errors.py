@@ -96,6 +96,10 @@ class AncillaryError(LidarOpsError, ValueError):
 class CatalogError(LidarOpsError):
     """A catalog or archive that cannot be opened, read or written."""
 
+
+class UnavailableError(CatalogError):
+    """A database, disk or store that does not serve."""
+
     unavailable = True
 
 

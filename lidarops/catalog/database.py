@@ -19,7 +19,7 @@ from sqlalchemy.dialects import sqlite
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.sources import Source
-from lidarops.errors import CatalogError, LidarOpsError
+from lidarops.errors import CatalogError, LidarOpsError, UnavailableError
 
 SCHEMA_VERSION: Final = 12
 """Raised with every change of a table; a database of another version is refused."""
@@ -280,7 +280,7 @@ class Database:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise CatalogError(
+                raise UnavailableError(
                     f"the folder of the catalog cannot be made: {error.strerror}",
                     file=folder,
                     remedy="choose another folder with --out",
@@ -411,7 +411,7 @@ class Database:
                 own: sqlite3.Connection = source.driver_connection  # type: ignore[assignment]
                 own.backup(target)
         except sqlite3.Error as error:
-            raise CatalogError(f"cannot be copied: {error}", file=self.place) from error
+            raise UnavailableError(f"cannot be copied: {error}", file=self.place) from error
 
     def _readable(self) -> sa.URL:
         """Return a URL that can be read also where the folder of the database cannot be written."""
@@ -469,6 +469,7 @@ class Database:
 
     def _catalog_error(self, error: sa.exc.SQLAlchemyError) -> CatalogError:
         cause = str(getattr(error, "orig", None) or error).strip()
+        kind: type[CatalogError] = UnavailableError
         if "full" in cause:
             remedy = "make space on the disk, then run again: finished scenes are kept"
         elif "readonly" in cause or "read-only" in cause:
@@ -476,10 +477,10 @@ class Database:
         elif not self._sqlite:
             remedy = "check that the server runs, and host, user, password and name in the URL"
         elif any(word in cause for word in _BROKEN):
-            remedy = _MOVE_AWAY
+            kind, remedy = CatalogError, _MOVE_AWAY
         else:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
-        return CatalogError(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
+        return kind(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
 
 
 def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> None:
@@ -588,9 +589,17 @@ def _engine(url: sa.URL) -> sa.Engine:
 def _tune_sqlite(connection: Any, _record: Any) -> None:
     cursor = connection.cursor()
     cursor.execute(f"PRAGMA busy_timeout={1000 * _PATIENCE}")
-    end = time.monotonic() + _PATIENCE
     # Query first, because setting it writes.
-    while cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+    if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+        _set_journal(cursor)
+    cursor.execute("PRAGMA synchronous=NORMAL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.close()
+
+
+def _set_journal(cursor: Any) -> None:
+    end = time.monotonic() + _PATIENCE
+    while True:
         try:
             cursor.execute("PRAGMA journal_mode=WAL")
         except sqlite3.OperationalError as error:
@@ -598,6 +607,5 @@ def _tune_sqlite(connection: Any, _record: Any) -> None:
             if "locked" not in str(error) or time.monotonic() > end:
                 raise
             time.sleep(_PAUSE)
-    cursor.execute("PRAGMA synchronous=NORMAL")
-    cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.close()
+        else:
+            return

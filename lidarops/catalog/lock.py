@@ -19,7 +19,7 @@ from typing import Final
 import sqlalchemy as sa
 
 from lidarops.catalog.database import LOCK, Database
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, UnavailableError
 
 HEARTBEAT: Final = 5.0
 """s between heartbeats."""
@@ -229,7 +229,7 @@ class Lock(AbstractContextManager["Lock"]):
         if current is not None:
             since = datetime.fromtimestamp(current.acquired, UTC)
             problem = f"held by {current.name} since {since:%Y-%m-%d %H:%M:%S} UTC"
-        return CatalogError(
+        return UnavailableError(
             problem,
             file=self._database.place,
             remedy=f"stop it, or wait for it with --wait SECONDS: after {SILENCE:.0f} s without a"

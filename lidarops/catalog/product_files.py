@@ -20,7 +20,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.lock import Lock, process_start
 from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import Role
 from lidarops.system.files import COPIES, MANIFEST, SITE, product_paths, sha256_of
 from lidarops.system.stores import Published, RemoteStore
@@ -83,7 +83,7 @@ def keep(output: Path, product: str, sha256: str) -> None:
         with suppress(FileNotFoundError):
             _link(output / "products" / product, target)
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"the replaced version cannot be kept: {error.strerror or error}",
             file=target,
             remedy="make space, or set superseded: remove in the campaign file",

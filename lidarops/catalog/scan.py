@@ -18,7 +18,7 @@ from lidarops.catalog.granules import Fingerprint
 from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row, unread_row
 from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import UNREADABLE, IdlePattern, Role, Status, digest
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import CRASHED, Processes
@@ -277,7 +277,7 @@ class _Scan:
         if self._gone and not self._files:
             raise self._emptied()
         if self._files > 1 and not self._readable:
-            raise CatalogError(
+            raise UnavailableError(
                 f"gives none of its {self._files} files; the catalog stays unchanged",
                 file=without_keys(self._archive),
                 field="archive",
@@ -317,7 +317,7 @@ class _Scan:
 
     def _emptied(self) -> CatalogError:
         # This is how an unmounted disk looks.
-        return CatalogError(
+        return UnavailableError(
             "holds no file that an instrument of the campaign claims, although the catalog knows"
             f" {len(self._gone)}; the catalog stays unchanged",
             file=without_keys(self._archive),

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from lidarops.errors import CatalogError
+from lidarops.errors import UnavailableError
 from lidarops.system.stores import RemoteStore, Stored
 
 RawFile = Stored
@@ -71,7 +71,7 @@ class Source:
         CatalogError
         """
         if not self._root.is_dir():
-            raise CatalogError(
+            raise UnavailableError(
                 "the archive is not a folder",
                 file=self._root,
                 remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
@@ -82,7 +82,7 @@ class Source:
             with os.scandir(folder) as listing:
                 entries = [(entry, entry.is_dir(follow_symlinks=False)) for entry in listing]
         except OSError as error:
-            raise CatalogError(
+            raise UnavailableError(
                 f"cannot be listed: {error.strerror}", file=folder, remedy="check its permissions"
             ) from error
         # In the order of the paths of their files.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, ParamSpec
 
 import typer
 
-from lidarops.errors import REFUSED, UNAVAILABLE, CatalogError, LidarOpsError
+from lidarops.errors import REFUSED, UNAVAILABLE, LidarOpsError, UnavailableError
 from lidarops.figures.wording import visible
 from lidarops.kinds import kinds
 
@@ -425,7 +425,7 @@ def set_up_log(level: str, *, as_json: bool, file: Path | None) -> None:
             logging.StreamHandler() if file is None else logging.FileHandler(file, delay=False)
         )
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"cannot be written: {error.strerror}", file=file, remedy="choose another --log-file"
         ) from error
     text = TextLines("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S")

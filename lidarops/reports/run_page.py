@@ -16,7 +16,7 @@ from urllib.parse import quote
 from jinja2 import Environment
 from markupsafe import Markup
 
-from lidarops.errors import CatalogError
+from lidarops.errors import UnavailableError
 from lidarops.figures import browser
 from lidarops.figures.panels import Figure
 from lidarops.figures.templates import environment, page_style
@@ -87,7 +87,7 @@ def build_report(
         write_atomically(folder / browser.SCRIPT, browser.script())
         write_atomically(target, _render(record, folder, filled).encode())
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"the report cannot be written: {error}",
             file=folder,
             remedy=f"make space or choose a folder you can write to, then lidarops report {folder}",

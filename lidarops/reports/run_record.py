@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from lidarops.errors import NO_FILE, CatalogError
+from lidarops.errors import NO_FILE, CatalogError, UnavailableError
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports.json_records import MismatchError, from_plain, plain
 from lidarops.system.files import write_atomically
@@ -66,7 +66,7 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(target, text.encode("ascii"))
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"cannot be written: {error}",
             file=target,
             remedy="make space, then run again, which makes the report; or lidarops report"

@@ -14,7 +14,12 @@ from typing import Final
 import xarray as xr
 
 from lidarops.campaign.model import Campaign
-from lidarops.errors import CatalogError, LidarOpsError, SceneError, UnreadableFileError
+from lidarops.errors import (
+    LidarOpsError,
+    SceneError,
+    UnavailableError,
+    UnreadableFileError,
+)
 from lidarops.raw.archive import open_counts
 from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
@@ -45,7 +50,7 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
         # What cannot be removed does not make the products wrong.
         return tempfile.TemporaryDirectory(prefix="lidarops-", ignore_cleanup_errors=True)
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"no temporary folder for fetched raw files can be made: {error}",
             remedy="make space, or set TMPDIR to a folder you can write to",
         ) from error

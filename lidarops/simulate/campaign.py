@@ -17,7 +17,7 @@ import xarray as xr
 from lidarops.campaign.model import Campaign, Station
 from lidarops.campaign.simulated_instrument import DamageKind
 from lidarops.campaign.simulation import SimulationSettings
-from lidarops.errors import CampaignError, CatalogError
+from lidarops.errors import CampaignError, UnavailableError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
 from lidarops.simulate.planned_files import (
@@ -181,7 +181,7 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"cannot be made: {error.strerror}",
             file=folder,
             field="archive",

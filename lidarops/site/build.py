@@ -18,7 +18,7 @@ import xarray as xr
 from markupsafe import Markup
 
 from lidarops import __version__
-from lidarops.errors import CatalogError, ProductError
+from lidarops.errors import CatalogError, ProductError, UnavailableError
 from lidarops.figures import any_kind, browser
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
@@ -358,7 +358,7 @@ def _write(site: Path, name: str, content: bytes | Path) -> None:
         elif not target.is_file() or target.read_bytes() != content:
             write_atomically(target, content)
     except OSError as error:
-        raise CatalogError(
+        raise UnavailableError(
             f"cannot be written: {error}",
             file=target,
             remedy="check that the folder can be written and the disk has space, then run again",

@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final, NamedTuple
 from urllib.parse import unquote
 
-from lidarops.errors import CatalogError, LidarOpsError, ProductError
+from lidarops.errors import CatalogError, LidarOpsError, ProductError, UnavailableError
 from lidarops.system.files import sha256_of
 
 _READ_ONLY: Final = frozenset({"http", "https"})
@@ -149,7 +149,7 @@ class RemoteStore:
         self._scheme = url.partition("://")[0]
         try:
             # Some drivers connect here.
-            with self._errors_as(CatalogError, "cannot be reached"):
+            with self._errors_as(UnavailableError, "cannot be reached"):
                 self._fs, prefix = fsspec.core.url_to_fs(url)
         except (ValueError, ImportError) as error:
             raise CatalogError(
@@ -181,7 +181,7 @@ class RemoteStore:
         CatalogError
             If the store cannot be reached or listed.
         """
-        with self._errors_as(CatalogError, "cannot be listed"):
+        with self._errors_as(UnavailableError, "cannot be listed"):
             # Another process may have written since the last listing.
             self._fs.invalidate_cache()
             listing = dict(self._sized(self._find(), is_used))
@@ -228,7 +228,7 @@ class RemoteStore:
                 else dict(self._walk(self._prefix))
             )
         except KeyError as error:
-            raise CatalogError(
+            raise UnavailableError(
                 "cannot be listed: a page says that more follow, and not where",
                 file=self.url,
                 remedy="try again, or ask who runs the store",
@@ -300,7 +300,7 @@ class RemoteStore:
             _confine(path)
         pairs = [(self._name(path), str(folder / path)) for path in paths]
         refused: dict[str, str] = {}
-        with self._errors_as(CatalogError, "cannot be read"):
+        with self._errors_as(UnavailableError, "cannot be read"):
             for path in paths:
                 (folder / path).parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -342,8 +342,10 @@ class RemoteStore:
         Raises
         ------
         ProductError
-            If the store is read-only, cannot be reached, or holds less than was sent, or if a
-            product is missing or differs from the ledger.
+            If the store is read-only or holds less than was sent, or if a product is missing or
+            differs from the ledger.
+        UnavailableError
+            If the store cannot be reached.
         """
         if self._scheme in _READ_ONLY:
             raise ProductError(
@@ -361,7 +363,7 @@ class RemoteStore:
         ]
         for first in range(0, len(due), _BATCH):
             batch = {path: products[path] for path in due[first : first + _BATCH]}
-            with self._errors_as(ProductError, "cannot be written"):
+            with self._errors_as(UnavailableError, "cannot be written"):
                 self._upload(root, batch)
             _append_journal(journal, batch)
         others = [
@@ -377,7 +379,7 @@ class RemoteStore:
         except CatalogError as error:
             if isinstance(error.__cause__, FileNotFoundError):
                 return ()
-            raise ProductError(error.problem, file=self.url, remedy=error.remedy) from error
+            raise
 
     def _upload(self, root: Path, products: Mapping[str, str]) -> None:
         for path, sha256 in products.items():
@@ -418,7 +420,7 @@ class RemoteStore:
         """Raise an OSError where an answer concerns one object, else as `_errors_as`."""
         _confine(path)
         try:
-            with self._errors_as(CatalogError, f"{path} cannot be read"):
+            with self._errors_as(UnavailableError, f"{path} cannot be read"):
                 yield
         except CatalogError as error:
             cause = error.__cause__

@@ -149,7 +149,7 @@ def test_what_cannot_be_written_is_one_line(read_only: Archive) -> None:
         ["publish", read_only.file, f"file://{read_only.folder}/copy"],
     ):
         code, output = _run(*command)
-        assert code == 1
+        assert code == 3
         assert output.startswith("error: ")
         assert "writ" in output or "ead-only" in output
 
@@ -198,7 +198,7 @@ def test_publishing_to_a_dead_host_is_one_line(
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
     code, output = _run("publish", made.file, url)
-    assert code == 1
+    assert code == 3
     assert output.startswith(f"error: {url}: cannot be ")
 
 
