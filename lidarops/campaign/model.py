@@ -229,6 +229,14 @@ class InstrumentFacts(SettingsModel):
         le=86400,
         description="clock of the raw files minus UTC; -18000 for files in the time of UTC-5",
     )
+    pre_trigger: float = quantity(
+        0.0,
+        unit="m",
+        ge=0,
+        le=1e5,
+        description="range of the record at which the pulse leaves; the bins before are in no"
+        " product",
+    )
     full_overlap_range: Metres = quantity(
         0.0,
         unit="m",

@@ -254,9 +254,11 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield from (f"        {line}" for line in _pointing(headers))
     yield f"        {_full_overlap(headers.look)}"
     if headers.look is not None and headers.look.late_light is not None:
+        late, width = headers.look.late_light, headers.layout[0].bin_width
+        place = f"light begins there, in bin {late / width:.0f} of {width:g} m"
         yield (
-            f"        # ? light begins at {headers.look.late_light:.0f} m: does the record begin"
-            " before the pulse? Ranges are too large by that, and range_offset takes at most 500 m"
+            f"        # pre_trigger: {late:.0f} m  # ? {place}: at which range of the record does"
+            " the pulse leave?"
         )
     if headers.pairs:
         yield f"        # pairs that can be joined: {', '.join(headers.pairs)}"

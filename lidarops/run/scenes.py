@@ -291,7 +291,10 @@ def _by_layout(
     dark: list[Granule],
 ) -> list[Scene]:
     layouts: dict[str, list[Granule]] = defaultdict(list)
-    for granule in members:
+    owner = campaign.instruments[instrument]
+    before = owner.facts_at(_start(members[0])).pre_trigger
+    dark = [granule.after_pulse(before) for granule in dark if granule.instrument == instrument]
+    for granule in (granule.after_pulse(before) for granule in members):
         layouts[_layout_key(granule.layout)].append(granule)
     scenes = []
     for key, group in sorted(layouts.items()):
@@ -300,7 +303,7 @@ def _by_layout(
             Scene(
                 id=f"{instrument}_{start:{STAMP}}{suffix}",
                 campaign=campaign.name,
-                station=campaign.instruments[instrument].station,
+                station=owner.station,
                 instrument=instrument,
                 start=start,
                 stop=stop,
@@ -308,8 +311,7 @@ def _by_layout(
                 dark=tuple(
                     granule
                     for granule in dark
-                    if granule.instrument == instrument
-                    and _layout_key(granule.layout) == key
+                    if _layout_key(granule.layout) == key
                     and [c.recorder for c in granule.layout]
                     == [c.recorder for c in group[0].layout]
                     and _start(group[0]) - DARK_REACH

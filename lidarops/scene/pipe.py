@@ -163,6 +163,9 @@ class ReadSettings(SettingsModel):
 
     wavelength: float = quantity(unit="m")
     recorder: str = ""
+    pre_trigger: float | None = quantity(
+        None, unit="m", description="of a record whose bins before the pulse are left out"
+    )
 
 
 def plan_read(case: ChannelCase[Any]) -> Entry:
@@ -178,7 +181,11 @@ def plan_read(case: ChannelCase[Any]) -> Entry:
     metres = case.facts_of_channel.wavelength or case.channel.wavelength
     if math.isnan(metres):
         return case.leave(READ_STEP, NO_WAVELENGTH, rule="channel")
-    settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder)
+    before = case.channel.pre_trigger or None
+    if not case.channel.bins:
+        reason = f"pre_trigger of {before:g} m leaves no bin: give what the record counts before"
+        return case.leave(READ_STEP, f"{reason} the pulse", rule="channel")
+    settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder, pre_trigger=before)
     return case.run(READ_STEP, f"required by {' and '.join(requesters)}", settings, rule="channel")
 
 

@@ -211,7 +211,7 @@ class _Work(ABC):
         job = self.job
         read = {step.channel for step in steps if step.name == READ_STEP}
         subtracted = [step.channel for step in steps if step.name == "dark"]
-        layout = [channel.name for channel in scene.layout]
+        layout = [channel.name for channel in scene.layout if channel.bins]
         held = [name for name in layout if name in read]
         opened = partial(open_granules, job.campaign, scene, root=self.root)
         archive = opened(scene.granules, channels=held, stretches=stretches)

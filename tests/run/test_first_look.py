@@ -80,7 +80,8 @@ def test_nothing_is_proposed_of_records_that_begin_before_the_pulse(
     campaign, text = drafted(case, tmp_path / "campaign.yaml")
     (lidar,) = campaign.instruments.values()
     assert lidar.products.model_dump(exclude_none=True).keys() == {"signal"}
-    assert "? light begins at 1967 m: does the record begin before the pulse?" in text
+    question = "# pre_trigger: 1967 m  # ? light begins there, in bin 524 of 3.75 m: at which range"
+    assert question in text
 
 
 def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
     stretch = 1.0 / math.cos(math.radians(zenith))
     window = case.request.reference
     # A window is a set of bin centres.
-    reach = case.last - 0.5 * case.channel.bin_width + case.range_offset
+    reach = case.last - 0.5 * case.channel.bin_width
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if top - bottom < window.width * stretch * (1.0 - 1e-9):
         return (
