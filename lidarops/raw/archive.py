@@ -288,8 +288,10 @@ def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
 # Files with equal channels share one tuple.
 @lru_cache(maxsize=128)
 def _with_names(channels: tuple[RawChannel, ...], layout: Layout) -> tuple[RawChannel, ...]:
-    named = zip(channels, layout, strict=True)
-    return tuple(replace(c, name=own.name, bins=own.bins, first=own.before) for c, own in named)
+    return tuple(
+        replace(c, name=own.name, bins=own.bins, first=None if own.bins == c.bins else own.before)
+        for c, own in zip(channels, layout, strict=True)
+    )
 
 
 class RawFiles:
@@ -436,10 +438,11 @@ class LazyChannel(BackendArray):
         if not (files.size and bins.size):
             return np.empty(files.shape + bins.shape, self.dtype)
         low, past, kept = 0, self.shape[1], self._kept
-        if kept is None and (self._first or bins.min() > 0 or bins.max() + 1 < past):
+        whole = self._first is None and bins.min() == 0 and bins.max() + 1 == past
+        if kept is None and not whole:
             low, past = int(bins.min()), int(bins.max()) + 1
             kept = ((low, past),)
-        if kept is not None:
+        if kept is not None and self._first:
             kept = tuple((first + self._first, end + self._first) for first, end in kept)
         values = np.empty((files.size, past - low), self.dtype)
         row = np.empty(past - low, np.dtype("<i4"))

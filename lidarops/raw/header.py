@@ -84,8 +84,9 @@ class RawChannel:
     """V; None unless photon counting."""
     bin_shift: float | None = None
     """Bins."""
-    first: int = 0
-    """Place of the first of `bins` in the file; those in front are from before the pulse."""
+    first: int | None = None
+    """Place of the first of `bins` in the file, of which others are left out; None of a whole
+    record."""
 
     def __hash__(self) -> int:
         return hash((self.name, self.places, self.shots))

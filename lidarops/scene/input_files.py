@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +19,9 @@ from lidarops.raw.archive import open_counts
 from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
+from lidarops.scene.choices import shows_background
 from lidarops.scene.dependence import scene_facts
+from lidarops.scene.profiles import BEFORE
 from lidarops.system.stores import RemoteStore
 
 # A file that a scan does not find either counts as lost, like one that cannot be read.
@@ -141,6 +143,7 @@ def open_granules(
     channels: list[str],
     *,
     stretches: Mapping[str, Stretches] | None = None,
+    before: bool = False,
 ) -> xr.Dataset:
     """Return the raw counts of some granules of a scene, lazy, with the pointing of the campaign.
 
@@ -154,6 +157,8 @@ def open_granules(
         Folder of the granules.
     channels, stretches
         As for `lidarops.raw.archive.open_archive`.
+    before : bool
+        Whether to add the bins before the pulse, as channels whose names begin with ``before_``.
 
     Raises
     ------
@@ -161,6 +166,8 @@ def open_granules(
         If a file cannot be read.
     """
     archive = open_counts(granules, root=root, channels=channels, stretches=stretches)
+    if before:
+        archive = archive.assign(_before_pulse(granules, root, channels))
     # Facts of the campaign override the pointing in the headers.
     facts = scene_facts(campaign, scene)
     fixed = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
@@ -170,3 +177,19 @@ def open_granules(
         if angle is not None
     }
     return archive.assign_coords(pointing) if pointing else archive
+
+
+def _before_pulse(
+    granules: Sequence[Granule], root: Path, channels: Collection[str]
+) -> Mapping[str, xr.DataArray]:
+    """Return the bins before the pulse of channels that have enough of them."""
+    shown = [c for c in granules[0].layout if c.name in channels and shows_background(c)]
+    if not shown:
+        return {}
+    records = (
+        replace(g, layout=tuple(replace(c, bins=c.before, pre_trigger=0.0) for c in g.layout))
+        for g in granules
+    )
+    archive = open_counts(records, root=root, channels=[channel.name for channel in shown])
+    own = {dim: f"{BEFORE}{dim}" for dim in map(str, archive.dims) if dim.startswith("range")}
+    return {f"{BEFORE}{name}": array for name, array in archive.rename(own).items()}

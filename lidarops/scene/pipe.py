@@ -37,6 +37,7 @@ from lidarops.records import (
 )
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
+from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.dead_time import (
     DeadTimeEstimate,
     ProfileGroup,
@@ -56,7 +57,14 @@ from lidarops.scene.case import (
     lag_is_unknown,
     prepared_channels,
 )
-from lidarops.scene.profiles import ChannelSignal, FileProfiles, GluedProfiles, Source, bin_ranges
+from lidarops.scene.profiles import (
+    BEFORE,
+    ChannelSignal,
+    FileProfiles,
+    GluedProfiles,
+    Source,
+    bin_ranges,
+)
 from lidarops.settings import SettingsModel, quantity
 
 _Power = npt.NDArray[np.float64]
@@ -519,6 +527,13 @@ def channel_signal(source: Source, steps: Sequence[PlannedStep], channel: str) -
     return signals[channel]
 
 
+def _dark(stages: Stages, source: Source, name: str) -> DarkSignals | None:
+    """Return the dark signals that are subtracted from a channel of the files."""
+    if stages.dark is None or source.dark is None or name not in source.dark:
+        return None
+    return labeled.read_dark(source.dark, name, method=stages.dark.method)
+
+
 def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
     """Give the profiles of a channel, what they are made with, and the air."""
     source = signal.source
@@ -528,9 +543,8 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
             signal.overlap = source.ancillaries.overlaps[stages.overlap.overlap_profile].at
     if stages.range_offset is not None:
         signal.range_offset = stages.range_offset.range_offset
-    dark = None
-    if stages.dark is not None and source.dark is not None:
-        dark = labeled.read_dark(source.dark, signal.channel, method=stages.dark.method)
+    before = f"{BEFORE}{signal.channel}"
+    dark, dark_before = (_dark(stages, source, name) for name in (signal.channel, before))
     correction = stages.dead_time
     if correction is not None and correction.analog is not None:
         _estimate_dead_time(signal, signal.channels[correction.analog], correction.lag)
@@ -539,20 +553,24 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
         signal.dead_time_uncertainty = correction.dead_time_uncertainty or 0.0
     if stages.noise is not None:
         signal.relative_variance = stages.noise.method == "differences"
+        condition = partial(
+            labeled.condition,
+            dead_time=signal.dead_time,
+            dead_time_uncertainty=signal.dead_time_uncertainty,
+            noise_variance=stages.noise.noise_variance,
+            baseline_uncertainty=stages.noise.baseline_uncertainty,
+        )
         signal.profiles = FileProfiles(
             signal.channel,
             bin_ranges(source.archive, signal.channel, signal.range_offset),
             dark,
             partial(
-                labeled.condition,
-                dead_time=signal.dead_time,
-                dead_time_uncertainty=signal.dead_time_uncertainty,
-                noise_variance=stages.noise.noise_variance,
-                baseline_uncertainty=stages.noise.baseline_uncertainty,
+                condition,
                 dark=dark,
                 range_offset=signal.range_offset,
                 full_overlap_range=signal.full_overlap_range or 0.0,
             ),
+            partial(condition, dark=dark_before) if before in source.archive else None,
         )
     if stages.glue is not None:
         estimated = stages.lag is not None and stages.lag.method == "estimate"

@@ -21,9 +21,11 @@ WIDTH, BINS, BEFORE = 7.5, 2000, 267
 """m and bins; the pulse leaves within the last of the bins before it."""
 PULSE = BEFORE * WIDTH - 2.5
 CHANNELS = ["analog_532o", "photon_532o", "glued_532o"]
+SKY = {"photon_532o": 1.0, "analog_532o": 0.05}
+"""Simulated background, MHz and mV."""
 PRODUCTS = {
     "signal": {"channels": CHANNELS},
-    "elastic": {"channels": CHANNELS, "average": "30min", "background": "tail_mean"},
+    "elastic": {"channels": CHANNELS, "average": "30min"},
 }
 
 
@@ -118,14 +120,26 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Campaign, Made, Made
 
 
 def test_products_are_those_of_records_that_begin_with_the_pulse(both) -> None:
+    """To the last bit where both have the background of the far range, as glued channels have."""
     _, whole, later = both
     assert whole.keys() == later.keys()
     assert len(whole) == 6
-    for key, (_, product) in whole.items():
-        expected = later[key][1]
+    for (kind, channel), (_, product) in whole.items():
+        expected = later[kind, channel][1]
         assert product["range"].values[0] == expected["range"].values[0] == 6.25
-        for name in (name for name, own in product.items() if own.dtype.kind != "O"):
-            np.testing.assert_array_equal(product[name].values, expected[name].values, str(key))
+        if channel == "glued_532o":
+            for name in (name for name, own in product.items() if own.dtype.kind != "O"):
+                np.testing.assert_array_equal(product[name].values, expected[name].values, name)
+            continue
+            continue
+        assert product.background_method == 3
+        score = (product.background - SKY[channel]) / product.background_standard_error
+        assert bool((np.abs(score) < 4.0).all())
+        name = {"signal": "signal", "elastic": "aerosol_backscatter"}[kind]
+        error = np.hypot(*(one[f"{name}_standard_error"] for one in (product, expected)))
+        score = (product[name] - expected[name]) / error
+        assert float(np.sqrt((score**2).mean())) < 0.3
+        assert bool((product.usable <= 1).mean() >= (expected.usable <= 1).mean() - 0.01)
 
 
 def test_products_are_made_again_from_their_provenance(both) -> None:
@@ -142,3 +156,21 @@ def test_a_pulse_beyond_the_record_leaves_no_channel(both, tmp_path: Path) -> No
     assert job.plan.steps == ()
     reason = "pre_trigger of 100000 m leaves no bin: give what the record counts before the pulse"
     assert reason in {left.reason for left in job.plan.left_out}
+
+
+def test_few_bins_before_the_pulse_give_no_background(both, tmp_path: Path) -> None:
+    """Their mean would be noisier than that of the far range."""
+    campaign, *_ = both
+    for pulse, method in ((150 * WIDTH, "tail_mean"), (250 * WIDTH, "before_pulse")):
+        own = written(tmp_path / method, pulse).model_copy(update={"archive": campaign.archive})
+        (job,) = scene_jobs(own)
+        methods = {
+            step.channel: step.settings["method"]
+            for step in job.plan.steps
+            if (step.name, step.product) == ("background", "signal")
+        }
+        assert methods == {
+            "analog_532o": method,
+            "photon_532o": method,
+            "glued_532o": "tail_mean",
+        }
