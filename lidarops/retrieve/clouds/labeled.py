@@ -105,6 +105,10 @@ class Clouds:
         """Bins that are cloudy in some profiles or the mean."""
         return np.asarray(self.mask | self.partly)
 
+    def within(self, bins: slice) -> Clouds:
+        """Return the clouds in some bins."""
+        return Clouds(self.mask[:, bins], self.fraction[:, bins], self.unknown[:, bins])
+
 
 def air_along(
     molecules: MolecularProfile, altitude: Array, distance: Array, wavelength: float
