@@ -108,7 +108,7 @@ class ChannelLayout:
     def before(self) -> int:
         """Number of bins of the record that begin before the pulse."""
         # Without rounding errors of a quotient of decimal numbers.
-        return math.ceil(round(self.pre_trigger / self.bin_width, 6)) if self.pre_trigger else 0
+        return math.ceil(round(self.pre_trigger / self.bin_width, 6))
 
 
 UNREADABLE: Final = "cannot be read"
@@ -173,8 +173,6 @@ class Granule(Header):
 
     def after_pulse(self, pre_trigger: float) -> Granule:
         """Return the granule without bins before the pulse, at so many m of its records."""
-        if not pre_trigger:
-            return self
         return replace(self, layout=_after_pulse(self.layout, pre_trigger))
 
     @property

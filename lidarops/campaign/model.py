@@ -243,6 +243,10 @@ class InstrumentFacts(SettingsModel):
         description="range from which the telescope receives the whole beam; nearer values are"
         " flagged or left out",
     )
+    full_overlap_assumed: bool = Field(
+        default=False,
+        description="whether nobody has checked full_overlap_range; plans and products state it",
+    )
     overlap_profile: Inside | None = Field(
         default=None,
         description="CSV or NetCDF file of range (m) and overlap (0 to 1), or a product raman,"

@@ -52,6 +52,7 @@ class Purpose(StrEnum):
     TELECOVER = "test of the telescope"
     POLARISATION = "calibration of the polarisation"
     BACKGROUND = "background"
+    UNLIT = "without light of the laser"
 
 
 _WORDS: Final = {

@@ -279,4 +279,5 @@ def _named(granule: Granule, plan: Plan, pre_trigger: float) -> Granule:
         and step.instrument in ("", granule.instrument)
     }
     names = recorder_names([(granule.layout, 1, datetime.fromtimestamp(0, UTC))], stated)
-    return replace(granule, layout=named_layout(granule.layout, names)).after_pulse(pre_trigger)
+    named = replace(granule, layout=named_layout(granule.layout, names))
+    return named.after_pulse(pre_trigger) if pre_trigger else named

@@ -292,9 +292,11 @@ def _by_layout(
 ) -> list[Scene]:
     layouts: dict[str, list[Granule]] = defaultdict(list)
     owner = campaign.instruments[instrument]
-    before = owner.facts_at(_start(members[0])).pre_trigger
-    dark = [granule.after_pulse(before) for granule in dark if granule.instrument == instrument]
-    for granule in (granule.after_pulse(before) for granule in members):
+    dark = [granule for granule in dark if granule.instrument == instrument]
+    if any(fact.pre_trigger for fact in owner.facts):
+        before = owner.facts_at(_start(members[0])).pre_trigger
+        members, dark = ([g.after_pulse(before) for g in own] for own in (members, dark))
+    for granule in members:
         layouts[_layout_key(granule.layout)].append(granule)
     scenes = []
     for key, group in sorted(layouts.items()):

@@ -227,8 +227,10 @@ def range_offset(channel: ChannelLayout, facts: ChannelFacts) -> float:
     With what is left of the bin in which the pulse leaves.
     """
     late = facts.lag * channel.bin_width if isinstance(facts.lag, float) else 0.0
-    begins = channel.before * channel.bin_width - channel.pre_trigger
-    return (facts.range_offset or 0.0) + begins - late
+    offset = (facts.range_offset or 0.0) - late
+    if channel.pre_trigger:
+        offset += channel.before * channel.bin_width - channel.pre_trigger
+    return offset
 
 
 def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:

@@ -48,14 +48,14 @@ def with_methods(product: xr.Dataset, signal: ChannelSignal, *, known_shape: boo
 
 def shows_background(channel: ChannelLayout) -> bool:
     """Return whether as many bins are from before the pulse as are in the far range by default."""
-    return channel.before >= max(BACKGROUND.tail_share * channel.bins, FEWEST_BINS)
+    least = max(BACKGROUND.tail_share * channel.bins, FEWEST_BINS)
+    return channel.pre_trigger >= least * channel.bin_width and not is_glued(channel.name)
 
 
 def before_pulse(case: ChannelCase[Any]) -> str:
     """Return why bins before the pulse give the background; empty where they do not."""
-    if is_glued(case.channel.name) or not shows_background(case.channel):
-        return ""
-    return f"mean of the {case.channel.before} bins before the pulse"
+    shown = shows_background(case.channel)
+    return f"mean of the {case.channel.before} bins before the pulse" if shown else ""
 
 
 def tail(case: ChannelCase[Any], limits: tuple[float, float] | None) -> tuple[float, float]:

@@ -37,7 +37,6 @@ from lidarops.records import (
 )
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.signal import labeled, labeled_gluing
-from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.dead_time import (
     DeadTimeEstimate,
     ProfileGroup,
@@ -214,7 +213,8 @@ def plan_overlap(case: ChannelCase[Any]) -> Entry:
             "the campaign gives no full_overlap_range: near bins are used as they are, and"
             " those whose signal shows no full overlap are rejected or to be used with care",
         )
-    reason = "bins nearer than full overlap are flagged and excluded"
+    assumed = ", which is assumed," if case.facts.full_overlap_assumed else ""
+    reason = f"bins nearer than full overlap{assumed} are flagged and excluded"
     if profile:
         reason = f"overlap_profile given by the campaign; {reason}"
     settings = OverlapSettings(full_overlap_range=full, overlap_profile=profile)
@@ -527,13 +527,6 @@ def channel_signal(source: Source, steps: Sequence[PlannedStep], channel: str) -
     return signals[channel]
 
 
-def _dark(stages: Stages, source: Source, name: str) -> DarkSignals | None:
-    """Return the dark signals that are subtracted from a channel of the files."""
-    if stages.dark is None or source.dark is None or name not in source.dark:
-        return None
-    return labeled.read_dark(source.dark, name, method=stages.dark.method)
-
-
 def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
     """Give the profiles of a channel, what they are made with, and the air."""
     source = signal.source
@@ -544,7 +537,11 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
     if stages.range_offset is not None:
         signal.range_offset = stages.range_offset.range_offset
     before = f"{BEFORE}{signal.channel}"
-    dark, dark_before = (_dark(stages, source, name) for name in (signal.channel, before))
+    dark = {
+        name: labeled.read_dark(source.dark, name, method=stages.dark.method)
+        for name in (signal.channel, before)
+        if stages.dark is not None and source.dark is not None and name in source.dark
+    }
     correction = stages.dead_time
     if correction is not None and correction.analog is not None:
         _estimate_dead_time(signal, signal.channels[correction.analog], correction.lag)
@@ -563,14 +560,14 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
         signal.profiles = FileProfiles(
             signal.channel,
             bin_ranges(source.archive, signal.channel, signal.range_offset),
-            dark,
+            dark.get(signal.channel),
             partial(
                 condition,
-                dark=dark,
+                dark=dark.get(signal.channel),
                 range_offset=signal.range_offset,
                 full_overlap_range=signal.full_overlap_range or 0.0,
             ),
-            partial(condition, dark=dark_before) if before in source.archive else None,
+            partial(condition, dark=dark.get(before)) if before in source.archive else None,
         )
     if stages.glue is not None:
         estimated = stages.lag is not None and stages.lag.method == "estimate"
