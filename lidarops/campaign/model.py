@@ -340,6 +340,10 @@ class Instrument(SettingsModel):
         description="angle in headers that state no scan: elevation, of any sign; zenith_angle,"
         " negative on the opposite side; stated: the latter, but -90 upwards, others refused",
     )
+    name_times: Literal["checked", "ignored"] = Field(
+        default="checked",
+        description="whether a start is refused that contradicts the time in the name of its file",
+    )
     position_tolerance: float = quantity(
         0.5,
         unit="degree",

@@ -251,6 +251,9 @@ def _instrument(
     pointing = headers.main.header_pointing
     if pointing != "stated":
         yield f"    header_pointing: {pointing}  # ? elevation or zenith_angle: headers do not tell"
+    doubtful = [header for header in headers.main.headers if header.time_doubt]
+    if doubtful:
+        yield f"    name_times: ignored  # ? {doubtful[0].time_doubt}"
     yield from _facts(headers, estimates=estimates)
     yield from _products(headers)
 

@@ -468,7 +468,8 @@ def build_raw_dataset(files: RawFiles, *, scaled: bool) -> xr.Dataset:
     grids = {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
     stated = [file.stated for file in files.files]
     notes = {note for header in stated for note in header.notes}
-    notes |= {header.doubt for header in stated if isinstance(header, RawHeader)} - {""}
+    read = [header for header in stated if isinstance(header, RawHeader)]
+    notes |= {doubt for header in read for doubt in (header.doubt, header.time_doubt)} - {""}
     variables: dict[str, _Variable] = {}
     for index, channel in enumerate(files.selected):
         dims = ("time", grids[files.grids[index]])

@@ -19,11 +19,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_820,
-    "lines of code alone": 46_305,
+    "lines": 70_863,
+    "lines of code alone": 46_339,
     "modules": 280,
     "dataclasses": 250,
-    "lines of dataclasses": 6_709,
+    "lines of dataclasses": 6_723,
     "tuning numbers": 220,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
@@ -31,8 +31,8 @@ MOST = {
     "lines of the largest package": 5_885,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 61, "functions": 591, "changes": 215},
-    "elastic": {"modules": 71, "functions": 737, "changes": 227},
+    "homogeneous": {"modules": 61, "functions": 593, "changes": 216},
+    "elastic": {"modules": 71, "functions": 740, "changes": 228},
 }
 
 
