@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import xarray as xr
 
+from lidarops.campaign.model import ChannelFacts
 from lidarops.constants import FIXED, KNOWN_SHAPE_PAPERS, LEAST_SPREAD, STEEPEST
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
@@ -24,7 +25,7 @@ from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.scene.case import ChannelCase, Entry, prepared_channels
+from lidarops.scene.case import ChannelCase, Entry, prepared_channels, range_offset
 from lidarops.scene.profiles import BEFORE, ChannelSignal
 from lidarops.settings import SettingsModel, quantity
 
@@ -46,16 +47,22 @@ def with_methods(product: xr.Dataset, signal: ChannelSignal, *, known_shape: boo
     )
 
 
-def shows_background(channel: ChannelLayout) -> bool:
-    """Return whether as many bins are from before the pulse as are in the far range by default."""
-    least = max(BACKGROUND.tail_share * channel.bins, FEWEST_BINS)
-    return channel.pre_trigger >= least * channel.bin_width and not is_glued(channel.name)
+def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:
+    """Return how many bins before the pulse give the background; 0 for too few, as of glued ones.
+
+    As many are needed as are in the far range by default.
+    """
+    if not channel.pre_trigger or is_glued(channel.name):
+        return 0
+    # Those in which the pulse leaves, by the offset of the channel, hold light.
+    bins = channel.before - max(math.ceil(range_offset(channel, facts) / channel.bin_width), 0)
+    return bins if bins >= max(BACKGROUND.tail_share * channel.bins, FEWEST_BINS) else 0
 
 
 def before_pulse(case: ChannelCase[Any]) -> str:
     """Return why bins before the pulse give the background; empty where they do not."""
-    shown = shows_background(case.channel)
-    return f"mean of the {case.channel.before} bins before the pulse" if shown else ""
+    bins = bins_before(case.channel, case.facts_of_channel)
+    return f"mean of the {bins} bins before the pulse" if bins else ""
 
 
 def tail(case: ChannelCase[Any], limits: tuple[float, float] | None) -> tuple[float, float]:

@@ -13,13 +13,13 @@ from typing import Final
 
 import xarray as xr
 
-from lidarops.campaign.model import Campaign
+from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
 from lidarops.errors import CatalogError, LidarOpsError, SceneError, UnreadableFileError
 from lidarops.raw.archive import open_counts
 from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
-from lidarops.scene.choices import shows_background
+from lidarops.scene.choices import bins_before
 from lidarops.scene.dependence import scene_facts
 from lidarops.scene.profiles import BEFORE
 from lidarops.system.stores import RemoteStore
@@ -166,10 +166,10 @@ def open_granules(
         If a file cannot be read.
     """
     archive = open_counts(granules, root=root, channels=channels, stretches=stretches)
-    if before:
-        archive = archive.assign(_before_pulse(granules, root, channels))
     # Facts of the campaign override the pointing in the headers.
     facts = scene_facts(campaign, scene)
+    if before and facts.pre_trigger:
+        archive = archive.assign(_before_pulse(granules, root, channels, facts))
     fixed = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
     pointing = {
         name: xr.full_like(archive["zenith_angle"], angle)
@@ -180,16 +180,26 @@ def open_granules(
 
 
 def _before_pulse(
-    granules: Sequence[Granule], root: Path, channels: Collection[str]
+    granules: Sequence[Granule], root: Path, channels: Collection[str], facts: InstrumentFacts
 ) -> Mapping[str, xr.DataArray]:
     """Return the bins before the pulse of channels that have enough of them."""
-    shown = [c for c in granules[0].layout if c.name in channels and shows_background(c)]
+    bins = {
+        channel.name: bins_before(channel, channel_facts(facts, channel.name))
+        for channel in granules[0].layout
+        if channel.name in channels
+    }
+    shown = [name for name, number in bins.items() if number]
     if not shown:
         return {}
     records = (
-        replace(g, layout=tuple(replace(c, bins=c.before, pre_trigger=0.0) for c in g.layout))
-        for g in granules
+        replace(
+            granule,
+            layout=tuple(
+                replace(c, bins=bins.get(c.name, c.bins), pre_trigger=0.0) for c in granule.layout
+            ),
+        )
+        for granule in granules
     )
-    archive = open_counts(records, root=root, channels=[channel.name for channel in shown])
+    archive = open_counts(records, root=root, channels=shown)
     own = {dim: f"{BEFORE}{dim}" for dim in map(str, archive.dims) if dim.startswith("range")}
     return {f"{BEFORE}{name}": array for name, array in archive.rename(own).items()}

@@ -174,3 +174,14 @@ def test_few_bins_before_the_pulse_give_no_background(both, tmp_path: Path) -> N
             "photon_532o": method,
             "glued_532o": "tail_mean",
         }
+
+
+def test_bins_in_which_a_channel_sees_the_pulse_give_no_background(tmp_path: Path) -> None:
+    """Its records are 90 m late, and hold light 90 m before the bin of the pulse."""
+    late = written(tmp_path / "late", PULSE, range_offset=90.0)
+    simulate_campaign(late)
+    products = made(late)
+    for channel, sky in SKY.items():
+        _, product = products["signal", channel]
+        score = (product.background - sky) / product.background_standard_error
+        assert bool((np.abs(score) < 4.0).all())

@@ -57,7 +57,7 @@ def _needs(case: ChannelCase[SignalSettings]) -> Entries:
         return
     if (reason := before_pulse(case)) and not limits:
         before = BackgroundSettings(method="before_pulse", range=(-case.channel.pre_trigger, 0.0))
-        yield case.run("background", reason, before, number=float(case.channel.before))
+        yield case.run("background", reason, before)
     else:
         yield background(case, case.request.background, limits)
     settings = RangeCorrection(least_signal_to_noise=case.request.least_signal_to_noise)
