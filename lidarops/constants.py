@@ -56,6 +56,8 @@ KNOWN_SHAPE_PAPERS: Final = f"{LEAST_SQUARES_PAPER}\n{LIDAR_EQUATION_PAPER}"
 """Of a background fitted with the shape of clean air, for the products in which that runs."""
 STEEPEST: Final = 80.0
 """degree; largest zenith angle at which a beam reaches aerosol-free air."""
+HIGHEST_CLOUD: Final = 20_000.0
+"""m; clouds of the tropics end below."""
 DARK_REACH: Final = timedelta(hours=24)
 """Longest time between a scene and the dark files that it uses."""
 FIXED: Final = 0.05

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, date, datetime
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Final, NamedTuple, Self, TypeVar
 
 from lidarops.kinds import kinds
@@ -100,6 +101,14 @@ class ChannelLayout:
     """0 for photon counting."""
     recorder: str = ""
     """What digitises it, such as ``BT5``; empty where the raw format names none."""
+    pre_trigger: float = 0.0
+    """m, of a record that began before the pulse; its bins up to there are none of `bins`."""
+
+    @property
+    def before(self) -> int:
+        """Number of bins of the record that begin before the pulse."""
+        # Without rounding errors of a quotient of decimal numbers.
+        return math.ceil(round(self.pre_trigger / self.bin_width, 6))
 
 
 UNREADABLE: Final = "cannot be read"
@@ -162,10 +171,23 @@ class Granule(Header):
     sha256: str | None = None
     """Digest of the file; None until the whole file has been read."""
 
+    def after_pulse(self, pre_trigger: float) -> Granule:
+        """Return the granule without bins before the pulse, at so many m of its records."""
+        return replace(self, layout=_after_pulse(self.layout, pre_trigger))
+
     @property
     def is_declared_invalid(self) -> bool:
         """Whether the campaign refuses the file, not its content."""
         return self.reason.startswith(INVALID)
+
+
+# An archive has few layouts.
+@lru_cache(maxsize=128)
+def _after_pulse(
+    layout: tuple[ChannelLayout, ...], pre_trigger: float
+) -> tuple[ChannelLayout, ...]:
+    stated = [replace(channel, pre_trigger=pre_trigger) for channel in layout]
+    return tuple(replace(c, bins=max(c.bins - c.before, 0)) for c in stated)
 
 
 @dataclass(frozen=True, slots=True)

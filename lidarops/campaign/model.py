@@ -229,11 +229,23 @@ class InstrumentFacts(SettingsModel):
         le=86400,
         description="clock of the raw files minus UTC; -18000 for files in the time of UTC-5",
     )
+    pre_trigger: float = quantity(
+        0.0,
+        unit="m",
+        ge=0,
+        le=1e5,
+        description="range of the record at which the pulse leaves; the bins before are in no"
+        " product",
+    )
     full_overlap_range: Metres = quantity(
         0.0,
         unit="m",
         description="range from which the telescope receives the whole beam; nearer values are"
         " flagged or left out",
+    )
+    full_overlap_assumed: bool = Field(
+        default=False,
+        description="whether nobody has checked full_overlap_range; plans and products state it",
     )
     overlap_profile: Inside | None = Field(
         default=None,
@@ -327,6 +339,10 @@ class Instrument(SettingsModel):
         default="stated",
         description="angle in headers that state no scan: elevation, of any sign; zenith_angle,"
         " negative on the opposite side; stated: the latter, but -90 upwards, others refused",
+    )
+    name_times: Literal["checked", "ignored"] = Field(
+        default="checked",
+        description="whether a start is refused that contradicts the time in the name of its file",
     )
     position_tolerance: float = quantity(
         0.5,

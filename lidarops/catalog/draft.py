@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from statistics import median
 from types import MappingProxyType
 from typing import Final
@@ -43,6 +44,11 @@ _USED: Final = frozenset({Purpose.MEASUREMENT, Purpose.DARK})
 """Purposes of files that a campaign names; others are a question."""
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
+_PACKED: Final = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
+"""Endings of files that may hold raw files."""
+_BY_WORDS: Final = "the words in their path"
+_TOLD: Final = {Purpose.UNLIT: "their counts"}
+"""What tells the purpose of files."""
 
 Position = tuple[float, float] | None
 
@@ -113,10 +119,11 @@ def draft_campaign(
     known, lone = _instruments(contents)
     if not known:
         reasons = [reason for _, reason in contents.refused[:1]]
+        packed = "".join(f"unpack {path}, or " for path in _packed(contents)[:1])
         raise CatalogError(
             "holds no raw file that can be used" + "".join(f": {reason}" for reason in reasons),
             file=archive,
-            remedy="give the folder of the raw files",
+            remedy=f"{packed}give the folder of the raw files",
         )
     scanning = [headers for headers in known.values() if _scans(headers)]
     sites = dict(zip(known, _sites(list(known.values())), strict=True))
@@ -244,6 +251,9 @@ def _instrument(
     pointing = headers.main.header_pointing
     if pointing != "stated":
         yield f"    header_pointing: {pointing}  # ? elevation or zenith_angle: headers do not tell"
+    doubtful = [header for header in headers.main.headers if header.time_doubt]
+    if doubtful:
+        yield f"    name_times: ignored  # ? {doubtful[0].time_doubt}"
     yield from _facts(headers, estimates=estimates)
     yield from _products(headers)
 
@@ -252,11 +262,13 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield "    facts:"
     yield f"      - clock_offset: 0  # ? s, clock of the files minus UTC; {_clock(headers.main)}"
     yield from (f"        {line}" for line in _pointing(headers))
-    yield f"        {_full_overlap(headers.look)}"
+    yield from (f"        {line}" for line in _full_overlap(headers.look))
     if headers.look is not None and headers.look.late_light is not None:
+        late, width = headers.look.late_light, headers.layout[0].bin_width
+        place = f"light begins there, in bin {late / width:.0f} of {width:g} m"
         yield (
-            f"        # ? light begins at {headers.look.late_light:.0f} m: does the record begin"
-            " before the pulse? Ranges are too large by that, and range_offset takes at most 500 m"
+            f"        # pre_trigger: {late:.0f} m  # ? {place}: at which range of the record does"
+            " the pulse leave?"
         )
     if headers.pairs:
         yield f"        # pairs that can be joined: {', '.join(headers.pairs)}"
@@ -298,16 +310,17 @@ def _clock(group: FileGroup) -> str:
     return f"headers are {hours:+g} h from names: one of both is local time"
 
 
-def _full_overlap(look: FirstLook | None) -> str:
-    if look is None or look.full_overlap is None:
-        return f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used; assumed"
-    if look.full_overlap < _ASSUMED_OVERLAP:
-        seen = f"assumed, signals stop rising at {look.full_overlap:g} m"
-        return f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used; {seen}"
-    return (
-        f"full_overlap_range: {look.full_overlap:g}  # ? m, nearer bins are not used; at least:"
-        " signals rise up to there"
-    )
+def _full_overlap(look: FirstLook | None) -> Iterator[str]:
+    found = None if look is None else look.full_overlap
+    if found is not None and found >= _ASSUMED_OVERLAP:
+        yield (
+            f"full_overlap_range: {found:g}  # ? m, nearer bins are not used; at least:"
+            " signals rise up to there"
+        )
+        return
+    seen = "" if found is None else f", signals stop rising at {found:g} m"
+    yield f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used{seen}"
+    yield "full_overlap_assumed: true  # until full_overlap_range is checked"
 
 
 def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:
@@ -380,7 +393,10 @@ def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[
 def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup]) -> Iterator[str]:
     """Yield comments on the files that no instrument has."""
     tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
-    rest = [path for path in contents.other if path not in tables]
+    packed = _packed(contents)
+    rest = [path for path in contents.other if path not in (*tables, *packed)]
+    endings = Counter(PurePosixPath(path).suffix or "no ending" for path in rest)
+    formats = ", ".join(f"{ending} {count}" for ending, count in endings.most_common(_SHOWN))
     named = "? soundings, lidar ratios or overlap? Name them in the facts, as molecular_profile"
     if archive.startswith(("/", "..")):
         # A campaign reads no file outside of its folder.
@@ -393,7 +409,7 @@ def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup])
         ),
         *(
             (
-                f"? {purpose} by the words in their path, left out of `files`",
+                f"? {purpose} by {_TOLD.get(purpose, _BY_WORDS)}, left out of `files`",
                 [p for group in contents.groups if group.purpose is purpose for p in group.files],
             )
             for purpose in Purpose
@@ -401,12 +417,17 @@ def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup])
         ),
         # As seen from the campaign file.
         (named, [f"{archive}/{path}" for path in tables]),
-        ("of no raw format", rest),
+        ("? packed and not read: unpack them, and run init again", packed),
+        (f"of no raw format and not read ({formats})", rest),
         ("damaged", [f"{path}: {reason}" for path, reason in contents.refused]),
     ):
         if paths:
             yield f"# {len(paths)} file{'s' * (len(paths) > 1)}, {title}:"
             yield from (f"#   {json.dumps(path)}" for path in paths[:_SHOWN])
+
+
+def _packed(contents: FolderContents) -> list[str]:
+    return [path for path in contents.other if path.lower().endswith(_PACKED)]
 
 
 def _text(value: str) -> str:

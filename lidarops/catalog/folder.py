@@ -8,7 +8,7 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Final
 
@@ -24,9 +24,9 @@ from lidarops.catalog.sources import (
 )
 from lidarops.constants import FIXED, STEEPEST
 from lidarops.errors import RawFormatError, RetrievalInputError
-from lidarops.raw.formats import parse_raw_header
+from lidarops.raw.formats import parse_raw_header, time_in_path
 from lidarops.raw.header import HeaderPointing, RawHeader, named_layout, recorder_names
-from lidarops.records import UNKNOWN_FORMAT, ChannelLayout, DetectionMode
+from lidarops.records import FEWEST_ALIKE, UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 
@@ -52,6 +52,7 @@ class Purpose(StrEnum):
     TELECOVER = "test of the telescope"
     POLARISATION = "calibration of the polarisation"
     BACKGROUND = "background"
+    UNLIT = "without light of the laser"
 
 
 _WORDS: Final = {
@@ -320,6 +321,11 @@ def read_folder(root: str, *, guess_pointing: bool = False) -> FolderContents:
                 refused.append((printable(file.path), str(error)))
         else:
             headers[_likeness(file.path, header)].append((file.path, header))
+    for key, members in list(headers.items()):
+        if not _names_tell_nothing(members):
+            headers[key] = [(path, header) for path, header in members if not header.time_doubt]
+            refused += [(printable(path), h.time_doubt) for path, h in members if h.time_doubt]
+    headers = {key: members for key, members in headers.items() if members}
     lidars: dict[tuple[object, ...], list[RawHeader]] = defaultdict(list)
     for members in headers.values():
         lidars[_lidar(members[0][1])] += [header for _, header in members]
@@ -331,6 +337,15 @@ def read_folder(root: str, *, guess_pointing: bool = False) -> FolderContents:
         tuple(other),
         tuple(printable(file.path) for file in copies),
     )
+
+
+def _names_tell_nothing(members: Sequence[tuple[str, RawHeader]]) -> bool:
+    """Return whether most names tell other days than headers, and not as a wrong clock does."""
+    doubtful = [(path, header) for path, header in members if header.time_doubt]
+    named = ((time_in_path(path, header.format), header.start) for path, header in doubtful)
+    away = [start - moment for moment, start in named if moment]
+    several = len(away) >= FEWEST_ALIKE and 2 * len(doubtful) > len(members)
+    return several and max(away) - min(away) > timedelta(days=1)
 
 
 def _named(groups: Sequence[FileGroup]) -> Iterator[FileGroup]:

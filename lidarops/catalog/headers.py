@@ -146,6 +146,8 @@ def _accepted(
     left_out = _left_out(header, facts, instrument, due.role)
     if left_out:
         return _refused(due, left_out, header.start - shift)
+    if instrument.name_times == "checked":
+        header.check_time()
     header = header.read_as(instrument.header_pointing)
     if header.doubt and facts.zenith_angle is None:
         raise RawFormatError(

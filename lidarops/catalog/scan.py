@@ -397,6 +397,7 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 patterns,
                 instrument.header_position,
                 instrument.header_pointing,
+                instrument.name_times,
                 instrument.position_tolerance,
                 instrument.altitude_tolerance,
                 station.model_dump(),

@@ -44,7 +44,7 @@ from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
-    from lidarops.records import LeftOut, Plan, PlannedStep
+    from lidarops.records import LeftOut, Plan, PlannedStep, Scene
     from lidarops.run.options import Selection
     from lidarops.run.staleness import Judgement, Stale
 
@@ -79,9 +79,11 @@ def show_plan(
     all_steps: AllStepsOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show scenes, their steps, what is left out and what is stale, and why. Processes nothing.
+    """Show scenes, their steps, what is left out and what is stale, and why. Keeps nothing.
 
-    Makes no folder: without an output folder the catalog is made for the moment.
+    Makes no folder: without an output folder the catalog is made for the moment. Of each instrument
+    with something to be made, the first file is processed: what has no usable value there is named
+    with the setting.
 
     Shows a screen of summaries, one for all scenes that are alike, with the memory that a process
     needs for a scene; with --all every step of each scene with its settings and reasons. Exit code
@@ -118,12 +120,15 @@ def _plan(
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
     earlier = earlier_problems(settings, selection)
     scenes = []
+    first: dict[str, Scene] = {}
     alike: dict[tuple[str, ...], list[Judgement]] = {}
     count = to_be_made = 0
     failed = False
     for judged in judgements:
         count += 1
         to_be_made += bool(judged.stale)
+        if judged.stale and judged.scene.granules and not judged.scene.members:
+            first.setdefault(judged.scene.instrument, judged.scene)
         failed |= judged.held or not judged.planned
         if judged.due or judged.held:
             for problems in earlier:
@@ -135,6 +140,7 @@ def _plan(
         elif not stale or judged.stale or judged.failure:
             lines = _scene_lines(judged, plan=not stale)
             alike.setdefault((judged.scene.instrument, *lines), []).append(judged)
+    empty = list(_empty(settings, first.values()))
     no_scene = not count and selects_no_scene(settings, selection)
     lacking = settings.metadata.lacking
     if as_json:
@@ -146,6 +152,7 @@ def _plan(
             "refused_files": {granule.path: granule.reason for granule in refused},
             **findings_document(findings),
             "lacking_metadata": list(lacking),
+            "empty_in_first_file": empty,
         }
         typer.echo(json.dumps(document, indent=2))
     else:
@@ -154,6 +161,8 @@ def _plan(
             say(NO_SCENE)
         _show_refused([granule.reason for granule in refused])
         most = None if everything else _FEW
+        columns = "product", "flag", "values", "settings"
+        show_rows("Without a usable value in the first file", columns, empty, most)
         show_findings(findings, most)
         _show_rest(lacking, *earlier, most)
         # With --stale, fresh scenes are not judged.
@@ -161,6 +170,15 @@ def _plan(
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
     exit_with_status(failed=failed or unexpected or any(earlier) or findings.failed)
+
+
+def _empty(campaign: Campaign, scenes: Iterable[Scene]) -> Iterator[tuple[str, ...]]:
+    """Yield what the first files of some scenes leave empty, and why; not of a store."""
+    from lidarops.run.first_look import empty_in_first_file
+
+    if "://" not in campaign.archive:
+        for scene in scenes:
+            yield from empty_in_first_file(campaign, scene)
 
 
 def _show_rest(
@@ -249,23 +267,11 @@ def _needs(plan: Plan) -> Iterator[str]:
 
 
 def _effect(step: PlannedStep, plan: Plan) -> str:
+    from lidarops.reports.rejections import settings_in_words
     from lidarops.scene.choices import idle_window
 
     idle = idle_window(step, plan.steps)
-    return f"no effect: {idle}" if idle else ", ".join(_settings(step))
-
-
-def _settings(step: PlannedStep) -> Iterator[str]:
-    """Yield the settings of a step with their units."""
-    from lidarops.scene.retrieval import settings_model
-    from lidarops.settings import unit_of
-    from lidarops.units import written
-
-    model = settings_model(step)
-    for key, value in step.settings.items():
-        unit = "" if value is None else unit_of(model, key)
-        words = written(value, unit) if isinstance(value, float) else f"{value} {unit}".rstrip()
-        yield f"{key} {words}"
+    return f"no effect: {idle}" if idle else ", ".join(settings_in_words(step))
 
 
 def _show_stale(title: str, judged: Judgement) -> None:

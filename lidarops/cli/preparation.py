@@ -71,6 +71,10 @@ def init(
             wrong_use=True,
         )
     contents = read_folder(str(root), guess_pointing=True)
+    if not headers_only:
+        from lidarops.run.first_look import without_light
+
+        contents = without_light(contents, root)
     draft = partial(
         draft_campaign,
         contents,

@@ -692,8 +692,9 @@ MOLECULAR_SOURCE: Final = coded(
 BACKGROUND_METHOD: Final = coded(
     "background_method",
     "method by which the background is estimated",
-    ("tail_mean", "cubic", "known_shape"),
-    "tail_mean: mean of the far range. cubic: from the cubic of a homogeneous section."
+    ("tail_mean", "cubic", "known_shape", "before_pulse"),
+    "before_pulse: mean of the bins of the record before the pulse. tail_mean: mean of the far"
+    " range. cubic: from the cubic of a homogeneous section."
     " known_shape: fitted to the far range with the shape of the signal of clean air; the mean of"
     " the far range where the fit fails. Haze that falls with height nearly as air does leaves no"
     " trace in that fit: backgrounds in simulated haze with a scale height of 3 km deviate by more"

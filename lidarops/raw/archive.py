@@ -288,7 +288,10 @@ def _renamed(header: RawHeader, layout: Layout) -> RawHeader:
 # Files with equal channels share one tuple.
 @lru_cache(maxsize=128)
 def _with_names(channels: tuple[RawChannel, ...], layout: Layout) -> tuple[RawChannel, ...]:
-    return tuple(replace(c, name=own.name) for c, own in zip(channels, layout, strict=True))
+    return tuple(
+        replace(c, name=own.name, bins=own.bins, first=None if own.bins == c.bins else own.before)
+        for c, own in zip(channels, layout, strict=True)
+    )
 
 
 class RawFiles:
@@ -420,7 +423,7 @@ class LazyChannel(BackendArray):
         self._format = files.format
         self._files = files.stamps
         self._places = files.places(index)
-        self._kept = files.kept.get(channel.name)
+        self._kept, self._first = files.kept.get(channel.name), channel.first
         self._scales = files.values(index, "scale") if scaled else None
         self.shape = (len(self._files), channel.bins)
         self.dtype = np.dtype(np.float32 if scaled else np.int32)
@@ -435,9 +438,12 @@ class LazyChannel(BackendArray):
         if not (files.size and bins.size):
             return np.empty(files.shape + bins.shape, self.dtype)
         low, past, kept = 0, self.shape[1], self._kept
-        if kept is None and (bins.min() > 0 or bins.max() + 1 < past):
+        whole = self._first is None and bins.min() == 0 and bins.max() + 1 == past
+        if kept is None and not whole:
             low, past = int(bins.min()), int(bins.max()) + 1
             kept = ((low, past),)
+        if kept is not None and self._first:
+            kept = tuple((first + self._first, end + self._first) for first, end in kept)
         values = np.empty((files.size, past - low), self.dtype)
         row = np.empty(past - low, np.dtype("<i4"))
         read_channel = raw_formats()[self._format].read_channel
@@ -462,7 +468,8 @@ def build_raw_dataset(files: RawFiles, *, scaled: bool) -> xr.Dataset:
     grids = {grid: "range" if i == 1 else f"range_{i}" for i, grid in enumerate(ordered, 1)}
     stated = [file.stated for file in files.files]
     notes = {note for header in stated for note in header.notes}
-    notes |= {header.doubt for header in stated if isinstance(header, RawHeader)} - {""}
+    read = [header for header in stated if isinstance(header, RawHeader)]
+    notes |= {doubt for header in read for doubt in (header.doubt, header.time_doubt)} - {""}
     variables: dict[str, _Variable] = {}
     for index, channel in enumerate(files.selected):
         dims = ("time", grids[files.grids[index]])

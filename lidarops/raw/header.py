@@ -84,6 +84,9 @@ class RawChannel:
     """V; None unless photon counting."""
     bin_shift: float | None = None
     """Bins."""
+    first: int | None = None
+    """Place of the first of `bins` in the file, of which others are left out; None of a whole
+    record."""
 
     def __hash__(self) -> int:
         return hash((self.name, self.places, self.shots))
@@ -134,6 +137,9 @@ class RawHeader(Header):
     doubt: str = ""
     """Why the pointing is unknown although the header holds one, in words; the file is refused
     unless the campaign gives header_pointing or zenith_angle."""
+    time_doubt: str = ""
+    """Why the start is in doubt, in words; the file is refused unless the campaign has
+    name_times ignored."""
     written_angle: float | None = None
     """degree; the angle as written, where no line of the file tells what it is."""
 
@@ -156,6 +162,17 @@ class RawHeader(Header):
         notes = [note for note in self.notes if POINTING_NOTE not in note]
         notes.append(f"the angle of the header is {POINTING_NOTE} {pointing}: header_pointing")
         return replace(self, zenith_angle=abs(angle), azimuth=azimuth, doubt="", notes=tuple(notes))
+
+    def check_time(self) -> None:
+        """Raise a `RawFormatError` where the start is in doubt."""
+        if self.time_doubt:
+            raise RawFormatError(
+                self.time_doubt,
+                file=self.path,
+                field="start",
+                remedy="leave the file out, or correct its header: one of them is wrong; or set"
+                " name_times: ignored, if names tell no time",
+            )
 
     @property
     def coordinates(self) -> tuple[float, float] | None:

@@ -222,7 +222,6 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
     start, stop = _moments(dates)
-    _check_name(first.strip(), start)
     place, notes = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, unknown = _parse_lasers(third)
     block_end = _dataset_lines_end(buffer, block_start, number)
@@ -260,6 +259,7 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         channels=channels,
         site=site,
         doubt=doubt,
+        time_doubt=_time_doubt(first.strip(), start),
         written_angle=place["zenith_as_written"] if scan is None else None,
         name=first.strip(),
         scan=scan,
@@ -370,10 +370,9 @@ def stated_start(buffer: bytes) -> datetime | None:
         if dates is None:
             return None
         start = _moments(dates)[0]
-        _check_name(_text(buffer[:first]).strip(), start)
     except RawFormatError:
         return None
-    return start
+    return None if _time_doubt(_text(buffer[:first]).strip(), start) else start
 
 
 def named_time(name: str) -> datetime | None:
@@ -394,16 +393,15 @@ def named_time(name: str) -> datetime | None:
         return None
 
 
-def _check_name(name: str, start: datetime) -> None:
-    """Refuse a start that is more than a day away from the time in the name of the file."""
+def _time_doubt(name: str, start: datetime) -> str:
+    """Return that a start is more than a day away from the time in the name of the file."""
     named = named_time(name)
-    if named is not None and abs(start - named) > _LONGEST:
-        raise RawFormatError(
-            f"states {start:%Y-%m-%d %H:%M}, the name of the file in its first line ({name})"
-            f" {named:%Y-%m-%d %H:%M}",
-            field="start",
-            remedy="leave the file out, or correct its header: one of them is wrong",
-        )
+    if named is None or abs(start - named) <= _LONGEST:
+        return ""
+    return (
+        f"states {start:%Y-%m-%d %H:%M}, the name of the file in its first line ({name})"
+        f" {named:%Y-%m-%d %H:%M}"
+    )
 
 
 def _refuse_export(data: bytes) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -19,12 +20,24 @@ from numpy.typing import NDArray
 from lidarops.campaign.model import Campaign, campaign_schema
 from lidarops.campaign.yaml_errors import with_plain_numbers
 from lidarops.catalog.draft import drafted_instruments
-from lidarops.catalog.folder import FirstLook, FolderContents, InstrumentHeaders
+from lidarops.catalog.folder import (
+    FileGroup,
+    FirstLook,
+    FolderContents,
+    InstrumentHeaders,
+    Purpose,
+)
 from lidarops.errors import LidarOpsError, SceneError
 from lidarops.netcdf.read import open_product
-from lidarops.records import RunRecord, file_channels, is_glued
-from lidarops.retrieve.signal.light import MEDIAN_OF_NORMAL
+from lidarops.raw.archive import open_archive
+from lidarops.records import RunRecord, Scene, file_channels, is_glued
+from lidarops.reports.rejections import OF_ONE_PROFILE, rejection_rows
+from lidarops.retrieve.signal.light import FEWEST, MEDIAN_OF_NORMAL
 from lidarops.run.archive import bring_up_to_date
+from lidarops.scene.job import Job
+from lidarops.scene.plan import plan_scene
+from lidarops.scene.processing import process_scene
+from lidarops.scene.profiles import lightless_profiles
 
 _MOST_FILES: Final = 96
 """Files of a look: all of half an hour of minutes, or four of each hour of a day."""
@@ -201,6 +214,46 @@ class _Look:
             return None, earliest
         farthest = max(float(np.median(found)) for found in ends.values())
         return float(np.ceil(farthest / _STEP) * _STEP), earliest
+
+
+def empty_in_first_file(campaign: Campaign, scene: Scene) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the products of a scene that its first file leaves without a usable value, and why.
+
+    Product, flag, share of the values and settings, but not what a longer average may change.
+    """
+    first = replace(scene, granules=scene.granules[:1])
+    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+        own = campaign.model_copy(update={"output": folder})
+        outcome = process_scene(Job(own, first, plan_scene(first, own)))
+    empty = tuple(product for product in outcome.products if product.usable == 0)
+    for row in rejection_rows([replace(outcome, products=empty)]):
+        if row[-1].partition(":")[0] in OF_ONE_PROFILE:
+            yield row
+
+
+def without_light(contents: FolderContents, root: Path) -> FolderContents:
+    """Return what a folder holds, with groups told apart whose files show no light of a laser."""
+    groups = (
+        replace(group, purpose=Purpose.UNLIT)
+        if group.purpose is Purpose.MEASUREMENT and _is_unlit(group, root)
+        else group
+        for group in contents.groups
+    )
+    return replace(contents, groups=tuple(groups))
+
+
+def _is_unlit(group: FileGroup, root: Path) -> bool:
+    """Return whether some files of a group show no light, in no channel."""
+    if len(group.files) < FEWEST:
+        return False
+    paths = [root / path for path in group.files[:: len(group.files) // FEWEST]]
+    try:
+        archive = open_archive(paths, mask_and_scale=False, header_position="ignore")
+        dark = lightless_profiles(archive, None).values()
+    except LidarOpsError:
+        # What cannot be read is refused with its reason when it is processed.
+        return False
+    return bool(dark) and all(bool(rows.all()) for rows in dark)
 
 
 def _sample(headers: InstrumentHeaders) -> list[str]:

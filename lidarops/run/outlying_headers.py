@@ -39,8 +39,9 @@ _REMEDY: Final = (
 
 ReadHeader = Callable[[Granule], RawHeader | None]
 """Header of a file; None where it cannot be read."""
-Ahead = Callable[[Granule], float]
-"""Clock of the instrument minus UTC at a file, s, which its start has not."""
+Ahead = Callable[[Granule], float | None]
+"""Clock of the instrument minus UTC at a file, s, which its start has not; None where names tell no
+time."""
 
 
 class Outlying(NamedTuple):
@@ -199,9 +200,9 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[
     away: dict[int, float] = {}
     longest = 0.0
     for place, granule in enumerate(around):
-        named = time_in_path(granule.path, granule.format)
-        if named and granule.start and granule.stop:
-            away[place] = (granule.start - named).total_seconds() + ahead(granule)
+        named, clock = time_in_path(granule.path, granule.format), ahead(granule)
+        if named and clock is not None and granule.start and granule.stop:
+            away[place] = (granule.start - named).total_seconds() + clock
             longest = max(longest, (granule.stop - granule.start).total_seconds())
     if len(away) <= FEWEST_ALIKE:
         return
@@ -209,7 +210,7 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[
     for place, own in away.items():
         granule = around[place]
         room = longest + _JITTER
-        if abs(abs(own - usual) - _SUMMER_TIME) <= room or any(
+        if abs(own - usual) <= room or any(
             abs(own - other) <= room for at, other in away.items() if at != place
         ):
             continue
@@ -218,7 +219,9 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[
                 f"the start {granule.start:%Y-%m-%d %H:%M:%S} UTC, {own - usual:+.0f} s away from"
             )
             text += " where its name and the files around it have it"
-            yield place, Outlying(text, "")
+            # Such a file may be the only one of its day before or after a change of time.
+            summer = abs(abs(own - usual) - _SUMMER_TIME) <= room
+            yield place, Outlying("", text) if summer else Outlying(text, "")
 
 
 def _shots(header: RawHeader | None) -> int:

@@ -155,7 +155,8 @@ class Recipe:
         start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
         raw = (record for record in inputs if record.role in RAW)
         granules = [_granule(archive, record, keys["instrument"], part["facts"]) for record in raw]
-        granules = [_named(granule, self.plan) for granule in granules]
+        before = part["facts"].get("pre_trigger", 0.0)
+        granules = [_named(granule, self.plan, before) for granule in granules]
         granules.sort(key=_order)
         return Scene(
             id=self.plan.scene,
@@ -265,8 +266,11 @@ def _granule(root: Path, record: InputRecord, instrument: str, facts: Mapping[st
     )
 
 
-def _named(granule: Granule, plan: Plan) -> Granule:
-    """Return a granule with the channel names of a product, whose plan states their recorders."""
+def _named(granule: Granule, plan: Plan, pre_trigger: float) -> Granule:
+    """Return a granule with the channel names of a product, whose plan states their recorders.
+
+    Without the bins before the pulse.
+    """
     own = {channel.name: channel.recorder for channel in granule.layout}
     stated = {
         step.channel: step.settings["recorder"]
@@ -275,4 +279,5 @@ def _named(granule: Granule, plan: Plan) -> Granule:
         and step.instrument in ("", granule.instrument)
     }
     names = recorder_names([(granule.layout, 1, datetime.fromtimestamp(0, UTC))], stated)
-    return replace(granule, layout=named_layout(granule.layout, names))
+    named = replace(granule, layout=named_layout(granule.layout, names))
+    return named.after_pulse(pre_trigger) if pre_trigger else named

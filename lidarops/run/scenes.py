@@ -291,6 +291,11 @@ def _by_layout(
     dark: list[Granule],
 ) -> list[Scene]:
     layouts: dict[str, list[Granule]] = defaultdict(list)
+    owner = campaign.instruments[instrument]
+    dark = [granule for granule in dark if granule.instrument == instrument]
+    if any(fact.pre_trigger for fact in owner.facts):
+        before = owner.facts_at(_start(members[0])).pre_trigger
+        members, dark = ([g.after_pulse(before) for g in own] for own in (members, dark))
     for granule in members:
         layouts[_layout_key(granule.layout)].append(granule)
     scenes = []
@@ -300,7 +305,7 @@ def _by_layout(
             Scene(
                 id=f"{instrument}_{start:{STAMP}}{suffix}",
                 campaign=campaign.name,
-                station=campaign.instruments[instrument].station,
+                station=owner.station,
                 instrument=instrument,
                 start=start,
                 stop=stop,
@@ -308,8 +313,7 @@ def _by_layout(
                 dark=tuple(
                     granule
                     for granule in dark
-                    if granule.instrument == instrument
-                    and _layout_key(granule.layout) == key
+                    if _layout_key(granule.layout) == key
                     and [c.recorder for c in granule.layout]
                     == [c.recorder for c in group[0].layout]
                     and _start(group[0]) - DARK_REACH

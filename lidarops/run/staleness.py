@@ -368,9 +368,12 @@ class Judge(DayStates):
             ),
         )
 
-    def _ahead(self, granule: Granule) -> float:
-        """Return the clock of the instrument minus UTC at a file, s."""
-        return self.campaign.instruments[granule.instrument].facts_at(_moment(granule)).clock_offset
+    def _ahead(self, granule: Granule) -> float | None:
+        """Return the clock of the instrument minus UTC at a file, s; None of one without names."""
+        instrument = self.campaign.instruments[granule.instrument]
+        if instrument.name_times == "ignored":
+            return None
+        return instrument.facts_at(_moment(granule)).clock_offset
 
     def _months(self, days: set[int]) -> Iterator[Scene]:
         """Yield the months that begin on some days, of which products are made."""

@@ -74,12 +74,12 @@ class ChannelCase(Generic[R_co]):
 
     @property
     def last(self) -> float:
-        """Far end of the last bin, m, without range offset."""
-        return self.channel.bins * self.channel.bin_width
+        """Far end of the last bin, m."""
+        return self.channel.bins * self.channel.bin_width + self.range_offset
 
     @property
     def range_offset(self) -> float:
-        """Shift of the ranges of the channel, m: the given offset minus the given lag."""
+        """Shift of the ranges of the channel, m."""
         return range_offset(self.channel, self.facts_of_channel)
 
     def run(
@@ -222,9 +222,15 @@ def joined_layout(
 
 
 def range_offset(channel: ChannelLayout, facts: ChannelFacts) -> float:
-    """Return the shift of the ranges of a channel, m: the given offset minus the given lag."""
+    """Return the shift of the ranges of a channel, m: the given offset minus the given lag.
+
+    With what is left of the bin in which the pulse leaves.
+    """
     late = facts.lag * channel.bin_width if isinstance(facts.lag, float) else 0.0
-    return (facts.range_offset or 0.0) - late
+    offset = (facts.range_offset or 0.0) - late
+    if channel.pre_trigger:
+        offset += channel.before * channel.bin_width - channel.pre_trigger
+    return offset
 
 
 def member_channel(layout: Iterable[ChannelLayout], name: str) -> ChannelLayout:

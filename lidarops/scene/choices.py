@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import xarray as xr
 
+from lidarops.campaign.model import ChannelFacts
 from lidarops.constants import FIXED, KNOWN_SHAPE_PAPERS, LEAST_SPREAD, STEEPEST
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import (
@@ -19,30 +20,49 @@ from lidarops.netcdf.variables import (
     whole_error,
 )
 from lidarops.raw.header import Stretches
-from lidarops.records import PlannedStep
-from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.records import ChannelLayout, PlannedStep, is_glued
 from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
-from lidarops.scene.case import ChannelCase, Entry, prepared_channels
+from lidarops.scene.case import ChannelCase, Entry, prepared_channels, range_offset
+from lidarops.scene.profiles import BEFORE, ChannelSignal
 from lidarops.settings import SettingsModel, quantity
 
 FEWEST_BINS: Final = BACKGROUND.fewest_bins
 """Fewest bins of a section, and of the range of a background."""
 
 
-def with_methods(
-    product: xr.Dataset, molecules: MolecularProfile, *, known_shape: bool
-) -> xr.Dataset:
+def with_methods(product: xr.Dataset, signal: ChannelSignal, *, known_shape: bool) -> xr.Dataset:
     """Return the product with the source of its air, and method and papers of its backgrounds."""
-    if known_shape:
+    before = f"{BEFORE}{signal.channel}" in signal.source.archive
+    method = "before_pulse" if before else "known_shape" if known_shape else "tail_mean"
+    if method == "known_shape":
         product = product.assign_attrs(references=KNOWN_SHAPE_PAPERS)
-    source = "standard_atmosphere" if molecules.standard else "sounding"
     return product.assign(
-        molecular_source=MOLECULAR_SOURCE.code(source),
-        background_method=BACKGROUND_METHOD.code("known_shape" if known_shape else "tail_mean"),
+        molecular_source=MOLECULAR_SOURCE.code(
+            "standard_atmosphere" if signal.molecules.standard else "sounding"
+        ),
+        background_method=BACKGROUND_METHOD.code(method),
     )
+
+
+def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:
+    """Return how many bins before the pulse give the background; 0 for too few, as of glued ones.
+
+    As many are needed as are in the far range by default.
+    """
+    if not channel.pre_trigger or is_glued(channel.name):
+        return 0
+    # Those in which the pulse leaves, by the offset of the channel, hold light.
+    bins = channel.before - max(math.ceil(range_offset(channel, facts) / channel.bin_width), 0)
+    return bins if bins >= max(BACKGROUND.tail_share * channel.bins, FEWEST_BINS) else 0
+
+
+def before_pulse(case: ChannelCase[Any]) -> str:
+    """Return why bins before the pulse give the background; empty where they do not."""
+    bins = bins_before(case.channel, case.facts_of_channel)
+    return f"mean of the {bins} bins before the pulse" if bins else ""
 
 
 def tail(case: ChannelCase[Any], limits: tuple[float, float] | None) -> tuple[float, float]:
@@ -60,7 +80,7 @@ def tail(case: ChannelCase[Any], limits: tuple[float, float] | None) -> tuple[fl
 class BackgroundSettings(SettingsModel):
     """How a background is estimated."""
 
-    method: Literal["tail_mean", "cubic", "known_shape"]
+    method: Literal["tail_mean", "cubic", "known_shape", "before_pulse"]
     range: tuple[float, float] = quantity(unit="m")
 
 

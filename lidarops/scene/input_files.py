@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,18 +13,15 @@ from typing import Final
 
 import xarray as xr
 
-from lidarops.campaign.model import Campaign
-from lidarops.errors import (
-    LidarOpsError,
-    SceneError,
-    UnavailableError,
-    UnreadableFileError,
-)
+from lidarops.campaign.model import Campaign, InstrumentFacts, channel_facts
+from lidarops.errors import LidarOpsError, SceneError, UnavailableError, UnreadableFileError
 from lidarops.raw.archive import open_counts
 from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
+from lidarops.scene.choices import bins_before
 from lidarops.scene.dependence import scene_facts
+from lidarops.scene.profiles import BEFORE
 from lidarops.system.stores import RemoteStore
 
 # A file that a scan does not find either counts as lost, like one that cannot be read.
@@ -146,6 +143,7 @@ def open_granules(
     channels: list[str],
     *,
     stretches: Mapping[str, Stretches] | None = None,
+    before: bool = False,
 ) -> xr.Dataset:
     """Return the raw counts of some granules of a scene, lazy, with the pointing of the campaign.
 
@@ -159,6 +157,8 @@ def open_granules(
         Folder of the granules.
     channels, stretches
         As for `lidarops.raw.archive.open_archive`.
+    before : bool
+        Whether to add the bins before the pulse, as channels whose names begin with ``before_``.
 
     Raises
     ------
@@ -168,6 +168,8 @@ def open_granules(
     archive = open_counts(granules, root=root, channels=channels, stretches=stretches)
     # Facts of the campaign override the pointing in the headers.
     facts = scene_facts(campaign, scene)
+    if before and facts.pre_trigger:
+        archive = archive.assign(_before_pulse(granules, root, channels, facts))
     fixed = {"zenith_angle": facts.zenith_angle, "azimuth": facts.azimuth}
     pointing = {
         name: xr.full_like(archive["zenith_angle"], angle)
@@ -175,3 +177,29 @@ def open_granules(
         if angle is not None
     }
     return archive.assign_coords(pointing) if pointing else archive
+
+
+def _before_pulse(
+    granules: Sequence[Granule], root: Path, channels: Collection[str], facts: InstrumentFacts
+) -> Mapping[str, xr.DataArray]:
+    """Return the bins before the pulse of channels that have enough of them."""
+    bins = {
+        channel.name: bins_before(channel, channel_facts(facts, channel.name))
+        for channel in granules[0].layout
+        if channel.name in channels
+    }
+    shown = [name for name, number in bins.items() if number]
+    if not shown:
+        return {}
+    records = (
+        replace(
+            granule,
+            layout=tuple(
+                replace(c, bins=bins.get(c.name, c.bins), pre_trigger=0.0) for c in granule.layout
+            ),
+        )
+        for granule in granules
+    )
+    archive = open_counts(records, root=root, channels=shown)
+    own = {dim: f"{BEFORE}{dim}" for dim in map(str, archive.dims) if dim.startswith("range")}
+    return {f"{BEFORE}{name}": array for name, array in archive.rename(own).items()}

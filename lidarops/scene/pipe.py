@@ -56,7 +56,14 @@ from lidarops.scene.case import (
     lag_is_unknown,
     prepared_channels,
 )
-from lidarops.scene.profiles import ChannelSignal, FileProfiles, GluedProfiles, Source, bin_ranges
+from lidarops.scene.profiles import (
+    BEFORE,
+    ChannelSignal,
+    FileProfiles,
+    GluedProfiles,
+    Source,
+    bin_ranges,
+)
 from lidarops.settings import SettingsModel, quantity
 
 _Power = npt.NDArray[np.float64]
@@ -163,6 +170,9 @@ class ReadSettings(SettingsModel):
 
     wavelength: float = quantity(unit="m")
     recorder: str = ""
+    pre_trigger: float | None = quantity(
+        None, unit="m", description="of a record whose bins before the pulse are left out"
+    )
 
 
 def plan_read(case: ChannelCase[Any]) -> Entry:
@@ -178,7 +188,11 @@ def plan_read(case: ChannelCase[Any]) -> Entry:
     metres = case.facts_of_channel.wavelength or case.channel.wavelength
     if math.isnan(metres):
         return case.leave(READ_STEP, NO_WAVELENGTH, rule="channel")
-    settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder)
+    before = case.channel.pre_trigger or None
+    if not case.channel.bins:
+        reason = f"pre_trigger of {before:g} m leaves no bin: give what the record counts before"
+        return case.leave(READ_STEP, f"{reason} the pulse", rule="channel")
+    settings = ReadSettings(wavelength=metres, recorder=case.channel.recorder, pre_trigger=before)
     return case.run(READ_STEP, f"required by {' and '.join(requesters)}", settings, rule="channel")
 
 
@@ -199,7 +213,8 @@ def plan_overlap(case: ChannelCase[Any]) -> Entry:
             "the campaign gives no full_overlap_range: near bins are used as they are, and"
             " those whose signal shows no full overlap are rejected or to be used with care",
         )
-    reason = "bins nearer than full overlap are flagged and excluded"
+    assumed = ", which is assumed," if case.facts.full_overlap_assumed else ""
+    reason = f"bins nearer than full overlap{assumed} are flagged and excluded"
     if profile:
         reason = f"overlap_profile given by the campaign; {reason}"
     settings = OverlapSettings(full_overlap_range=full, overlap_profile=profile)
@@ -521,9 +536,12 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
             signal.overlap = source.ancillaries.overlaps[stages.overlap.overlap_profile].at
     if stages.range_offset is not None:
         signal.range_offset = stages.range_offset.range_offset
-    dark = None
-    if stages.dark is not None and source.dark is not None:
-        dark = labeled.read_dark(source.dark, signal.channel, method=stages.dark.method)
+    before = f"{BEFORE}{signal.channel}"
+    dark = {
+        name: labeled.read_dark(source.dark, name, method=stages.dark.method)
+        for name in (signal.channel, before)
+        if stages.dark is not None and source.dark is not None and name in source.dark
+    }
     correction = stages.dead_time
     if correction is not None and correction.analog is not None:
         _estimate_dead_time(signal, signal.channels[correction.analog], correction.lag)
@@ -532,20 +550,24 @@ def _carry_out(stages: Stages, signal: ChannelSignal) -> None:
         signal.dead_time_uncertainty = correction.dead_time_uncertainty or 0.0
     if stages.noise is not None:
         signal.relative_variance = stages.noise.method == "differences"
+        condition = partial(
+            labeled.condition,
+            dead_time=signal.dead_time,
+            dead_time_uncertainty=signal.dead_time_uncertainty,
+            noise_variance=stages.noise.noise_variance,
+            baseline_uncertainty=stages.noise.baseline_uncertainty,
+        )
         signal.profiles = FileProfiles(
             signal.channel,
             bin_ranges(source.archive, signal.channel, signal.range_offset),
-            dark,
+            dark.get(signal.channel),
             partial(
-                labeled.condition,
-                dead_time=signal.dead_time,
-                dead_time_uncertainty=signal.dead_time_uncertainty,
-                noise_variance=stages.noise.noise_variance,
-                baseline_uncertainty=stages.noise.baseline_uncertainty,
-                dark=dark,
+                condition,
+                dark=dark.get(signal.channel),
                 range_offset=signal.range_offset,
                 full_overlap_range=signal.full_overlap_range or 0.0,
             ),
+            partial(condition, dark=dark.get(before)) if before in source.archive else None,
         )
     if stages.glue is not None:
         estimated = stages.lag is not None and stages.lag.method == "estimate"

@@ -211,10 +211,10 @@ class _Work(ABC):
         job = self.job
         read = {step.channel for step in steps if step.name == READ_STEP}
         subtracted = [step.channel for step in steps if step.name == "dark"]
-        layout = [channel.name for channel in scene.layout]
+        layout = [channel.name for channel in scene.layout if channel.bins]
         held = [name for name in layout if name in read]
         opened = partial(open_granules, job.campaign, scene, root=self.root)
-        archive = opened(scene.granules, channels=held, stretches=stretches)
+        archive = opened(scene.granules, channels=held, stretches=stretches, before=True)
         # All channels and bins tell, whatever is made of them.
         lightless = (
             lightless_profiles(opened(scene.granules, channels=layout), job.profiles_per_chunk)
@@ -229,7 +229,11 @@ class _Work(ABC):
             self.notes[f"without light: {words}"] = None
         source = Source(
             archive=archive,
-            dark=(opened(scene.dark, channels=subtracted) if subtracted and scene.dark else None),
+            dark=(
+                opened(scene.dark, channels=subtracted, before=True)
+                if subtracted and scene.dark
+                else None
+            ),
             ancillaries=Ancillaries.read(job.campaign.folder, ancillary_files(steps)),
             station_altitude=job.campaign.stations[scene.station].altitude,
         )

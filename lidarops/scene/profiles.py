@@ -17,7 +17,7 @@ from lidarops.campaign.ancillary_files import Ancillaries
 from lidarops.constants import DEAD_TIME_UNCERTAINTY
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
-from lidarops.retrieve.signal import labeled_gluing, light
+from lidarops.retrieve.signal import labeled, labeled_gluing, light
 from lidarops.retrieve.signal.dark import DarkSignals
 from lidarops.retrieve.signal.labeled_averaging import ClockAverage, IntervalSums, Screening
 from lidarops.retrieve.signal.lag import ChannelLag
@@ -31,6 +31,8 @@ GEOMETRY: Final = ("time", "time_bnds", "zenith_angle", "azimuth")
 """Coordinates that every product over the time of the profiles has."""
 LIGHTLESS: Final = "lightless"
 """End of the name of the variable of a channel that tells which profiles hold no light."""
+BEFORE: Final = "before_"
+"""Begin of the name of the bins of a channel before the pulse."""
 _PARTS: Final = ("power", "variance", "quality")
 
 
@@ -74,6 +76,8 @@ class FileProfiles:
         The dark signals that are subtracted.
     condition : callable
         `lidarops.retrieve.signal.labeled.condition` with its settings.
+    of_before : callable, optional
+        As `condition`, of the bins before the pulse.
     """
 
     def __init__(
@@ -82,9 +86,11 @@ class FileProfiles:
         range: npt.NDArray[np.float64],  # noqa: A002 - the field's word
         dark: DarkSignals | None,
         condition: Callable[[xr.Dataset, str], xr.Dataset],
+        of_before: Callable[[xr.Dataset, str], xr.Dataset] | None = None,
     ) -> None:
         self.range = range
         self._channel, self._dark, self._condition = channel, dark, condition
+        self._of_before = of_before
 
     def shots(self, counts: xr.Dataset) -> xr.DataArray:
         """Return the number of laser shots of each profile."""
@@ -95,7 +101,10 @@ class FileProfiles:
         conditioned = self._condition(counts, self._channel)
         if (dark := f"{self._channel}_{LIGHTLESS}") in counts:
             conditioned["quality"][counts[dark].to_numpy()] = np.int32(Quality.NO_SIGNAL)
-        return conditioned
+        if self._of_before is None:
+            return conditioned
+        before = self._of_before(counts, f"{BEFORE}{self._channel}")
+        return conditioned.assign(labeled.sky_before(before))
 
     def sums(
         self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
@@ -170,6 +179,7 @@ class GluedProfiles:
         analog, photon = means
         glued = labeled_gluing.glue(analog, photon, self._lag)
         kept = photon.isel(range=slice(glued.sizes["range"])).drop_vars(_PARTS)
+        kept = kept.drop_vars((labeled.SKY, labeled.SKY_VARIANCE), errors="ignore")
         joined = kept.assign(glued.variables)
         return joined.assign(labeled_gluing.glue_cells(analog, photon, glued)) if cells else joined
 
@@ -418,7 +428,8 @@ def chunks(
     allowed = functools.reduce(np.intersect1d, limiting, np.arange(count + 1))
     if not allowed.size or allowed[-1] < count:
         allowed = np.append(allowed, count)
-    known = tuple(f"{name}_" for name in (*GEOMETRY, *channels))
+    wanted = (*GEOMETRY, *channels, *(f"{BEFORE}{name}" for name in channels))
+    known = tuple(f"{name}_" for name in wanted)
     archive = archive[[name for name in archive.variables if f"{name}_".startswith(known)]]
     first = 0
     while first < count:

@@ -415,7 +415,8 @@ class Simulator:
 
 
 def _offset(conditions: _Conditions, channel: str) -> float:
-    return channel_facts(conditions.facts, channel).range_offset or 0.0
+    facts = conditions.facts
+    return (channel_facts(facts, channel).range_offset or 0.0) - facts.pre_trigger
 
 
 def _cache(cache: dict[Key, Cached], key: Key, value: Cached) -> Cached:

@@ -19,20 +19,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_443,
-    "lines of code alone": 46_018,
-    "modules": 279,
+    "lines": 70_863,
+    "lines of code alone": 46_339,
+    "modules": 280,
     "dataclasses": 250,
-    "lines of dataclasses": 6_688,
+    "lines of dataclasses": 6_723,
     "tuning numbers": 220,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 5_823,
+    "lines of the largest package": 5_885,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 61, "functions": 589, "changes": 215},
-    "elastic": {"modules": 71, "functions": 732, "changes": 227},
+    "homogeneous": {"modules": 61, "functions": 593, "changes": 216},
+    "elastic": {"modules": 71, "functions": 740, "changes": 228},
 }
 
 

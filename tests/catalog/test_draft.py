@@ -15,6 +15,7 @@ from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
 from lidarops.records import Granule, Role, Status
+from lidarops.run.archive import bring_up_to_date
 
 
 def drafted(folder: Path, campaign: Path) -> tuple[Campaign, str]:
@@ -398,6 +399,34 @@ def test_names_by_another_time_than_headers_are_a_question(
         write(tmp_path / f"raw/h26301{hour:02d}.{number:02d}0000", content(600.0 + number))
     _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert question in next(line for line in text.splitlines() if "clock_offset" in line)
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_names_that_tell_no_time_are_a_question_and_a_clock_far_from_them_is_none(
+    tmp_path: Path, free: bool
+) -> None:
+    """Of a clock without battery, all files are as far from their names."""
+    days = [3, 17, 5, 28, 11] if free else [13] * 5
+    for number, day in enumerate(days):
+        name = f"h265{day:02d}{10 + number}.000000"
+        data = content(600.0 + number)
+        first, rest = data.split(b"\r\n", 1)
+        data = b" ".join([f" {name}".encode()]).ljust(len(first)) + b"\r\n" + rest
+        write(tmp_path / "raw" / name, data)
+    if not free:
+        shown = CliRunner().invoke(app, ["init", str(tmp_path / "raw"), str(tmp_path / "c.yaml")])
+        assert "states 2026-03-01 10:00, the name of the file in its first line" in shown.output
+        return
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert "name_times: ignored  # ? states 2026-03-01 10:00, the name of the file" in text
+    for checked, status in ((False, Status.GOOD), (True, Status.REFUSED)):
+        if checked:
+            path = tmp_path / "campaign.yaml"
+            path.write_text(text.replace("name_times: ignored", "name_times: checked"))
+            campaign = load_campaign(path)
+        result = bring_up_to_date(campaign)
+        assert {granule.status for granule in granules(campaign)} == {status}
+        assert not result.set_aside
 
 
 def test_the_letters_of_a_station_are_no_words(tmp_path: Path) -> None:

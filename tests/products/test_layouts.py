@@ -219,7 +219,7 @@ def test_method_codes_are_published_and_keep_their_numbers():
         for row in layout_of(kind).data
         if row.name.endswith(("_method", "_source")) and known.package.startswith("lidarops.")
     }
-    background = ("tail_mean", "cubic", "known_shape")
+    background = ("tail_mean", "cubic", "known_shape", "before_pulse")
     assert coded == {
         ("homogeneous", "retrieval_method"): (
             "compressed", "direct", "cubic", "known_background", "linearized", "known_extinction",

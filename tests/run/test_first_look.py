@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from support import factories
 from support.archives import raw_archives
 from typer.testing import CliRunner
 
@@ -80,7 +84,8 @@ def test_nothing_is_proposed_of_records_that_begin_before_the_pulse(
     campaign, text = drafted(case, tmp_path / "campaign.yaml")
     (lidar,) = campaign.instruments.values()
     assert lidar.products.model_dump(exclude_none=True).keys() == {"signal"}
-    assert "? light begins at 1967 m: does the record begin before the pulse?" in text
+    question = "# pre_trigger: 1967 m  # ? light begins there, in bin 524 of 3.75 m: at which range"
+    assert question in text
 
 
 def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> None:
@@ -129,3 +134,44 @@ def test_what_is_proposed_of_real_archives_is_usable(
             first = opened["range"][known.any("time")].min().item()
         assert low.mean().item() >= least
         assert first <= elastic[product.channel.partition("_")[2]]
+
+
+def test_what_the_first_file_leaves_empty_is_named_with_its_setting(tmp_path: Path) -> None:
+    """Nothing is nearer than 100 km; whether anybody checked that is stated, too."""
+    raw_archives.write(tmp_path / "raw/coast/h00", raw_archives.content(0.0, bins=1000))
+    facts = {"full_overlap_range": 1e5, "full_overlap_assumed": True}
+    products = {"signal": {"channels": ["photon_532o"]}}
+    settings = factories.campaign(facts=[facts], products=products)
+    path = tmp_path / "campaign.yaml"
+    path.write_text(yaml.safe_dump(settings.model_dump(mode="json", exclude={"simulation"})))
+
+    def told(*words: str) -> Any:
+        return json.loads(CliRunner().invoke(app, [*words, str(path), "--json"]).output)
+
+    words = "bins nearer than full overlap, which is assumed, are flagged and excluded"
+    setting = f"overlap: full_overlap_range 100000 m, {words}"
+    row = ["signal photon_532o of lidar", "incomplete_overlap", "100 %", setting]
+    assert row in told("plan")["empty_in_first_file"]
+    assert row in told("reprocess")["rejections"]
+    assert told("plan")["empty_in_first_file"] == []
+
+
+def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_path: Path) -> None:
+    case = data_root / "cases/laser_off"
+    if not case.is_dir():
+        pytest.skip("no case of a laser that was off")
+    (tmp_path / "raw/night").mkdir(parents=True)
+    for path in (*sorted((case / "raw").glob("h*"))[:20], *sorted((case / "rawoff").glob("h*"))):
+        target = tmp_path / "raw" / ("night" if path.parent.name == "rawoff" else "") / path.name
+        target.symlink_to(path)
+    for name in ("session.ZIP", "notes.txt", "log.txt"):
+        (tmp_path / "raw" / name).touch()
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert [lidar.files for lidar in campaign.instruments.values()] == [["h*"]]
+    assert "# 30 files, ? without light of the laser by their counts, left out" in text
+    assert "# 1 file, ? packed and not read: unpack them, and run init again:" in text
+    assert "# 2 files, of no raw format and not read (.txt 2):" in text
+    (tmp_path / "raw/alone").mkdir()
+    (tmp_path / "raw/alone/session.zip").touch()
+    shown = CliRunner().invoke(app, ["init", str(tmp_path / "raw/alone"), str(tmp_path / "b.yaml")])
+    assert "unpack session.zip" in shown.output

@@ -25,6 +25,7 @@ from lidarops.scene.case import (
 from lidarops.scene.choices import (
     AverageSettings,
     average,
+    before_pulse,
     fixed_zenith,
     with_low_signal_to_noise,
     with_methods,
@@ -60,7 +61,7 @@ def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
     stretch = 1.0 / math.cos(math.radians(zenith))
     window = case.request.reference
     # A window is a set of bin centres.
-    reach = case.last - 0.5 * case.channel.bin_width + case.range_offset
+    reach = case.last - 0.5 * case.channel.bin_width
     bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
     if top - bottom < window.width * stretch * (1.0 - 1e-9):
         return (
@@ -74,6 +75,8 @@ def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
 
 def _known_shape(case: Case) -> Entry:
     """Fit the background with the shape of the signal of aerosol-free air, where requested."""
+    if reason := before_pulse(case):
+        return case.leave("known_shape", f"the background is the {reason}")
     if case.request.background == "known_shape":
         return case.run("known_shape", "the far range is assumed to be aerosol-free, and tested")
     return case.leave(
@@ -186,7 +189,7 @@ class _Inversion(ProductStream):
         least = settings.least_signal_to_noise
         flagged = with_low_signal_to_noise(inverted, LAYOUT.weighed, least)
         glued = flagged.assign(gluing(averages))
-        return with_methods(glued, signal.molecules, known_shape=self._known_shape)
+        return with_methods(glued, signal, known_shape=self._known_shape)
 
 
 RETRIEVAL: Final = Retrieval(settings=ElasticPlan, needs=_needs, stream=_Inversion, held=_held)

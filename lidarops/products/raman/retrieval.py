@@ -27,6 +27,7 @@ from lidarops.scene.case import REQUESTED, ChannelCase, Entries, member_channel
 from lidarops.scene.choices import (
     AverageSettings,
     average,
+    before_pulse,
     fixed_zenith,
     with_low_signal_to_noise,
     with_methods,
@@ -137,7 +138,9 @@ def _needs(case: Case) -> Entries:
     taken = ["read", "overlap", "noise", "glue", "molecular", "average"]
     stages = "read", "noise", "glue"
     taken += [f"{raman}/{stage}" for raman in settings.channels for stage in stages]
-    yield case.run("raman", REQUESTED, settings, needs=taken)
+    before = before_pulse(case)
+    reason = f"{REQUESTED}; each background is a {before}" if before else REQUESTED
+    yield case.run("raman", reason, settings, needs=taken)
 
 
 def _held(settings: RamanPlan, work: Workload) -> float:
@@ -203,7 +206,7 @@ class _Retrieval(ProductStream):
         )
         weighed = [name for name in LAYOUT.weighed if name in retrieved]
         flagged = with_low_signal_to_noise(retrieved, weighed, settings.least_signal_to_noise)
-        return with_methods(flagged, signal.molecules, known_shape=settings.known_shape)
+        return with_methods(flagged, signal, known_shape=settings.known_shape)
 
     def _water(self, averages: xr.Dataset) -> labeled.WaterVapour:
         settings = self._settings

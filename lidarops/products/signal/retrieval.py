@@ -20,6 +20,7 @@ from lidarops.scene.choices import (
     FEWEST_BINS,
     BackgroundSettings,
     background,
+    before_pulse,
     tail,
     with_low_signal_to_noise,
 )
@@ -54,7 +55,11 @@ def _needs(case: ChannelCase[SignalSettings]) -> Entries:
         )
         yield case.leave("signal", reason, number=bins)
         return
-    yield background(case, case.request.background, limits)
+    if (reason := before_pulse(case)) and not limits:
+        before = BackgroundSettings(method="before_pulse", range=(-case.channel.pre_trigger, 0.0))
+        yield case.run("background", reason, before)
+    else:
+        yield background(case, case.request.background, limits)
     settings = RangeCorrection(least_signal_to_noise=case.request.least_signal_to_noise)
     taken = ("overlap", "noise", "glue", "background")
     yield case.run("signal", REQUESTED, settings, needs=taken)

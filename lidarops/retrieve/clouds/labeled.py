@@ -26,6 +26,7 @@ from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.signal.labeled import (
     ActualNoise,
     actual_noise,
+    background_before,
     baseline_error,
     counts_per_power,
 )
@@ -104,6 +105,10 @@ class Clouds:
         """Bins that are cloudy in some profiles or the mean."""
         return np.asarray(self.mask | self.partly)
 
+    def within(self, bins: slice) -> Clouds:
+        """Return the clouds in some bins."""
+        return Clouds(self.mask[:, bins], self.fraction[:, bins], self.unknown[:, bins])
+
 
 def air_along(
     molecules: MolecularProfile, altitude: Array, distance: Array, wavelength: float
@@ -147,7 +152,7 @@ class MeanProfiles:
         partial = np.where(np.isnan(self.overlap), int(Quality.INCOMPLETE_OVERLAP), 0)
         quality = averages["quality"].to_numpy() & np.int32(_CARRIED)
         self.quality = quality | partial.astype(np.int32)
-        self.raw = averages["power"].to_numpy()
+        self.raw, self.sky = averages["power"].to_numpy(), background_before(averages)
         noise = noise or actual_noise(averages)
         length = noise.correlation_length
         self.noise, self.correlation_length = noise.variance, length
@@ -437,7 +442,9 @@ def _subtract_background(means: MeanProfiles, usable: Booleans, *, known_shape: 
     noise, r = means.noise * means.correlation_length[:, np.newaxis], means.distance
     # The mean of a bin that was saturated in some profiles is that of the others.
     raw = np.where((means.quality & np.int32(Quality.SATURATED)) != 0, np.nan, means.raw)
-    if not known_shape:
+    if means.sky is not None:
+        sky = means.sky
+    elif not known_shape:
         sky = estimate.from_tail(raw, r, noise)
     else:
         sky = estimate.from_known_shape(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lidarops.constants import HIGHEST_CLOUD
 from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.air import reference_window as _reference
 from lidarops.retrieve.air.molecular import HIGHEST, MolecularProfile
@@ -115,6 +116,9 @@ def invert_elastic(
     signal, clouds = signal_and_clouds(
         means, averages, reference, known_shape=known_shape, overlap_is_stated=overlap_is_stated
     )
+    # Beyond, no value can be used, and noise passes for clouds.
+    highest = max(reference.highest, (HIGHEST_CLOUD - station_altitude) / climb)
+    used = slice(int(np.searchsorted(distance, highest, side="right")))
     window = reference_window(signal, means, reference, clouds.any)
     solution = _elastic.invert_elastic(
         signal.power,
@@ -148,7 +152,7 @@ def invert_elastic(
             **window_variables(window, reference, station_altitude, climb),
             "cloud_mask": (("time", "range"), clouds.state),
             "cloud_fraction": (("time", "range"), clouds.fraction),
-            **cloud_heights(clouds, distance, station_altitude, climb),
+            **cloud_heights(clouds.within(used), distance[used], station_altitude, climb),
             "background": ("time", signal.background),
             "background_standard_error": ("time", signal.background_standard_error),
             "quality_flag": (("time", "range"), quality),
@@ -158,7 +162,7 @@ def invert_elastic(
         },
         coords={name: averages[name] for name in averages.coords},
     )
-    return without_analog_background(product, averages)
+    return without_analog_background(product.isel(range=used), averages)
 
 
 def _systematic_errors(

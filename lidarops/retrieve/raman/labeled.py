@@ -39,6 +39,7 @@ from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import (
     actual_noise,
     analog_alone,
+    background_before,
     counts_per_power,
     systematic_changes,
     without_analog_background,
@@ -106,7 +107,9 @@ class _Channel:
         if self._share:
             # Without the square of range, it is nearly a line over one bin.
             own = np.interp(r, self._distance, shape * self._distance**2) / r**2
-        if known_shape:
+        if before := background_before(self.averages):
+            sky = before
+        elif known_shape:
             sky = estimate.from_known_shape(
                 self._power, r, self._variance, own, exposure=self._counts
             )

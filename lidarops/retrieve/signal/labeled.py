@@ -15,6 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from lidarops.constants import DEAD_TIME_UNCERTAINTY, LICEL_RANGE_PER_MICROSECOND
+from lidarops.flags import Quality
 from lidarops.records import DetectionMode
 from lidarops.retrieve.background.estimate import Background, from_cubic, from_tail
 from lidarops.retrieve.common import inputs
@@ -29,6 +30,9 @@ DEAD_TIME_ERROR: Final = "dead_time_standard_error"
 BASELINE_ERROR: Final = "baseline_standard_error"
 """Attribute of the power of analog, mV and the share of the largest power."""
 
+SKY: Final = "sky"
+SKY_VARIANCE: Final = "sky_variance"
+"""Names of the background as bins before the pulse give it, and of its variance."""
 CORRELATION_LENGTH: Final = "noise_correlation_length"
 """Name of the integral correlation length of noise along range, bins."""
 
@@ -38,11 +42,13 @@ class BackgroundMethod(StrEnum):
 
     TAIL_MEAN = "tail_mean"
     CUBIC = "cubic"
+    BEFORE_PULSE = "before_pulse"
 
 
 _BACKGROUNDS: Final[dict[BackgroundMethod, tuple[Callable[..., Background], str]]] = {
     BackgroundMethod.TAIL_MEAN: (from_tail, "mean of the bins"),
     BackgroundMethod.CUBIC: (from_cubic, "cubic of a homogeneous section"),
+    BackgroundMethod.BEFORE_PULSE: (from_tail, "mean of the bins before the pulse,"),
 }
 """Function of each method, and the words of ``steps``."""
 
@@ -137,6 +143,35 @@ def condition(
             "range": ("range", distance, counts[grid].attrs),
         },
     )
+
+
+def sky_before(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the background of profiles as bins before the pulse give it, and its variance.
+
+    Parameters
+    ----------
+    profiles : xr.Dataset
+        The bins before the pulse, from `condition`.
+    """
+    power, distance = profiles["power"], profiles["range"].to_numpy().astype(np.float64)
+    noise = actual_noise(profiles)
+    of_means = noise.variance * noise.correlation_length[..., np.newaxis]
+    sky = from_tail(power.to_numpy(), distance, of_means, (distance[0], distance[-1]))
+    level = power.isel(range=0, drop=True)
+    return {
+        SKY: level.copy(data=sky.background),
+        SKY_VARIANCE: level.copy(data=sky.standard_error**2),
+    }
+
+
+def background_before(profiles: xr.Dataset) -> Background | None:
+    """Return the background that bins before the pulse gave; None of profiles without it."""
+    if SKY not in profiles:
+        return None
+    value, error = profiles[SKY].to_numpy(), np.sqrt(profiles[SKY_VARIANCE].to_numpy())
+    none, no = np.zeros(value.shape), np.zeros(value.shape, dtype=np.bool_)
+    missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
+    return Background(value, error, none, none, no, no, missing)
 
 
 def _baseline(given: float | None, dark: DarkSignals | None) -> tuple[float, float]:
@@ -243,7 +278,7 @@ def correct_for_range(
         From `condition`.
     background_range : (float, float)
         m; the bins whose mean is the background, or the homogeneous section of the cubic.
-    background_method : {"tail_mean", "cubic"}
+    background_method : {"tail_mean", "cubic", "before_pulse"}
         See `lidarops.retrieve.background.estimate`.
 
     Returns
@@ -273,7 +308,8 @@ def correct_for_range(
     power, length = conditioned["power"].to_numpy(), noise.correlation_length
     distance = conditioned["range"].to_numpy().astype(np.float64)
     of_means = noise.variance * length[..., np.newaxis]
-    sky = _BACKGROUNDS[method][0](power, distance, of_means, background_range)
+    sky = background_before(conditioned) if method is BackgroundMethod.BEFORE_PULSE else None
+    sky = sky or _BACKGROUNDS[method][0](power, distance, of_means, background_range)
     level, level_error = sky.background[..., np.newaxis], sky.standard_error[..., np.newaxis]
     square = distance**2
     # Negative values are kept: clipping would bias every mean.

@@ -26,7 +26,12 @@ from lidarops.retrieve.signal.averaging import (
     outlying_parts,
     tail_of_cells,
 )
-from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, DEAD_TIME_ERROR
+from lidarops.retrieve.signal.labeled import (
+    CORRELATION_LENGTH,
+    DEAD_TIME_ERROR,
+    SKY,
+    SKY_VARIANCE,
+)
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _PROFILES_IN_CACHE: Final = 32
@@ -46,6 +51,7 @@ class PartSums:
 
     sums: RunningMean
     lengths: RunningMean
+    """Of the noise, and of the background that bins before the pulse give."""
     quality: Flags
     """(part, range), without INPUT_MISSING, and NO_SIGNAL only where no profile has shots."""
     profiles: Flags
@@ -148,7 +154,7 @@ class IntervalSums:
         self._open, groups = number, self._groups[number : number + 2]
         self._first_group, shape = int(groups[0]), (int(np.ptp(groups)), self.range.size)
         self._sums, self._bits = RunningMean(shape), np.zeros(shape, dtype=np.int32)
-        self._lengths = RunningMean((shape[0], 1))
+        self._lengths = RunningMean((shape[0], 2))
         shared, times = self._shared_variance, self._middles[number : number + 1]
         self._shared = None if shared is None or not times.size else shared(times)
 
@@ -156,7 +162,11 @@ class IntervalSums:
         """Add the next profiles, from `lidarops.retrieve.signal.labeled.condition`."""
         names = ("power", "variance", "quality", CORRELATION_LENGTH)
         arrays = [conditioned[name].to_numpy()[rows] for name in names]
-        units = {name: dict(conditioned[name].attrs) for name in ("power", "variance", "range")}
+        # Where bins before the pulse give none, what stands here is not used.
+        sky = (name if name in conditioned else CORRELATION_LENGTH for name in (SKY, SKY_VARIANCE))
+        arrays += [conditioned[name].to_numpy()[rows] for name in sky]
+        stated = [name for name in ("power", "variance", "range", SKY) if name in conditioned]
+        units = {name: dict(conditioned[name].attrs) for name in stated}
         first, count = 0, len(arrays[0])
         while first < count:
             left = self.left
@@ -173,7 +183,12 @@ class IntervalSums:
             first = past
 
     def _add(
-        self, power: Array, variance: Array, quality: npt.NDArray[np.int32], length: Array
+        self,
+        power: Array,
+        variance: Array,
+        quality: npt.NDArray[np.int32],
+        length: Array,
+        *sky: Array,
     ) -> None:
         profiles = slice(self._added, self._added + len(power))
         group, weights = self._group[profiles] - self._first_group, self._weights[profiles]
@@ -186,7 +201,9 @@ class IntervalSums:
             weights=weights,
             shared_variance=0.0 if common is None else common,
         )
-        self._lengths.add(length[:, np.newaxis], 0.0, groups=group, weights=weights)
+        scalars = np.stack([length, sky[0]], axis=1)
+        errors = np.stack([np.zeros(length.size), sky[1]], axis=1)
+        self._lengths.add(scalars, errors, groups=group, weights=weights)
         join_bits(frozen(quality), frozen(group), int(~_MISSING), self._bits)
         self._added += len(power)
 
@@ -315,7 +332,7 @@ class ClockAverage:
         power, variance = cells_of_parts(
             sums.sums.sums, usable, self._first + lag, self._past + lag, self._bins
         )
-        totals, weighted = sums.lengths.sums[:2]
+        totals, weighted = sums.lengths.sums[:2, :, :1]
         variance *= np.where(totals > 0.0, weighted / np.maximum(totals, 1.0), 1.0)
         sky, error = tail_of_cells(power, variance)
         power -= sky
@@ -344,6 +361,8 @@ class ClockAverage:
             },
             coords={**record.times_of(numbers), "range": ("range", record.range, units["range"])},
         )
+        if SKY in units:
+            labeled = labeled.assign({name: ("time", of[name]) for name in (SKY, SKY_VARIANCE)})
         if self._screening is None:
             return labeled
         parts = [name for name in of if name.startswith("part_")]
@@ -355,13 +374,15 @@ class ClockAverage:
 
 def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:
     """Return the mean of the parts that are kept."""
-    averages = sums.sums.joined(kept)
+    averages, scalars = sums.sums.joined(kept), sums.lengths.joined(kept)
     quality = sums.quality if kept.all() else sums.quality[kept]
     return {
         "power": averages.values[0],
         "variance": (averages.variance + averages.shared_variance)[0],
         "quality": np.bitwise_or.reduce(quality, axis=0),
-        "length": float(sums.lengths.joined(kept).values[0, 0]),
+        "length": float(scalars.values[0, 0]),
+        SKY: float(scalars.values[0, 1]),
+        SKY_VARIANCE: float(scalars.variance[0, 1]),
         "profiles": np.int32(sums.profiles[kept].sum()),
         "shots": np.int32(sums.shots[kept].sum()),
     }

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from lidarops.constants import HIGHEST_CLOUD
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import WITHHELD, Quality
 from lidarops.products.elastic.variables import FLAGS
@@ -274,6 +275,18 @@ def cloud(height, strength, width=60.0):
         return particles(z) + strength * np.exp(-0.5 * ((z - height) / width) ** 2)
 
     return backscatter
+
+
+@pytest.mark.parametrize(("zenith", "highest", "end"), [(0.0, 11e3, 19.9e3), (60.0, 11e3, 39.8e3),
+                                                        (0.0, 25e3, 25e3)])  # fmt: skip
+def test_a_long_record_is_cut_above_all_clouds_and_references(zenith, highest, end):
+    """In 84 km of noise, a cloud is found by chance."""
+    far = 7.5 * (np.arange(11_000) + 0.5)
+    reference = Reference(5000.0, highest, 1000.0, 1.0, 0.0)
+    data = counted(light(far, zenith=zenith), 5, r=far, zenith=zenith)
+    solution = solved(data, reference=reference)
+    assert abs(float(solution["range"][-1]) - end) < 7.5
+    assert not (solution["cloud_top_altitude"] > HIGHEST_CLOUD).any()
 
 
 def test_a_cloud_below_the_reference_is_flagged_with_all_bins_below_it():
@@ -794,7 +807,7 @@ def test_an_inversion_away_from_the_reference_stops_where_it_is_unstable():
 
 def test_bins_beyond_the_atmosphere_are_left_out():
     r = 7.5 * (np.arange(16_380) + 0.5)
-    retrieved = solved(noiseless(light(r), r))
+    retrieved = solved(noiseless(light(r), r), reference=Reference(5e3, 9e4, 1e3, 1.0, 0.0))
     assert float(retrieved["range"][-1]) < 84_000.0 < float(retrieved["range"][-1]) + STATION + 7.5
     assert_missing_is_flagged(retrieved)
 

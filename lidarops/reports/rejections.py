@@ -1,0 +1,72 @@
+"""Which settings the flags follow from that reject many values of products, in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+from lidarops.figures.wording import percent
+from lidarops.flags import Severity
+from lidarops.kinds import flags_of
+from lidarops.records import LeftOut, Plan, PlannedStep, ProductRecord, SceneOutcome, file_channels
+from lidarops.scene.retrieval import settings_model
+from lidarops.settings import unit_of
+from lidarops.units import written
+
+MANY: Final = 0.25
+"""Least share of the values that a flag rejects to be named."""
+_STAGES: Final = {
+    "incomplete_overlap": "overlap", "unknown_overlap": "overlap", "saturated": "dead_time",
+    "negative_backscatter": "overlap", "poor_stratification": "dead_time",
+    "no_gluing": "lag", "no_reference": "reference", "unstable_inversion": "reference",
+    "low_signal": "average", "not_homogeneous": "homogeneous", "no_signal": "read",
+}  # fmt: skip
+"""Rejecting flags, and the entry of a plan whose settings they follow from."""
+OF_ONE_PROFILE: Final = frozenset({"overlap", "dead_time", "lag", "read"})
+"""Entries whose flags no longer average changes."""
+
+
+def settings_in_words(step: PlannedStep) -> Iterator[str]:
+    """Yield the settings of a step with their units."""
+    model = settings_model(step)
+    for key, value in step.settings.items():
+        unit = "" if value is None else unit_of(model, key)
+        words = written(value, unit) if isinstance(value, float) else f"{value} {unit}".rstrip()
+        yield f"{key} {words}"
+
+
+def rejecting_flags(product: ProductRecord) -> Iterator[tuple[str, int]]:
+    """Yield the flags that reject many values of a product, the most frequent first."""
+    flags = flags_of(product.kind)
+    for name, count in sorted(product.flagged.items(), key=lambda one: -one[1]):
+        bit = flags.named(name)
+        if bit and bit.severity is Severity.REJECT and count >= MANY * product.values:
+            yield bit.word, count
+
+
+def decided_by(plan: Plan, product: ProductRecord, flag: str) -> str:
+    """Return which settings of a plan a flag of a product follows from; empty if from none."""
+    channels = (product.channel, *file_channels(product.channel))
+    entries: tuple[PlannedStep | LeftOut, ...] = (*plan.steps, *plan.left_out)
+    for entry in entries:
+        if entry.name == _STAGES.get(flag) and entry.channel in channels:
+            stated = settings_in_words(entry) if isinstance(entry, PlannedStep) else ()
+            return f"{entry.name}: {', '.join((*stated, entry.reason))}"
+    return ""
+
+
+def rejection_rows(scenes: Iterable[SceneOutcome]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield product, flag, share of the values, and settings, of flags that reject many of them."""
+    rejected: Counter[tuple[str, str, str]] = Counter()
+    values: Counter[str] = Counter()
+    for scene in scenes:
+        plan = scene.plan or Plan(scene.scene, (), ())
+        for product in scene.products:
+            name = f"{product.kind} {product.channel} of {scene.instrument}"
+            values[name] += product.values
+            for flag, count in rejecting_flags(product):
+                rejected[name, flag, decided_by(plan, product, flag)] += count
+    for (name, flag, words), count in rejected.most_common():
+        if words and count >= MANY * values[name]:
+            yield name, flag, percent(count / values[name]), words
