@@ -171,10 +171,6 @@ class Granule(Header):
     sha256: str | None = None
     """Digest of the file; None until the whole file has been read."""
 
-    def after_pulse(self, pre_trigger: float) -> Granule:
-        """Return the granule without bins before the pulse, at so many m of its records."""
-        return replace(self, layout=_after_pulse(self.layout, pre_trigger))
-
     @property
     def is_declared_invalid(self) -> bool:
         """Whether the campaign refuses the file, not its content."""
@@ -183,9 +179,8 @@ class Granule(Header):
 
 # An archive has few layouts.
 @lru_cache(maxsize=128)
-def _after_pulse(
-    layout: tuple[ChannelLayout, ...], pre_trigger: float
-) -> tuple[ChannelLayout, ...]:
+def after_pulse(layout: tuple[ChannelLayout, ...], pre_trigger: float) -> tuple[ChannelLayout, ...]:
+    """Return channels without the bins before a pulse at so many m of the record."""
     stated = [replace(channel, pre_trigger=pre_trigger) for channel in layout]
     return tuple(replace(c, bins=max(c.bins - c.before, 0)) for c in stated)
 

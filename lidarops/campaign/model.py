@@ -234,8 +234,8 @@ class InstrumentFacts(SettingsModel):
         unit="m",
         ge=0,
         le=1e5,
-        description="range of the record at which the pulse leaves; the bins before are in no"
-        " product",
+        description="range of the record at which the pulse leaves; the bins before give the"
+        " background where they are enough, and are in no product",
     )
     full_overlap_range: Metres = quantity(
         0.0,

@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from pathlib import PurePosixPath
 from statistics import median
 from types import MappingProxyType
@@ -42,13 +43,11 @@ _ASSUMED_OVERLAP: Final = 500.0
 """m; of most telescopes. A signal may stop rising earlier, by haze at the ground."""
 _USED: Final = frozenset({Purpose.MEASUREMENT, Purpose.DARK})
 """Purposes of files that a campaign names; others are a question."""
+_DAY: Final = timedelta(days=1)
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
 _PACKED: Final = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 """Endings of files that may hold raw files."""
-_BY_WORDS: Final = "the words in their path"
-_TOLD: Final = {Purpose.UNLIT: "their counts"}
-"""What tells the purpose of files."""
 
 Position = tuple[float, float] | None
 
@@ -298,7 +297,21 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
 
 
 def _clock(group: FileGroup) -> str:
-    """Return what is to be said of the clock: how far names are from headers, or an example."""
+    """Return what is to be said of the clock: files that contradict their neighbours or names.
+
+    Or an example.
+    """
+    files = sorted(
+        (path, header.start) for path, header in zip(group.files, group.headers, strict=True)
+    )
+    beside = zip(files, files[1:], files[2:], strict=False)
+    lone = [
+        path
+        for (_, before), (path, start), (_, after) in beside
+        if before <= after and not before - _DAY <= start <= after + _DAY
+    ]
+    if lone:
+        return f"{lone[0]} starts more than a day away from those beside it by name"
     away = [
         (header.start - named).total_seconds()
         for path, header in zip(group.files, group.headers, strict=True)
@@ -409,7 +422,7 @@ def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup])
         ),
         *(
             (
-                f"? {purpose} by {_TOLD.get(purpose, _BY_WORDS)}, left out of `files`",
+                f"? {purpose} by path or counts, left out of `files`",
                 [p for group in contents.groups if group.purpose is purpose for p in group.files],
             )
             for purpose in Purpose

@@ -339,7 +339,6 @@ def _show_refused(refused: list[Granule], most: int | None = None) -> None:
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
-    from lidarops.reports.rejections import rejection_rows
     from lidarops.run.archive import refused_files
 
     record, scenes = result.record, result.scenes
@@ -380,7 +379,7 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
             for scene in scenes
             for pair in scene.disagreements
         ],
-        "rejections": list(rejection_rows(scenes)),
+        "rejections": _rejections(scenes),
         "scene_notes": {scene.scene: list(scene.notes) for scene in scenes if scene.notes},
         "orphans": {
             orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
@@ -413,7 +412,6 @@ def _print_result(
     campaign: Campaign, result: Result, *, no_scene: bool, removing: bool, everything: bool
 ) -> None:
     from lidarops.reports.findings import disagreement_rows, scene_note_rows
-    from lidarops.reports.rejections import rejection_rows
     from lidarops.run.archive import refused_files
 
     scenes, most = result.scenes, None if everything else _FEW_ROWS
@@ -440,7 +438,7 @@ def _print_result(
     _show_scenes_with_problems(result, most)
     title = "Rejected values, and the settings that they follow from"
     columns = "product", "flag", "values", "settings"
-    show_rows(title, columns, rejection_rows(scenes), most)
+    show_rows(title, columns, _rejections(scenes), most)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
@@ -456,6 +454,14 @@ def _print_result(
         if not result.findings.failed:
             state = "every requested product is fresh or cannot be made"
         say(f"nothing to do: {state}{never_made(result.findings)}")
+
+
+def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str]]:
+    if not scenes:
+        return []
+    from lidarops.reports.rejections import rejection_rows
+
+    return list(rejection_rows(scenes))
 
 
 def _show_products(scenes: Sequence[SceneOutcome], *, everything: bool) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -140,7 +140,7 @@ def _plan(
         elif not stale or judged.stale or judged.failure:
             lines = _scene_lines(judged, plan=not stale)
             alike.setdefault((judged.scene.instrument, *lines), []).append(judged)
-    empty = list(_empty(settings, first.values()))
+    empty = _empty(settings, first.values())
     no_scene = not count and selects_no_scene(settings, selection)
     lacking = settings.metadata.lacking
     if as_json:
@@ -172,13 +172,13 @@ def _plan(
     exit_with_status(failed=failed or unexpected or any(earlier) or findings.failed)
 
 
-def _empty(campaign: Campaign, scenes: Iterable[Scene]) -> Iterator[tuple[str, ...]]:
-    """Yield what the first files of some scenes leave empty, and why; not of a store."""
-    from lidarops.run.first_look import empty_in_first_file
+def _empty(campaign: Campaign, scenes: Collection[Scene]) -> list[tuple[str, str, str, str]]:
+    """Return what the first files of some scenes leave empty, and why; not of a store."""
+    if not scenes or "://" in campaign.archive:
+        return []
+    from lidarops.run.first_look import empty_in_first_files
 
-    if "://" not in campaign.archive:
-        for scene in scenes:
-            yield from empty_in_first_file(campaign, scene)
+    return list(empty_in_first_files(campaign, scenes))
 
 
 def _show_rest(

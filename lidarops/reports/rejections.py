@@ -23,8 +23,6 @@ _STAGES: Final = {
     "low_signal": "average", "not_homogeneous": "homogeneous", "no_signal": "read",
 }  # fmt: skip
 """Rejecting flags, and the entry of a plan whose settings they follow from."""
-OF_ONE_PROFILE: Final = frozenset({"overlap", "dead_time", "lag", "read"})
-"""Entries whose flags no longer average changes."""
 
 
 def settings_in_words(step: PlannedStep) -> Iterator[str]:
@@ -34,15 +32,6 @@ def settings_in_words(step: PlannedStep) -> Iterator[str]:
         unit = "" if value is None else unit_of(model, key)
         words = written(value, unit) if isinstance(value, float) else f"{value} {unit}".rstrip()
         yield f"{key} {words}"
-
-
-def rejecting_flags(product: ProductRecord) -> Iterator[tuple[str, int]]:
-    """Yield the flags that reject many values of a product, the most frequent first."""
-    flags = flags_of(product.kind)
-    for name, count in sorted(product.flagged.items(), key=lambda one: -one[1]):
-        bit = flags.named(name)
-        if bit and bit.severity is Severity.REJECT and count >= MANY * product.values:
-            yield bit.word, count
 
 
 def decided_by(plan: Plan, product: ProductRecord, flag: str) -> str:
@@ -65,8 +54,10 @@ def rejection_rows(scenes: Iterable[SceneOutcome]) -> Iterator[tuple[str, str, s
         for product in scene.products:
             name = f"{product.kind} {product.channel} of {scene.instrument}"
             values[name] += product.values
-            for flag, count in rejecting_flags(product):
-                rejected[name, flag, decided_by(plan, product, flag)] += count
+            flags = flags_of(product.kind)
+            for bit, count in ((flags.named(flag), n) for flag, n in product.flagged.items()):
+                if bit and bit.severity is Severity.REJECT:
+                    rejected[name, bit.word, decided_by(plan, product, bit.word)] += count
     for (name, flag, words), count in rejected.most_common():
         if words and count >= MANY * values[name]:
             yield name, flag, percent(count / values[name]), words

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -31,7 +31,7 @@ from lidarops.errors import LidarOpsError, SceneError
 from lidarops.netcdf.read import open_product
 from lidarops.raw.archive import open_archive
 from lidarops.records import RunRecord, Scene, file_channels, is_glued
-from lidarops.reports.rejections import OF_ONE_PROFILE, rejection_rows
+from lidarops.reports.rejections import rejection_rows
 from lidarops.retrieve.signal.light import FEWEST, MEDIAN_OF_NORMAL
 from lidarops.run.archive import bring_up_to_date
 from lidarops.scene.job import Job
@@ -58,6 +58,9 @@ _LATEST: Final = 1000.0
 that sees only far air it begins at 750 m."""
 _LIGHT: Final = 10.0
 """Standard errors of a bin by which three bins in a row show light."""
+
+_OF_ONE_PROFILE: Final = ("overlap:", "dead_time:", "lag:", "read:")
+"""Entries of a plan whose flags a longer average does not change."""
 
 Floats = NDArray[np.float64]
 
@@ -216,19 +219,22 @@ class _Look:
         return float(np.ceil(farthest / _STEP) * _STEP), earliest
 
 
-def empty_in_first_file(campaign: Campaign, scene: Scene) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the products of a scene that its first file leaves without a usable value, and why.
+def empty_in_first_files(
+    campaign: Campaign, scenes: Iterable[Scene]
+) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the products of scenes that their first file leaves without a usable value, and why.
 
     Product, flag, share of the values and settings, but not what a longer average may change.
     """
-    first = replace(scene, granules=scene.granules[:1])
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        own = campaign.model_copy(update={"output": folder})
-        outcome = process_scene(Job(own, first, plan_scene(first, own)))
-    empty = tuple(product for product in outcome.products if product.usable == 0)
-    for row in rejection_rows([replace(outcome, products=empty)]):
-        if row[-1].partition(":")[0] in OF_ONE_PROFILE:
-            yield row
+    for scene in scenes:
+        first = replace(scene, granules=scene.granules[:1])
+        with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
+            own = campaign.model_copy(update={"output": folder})
+            outcome = process_scene(Job(own, first, plan_scene(first, own)))
+        empty = tuple(product for product in outcome.products if product.usable == 0)
+        for row in rejection_rows([replace(outcome, products=empty)]):
+            if row[-1].startswith(_OF_ONE_PROFILE):
+                yield row
 
 
 def without_light(contents: FolderContents, root: Path) -> FolderContents:

@@ -27,6 +27,7 @@ from lidarops.records import (
     Stamp,
     Status,
     UnusedFile,
+    after_pulse,
 )
 from lidarops.scene.dependence import UNUSED
 
@@ -155,8 +156,7 @@ class Recipe:
         start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
         raw = (record for record in inputs if record.role in RAW)
         granules = [_granule(archive, record, keys["instrument"], part["facts"]) for record in raw]
-        before = part["facts"].get("pre_trigger", 0.0)
-        granules = [_named(granule, self.plan, before) for granule in granules]
+        granules = [_named(granule, self.plan, part["facts"]) for granule in granules]
         granules.sort(key=_order)
         return Scene(
             id=self.plan.scene,
@@ -266,7 +266,7 @@ def _granule(root: Path, record: InputRecord, instrument: str, facts: Mapping[st
     )
 
 
-def _named(granule: Granule, plan: Plan, pre_trigger: float) -> Granule:
+def _named(granule: Granule, plan: Plan, facts: Mapping[str, Any]) -> Granule:
     """Return a granule with the channel names of a product, whose plan states their recorders.
 
     Without the bins before the pulse.
@@ -279,5 +279,5 @@ def _named(granule: Granule, plan: Plan, pre_trigger: float) -> Granule:
         and step.instrument in ("", granule.instrument)
     }
     names = recorder_names([(granule.layout, 1, datetime.fromtimestamp(0, UTC))], stated)
-    named = replace(granule, layout=named_layout(granule.layout, names))
-    return named.after_pulse(pre_trigger) if pre_trigger else named
+    layout = named_layout(granule.layout, names)
+    return replace(granule, layout=after_pulse(layout, facts.get("pre_trigger", 0.0)))

@@ -45,6 +45,7 @@ from lidarops.records import (
     Scene,
     Status,
     UnusedFile,
+    after_pulse,
     day_of,
 )
 
@@ -295,7 +296,10 @@ def _by_layout(
     dark = [granule for granule in dark if granule.instrument == instrument]
     if any(fact.pre_trigger for fact in owner.facts):
         before = owner.facts_at(_start(members[0])).pre_trigger
-        members, dark = ([g.after_pulse(before) for g in own] for own in (members, dark))
+        members, dark = (
+            [replace(g, layout=after_pulse(g.layout, before)) for g in own]
+            for own in (members, dark)
+        )
     for granule in members:
         layouts[_layout_key(granule.layout)].append(granule)
     scenes = []

@@ -104,7 +104,7 @@ class FileProfiles:
         if self._of_before is None:
             return conditioned
         before = self._of_before(counts, f"{BEFORE}{self._channel}")
-        return conditioned.assign(labeled.sky_before(before))
+        return conditioned.assign({labeled.SKY: (("time", "sky_part"), labeled.sky_before(before))})
 
     def sums(
         self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
@@ -179,7 +179,7 @@ class GluedProfiles:
         analog, photon = means
         glued = labeled_gluing.glue(analog, photon, self._lag)
         kept = photon.isel(range=slice(glued.sizes["range"])).drop_vars(_PARTS)
-        kept = kept.drop_vars((labeled.SKY, labeled.SKY_VARIANCE), errors="ignore")
+        kept = kept.drop_vars(labeled.SKY, errors="ignore")
         joined = kept.assign(glued.variables)
         return joined.assign(labeled_gluing.glue_cells(analog, photon, glued)) if cells else joined
 

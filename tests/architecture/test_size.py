@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_863,
-    "lines of code alone": 46_339,
+    "lines": 70_881,
+    "lines of code alone": 46_357,
     "modules": 280,
     "dataclasses": 250,
-    "lines of dataclasses": 6_723,
+    "lines of dataclasses": 6_718,
     "tuning numbers": 220,
     "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
-    "lines of the largest package": 5_885,
+    "lines of the largest package": 5_901,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 61, "functions": 593, "changes": 216},

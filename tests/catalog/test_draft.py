@@ -370,7 +370,7 @@ def test_files_of_tests_and_calibrations_are_a_question_and_no_measurements(
     known = {granule.path: granule.role for granule in granules(campaign)}
     expected = dict.fromkeys(usual, Role.SIGNAL) | (dict.fromkeys(paths, role) if role else {})
     assert known == expected
-    assert ("by the words in their path, left out of `files`" in text) == (role is None)
+    assert ("by path or counts, left out of `files`" in text) == (role is None)
     assert all(path in text for path in paths) or role is not None
 
 
@@ -399,6 +399,15 @@ def test_names_by_another_time_than_headers_are_a_question(
         write(tmp_path / f"raw/h26301{hour:02d}.{number:02d}0000", content(600.0 + number))
     _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert question in next(line for line in text.splitlines() if "clock_offset" in line)
+
+
+def test_a_start_far_from_those_beside_it_by_name_is_a_question(tmp_path: Path) -> None:
+    """Names tell no time; one file is of another year, and one session of another day."""
+    for number, minutes in enumerate([600, 601, -500_000, 603, 604, 9000, 9001]):
+        write(tmp_path / f"raw/night{number}", content(minutes))
+    _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    question = next(line for line in text.splitlines() if "clock_offset" in line)
+    assert question.endswith("; night2 starts more than a day away from those beside it by name")
 
 
 @pytest.mark.parametrize("free", [True, False])

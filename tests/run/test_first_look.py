@@ -168,7 +168,7 @@ def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_
         (tmp_path / "raw" / name).touch()
     campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert [lidar.files for lidar in campaign.instruments.values()] == [["h*"]]
-    assert "# 30 files, ? without light of the laser by their counts, left out" in text
+    assert "# 30 files, ? without light of the laser by path or counts, left out" in text
     assert "# 1 file, ? packed and not read: unpack them, and run init again:" in text
     assert "# 2 files, of no raw format and not read (.txt 2):" in text
     (tmp_path / "raw/alone").mkdir()

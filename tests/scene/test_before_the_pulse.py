@@ -13,7 +13,7 @@ from support.archives.scene_jobs import scene_jobs
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.raw import licel
-from lidarops.run.archive import reprocess
+from lidarops.run.archive import Options, reprocess
 from lidarops.run.reproduction import explain_difference, reproduce_product
 from lidarops.simulate.campaign import simulate_campaign
 
@@ -88,9 +88,9 @@ def written(folder: Path, pre_trigger: float, **facts: Any) -> Campaign:
 Made = dict[tuple[str, str], tuple[Path, xr.Dataset]]
 
 
-def made(campaign: Campaign) -> Made:
+def made(campaign: Campaign, **options: Any) -> Made:
     """Process a campaign, and return its products by kind and channel."""
-    record = reprocess(campaign)
+    record = reprocess(campaign, options=Options(**options))
     (scene,) = record.scenes
     assert scene.error == ""
     paths = {(one.kind, one.channel): campaign.products_root / one.path for one in scene.products}
@@ -147,6 +147,14 @@ def test_products_are_made_again_from_their_provenance(both) -> None:
     for path, _ in whole.values():
         result = reproduce_product(path, archive=campaign.archive)
         assert result.identical, explain_difference(result)
+
+
+def test_chunks_of_profiles_change_no_bit(both, tmp_path: Path) -> None:
+    campaign, whole, _ = both
+    parts = made(campaign.model_copy(update={"output": str(tmp_path)}), profiles_per_chunk=5)
+    for key, (_, product) in whole.items():
+        for name in (name for name, own in product.items() if own.dtype.kind != "O"):
+            np.testing.assert_array_equal(product[name].values, parts[key][1][name].values, name)
 
 
 def test_a_pulse_beyond_the_record_leaves_no_channel(both, tmp_path: Path) -> None:

@@ -31,8 +31,7 @@ BASELINE_ERROR: Final = "baseline_standard_error"
 """Attribute of the power of analog, mV and the share of the largest power."""
 
 SKY: Final = "sky"
-SKY_VARIANCE: Final = "sky_variance"
-"""Names of the background as bins before the pulse give it, and of its variance."""
+"""Name of the background as bins before the pulse give it, and its variance, (time, 2)."""
 CORRELATION_LENGTH: Final = "noise_correlation_length"
 """Name of the integral correlation length of noise along range, bins."""
 
@@ -145,33 +144,23 @@ def condition(
     )
 
 
-def sky_before(profiles: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return the background of profiles as bins before the pulse give it, and its variance.
-
-    Parameters
-    ----------
-    profiles : xr.Dataset
-        The bins before the pulse, from `condition`.
-    """
+def sky_before(profiles: xr.Dataset) -> npt.NDArray[np.float64]:
+    """Return mean power and its variance, (time, 2), of bins before the pulse from `condition`."""
     power, distance = profiles["power"], profiles["range"].to_numpy().astype(np.float64)
     noise = actual_noise(profiles)
     of_means = noise.variance * noise.correlation_length[..., np.newaxis]
     sky = from_tail(power.to_numpy(), distance, of_means, (distance[0], distance[-1]))
-    level = power.isel(range=0, drop=True)
-    return {
-        SKY: level.copy(data=sky.background),
-        SKY_VARIANCE: level.copy(data=sky.standard_error**2),
-    }
+    return np.stack([sky.background, sky.standard_error**2], axis=-1)
 
 
 def background_before(profiles: xr.Dataset) -> Background | None:
     """Return the background that bins before the pulse gave; None of profiles without it."""
     if SKY not in profiles:
         return None
-    value, error = profiles[SKY].to_numpy(), np.sqrt(profiles[SKY_VARIANCE].to_numpy())
+    value, variance = profiles[SKY].to_numpy().T
     none, no = np.zeros(value.shape), np.zeros(value.shape, dtype=np.bool_)
     missing = np.where(np.isnan(value), np.int32(Quality.INPUT_MISSING), np.int32(0))
-    return Background(value, error, none, none, no, no, missing)
+    return Background(value, np.sqrt(variance), none, none, no, no, missing)
 
 
 def _baseline(given: float | None, dark: DarkSignals | None) -> tuple[float, float]:

@@ -26,12 +26,7 @@ from lidarops.retrieve.signal.averaging import (
     outlying_parts,
     tail_of_cells,
 )
-from lidarops.retrieve.signal.labeled import (
-    CORRELATION_LENGTH,
-    DEAD_TIME_ERROR,
-    SKY,
-    SKY_VARIANCE,
-)
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, DEAD_TIME_ERROR, SKY
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _PROFILES_IN_CACHE: Final = 32
@@ -162,9 +157,13 @@ class IntervalSums:
         """Add the next profiles, from `lidarops.retrieve.signal.labeled.condition`."""
         names = ("power", "variance", "quality", CORRELATION_LENGTH)
         arrays = [conditioned[name].to_numpy()[rows] for name in names]
-        # Where bins before the pulse give none, what stands here is not used.
-        sky = (name if name in conditioned else CORRELATION_LENGTH for name in (SKY, SKY_VARIANCE))
-        arrays += [conditioned[name].to_numpy()[rows] for name in sky]
+        # Without bins before the pulse, this is not used.
+        sky = (
+            conditioned[SKY].to_numpy()[rows]
+            if SKY in conditioned
+            else np.zeros((len(arrays[0]), 2))
+        )
+        arrays.append(sky)
         stated = [name for name in ("power", "variance", "range", SKY) if name in conditioned]
         units = {name: dict(conditioned[name].attrs) for name in stated}
         first, count = 0, len(arrays[0])
@@ -188,7 +187,7 @@ class IntervalSums:
         variance: Array,
         quality: npt.NDArray[np.int32],
         length: Array,
-        *sky: Array,
+        sky: Array,
     ) -> None:
         profiles = slice(self._added, self._added + len(power))
         group, weights = self._group[profiles] - self._first_group, self._weights[profiles]
@@ -201,9 +200,8 @@ class IntervalSums:
             weights=weights,
             shared_variance=0.0 if common is None else common,
         )
-        scalars = np.stack([length, sky[0]], axis=1)
-        errors = np.stack([np.zeros(length.size), sky[1]], axis=1)
-        self._lengths.add(scalars, errors, groups=group, weights=weights)
+        scalars, errors = np.insert(sky, 0, length, axis=1), np.insert(sky[:, 1:], 0, 0.0, axis=1)
+        self._lengths.add(scalars[:, :2], errors, groups=group, weights=weights)
         join_bits(frozen(quality), frozen(group), int(~_MISSING), self._bits)
         self._added += len(power)
 
@@ -362,7 +360,7 @@ class ClockAverage:
             coords={**record.times_of(numbers), "range": ("range", record.range, units["range"])},
         )
         if SKY in units:
-            labeled = labeled.assign({name: ("time", of[name]) for name in (SKY, SKY_VARIANCE)})
+            labeled[SKY] = ("time", "sky_part"), of[SKY]
         if self._screening is None:
             return labeled
         parts = [name for name in of if name.startswith("part_")]
@@ -381,8 +379,7 @@ def _mean(sums: PartSums, kept: Booleans) -> dict[str, Any]:
         "variance": (averages.variance + averages.shared_variance)[0],
         "quality": np.bitwise_or.reduce(quality, axis=0),
         "length": float(scalars.values[0, 0]),
-        SKY: float(scalars.values[0, 1]),
-        SKY_VARIANCE: float(scalars.variance[0, 1]),
+        SKY: np.array([scalars.values[0, 1], scalars.variance[0, 1]]),
         "profiles": np.int32(sums.profiles[kept].sum()),
         "shots": np.int32(sums.shots[kept].sum()),
     }
