@@ -142,7 +142,7 @@ def test_values_without_the_bit_are_right(partly_cloudy):
     r = partly_cloudy["range"].to_numpy()
     true = HAZE + CIRRUS * 2 / PROFILES
     length = np.nan_to_num(partly_cloudy["vertical_resolution"].to_numpy()[0], nan=60.0)
-    extinction = mean_over(true, STEP, r, length)
+    extinction = mean_over(true, STEP, r, length, 300.0)
     backscatter = HAZE / 50.0 + CIRRUS / CLOUD_RATIO * 2 / PROFILES
     good = (partly_cloudy["quality_flag"].to_numpy()[0] == 0) & inside(partly_cloudy, 400.0, 7500.0)
     assert good.sum() > 60
