@@ -263,5 +263,5 @@ def touched(mask: Booleans, resolution: Array, step: float) -> Booleans:
     first = np.maximum(number - half, np.minimum(number, nearest))
     stop = np.minimum(first + 2 * half + 1, count)
     sums = np.pad(np.cumsum(mask, axis=-1), ((0, 0), (1, 0)))
-    inside = np.take_along_axis(sums, stop, axis=-1) - np.take_along_axis(sums, first, axis=-1)
-    return np.asarray(inside > 0)
+    until, before = (np.take_along_axis(sums, at, axis=-1) for at in (stop, first))
+    return np.asarray(until > before)
