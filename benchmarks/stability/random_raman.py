@@ -238,32 +238,16 @@ def _scored(failure: Failure, sky: Sky, result: RamanResult) -> Iterator[ScoredV
     nearest = float(sky.cells.range[np.argmax(full)]) - 0.5 * _CELL
     length = np.where(np.isnan(result.vertical_resolution), _CELL, result.vertical_resolution)
     none = np.zeros_like(result.quality)
-    for quantity, name, value, truth, stated in (
-        (
-            "extinction",
-            "aerosol_extinction",
-            result.extinction,
-            mean_over(sky.extinction, _STEP, sky.cells.range, length, nearest),
-            result.extinction_standard_error,
-        ),
-        (
-            "backscatter",
-            "aerosol_backscatter",
-            result.backscatter,
-            sky.cells.mean(sky.backscatter),
-            result.backscatter_standard_error,
-        ),
-        (
-            "lidar ratio",
-            "lidar_ratio",
-            result.lidar_ratio,
-            np.array(sky.lidar_ratio),
-            result.lidar_ratio_standard_error,
-        ),
+    extinction = mean_over(sky.extinction, _STEP, sky.cells.range, length, nearest)
+    for attribute, name, truth in (
+        ("extinction", "aerosol_extinction", extinction),
+        ("backscatter", "aerosol_backscatter", sky.cells.mean(sky.backscatter)),
+        ("lidar_ratio", "lidar_ratio", np.full(full.shape, sky.lidar_ratio)),
     ):
+        value, stated = getattr(result, attribute), getattr(result, f"{attribute}_standard_error")
         bits = concerning(name, result.quality, none)[:, inside]
         yield ScoredValues(
-            failure, quantity, (value - truth)[:, inside], stated[:, inside], 0.0, bits,
-            RamanQuality, uncertain=bits != 0,
+            failure, attribute.replace("_", " "), (value - truth)[:, inside], stated[:, inside],
+            0.0, bits, RamanQuality, uncertain=bits != 0,
             solvable=(full & (value > _PRECISE * stated))[:, inside],
         )  # fmt: skip
