@@ -6,17 +6,14 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
-import pandas as pd
 
-from benchmarks.harness.statistics import clustered_share
 from benchmarks.harness.verdicts import Scores, Target
 from benchmarks.stability.random_homogeneous import random_paths
-from benchmarks.stability.random_scenes import TARGET
+from benchmarks.stability.random_scenes import Part, shares
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
-SHARE: Final = "share"
 _REJECTED: Final = np.int32(rejecting((*Quality, *HomogeneousQuality)))
 _DECIDED: Final = (Quality.LOW_SIGNAL, Quality.NEGATIVE_AMPLITUDE)
 _NEEDLESS: Final = Target(1e-3, own=True)
@@ -27,10 +24,6 @@ _COUNTED: Final = 100
 """Profiles of a cluster of few photon counts."""
 _DECIDING: Final = 200
 """Profiles of a cluster in which single bits decide."""
-
-
-Part = tuple[str, str, float, int]
-"""Case, figure, and events among trials in one cluster."""
 
 
 def few_counts(cluster: int, *, counts: float) -> Iterator[Part]:
@@ -77,10 +70,4 @@ def flag_rates(clusters: int) -> Scores:
     """Return the shares of flagged profiles, by flag and condition."""
     parts = [p for c in _FEW for cluster in range(clusters) for p in few_counts(cluster, counts=c)]
     parts += [part for cluster in range(clusters) for part in deciding_bits(cluster)]
-    rows = pd.DataFrame(parts, columns=["case", "figure", "events", "trials"])
-    scores: Scores = {}
-    for (case, figure), group in rows.groupby(["case", "figure"], sort=False):
-        share = clustered_share(*group[["events", "trials"]].to_numpy(dtype=float).T)
-        judged = _NEEDLESS.judged(share) if "Poisson" in case else None
-        scores[case, figure] = {"values": int(group["trials"].sum()), SHARE: share, TARGET: judged}
-    return scores
+    return shares(parts, lambda case, _: _NEEDLESS if "Poisson" in case else None)

@@ -222,11 +222,11 @@ def _solve_damaged(
 _LONG_WAVES: Final = (300.0, 3000.0)
 """m; lengths of the waves of the lidar ratio."""
 _DEFAULT: Final = VisibilityProductSettings.model_fields["lidar_ratio_relative_error"].default
-_VARIED: Final = (
-    ("varies by 7 %, the default declared", 0.07, _DEFAULT),
-    ("varies by 10 %, 10 % declared", 0.1, 0.1),
-)
-"""Words of a class, rms variation of the lidar ratio within a network, and what is declared."""
+_VARIED: Final = {
+    0.07: {"the default declared": _DEFAULT},
+    0.1: {"the default declared": _DEFAULT, "10 % declared": 0.1},
+}
+"""What is declared, by the rms variation of the lidar ratio within a network and words."""
 _NOT_SHOWN: Final = "the signals do not show how the lidar ratio varies: the user declares it"
 
 
@@ -284,15 +284,17 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     at = net.origin[:, :, np.newaxis] + net.direction[:, :, np.newaxis] * clean.range
     phase = wave[0] * at[:, 0] + wave[1] * at[:, 2] + rng.uniform(0.0, 2.0 * np.pi)
     seed = int(rng.integers(2**31))
-    for words, varied, declared in _VARIED:
+    for varied, declared in _VARIED.items():
         ratio = np.exp(varied * np.sqrt(2.0) * np.sin(phase))
         power, variance = replace(clean, power=clean.power / ratio).draw(noise, profiles, seed)
         solver = _solver(clean, power, variance)
         result = solver.solve(power)
-        # As products state it.
-        systematic = labeled._lidar_ratio_error(solver, result, declared)  # noqa: SLF001
-        failure = Failure(f"lidar ratio {words}", unseen=_NOT_SHOWN)
-        yield scored(failure, result, clean.truth(profiles), systematic)
+        for words, error in declared.items():
+            name = f"lidar ratio varies by {100.0 * varied:g} %, {words}"
+            failure = Failure(name, unseen=_NOT_SHOWN)
+            # As products state it.
+            systematic = labeled._lidar_ratio_error(solver, result, error)  # noqa: SLF001
+            yield scored(failure, result, clean.truth(profiles), systematic)
 
 
 def _solver(clean: Signals, power: Array, variance: Array) -> Any:

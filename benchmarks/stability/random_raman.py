@@ -1,7 +1,8 @@
-"""Random skies above a Raman lidar, by a forward model of their own."""
+"""Skies above a Raman lidar by a forward model of their own, of benchmarks and of tests."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
@@ -12,6 +13,7 @@ from benchmarks.harness.figure import Array
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.common.arrays import Flags
 from lidarops.retrieve.raman.flags import RamanQuality, concerning
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
@@ -24,15 +26,19 @@ from lidarops.retrieve.raman.signals import (
 
 Random = np.random.Generator
 
-_LASER: Final = 354.7e-9
-_RAMAN: Final = 386.7e-9
+LASER: Final = 354.7e-9
+RAMAN: Final = 386.7e-9
 _STEP: Final = 30.0
 _RANGE: Final = _STEP * (np.arange(400, dtype=np.float64) + 0.5)
 _CELL: Final = 60.0
-_FULL_OVERLAP: Final = 300.0
-"""That of products."""
+_FULL_OVERLAPS: Final = (200.0, 2500.0)
+"""m."""
+_SHORTEST: Final = 50.0
+"""m, least length over which what overlap lacks falls; at most, the range of full overlap."""
 _COMPARED: Final = 6000.0
 """m; values below are compared with the truth."""
+_PRECISE: Final = 3.0
+"""Stated errors above which a value beyond full overlap should not be doubted."""
 _EXPONENT: Final = 1.2
 _EXPONENT_ERROR: Final = 0.5
 _REFERENCE_ERROR: Final = 0.02
@@ -45,156 +51,203 @@ _TOPS: Final = (2000.0, 5000.0)
 
 
 @dataclass(frozen=True, slots=True)
-class _Sky:
+class Sky:
+    """A particle profile over a standard atmosphere, with counts of both signals, (bin,)."""
+
     extinction: Array
-    """m-1, (bin,)."""
+    """m-1."""
     lidar_ratio: float
-    exponent: float = _EXPONENT
-    assumed_error: float = 0.0
-    """Stated error of the exponent."""
-    aloft: float = 0.0
-    """Particle over molecular backscatter in the reference window."""
-    reference_error: float = 0.0
-    lacking: float = 0.0
-    """Of the overlap where it is stated to be full."""
-    scale: float = 1.0
-    """m, over which that falls."""
+    raman: Array
+    """Mean counts without background."""
+    elastic: Array
+    air: AirColumn
+    cells: Cells
+    settings: RamanSettings
+
+    @property
+    def backscatter(self) -> Array:
+        """Backscatter of particles, m-1 sr-1."""
+        return self.extinction / self.lidar_ratio
+
+    @property
+    def ratio(self) -> float:
+        """Particle extinction at the Raman wavelength over that at the laser's."""
+        return self.air.particle_ratio(self.settings.angstrom_exponent)
+
+    @property
+    def quality(self) -> Flags:
+        """Bits of the cells of one profile: partial overlap where the overlap is not known."""
+        partial = np.isnan(self.cells.split(self.air.overlap)).any(axis=-1)
+        return np.where(partial, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))[np.newaxis]
+
+    def signal(self, counts: Array) -> ChannelSignal:
+        """Return counts (profile, bin) as a signal."""
+        rows, bins = counts.shape
+        mean, zero = np.maximum(counts.mean(axis=0), 1e-3), np.zeros(rows)
+        variance = np.broadcast_to(mean, counts.shape)
+        return ChannelSignal(counts, variance, zero, zero, np.zeros((1, bins)), np.ones(rows))
+
+    def drawn(self, rng: Random, profiles: int) -> tuple[ChannelSignal, ChannelSignal]:
+        """Return noisy profiles of the Raman and of the elastic signal."""
+        raman, elastic = (
+            self.signal(rng.poisson(mean, (profiles, mean.size)).astype(float))
+            for mean in (self.raman, self.elastic)
+        )
+        return raman, elastic
 
 
-def _hazy(rng: Random) -> _Sky:
-    """Return haze that falls with height and ends smoothly."""
-    amount, scale = np.exp(rng.uniform(np.log(2e-5), np.log(3e-4))), rng.uniform(800.0, 3000.0)
+def along(values: Array, step: float) -> Array:
+    """Return the integral from the lidar to the middle of each bin."""
+    return np.asarray(np.cumsum(values) * step - 0.5 * values * step)
+
+
+def mean_over(
+    profile: Array, step: float, middle: Array, length: Array, nearest: float = 0.0
+) -> Array:
+    """Return means of a profile of bins over lengths around heights, from `nearest` on."""
+    whole = np.concatenate([[0.0], np.cumsum(profile)]) * step
+    edges = step * np.arange(profile.size + 1)
+    low = np.maximum(middle - 0.5 * length, nearest)
+    high = np.minimum(low + length, edges[-1])
+    return np.asarray((np.interp(high, edges, whole) - np.interp(low, edges, whole)) / (high - low))
+
+
+def make_sky(
+    extinction: Array,
+    step: float,
+    light: float,
+    *,
+    lidar_ratio: float = 50.0,
+    exponent: float = 1.2,
+    cell: float = 60.0,
+    full_overlap: float = 300.0,
+    window: tuple[float, float, float] = (7000.0, 12_000.0, 5000.0),
+    brightness: float = 3.0,
+) -> Sky:
+    """Return a sky of bins of `step` m; `light` is the mean count of the Raman bin at 1 km.
+
+    `brightness` is that of the elastic bin over it.
+    """
+    r = step * (np.arange(extinction.size, dtype=np.float64) + 0.5)
+    molecules = MolecularProfile.us_standard()
+    ratio = (LASER / RAMAN) ** exponent
+    backscatter = molecules.backscatter(r, LASER)
+    depth, raman_depth = (along(molecules.extinction(r, x), step) for x in (LASER, RAMAN))
+    density, particles = molecules.number_density(r), along(extinction, step)
+    seen = np.minimum(r / max(full_overlap, step), 1.0) ** 2
+    raman = seen * density / r**2 * np.exp(-depth - raman_depth - (1.0 + ratio) * particles)
+    total = backscatter + extinction / lidar_ratio
+    elastic = seen * total / r**2 * np.exp(-2.0 * depth - 2.0 * particles)
+    known = np.where(r >= full_overlap, 1.0, np.nan)
+    low, high, width = window
+    at = int(np.searchsorted(r, 1000.0))
+    return Sky(
+        extinction,
+        lidar_ratio,
+        light * raman / raman[at],
+        brightness * light * elastic / elastic[at],
+        AirColumn(r, backscatter, depth, raman_depth, density, known, LASER, RAMAN),
+        make_cells(r, r[-1] + step, cell),
+        RamanSettings(
+            highest=high,
+            reference=RamanReference(lowest=low, highest=high, width=width, relative_error=0.0),
+            angstrom_exponent=exponent,
+            angstrom_standard_error=0.0,
+            molecular_relative_error=0.0,
+            overlap_relative_error=0.0,
+            full_overlap_error=0.0,
+        ),
+    )
+
+
+def _hazy(rng: Random, exponent: float = _EXPONENT) -> Sky:
+    """Return haze that falls with height and ends smoothly; the settings are those of products."""
+    amount, scale = _between(rng, 2e-5, 3e-4), rng.uniform(800.0, 3000.0)
     top = 1.0 + np.exp((_RANGE - rng.uniform(*_TOPS)) / 300.0)
-    return _Sky(amount * np.exp(-_RANGE / scale) / top, float(rng.uniform(*_LIDAR_RATIOS)))
+    sky = make_sky(
+        amount * np.exp(-_RANGE / scale) / top, _STEP, _between(rng, *_COUNTS),
+        lidar_ratio=float(rng.uniform(*_LIDAR_RATIOS)), exponent=exponent, cell=_CELL,
+        full_overlap=_between(rng, *_FULL_OVERLAPS),
+    )  # fmt: skip
+    settings = RamanSettings(
+        reference=RamanReference(relative_error=0.0),
+        angstrom_exponent=_EXPONENT,
+        angstrom_standard_error=0.0,
+        molecular_relative_error=0.0,
+        overlap_relative_error=0.0,
+    )
+    return replace(sky, settings=settings)
 
 
-def _of_other_colour(sky: _Sky, rng: Random) -> _Sky:
+def _between(rng: Random, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def _of_other_colour(rng: Random) -> Sky:
     off = _EXPONENT_ERROR * float(np.clip(rng.normal(), -3.0, 3.0))
-    return replace(sky, exponent=_EXPONENT + off, assumed_error=_EXPONENT_ERROR)
+    sky = _hazy(rng, _EXPONENT + off)
+    return replace(sky, settings=replace(sky.settings, angstrom_standard_error=_EXPONENT_ERROR))
 
 
-def _with_particles_aloft(sky: _Sky, rng: Random) -> _Sky:
-    return replace(sky, aloft=float(rng.uniform(0.0, 0.05)), reference_error=_REFERENCE_ERROR)
+def _with_particles_aloft(rng: Random) -> Sky:
+    sky, share = _hazy(rng), rng.uniform(0.0, 0.05)
+    more = share * sky.air.backscatter / (sky.air.backscatter + sky.backscatter)
+    reference = RamanReference(relative_error=_REFERENCE_ERROR)
+    return replace(
+        sky,
+        elastic=sky.elastic * (1.0 + more * (_RANGE > _COMPARED)),
+        settings=replace(sky.settings, reference=reference),
+    )
 
 
-def _with_overlap(sky: _Sky, rng: Random) -> _Sky:
-    return replace(sky, lacking=0.05, scale=float(rng.uniform(50.0, 300.0)))
+def _with_overlap(rng: Random) -> Sky:
+    sky = _hazy(rng)
+    full = float(_RANGE[np.isfinite(sky.air.overlap)][0])
+    fall = np.exp(-np.maximum(_RANGE - full, 0.0) / _between(rng, _SHORTEST, full))
+    seen = 1.0 - 0.05 * fall
+    return replace(sky, raman=seen * sky.raman, elastic=seen * sky.elastic)
 
 
 _COLOUR: Final = "two wavelengths do not show the colour of extinction: the stated error covers it"
 _ALIKE: Final = "particles that are mixed as air is look like air in the reference window"
 _NEAR: Final = "what overlap lacks looks like extinction: the stated error covers it"
-FAILURES: Final[tuple[tuple[Failure, Callable[[_Sky, Random], _Sky]], ...]] = (
-    (Failure("none", satisfied=True), lambda sky, _: sky),
+FAILURES: Final[tuple[tuple[Failure, Callable[[Random], Sky]], ...]] = (
+    (Failure("none", satisfied=True), _hazy),
     (Failure("Angstrom exponent off as stated", unseen=_COLOUR), _of_other_colour),
     (Failure("particles in the reference window", unseen=_ALIKE), _with_particles_aloft),
     (Failure("overlap 5 percent off", unseen=_NEAR), _with_overlap),
 )
 
 
-def _along(values: Array) -> Array:
-    """Return the integral from the lidar to the middle of each bin."""
-    return np.asarray(np.cumsum(values) * _STEP - 0.5 * values * _STEP)
-
-
-def _air() -> tuple[AirColumn, Cells]:
-    molecules = MolecularProfile.us_standard()
-    air = AirColumn(
-        range=_RANGE,
-        backscatter=molecules.backscatter(_RANGE, _LASER),
-        depth=_along(molecules.extinction(_RANGE, _LASER)),
-        raman_depth=_along(molecules.extinction(_RANGE, _RAMAN)),
-        density=molecules.number_density(_RANGE),
-        overlap=np.where(_RANGE >= _FULL_OVERLAP, 1.0, np.nan),
-        wavelength=_LASER,
-        raman_wavelength=_RAMAN,
-    )
-    return air, make_cells(_RANGE, _RANGE[-1] + _STEP, _CELL)
-
-
-def _counts(sky: _Sky, air: AirColumn, light: float) -> tuple[Array, Array, Array]:
-    """Return mean counts of the Raman and the elastic signal, and particle backscatter."""
-    seen = np.minimum(_RANGE / _FULL_OVERLAP, 1.0) ** 2
-    beyond = np.maximum(_RANGE - _FULL_OVERLAP, 0.0)
-    seen = seen * (1.0 - sky.lacking * np.exp(-beyond / sky.scale))
-    particles = _along(sky.extinction)
-    longer = (_LASER / _RAMAN) ** sky.exponent
-    raman = seen * air.density / _RANGE**2
-    raman = raman * np.exp(-air.depth - air.raman_depth - (1.0 + longer) * particles)
-    backscatter = sky.extinction / sky.lidar_ratio + sky.aloft * air.backscatter * (
-        _RANGE > _COMPARED
-    )
-    elastic = seen * (air.backscatter + backscatter) / _RANGE**2
-    elastic = elastic * np.exp(-2.0 * air.depth - 2.0 * particles)
-    at = int(np.searchsorted(_RANGE, 1000.0))
-    return light * raman / raman[at], 3.0 * light * elastic / elastic[at], backscatter
-
-
-def _signal(counts: Array) -> ChannelSignal:
-    rows, bins = counts.shape
-    variance = np.broadcast_to(np.maximum(counts.mean(axis=0), 1e-3), counts.shape)
-    zero = np.zeros(rows)
-    return ChannelSignal(counts, variance, zero, zero, np.zeros((1, bins)), np.ones(rows))
-
-
 def score_raman(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield extinctions, backscatters and lidar ratios of profiles of one random sky."""
-    air, cells = _air()
-    partial = np.isnan(cells.split(air.overlap)).any(axis=-1)
-    quality = np.where(partial, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
-    for number, (failure, change) in enumerate(FAILURES):
+    for number, (failure, draw) in enumerate(FAILURES):
         rng = np.random.default_rng((88, cluster, number))
-        sky = change(_hazy(rng), rng)
-        light = float(np.exp(rng.uniform(np.log(_COUNTS[0]), np.log(_COUNTS[1]))))
-        raman, elastic, backscatter = _counts(sky, air, light)
-        signals = [
-            _signal(rng.poisson(mean, (profiles, mean.size)).astype(float))
-            for mean in (raman, elastic)
-        ]
-        settings = RamanSettings(
-            reference=RamanReference(relative_error=sky.reference_error),
-            angstrom_exponent=_EXPONENT,
-            angstrom_standard_error=sky.assumed_error,
-            molecular_relative_error=0.0,
-            overlap_relative_error=0.0,
+        sky = draw(rng)
+        quality = np.repeat(sky.quality, profiles, axis=0)
+        result = retrieve_raman(
+            *sky.drawn(rng, profiles), sky.air, sky.cells, sky.settings, quality=quality
         )
-        bits = np.repeat(quality[np.newaxis], profiles, axis=0)
-        result = retrieve_raman(signals[0], signals[1], air, cells, settings, quality=bits)
-        yield from _scored(failure, sky, cells, cells.mean(backscatter), result)
+        yield from _scored(failure, sky, result)
 
 
-def _scored(
-    failure: Failure, sky: _Sky, cells: Cells, backscatter: Array, result: RamanResult
-) -> Iterator[ScoredValues]:
-    inside = cells.range < _COMPARED
+def _scored(failure: Failure, sky: Sky, result: RamanResult) -> Iterator[ScoredValues]:
+    """Yield the values of each quantity, which flags of others should not doubt."""
+    inside = sky.cells.range < _COMPARED
+    full = sky.quality == 0
+    nearest = float(sky.cells.range[np.argmax(full)]) - 0.5 * _CELL
     length = np.where(np.isnan(result.vertical_resolution), _CELL, result.vertical_resolution)
-    whole = np.concatenate([[0.0], np.cumsum(sky.extinction)]) * _STEP
-    edges = _STEP * np.arange(whole.size)
-    low = np.maximum(cells.range - 0.5 * length, 0.0)
-    high = np.minimum(cells.range + 0.5 * length, edges[-1])
-    extinction = (np.interp(high, edges, whole) - np.interp(low, edges, whole)) / (high - low)
     none = np.zeros_like(result.quality)
-    for quantity, name, error, stated in (
-        (
-            "extinction",
-            "aerosol_extinction",
-            result.extinction - extinction,
-            result.extinction_standard_error,
-        ),
-        (
-            "backscatter",
-            "aerosol_backscatter",
-            result.backscatter - backscatter,
-            result.backscatter_standard_error,
-        ),
-        (
-            "lidar ratio",
-            "lidar_ratio",
-            result.lidar_ratio - sky.lidar_ratio,
-            result.lidar_ratio_standard_error,
-        ),
+    extinction = mean_over(sky.extinction, _STEP, sky.cells.range, length, nearest)
+    for attribute, name, truth in (
+        ("extinction", "aerosol_extinction", extinction),
+        ("backscatter", "aerosol_backscatter", sky.cells.mean(sky.backscatter)),
+        ("lidar_ratio", "lidar_ratio", np.full(full.shape, sky.lidar_ratio)),
     ):
+        value, stated = getattr(result, attribute), getattr(result, f"{attribute}_standard_error")
+        bits = concerning(name, result.quality, none)[:, inside]
         yield ScoredValues(
-            failure, quantity, error[:, inside], stated[:, inside], 0.0,
-            concerning(name, result.quality, none)[:, inside], RamanQuality,
+            failure, attribute.replace("_", " "), (value - truth)[:, inside], stated[:, inside],
+            0.0, bits, RamanQuality, uncertain=bits != 0,
+            solvable=(full & (value > _PRECISE * stated))[:, inside],
         )  # fmt: skip

@@ -204,6 +204,7 @@ COVERED_BY_95: Final = Target(0.97, 0.94)
 """Share of the truths within 1.96 stated errors where the model holds."""
 COVERED_BY_68: Final = Target(0.72, 0.66)
 """The same within one."""
+SHARE: Final = "share"
 FALSE_RANDOM: Final = "false, random error"
 FALSE_PLAIN: Final = "and not uncertain"
 TARGET: Final = "target"
@@ -223,6 +224,21 @@ TARGETS: Final = {
 """Quantities with a verdict, and the shares that they judge where the model holds and elsewhere."""
 _EDGES: Final = np.concatenate([[1e-6], np.geomspace(1e-3, 1e2, 501), [1e6]])
 """Sizes of errors, in stated ones, between which values are counted."""
+
+
+Part = tuple[str, str, float, int]
+"""Case, class, and events among trials in one cluster."""
+
+
+def shares(parts: Iterable[Part], target: Callable[[str, str], Target | None]) -> Scores:
+    """Return shares of events by case and class, and whether they meet the target of each."""
+    rows = pd.DataFrame(parts, columns=["case", "class", "events", "values"])
+    scores: Scores = {}
+    for (case, name), group in rows[rows["values"] > 0].groupby(["case", "class"], sort=False):
+        share = clustered_share(*group[["events", "values"]].to_numpy(dtype=float).T)
+        judged = _judged(share, target(case, name))
+        scores[case, name] = {"values": int(group["values"].sum()), SHARE: share, TARGET: judged}
+    return scores
 
 
 def collect(

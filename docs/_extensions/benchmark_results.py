@@ -140,11 +140,13 @@ def _rounded(value: float, digits: int) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def page(name: str) -> str:
-    """Return the machine and the tables of a benchmark."""
+def page(name: str, part: str = "") -> str:
+    """Return the machine and the tables of a benchmark, or those whose titles end with a part."""
     result = read(name)
     lines = [facts(result)]
     for title, rows in result["tables"].items():
+        if not title.endswith(part):
+            continue
         case, method = result["headings"][title]
         shown = table(pd.DataFrame(rows, columns=COLUMNS, dtype=object), case=case, method=method)
         cells = shown.itertuples(index=False, name=None)

@@ -36,6 +36,9 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
     "stability": partial(benchmark_results.page, "stability"),
     "stiff-cases": stiff_cases.page,
     "throughput": partial(benchmark_results.page, "throughput"),
+    "varying-lidar-ratio": partial(
+        benchmark_results.page, "stability", "networks, varying lidar ratio"
+    ),
     "verdicts": verdicts.page,
 }
 

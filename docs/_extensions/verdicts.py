@@ -13,8 +13,8 @@ from benchmarks.harness.figure import share_text
 from benchmarks.harness.results import cell
 from benchmarks.harness.timing import CPU_TIME
 from benchmarks.harness.verdicts import Judgement, Verdict
-from benchmarks.stability import flag_rates, reasons
-from benchmarks.stability.random_scenes import SATISFIED, TARGET, TARGETS
+from benchmarks.stability import reasons
+from benchmarks.stability.random_scenes import SATISFIED, SHARE, TARGET, TARGETS
 from benchmarks.stability.reasons import Unmet
 
 _WORDS: Final = {TARGET: "false", "needless target": "needless"}
@@ -80,7 +80,7 @@ def judged_row(figures: dict[tuple[str, str, str], Row], row: Row) -> Row | None
     held, elsewhere = TARGETS[row.quantity]
     judged = judgement(row)
     holds = judged is not None and judged.limits == share_text(SATISFIED)
-    for quantity in (held if holds else elsewhere, flag_rates.SHARE, CPU_TIME):
+    for quantity in (held if holds else elsewhere, SHARE, CPU_TIME):
         figure = figures.get((row.case, row.method, quantity))
         if figure is not None:
             return figure

@@ -394,7 +394,7 @@ def _profile_weights(raw: Table, total: Array) -> Array:
 
 
 def _as_resolved(raw: Table) -> Array:
-    """Return backscatter over the resolution of extinction, m-1 sr-1, NaN where it has none."""
+    """Return backscatter over the air of extinction, m-1 sr-1, NaN where it has none."""
     ranges = raw["range"][1]
     step = float(np.median(np.diff(ranges)))
     edges = np.append(ranges - 0.5 * step, ranges[-1] + 0.5 * step)
@@ -405,7 +405,8 @@ def _as_resolved(raw: Table) -> Array:
         there = np.isfinite(values)
         sums = np.append(0.0, np.cumsum(np.where(there, values, 0.0)))
         counts = np.append(0.0, np.cumsum(there))
-        low, high = ranges - 0.5 * length, ranges + 0.5 * length
+        low = np.maximum(ranges - 0.5 * length, edges[int(np.isfinite(length).argmax())])
+        high = low + length
         total, bins = (np.interp(high, edges, c) - np.interp(low, edges, c) for c in (sums, counts))
         resolved[row] = np.where(there & (bins > 0.0), total, np.nan) / np.where(bins > 0, bins, 1)
     return resolved

@@ -206,6 +206,17 @@ def test_measured_lidar_ratios_are_averaged_by_the_noise_of_profiles(tmp_path: P
         lidar_ratio_profile(tmp_path, "night.nc")
 
 
+def test_backscatter_is_averaged_over_the_air_of_extinction(tmp_path: Path) -> None:
+    """Not over nearer air, where both channels have the same overlap and extinction is missing."""
+    _product(tmp_path, [[np.nan, 50.0, 50.0]], 1.0, 0, backscatter=[[10.0, 1.0, 1.0]])
+    product = xr.load_dataset(tmp_path / "night.nc")
+    length = product["vertical_resolution"].where(product["aerosol_extinction"] > 0.0)
+    product["vertical_resolution"] = 2.0 * length
+    product.to_netcdf(tmp_path / "night.nc")
+    profile, _ = lidar_ratio_profile(tmp_path, "night.nc")
+    np.testing.assert_allclose(profile.ratio, 50.0)
+
+
 def test_profiles_of_uncertain_background_hardly_count(tmp_path: Path) -> None:
     background, ratio = np.full((47, 1), 0.05), np.full((47, 2), 60.0)
     background[4], ratio[4] = 3.0, 500.0

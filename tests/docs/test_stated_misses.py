@@ -44,7 +44,7 @@ STATED = {
     ),
     (
         "networks, varying lidar ratio", "extinction",
-        "lidar ratio varies by 7 %, the default declared",
+        "lidar ratio varies by 10 %, the default declared",
     ): ("visibility", "", "by 7 percent (rms)"),
 }  # fmt: skip
 """Part, quantity and class of the benchmark: product, variable (none: the file) and words."""

@@ -89,9 +89,11 @@ def test_a_simulated_night_agrees_with_the_truth(night):
     assert (product["profiles_left_out"].values == 0).all()
     r = product["range"].values
     length = np.nan_to_num(product["vertical_resolution"].values, nan=60.0)
-    extinction = mean_over(true["aerosol_extinction"], STEP, r, length)
+    nearest = r[np.isfinite(product["aerosol_extinction"].values).any(axis=0)][0] - 30.0
+    extinction = mean_over(true["aerosol_extinction"], STEP, r, length, nearest)
     backscatter = mean_over(true["aerosol_backscatter"], STEP, r, np.full(r.size, 60.0))
-    ratio = extinction / np.maximum(mean_over(true["aerosol_backscatter"], STEP, r, length), 1e-12)
+    resolved = mean_over(true["aerosol_backscatter"], STEP, r, length, nearest)
+    ratio = extinction / np.maximum(resolved, 1e-12)
     water = SURFACE * np.exp(-r / SCALE_HEIGHT)
     cases = (
         ("aerosol_extinction", extinction),

@@ -159,7 +159,8 @@ LAYOUT: Final = Layout(
         Row(
             "vertical_resolution",
             "effective resolution of extinction and lidar ratio along the beam",
-            "Length over which a mean has the noise of the value.",
+            "Length over which a mean has the noise of the value. The mean is centred on the bin,"
+            " but begins at the first one with extinction where it would reach before it.",
             units="m",
             coverage=Coverage.AUXILIARY,
             bits=8,

@@ -140,8 +140,8 @@ LAYOUT: Final = Layout(
     f" 3000 m: noise hides the field. {MEASURED_SHARES}"
     " The error that the prior leaves is common to all profiles, so that a mean over"
     " time does not reduce it. total_extinction_systematic_error includes a lidar ratio that varies"
-    " over the network as declared, by 7 percent (rms) if not stated: where it varies by more than"
-    " declared, values without a flag deviate by more than 4 standard errors.",
+    " over the network as declared, by default by 7 percent (rms). Where it varies by more, some"
+    " values without a flag deviate by more than 4 standard errors.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=_COORDINATES,

@@ -404,7 +404,7 @@ def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
     kernel = step * (beyond - 0.5 * weights)
     resolution = step / root_of_squares(kernel) ** 2
     walk = np.sqrt(1.0 / fit.walk) / (step * both)
-    away = kernel - mean_weights(resolution, step)
+    away = kernel - mean_weights(resolution, step, step * int(np.argmax(fit.information > 0.0)))
     return Extinction(
         value=slope(fit.depth, step) / both,
         kernel=kernel,
@@ -420,15 +420,15 @@ def _summed(weights: Array) -> Array:
     return root_of_squares(np.cumsum(weights[:, :0:-1], axis=1))
 
 
-def mean_weights(length: Array, step: float) -> Array:
+def mean_weights(length: Array, step: float, nearest: float = 0.0) -> Array:
     """Return the weights of cells in means over a length around each cell, within the profile.
 
     Parameters
     ----------
     length : (cell,) float
         m.
-    step : float
-        m, length of a cell.
+    step, nearest : float
+        m, length of a cell; first range with data: means that would begin before it begin there.
 
     Returns
     -------
@@ -436,9 +436,7 @@ def mean_weights(length: Array, step: float) -> Array:
         Rows have the sum 1.
     """
     edges = np.arange(length.size + 1) * step
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    low, high = middle - 0.5 * length, middle + 0.5 * length
-    inside = np.minimum(high[:, np.newaxis], edges[1:])
-    inside -= np.maximum(low[:, np.newaxis], edges[:-1])
-    np.maximum(inside, 0.0, out=inside)
+    low = np.maximum(edges[:-1] + 0.5 * (step - length), nearest)
+    high = np.minimum((low + length)[:, np.newaxis], edges[1:])
+    inside = np.maximum(high - np.maximum(low[:, np.newaxis], edges[:-1]), 0.0)
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))

@@ -253,15 +253,15 @@ def touched(mask: Booleans, resolution: Array, step: float) -> Booleans:
     ----------
     mask : (profile, cell) bool
     resolution : (profile, cell) float
-        m, length over which a value is a mean; NaN for the cell itself.
+        m, length over which a value is a mean of cells that have one; NaN for the cell itself.
     step : float
         m, length of a cell.
     """
     count = mask.shape[-1]
     half = np.ceil(np.maximum(np.nan_to_num(resolution) / step - 1.0, 0.0) / 2.0).astype(np.intp)
-    number = np.arange(count)
-    first, stop = np.maximum(number - half, 0), np.minimum(number + half + 1, count)
-    sums = np.zeros((len(mask), count + 1), dtype=np.intp)
-    np.cumsum(mask, axis=-1, out=sums[:, 1:])
-    inside = np.take_along_axis(sums, stop, axis=-1) - np.take_along_axis(sums, first, axis=-1)
-    return np.asarray(inside > 0)
+    number, nearest = np.arange(count), np.isfinite(resolution).argmax(axis=-1)[:, np.newaxis]
+    first = np.maximum(number - half, np.minimum(number, nearest))
+    stop = np.minimum(first + 2 * half + 1, count)
+    sums = np.pad(np.cumsum(mask, axis=-1), ((0, 0), (1, 0)))
+    until, before = (np.take_along_axis(sums, at, axis=-1) for at in (stop, first))
+    return np.asarray(until > before)

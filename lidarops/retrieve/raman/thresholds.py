@@ -44,9 +44,9 @@ class Thresholds(NamedTuple):
     (`tests/retrieve/raman/test_raman_coverage.py`); in the night of Manaus, whose overlap is not
     full where it was stated to be, all values up to 6 km (`tests/end_to_end/test_raman.py`)."""
     overlap_scales: tuple[float, ...] = (0.3, 1.0)
-    """Over the range from which overlap is stated to be full: scales of range over which what is
-    lacking there falls. Of 5 percent that fall over 50 to 300 m, .02 percent of extinctions are off
-    by more than 4 errors, with one of the scales .07 and .15 percent (``benchmarks stability``)."""
+    """Scales over which what overlap lacks falls, over the range where it is stated to be full. Of
+    5 percent that fall over 50 m or more, .01 percent of extinctions are off by more than 4 errors,
+    with one of the scales .03 and .07 percent (skies of ``benchmarks stability``)."""
     fewest_cells: int = 8
     """Cells with data of a profile that is fitted. Assumed."""
     standard_slope_error: float = 1.6e-5

@@ -19,10 +19,12 @@ from benchmarks.harness.statistics import clustered_share, design_effect
 from benchmarks.harness.timing import CPU_TIME, cpu_seconds
 from benchmarks.harness.verdicts import Verdict
 from benchmarks.stability import (
+    random_dead_times,
     random_elastic,
     random_homogeneous,
     random_light,
     random_networks,
+    random_raman,
     random_scans,
     random_signals,
     reasons,
@@ -43,6 +45,7 @@ from benchmarks.stability.random_scenes import (
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.dead_time import DeadTimeEstimate
 
 pytestmark = pytest.mark.slow
 
@@ -390,7 +393,7 @@ def test_networks_have_the_same_values_each_time():
 @pytest.mark.parametrize("told", [False, True])
 def test_profiles_without_light_are_counted_where_they_are_missed(monkeypatch, told):
     right = random_light.light_scores(5)
-    assert [score["target"] is None for score in right.values()].count(True) == 1
+    assert [score["target"] is None for score in right.values()].count(True) == 3
     assert {score["share"].value for score in right.values() if score["target"]} == {0.0}
 
     def all_alike(found, _):
@@ -399,6 +402,28 @@ def test_profiles_without_light_are_counted_where_they_are_missed(monkeypatch, t
     monkeypatch.setattr(random_light, "lightless", all_alike)
     for (case, _), score in random_light.light_scores(2).items():
         assert score["share"].value == float(told == ("flagged" in case)), case
+
+
+def test_values_doubted_for_another_quantity_are_counted(monkeypatch):
+    """Lidar ratios are missing in most of these skies."""
+
+    def doubted():
+        scores = collect(lambda k: random_raman.score_raman(k, 4), 6).rates(0.05)
+        return scores["extinction", "none"]["needlessly flagged"].value
+
+    assert doubted() == 0.0
+    monkeypatch.setattr(random_raman, "concerning", lambda _, found, __: found)
+    assert doubted() > 0.5
+
+
+def test_dead_times_that_are_missing_or_far_are_counted(monkeypatch):
+    right = random_dead_times.dead_time_scores(1)
+    assert len(right) == 2 * len(random_dead_times.SCENES)
+    assert {score["share"].value for score in right.values()} == {0.0}
+    for found in (None, DeadTimeEstimate(1e-9, 1e-13, 0.5)):
+        monkeypatch.setattr(random_dead_times, "estimate_dead_time", lambda *_, one=found: one)
+        wrong = random_dead_times.dead_time_scores(1)
+        assert {score["share"].value for score in wrong.values()} == {1.0}
 
 
 def test_the_cost_of_all_parts_is_a_target():

@@ -142,7 +142,7 @@ def test_values_without_the_bit_are_right(partly_cloudy):
     r = partly_cloudy["range"].to_numpy()
     true = HAZE + CIRRUS * 2 / PROFILES
     length = np.nan_to_num(partly_cloudy["vertical_resolution"].to_numpy()[0], nan=60.0)
-    extinction = mean_over(true, STEP, r, length)
+    extinction = mean_over(true, STEP, r, length, 300.0)
     backscatter = HAZE / 50.0 + CIRRUS / CLOUD_RATIO * 2 / PROFILES
     good = (partly_cloudy["quality_flag"].to_numpy()[0] == 0) & inside(partly_cloudy, 400.0, 7500.0)
     assert good.sum() > 60
@@ -189,8 +189,12 @@ def test_states_of_cells_are_those_of_their_bins():
 
 def test_a_cloud_takes_part_in_the_values_within_the_resolution():
     mask = np.zeros((2, 9), np.bool_)
-    mask[:, 4] = True
+    mask[:, 6] = True
     resolution = np.array([np.full(9, np.nan), np.full(9, 250.0)])
     near = touched(mask, resolution, 60.0)
-    assert np.flatnonzero(near[0]).tolist() == [4]
-    assert np.flatnonzero(near[1]).tolist() == [2, 3, 4, 5, 6]
+    assert np.flatnonzero(near[0]).tolist() == [6]
+    assert np.flatnonzero(near[1]).tolist() == [4, 5, 6, 7, 8]
+    # Of cells next to partial overlap, the mean begins there.
+    resolution = np.where(np.arange(9) < 3, np.nan, 250.0)[np.newaxis]
+    near = touched(np.arange(9)[np.newaxis] == 6, resolution, 60.0)
+    assert np.flatnonzero(near[0]).tolist() == [3, 4, 5, 6, 7, 8]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.raman_signals import make_sky, sliding_line
+from support.raman_signals import make_sky, mean_over, sliding_line
 
 from lidarops.retrieve.raman.depth_fit import SignalNoise, extinction_of, fit_depth, mean_weights
 from lidarops.retrieve.raman.signals import cell_signals
@@ -14,9 +14,9 @@ R = STEP * (np.arange(400) + 0.5)
 HAZE = 1.5e-4 * np.exp(-R / 1500.0) + 8e-5 * np.exp(-0.5 * ((R - 2500.0) / 300.0) ** 2)
 
 
-def solved(extinction, light, counts=None):
+def solved(extinction, light, counts=None, **of_sky):
     """Return the extinction of one profile of cells of one bin, and the bins of full overlap."""
-    sky = make_sky(extinction, STEP, light, cell=STEP)
+    sky = make_sky(extinction, STEP, light, cell=STEP, **of_sky)
     signal = sky.signal((sky.raman if counts is None else counts)[np.newaxis])
     (cells,) = cell_signals(signal, sky.air.raman_shape, sky.cells)
     full = sky.quality[0] == 0
@@ -74,6 +74,27 @@ def test_weights_of_means_are_those_of_the_cells_that_overlap():
     np.testing.assert_allclose(weights[0], [1.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(weights[1], [0.25, 0.5, 0.25, 0.0])
     np.testing.assert_allclose(weights[2], [0.0, 1 / 3, 1 / 3, 1 / 3])
+    # Where the signal shows no extinction before the second cell.
+    weights = mean_weights(np.full(4, 20.0), 10.0, 10.0)
+    np.testing.assert_allclose(weights[1], [0.0, 0.5, 0.5, 0.0])
+    np.testing.assert_allclose(weights[2], [0.0, 0.25, 0.5, 0.25])
+
+
+def test_extinction_next_to_partial_overlap_is_that_of_the_air_beyond():
+    """Of random walks, values differ from means that begin there by the stated error."""
+    rng = np.random.default_rng(6)
+    found, full, _ = solved(HAZE, 300.0, full_overlap=2000.0)
+    first = int(np.argmax(full))
+    assert found.vertical_resolution[first] > 500.0
+    walks = np.cumsum(rng.normal(size=(1000, R.size)), axis=1)
+    there = slice(first, first + 10)
+    mean = [
+        mean_over(walk, STEP, R[there], found.vertical_resolution[there], STEP * first)
+        for walk in walks
+    ]
+    scatter = np.std(walks @ found.kernel[there].T - mean, axis=0)
+    stated = found.resolution_error[there]
+    np.testing.assert_allclose(scatter / scatter[-1], stated / stated[-1], rtol=0.1)
 
 
 @pytest.mark.parametrize("light", [3.0, 300.0])

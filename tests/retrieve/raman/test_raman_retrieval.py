@@ -221,14 +221,11 @@ def test_an_overlap_that_is_not_full_where_stated_is_found():
     rng = np.random.default_rng(4)
     for true, to in ((300.0, 0.0), (2500.0, 2200.0)):
         sky = make_sky(HAZE, STEP, 5000.0, full_overlap=true, window=WINDOW)
-        raman, elastic = (
-            sky.signal(rng.poisson(mean, (5, R.size)).astype(float))
-            for mean in (sky.raman, sky.elastic)
-        )
         r = sky.cells.range
         partial = np.where(r < 1000.0, np.int32(Quality.INCOMPLETE_OVERLAP), np.int32(0))
         quality = np.tile(partial, (5, 1))
-        found = retrieve_raman(raman, elastic, sky.air, sky.cells, sky.settings, quality=quality)
+        signals = sky.drawn(rng, 5)
+        found = retrieve_raman(*signals, sky.air, sky.cells, sky.settings, quality=quality)
         negative = (found.quality & RamanQuality.NEGATIVE_EXTINCTION) != 0
         assert negative[:, (r > 1000.0) & (r < to)].all()
         assert to > 0.0 or not negative.any()

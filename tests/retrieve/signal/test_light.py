@@ -6,31 +6,32 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.light_counts import RANGE as R
+from support.light_counts import SHAPE, draw_counts
 
 from lidarops.retrieve.signal.light import Light, excess_over_far, light_of, lightless
 
-R = 7.5 * (np.arange(2000) + 0.5)
 DAY, NIGHT = 30.0, 0.02
 """Counts of a bin by the sky."""
 
 
 def shape(nearest=0.0, cloud=0.0):
     """Return light along range, 1 at 300 m; from a range on, or behind a cloud at 300 m."""
-    light = np.minimum(R / 300.0, 1.0) ** 2 * (300.0 / R) ** 2 * np.exp(-R / 4000.0)
-    light = light * (1.0 + cloud * np.exp(-(((R - 300.0) / 30.0) ** 2)))
+    light = SHAPE * np.exp(-R / 4000.0) * (1.0 + cloud * np.exp(-(((R - 300.0) / 30.0) ** 2)))
     light[R > 300.0] *= 1.0 / (1.0 + cloud)
     return light * (nearest <= R)
 
 
 def photons(rng, light, sky=DAY, number=40, **of_shape):
     """Return counts of profiles, with these by light at 300 m."""
-    return rng.poisson(sky + light * shape(**of_shape), (number, R.size))
+    rows = np.broadcast_to(light * shape(**of_shape), (number, R.size))
+    return draw_counts(rng, rows, analog=False, level=sky)
 
 
 def analog(rng, light, number=40, noise=50.0, **of_shape):
-    """Return summed counts of a digitiser, whose offset is 6000, with these by light at 300 m."""
-    values = 6000.0 + light * shape(**of_shape) + rng.normal(0.0, noise, (number, R.size))
-    return np.rint(values).astype(np.int64)
+    """Return summed counts of a digitiser, with these by light at 300 m."""
+    rows = np.broadcast_to(light * shape(**of_shape), (number, R.size))
+    return draw_counts(rng, rows, analog=True, level=noise)
 
 
 def found(counts, shots=None):
@@ -83,6 +84,25 @@ def test_light_that_a_profile_shows_itself_is_never_none(made):
     assert not (excess < 6.0).sum() > 2
     dusty = np.concatenate([made(rng, 20000.0), made(rng, 1000.0, number=500)])
     assert not dark_of({"elastic": dusty})["elastic"].any()
+
+
+@pytest.mark.parametrize(("made", "light"), [(photons, 250.0), (analog, 2200.0)])
+def test_a_channel_tells_if_a_twentieth_of_its_light_would_show(made, light):
+    """Of weaker light, a twentieth of what most profiles show is lost in the noise."""
+    rng = np.random.default_rng(15)
+
+    def with_few_of_a_twentieth(most):
+        parts = (most, 40), (0.05 * most, 4), (0.0, 20)
+        counts = np.concatenate([made(rng, x, number=n) for x, n in parts])
+        (dark,) = dark_of({"weak": counts}).values()
+        return np.median(found(counts[:40]).excess), dark
+
+    excess, dark = with_few_of_a_twentieth(light)
+    assert 230.0 < excess < 390.0
+    np.testing.assert_array_equal(np.flatnonzero(dark), np.arange(44, 64))
+    excess, dark = with_few_of_a_twentieth(0.4 * light)
+    assert 90.0 < excess < 120.0
+    assert not dark.any()
 
 
 @given(

@@ -1,0 +1,7 @@
+"""Counts of light along range: those of the stability benchmark."""
+
+from __future__ import annotations
+
+from benchmarks.stability.random_light import RANGE, SHAPE, draw_counts
+
+__all__ = ["RANGE", "SHAPE", "draw_counts"]
