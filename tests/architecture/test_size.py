@@ -19,13 +19,13 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_443,
-    "lines of code alone": 46_018,
+    "lines": 69_789,
+    "lines of code alone": 45_582,
     "modules": 279,
-    "dataclasses": 250,
-    "lines of dataclasses": 6_688,
-    "tuning numbers": 220,
-    "tuning numbers that are assumed": 65,
+    "dataclasses": 245,
+    "lines of dataclasses": 6_610,
+    "tuning numbers": 214,
+    "tuning numbers that are assumed": 64,
     "copied thresholds": 0,
     "most parameters": 14,
     "lines of the largest package": 5_823,

@@ -147,7 +147,7 @@ class OpticalDepthSettings:
     """Standard deviation of the logarithms on top of the noise; estimated if not given."""
     largest_gradient: float = LARGEST_GRADIENT
     """m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
-    `extinction_gradient_error`, unless the residuals show a larger one."""
+    `extinction_gradient_error`."""
     layers: Sequence[tuple[float, float]] = ()
     """m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
     altitudes and the station, by at most half the distance to the next one."""
@@ -167,19 +167,15 @@ class BlockSettings(OpticalDepthSettings):
     """(layer, 2) levels at bottom and top of layers: 0 for the lidar, k + 1 for altitude k."""
 
 
-def solve_cycles(
-    signal: Array, variance: Array, dead_time_change: Array | None, settings: BlockSettings
-) -> MultiAngleResult:
+def solve_cycles(signal: Array, variance: Array, settings: BlockSettings) -> MultiAngleResult:
     """Return the solution of the profiles of one block, without the reasons for missing values.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
-    dead_time_change : (profile, angle, altitude) float or None
-        Of the signal, with one standard error of the dead time.
     settings : BlockSettings
     """
-    beams = _block.make_beam_block(signal, variance, settings.scan, dead_time_change)
+    beams = _block.make_beam_block(signal, variance, settings.scan)
     fit = _block.regress(beams, settings.inhomogeneity)
     method, reason = _choose_method(beams, settings)
     profiles = _solve(method, beams, fit, settings)
@@ -246,7 +242,7 @@ def _single_altitudes(
         settings,
         depth=profiles.optical_depth,
         error=error,
-        slopes=_gradient_slopes(profiles, beams, fit, settings),
+        slopes=_gradient_slopes(fit, settings),
         correlation=np.pad(correlation * fit.shared, ((0, 0), (1, 0))),
     )
     share = np.sqrt(fit.column(kh.AIR) * fit.inhomogeneity)
@@ -256,9 +252,10 @@ def _single_altitudes(
 
 def _correlation(beams: BeamBlock, fit: Regression) -> float:
     """Return the correlation of the air at neighbouring altitudes, which residuals show."""
+    some, columns = fit.typical(), beams.columns
     return correlation_of_air(
-        fit.residual, beams.noise, fit.leverage, fit.inhomogeneity, beams.path,
-        np.ascontiguousarray(fit.column(kh.SIDES)),
+        some.residual, beams.typical().noise, some.leverage, fit.inhomogeneity,
+        columns if beams.sides else columns[:2],
     )  # fmt: skip
 
 
@@ -312,7 +309,7 @@ def _fill_single(
 ) -> None:
     """Fill estimates of single altitudes within the reach, and what follows from them.
 
-    `slopes`, (2, profile, altitude), are the errors by the largest gradient to the east and north,
+    `slopes`, (axis, profile, altitude), are the errors by the largest gradient along the axes,
     `correlation` is that of the error with the one at the altitude below.
     """
     within = np.isfinite(profiles.optical_depth) & np.isfinite(depth)
@@ -354,8 +351,8 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
         "extinction_standard_error", "effective_degrees_of_freedom", "data_share",
     ):  # fmt: skip
         getattr(profiles, name)[rows] = getattr(smooth, name)
-    slopes = np.full((2, *within.shape), np.nan)
-    of_single = _gradient_slopes(profiles, beams, fit, settings)
+    of_single = _gradient_slopes(fit, settings)
+    slopes = np.full(of_single.shape, np.nan)
     for slope, single in zip(slopes, of_single, strict=True):
         one = np.where(within, single, 0.0)[rows]
         slope[rows] = smooth.respond(one) if one.any() else 0.0 * smooth.optical_depth
@@ -405,32 +402,28 @@ def _start(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> MultiA
     return profiles
 
 
-def _gradient_slopes(
-    profiles: MultiAngleResult, beams: BeamBlock, fit: Regression, settings: BlockSettings
-) -> Array:
-    """Return the error of optical depth by a gradient to the east and to the north.
-
-    The gradient is the declared one, or that which the residuals show where it is larger. One that
-    is too large for air raises `POOR_STRATIFICATION`.
-    """
-    shown = _horizontal_variation.visible_gradient(beams, fit, settings.height)
-    if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
-        known = np.isfinite(profiles.optical_depth)
-        profiles.mark(MultiAngleQuality.POOR_STRATIFICATION, known)
-    scale = max(settings.largest_gradient, shown) * settings.height
-    return np.stack([fit.column(kh.SLOPE_EAST) * scale, fit.column(kh.SLOPE_NORTH) * scale])
+def _gradient_slopes(fit: Regression, settings: BlockSettings) -> Array:
+    """Return the errors of optical depth by the declared gradient along the axes of the scan."""
+    slopes = fit.table[:, kh.SLOPES : kh.SLOPES + 2] * settings.largest_gradient * settings.height
+    return np.asarray(slopes.swapaxes(0, 1))
 
 
 def _fill_gradient_errors(
     profiles: MultiAngleResult, slopes: Array, settings: BlockSettings
 ) -> None:
-    """Fill the gradient errors from the signed errors of gradients to the east and north."""
-    profiles.optical_depth_gradient_error[:] = np.hypot(*slopes)
-    profiles.extinction_gradient_error[:] = np.hypot(
-        *(_layer_means(slope, settings.height) for slope in slopes)
+    """Fill the gradient errors from the signed errors by gradients along the axes."""
+    profiles.optical_depth_gradient_error[:] = _length(slopes)
+    profiles.extinction_gradient_error[:] = _length(
+        [_layer_means(slope, settings.height) for slope in slopes]
     )
-    across = (np.diff(_at_layers(slope, settings), axis=2)[..., 0] for slope in slopes)
-    profiles.layer_optical_depth_gradient_error[:] = np.hypot(*across)
+    profiles.layer_optical_depth_gradient_error[:] = _length(
+        [np.diff(_at_layers(slope, settings), axis=2)[..., 0] for slope in slopes]
+    )
+
+
+def _length(parts: Sequence[Array] | Array) -> Array:
+    """Return the root of the sum of squares over axes."""
+    return np.asarray(np.sqrt(np.square(parts).sum(axis=0)))
 
 
 def _layer_means(optical_depth: Array, height: Array) -> Array:

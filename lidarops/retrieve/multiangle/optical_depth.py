@@ -47,7 +47,6 @@ def retrieve_optical_depth(
     variance: npt.ArrayLike,
     azimuth: npt.ArrayLike | None = None,
     settings: OpticalDepthSettings = _DEFAULT,
-    dead_time_change: npt.ArrayLike | None = None,
     signal_quality: Flags | None = None,
 ) -> MultiAngleResult:
     """Retrieve optical depth and extinction from signals at several zenith angles.
@@ -66,14 +65,9 @@ def retrieve_optical_depth(
         m, ascending, above the station; uniform for "joint".
     variance : (profile, angle, altitude) float
         Variance of the noise alone, in the square of the unit of the signal, broadcast against it.
-        For counts, give that of a smoothed rate (`lidarops.retrieve.signal.counts_to_signal`):
-        variances from single counts make intervals too narrow.
     azimuth : (angle,) float, optional
         degree; the same for all angles if not given.
     settings : OpticalDepthSettings
-    dead_time_change : (profile, angle, altitude) float, optional
-        Change of the signal with one standard error of the dead time, in all beams together, which
-        looks like a horizontal gradient near the lidar; NaN where there is no signal.
     signal_quality : (profile, altitude) int, optional
         Bits of the signals of all beams, which tell why values are missing; by default
         INPUT_MISSING where no beam has a signal and its variance.
@@ -105,10 +99,7 @@ def retrieve_optical_depth(
         scan=scan,
         levels=layer_levels(settings.layers, altitude, station_altitude=station)[0],
     )
-    change = None
-    if dead_time_change is not None:
-        change = np.nan_to_num(_cube(dead_time_change, "dead_time_change", rows.shape))
-    result = _methods.solve_cycles(rows, noise, change, block)
+    result = _methods.solve_cycles(rows, noise, block)
     _with_reasons(result, rows, noise, signal_quality)
     return result
 

@@ -69,14 +69,10 @@ class Thresholds(NamedTuple):
     assumed."""
 
     # Samples (`_block`).
-    lowest_snr: float = 3.0
-    """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
-    light (`test_kano_hamilton`)."""
-    swallowed_snr: float = 2.0
-    """The same of the altitudes from one upwards: the wide window would accept samples behind a
-    cloud that swallows the beam; by the stiff case of optical depth 20."""
-    ahead: int = 5
-    """Altitudes of that mean, a third of those around; by the same case."""
+    lowest_snr: float = 1.5
+    """Signal over noise, means of an altitude and the next four, below which a beam ends; with 3,
+    optical depths in weak light are 15 percent less exact (`benchmarks.accuracy`, SNR 300), and
+    fewer have a value."""
 
     # Fit at single altitudes (`_block`, `_methods`).
     pooled: int = 15
@@ -95,20 +91,6 @@ class Thresholds(NamedTuple):
     negative: float = 2.0
     """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
     alone in 2.3 percent of the altitudes where the air is clear."""
-
-    # Horizontal gradient (`_horizontal_variation`, `_methods`).
-    gradient_window: float = 1000.0
-    """m, window in which the residuals are tested for a gradient; assumed."""
-    gradient_noise: float = 0.04
-    """Variance of a logarithm from which a sample is left out of that test. Noisier samples are
-    biased, and together look like a gradient: deviations from level air are 1.1 standard errors
-    without them, 1.4 with them (`test_level_air_shows_no_gradient`)."""
-    gradient_false_alarm: float = 1e-3
-    """Probability that chance shows a gradient along an axis at any altitude of a block; chosen."""
-    largest_gradient: float = 3e-4
-    """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
-    no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted
-    analog signals of scans up to 25 degrees of elevation show 2e-3 and more."""
 
     # Stratification (`_horizontal_variation`).
     growth: float = 1.5**2
