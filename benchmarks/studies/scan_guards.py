@@ -20,9 +20,8 @@ from benchmarks.studies.ablation import (
 )
 from lidarops.retrieve.multiangle import (
     _calibration,
-    _horizontal_variation,
-    _methods,
     _smoothing,
+    optical_depth,
     smooth_profile,
 )
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
@@ -50,7 +49,7 @@ def _uncalibrated(
 GUARDS: Final = (
     Guard("NO_RESIDUAL", int(MultiAngleQuality.NO_RESIDUAL)),
     Guard("INTERPOLATED", int(MultiAngleQuality.INTERPOLATED)),
-    Guard("path variation", off=without((_horizontal_variation, "path_variation_from", _nothing))),
+    Guard("path variation", off=without((optical_depth, "path_variation_from", _nothing))),
     Guard(
         "few residuals: inflation",
         off=without((smooth_profile, "inflation", lambda noise: np.ones(noise.freedom.size))),
@@ -62,7 +61,7 @@ GUARDS: Final = (
         off=without((smooth_profile, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
-    Guard("correlation", off=without((_methods, "correlation_of_air", lambda *_: 0.0))),
+    Guard("correlation", off=without((optical_depth, "correlation_of_air", lambda *_: 0.0))),
 )
 
 if __name__ == "__main__":

@@ -19,11 +19,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_789,
-    "lines of code alone": 45_582,
-    "modules": 279,
-    "dataclasses": 245,
-    "lines of dataclasses": 6_610,
+    "lines": 69_746,
+    "lines of code alone": 45_542,
+    "modules": 278,
+    "dataclasses": 244,
+    "lines of dataclasses": 6_576,
     "tuning numbers": 214,
     "tuning numbers that are assumed": 64,
     "copied thresholds": 0,

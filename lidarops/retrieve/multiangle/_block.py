@@ -48,11 +48,9 @@ class BeamBlock:
     """(profile, angle, altitude); 0 where there is no sample."""
     noise: Array
     """Their variances; inf where there is no sample."""
-    path: Array
-    """(angle, altitude), finite: slant path."""
-    axes: Array
-    """(axis, angle, altitude), finite: horizontal distance over altitude along the axes of the
-    scan, the longer one first; one if the beams lie in one vertical plane."""
+    columns: Array
+    """(column, angle, altitude), finite: ones, slant path, and horizontal distance over altitude
+    along the axes of the scan, the longer one first; one if beams lie in one vertical plane."""
     alive: Indices
     """(profile, altitude): number of beams not yet lost in noise."""
     sides: bool
@@ -61,9 +59,14 @@ class BeamBlock:
     """Beams that an altitude needs to be within the reach."""
 
     @property
-    def columns(self) -> Array:
-        """Ones, slant path, and distances along the axes, (column, angle, altitude)."""
-        return np.stack([np.ones_like(self.path), self.path, *self.axes])
+    def path(self) -> Array:
+        """Slant path, (angle, altitude)."""
+        return np.asarray(self.columns[1])
+
+    @property
+    def axes(self) -> Array:
+        """Distances along the axes, (axis, angle, altitude)."""
+        return np.asarray(self.columns[2:])
 
     def typical(self) -> BeamBlock:
         """Return the profiles from which what a block has in common is estimated."""
@@ -137,25 +140,27 @@ def make_beam_block(signal: Array, variance: Array, scan: Scan) -> BeamBlock:
     return BeamBlock(
         logarithm,
         noise,
-        np.nan_to_num(scan.path, nan=1.0),
-        along_axes(distances),
+        fit_columns(np.nan_to_num(scan.path, nan=1.0), distances),
         alive,
         surrounds_zenith(scan.tilted_azimuths),
         min(3, max(int(scan.usable.sum()), 2)),
     )
 
 
-def along_axes(distances: Array) -> Array:
-    """Return horizontal distances along the axes of a scan, (axis, angle, altitude).
+def fit_columns(path: Array, distances: Array) -> Array:
+    """Return the columns of a fit, see `BeamBlock`.
 
     Parameters
     ----------
+    path : (angle, altitude) float
     distances : (2, angle, altitude) float
         To the east and north.
     """
     lengths, axes = np.linalg.eigh(np.einsum("iak,jak->ij", distances, distances))
     longest = axes.T[::-1][: 1 + int(lengths[0] > _DEPENDENT * lengths[1])]
-    return np.ascontiguousarray(np.einsum("ij,jak->iak", longest, distances))
+    return np.concatenate(
+        [[np.ones_like(path), path], np.einsum("ij,jak->iak", longest, distances)]
+    )
 
 
 def regress(beams: BeamBlock, inhomogeneity: float | None) -> Regression:
@@ -180,9 +185,9 @@ def regress(beams: BeamBlock, inhomogeneity: float | None) -> Regression:
 
 def refit(beams: BeamBlock, inhomogeneity: Array, freedom: Array) -> Regression:
     """Fit with a given variance of the inhomogeneity and its degrees of freedom."""
-    design = beams.columns
-    centre = design.mean(axis=1)
-    design[1:] -= centre[1:, np.newaxis]
+    centre = beams.columns.mean(axis=1)
+    centre[0] = 0.0
+    design = (beams.columns - centre[:, np.newaxis]).swapaxes(0, 1).copy()
     logarithm, noise = (np.ascontiguousarray(part) for part in (beams.logarithm, beams.noise))
     residual, leverage = np.empty(noise.shape), np.empty(noise.shape)
     table = np.empty((len(noise), kh.COLUMNS, noise.shape[2]))

@@ -11,11 +11,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.multiangle import _smoothing
-from lidarops.retrieve.multiangle.altitude_correlation import (
-    AltitudeNoise,
-    correlated_precision,
-    decayed_sums,
-)
+from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, decayed_sums
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 
@@ -37,7 +33,12 @@ class Sandwich(NamedTuple):
 
     @classmethod
     def of(
-        cls, typical: tuple[Array, Array], correlation: float, stiffness: Array, weight: float
+        cls,
+        typical: tuple[Array, Array],
+        bands: Array,
+        correlation: float,
+        stiffness: Array,
+        weight: float,
     ) -> Self:
         """Return the matrices.
 
@@ -45,6 +46,8 @@ class Sandwich(NamedTuple):
         ----------
         typical : (altitude, 1) float, (altitude - 1, 1) float
             Information, and correlation of errors at neighbouring altitudes in equal air.
+        bands : (2, altitude, 1) float
+            Precision of the same.
         correlation : float
             Of the air at neighbouring altitudes.
         stiffness : (3, altitude) float
@@ -52,7 +55,6 @@ class Sandwich(NamedTuple):
             Of the penalty.
         """
         information, shared = typical
-        bands = correlated_precision(information, shared, correlation)
         every = np.eye(len(information))
         repeated = np.repeat(bands, len(every), axis=2)
         factors, rough = (
@@ -144,7 +146,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     square = np.where(reached, depth[:, tops] ** 2, np.nan)
     noise = np.where(reached, variance[:, tops], np.nan)
     # The median, because the square of a single noisy profile may exceed all others.
-    usual = np.maximum(np.nanmedian(square, axis=0), np.finfo(np.float64).tiny)
+    usual = np.maximum(_median(square, reached.sum(axis=0)), np.finfo(np.float64).tiny)
     weight = (usual / (usual + noise)) ** 2
     total = np.nansum(weight, axis=0)
     # Zero if no profile is known, or most have no optical depth at all.
@@ -155,6 +157,12 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     known = np.isfinite(own_square) & np.isfinite(usual_square) & (usual_square > 0.0)
     relative = np.where(known, own_square, 1.0) / np.where(known, usual_square, 1.0)
     return np.asarray(np.maximum(relative, THRESHOLDS.least_scale))
+
+
+def _median(values: Array, count: Integers) -> Array:
+    """Return the median of the first axis, of which `count` values are no NaN."""
+    ordered, each = np.sort(values, axis=0), np.arange(count.size)
+    return np.asarray(0.5 * (ordered[(count - 1) // 2, each] + ordered[count // 2, each]))
 
 
 def _smoothing_square(bias: Array, known: Array) -> Array:

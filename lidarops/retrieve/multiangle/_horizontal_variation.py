@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from scipy.special import polygamma
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Indices
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression, refit
 from lidarops.retrieve.multiangle.altitude_correlation import windowed
@@ -36,54 +36,38 @@ def path_variation_from(beams: BeamBlock, fit: Regression) -> int | None:
     if tested.size < _FEWEST_ALTITUDES:
         return None
     third = tested.size // _THIRDS
-    lower, upper = _beam_means(beams, fit.inhomogeneity, tested[:third], tested[-third:])
-    known = (lower.freedom > 0) & (upper.freedom > 0)
-    lower, upper = lower.select(known), upper.select(known)
-    if not _grows(lower, upper):
+    value, freedom = _beam_means(beams, fit.inhomogeneity, tested[:third], tested[-third:])
+    known = (freedom > 0.0).all(axis=0)
+    value, freedom = value[:, known], freedom[:, known]
+    if not _grows(value, freedom):
         return None
-    if np.count_nonzero(known) < _FEWEST_PROFILES:
-        return 0
-    return 0 if _grows(lower.deviations(), upper.deviations()) else int(tested[third - 1]) + 1
+    profiles = np.count_nonzero(known)
+    seen = value != 0.0
+    mean = value.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    away = np.where(seen, value - mean, 0.0)
+    own = profiles < _FEWEST_PROFILES or _grows(away, (1.0 - 1.0 / profiles) * freedom)
+    return 0 if own else int(tested[third - 1]) + 1
 
 
-@dataclass(frozen=True, slots=True)
-class _Means:
-    """Means of beams over a third of the altitudes, scaled to variance 1 for white noise."""
-
-    value: Array
-    """(profile, beam)"""
-    freedom: Array
-    """(profile,)"""
-
-    def select(self, profiles: Booleans) -> _Means:
-        """Return the means of some profiles."""
-        return _Means(self.value[profiles], self.freedom[profiles])
-
-    def deviations(self) -> _Means:
-        """Return the deviations from the mean over profiles."""
-        known = self.value != 0.0
-        mean = self.value.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        left = 1.0 - 1.0 / self.freedom.size
-        return _Means(np.where(known, self.value - mean, 0.0), left * self.freedom)
-
-
-def _grows(lower: _Means, upper: _Means) -> bool:
-    squares = [float((means.value**2).sum()) for means in (lower, upper)]
-    freedom = [float(means.freedom.sum()) for means in (lower, upper)]
-    if min(squares + freedom) <= 0.0:
+def _grows(value: Array, freedom: Array) -> bool:
+    """Return whether means of the upper third scatter more than those of the lower one."""
+    squares, total = (value**2).sum(axis=(1, 2)), freedom.sum(axis=1)
+    if min(squares.min(), total.min()) <= 0.0:
         return False
     # White noise has variance 1. A smaller one comes from an overestimated inhomogeneity, and
     # growth from there to 1 is that of detector noise.
-    growth = squares[1] / freedom[1] / max(squares[0] / freedom[0], 1.0)
-    spread = math.sqrt(sum(polygamma(1, 0.5 * count) for count in freedom))
-    return growth > THRESHOLDS.growth and math.log(growth) > THRESHOLDS.growth_certainty * spread
+    growth = squares[1] / total[1] / max(squares[0] / total[0], 1.0)
+    spread = math.sqrt(polygamma(1, 0.5 * total).sum())
+    return bool(
+        growth > THRESHOLDS.growth and math.log(growth) > THRESHOLDS.growth_certainty * spread
+    )
 
 
-def _beam_means(beams: BeamBlock, inhomogeneity: Array, *thirds: Indices) -> tuple[_Means, _Means]:
-    """Average each beam of each profile over the lower and the upper third.
+def _beam_means(beams: BeamBlock, inhomogeneity: Array, *thirds: Indices) -> tuple[Array, Array]:
+    """Return means of beams over thirds of the altitudes, (third, profile, beam), and freedoms.
 
     Of what the fit with gradients leaves of samples with less noise than the inhomogeneity of the
-    lower third.
+    lower third, scaled to variance 1 for white noise. Degrees of freedom are (third, profile).
     """
     scatter = np.full(inhomogeneity.size, inhomogeneity[thirds[0]].mean())
     some = beams.typical()
@@ -91,18 +75,18 @@ def _beam_means(beams: BeamBlock, inhomogeneity: Array, *thirds: Indices) -> tup
     fit = refit(clear, scatter, np.zeros_like(scatter))
     size = np.nan_to_num(fit.residual) / np.sqrt(clear.noise + scatter)
     size = np.clip(size, -_CLIPPED, _CLIPPED)
-    means = []
+    value, freedom = [], []
     for third in thirds:
         used = fit.column(kh.FREEDOM)[:, third]
         filled = np.count_nonzero(used, axis=1)
         # With fewer altitudes the mean would not represent the third.
         on = 2 * filled >= third.size
         # The root gives white noise variance 1, however many altitudes are missing.
-        root = np.sqrt(np.maximum(filled, 1))[:, np.newaxis]
-        mean = size[..., third].sum(axis=2) / root
-        freedom = used.sum(axis=1) / np.maximum(filled, 1)
-        means.append(_Means(np.where(on[:, np.newaxis], mean, 0.0), np.where(on, freedom, 0.0)))
-    return means[0], means[1]
+        root = np.sqrt(np.maximum(filled, 1))
+        mean = size[..., third].sum(axis=2) / root[:, np.newaxis]
+        value.append(np.where(on[:, np.newaxis], mean, 0.0))
+        freedom.append(np.where(on, used.sum(axis=1) / np.maximum(filled, 1), 0.0))
+    return np.stack(value), np.stack(freedom)
 
 
 def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: Array) -> Array:

@@ -47,30 +47,35 @@ _RIGHT: Final = 0
 _INVERSE: Final = 1
 """Inverse squared lengths of the orthogonal columns; 0 if left out."""
 _SHARE: Final = 2
-"""Share of each of their coefficients in that of the path."""
+"""Share of each of their coefficients in that of the path; then in an optical depth of unit
+variance, per weight."""
+
+
+# Loops that write one array are vectorised: of more, the compiler cannot tell whether they overlap.
+# Slices in them would count references, which takes longer than a loop.
 
 
 @compiled
-def _sums(
-    y: Array, noise: Array, scatter: Array, design: Array, weights: Array, a: Array, b: Array
-) -> None:
-    """Fill the weights and the sums over beams of the normal equations."""
-    columns, altitudes = b.shape
+def _add_sums(
+    y: Array, noise: Array, scatter: Array, design: Array, used: int,
+    weights: Array, spare: Array, a: Array, f: Array,
+) -> None:  # fmt: skip
+    """Fill the weights, and add all beams to the sums of the normal equations."""
+    columns, altitudes = design.shape[1:]
     row = np.empty(altitudes)
-    a[:], b[:] = 0.0, 0.0
     for beam in range(y.shape[0]):
-        w = weights[beam]
         for k in range(altitudes):
-            w[k] = 1.0 / (noise[beam, k] + scatter[k])
+            weights[beam, k] = 1.0 / (noise[beam, k] + scatter[k])
+        for k in range(altitudes):
+            spare[k] += 1.0 if weights[beam, k] > 0.0 else 0.0
         for c in range(columns):
-            x, right = design[c, beam], b[c]
             for k in range(altitudes):
-                row[k] = w[k] * x[k]
-                right[k] += row[k] * y[beam, k]
-            for e in range(c + 1):
-                x, left = design[e, beam], a[c, e]
+                row[k] = weights[beam, k] * design[beam, c, k]
+            for e in range(min(c + 1, used)):
                 for k in range(altitudes):
-                    left[k] += row[k] * x[k]
+                    a[c, e, k] += row[k] * design[beam, e, k]
+            for k in range(altitudes if c < used else 0):
+                f[_RIGHT, c, k] += row[k] * y[beam, k]
 
 
 @compiled
@@ -132,39 +137,50 @@ def _solve(a: Array, f: Array, centre: Array, out: Array) -> None:
             out[INTERCEPT_VARIANCE, k] += value * value * f[_INVERSE, c, k]
     for k in range(a.shape[2]):
         out[INFORMATION, k] = 1.0 / out[INFORMATION, k]
+        root = 0.5 * math.sqrt(out[INFORMATION, k]) if f[_INVERSE, _PATH, k] > 0.0 else 0.0
+        for c in range(a.shape[0]):
+            f[_SHARE, c, k] *= root * f[_INVERSE, c, k]
 
 
 @compiled
 def _fill_residuals(
-    y: Array, weights: Array, design: Array, a: Array, f: Array, residual: Array, hat: Array,
-    out: Array,
+    y: Array, weights: Array, design: Array, a: Array, f: Array,
+    residual: Array, hat: Array, lever: Array,
 ) -> None:  # fmt: skip
-    """Fill residuals, leverages, and the sums over beams that need them."""
-    columns, altitudes = f.shape[1:]
-    q, lever, scale = np.empty((columns, altitudes)), np.empty(altitudes), np.empty(altitudes)
-    for k in range(altitudes):
-        known = f[_INVERSE, _PATH, k] > 0.0
-        scale[k] = 0.5 * math.sqrt(out[INFORMATION, k]) if known else 0.0
+    """Fill residuals, leverages, and the parts of beams in an optical depth of unit variance."""
+    q = np.empty(f.shape[1:])
     for beam in range(y.shape[0]):
-        w, left, own = weights[beam], residual[beam], hat[beam]
-        left[:], own[:], lever[:] = y[beam], 0.0, 0.0
-        for c in range(columns):
-            q[c] = design[c, beam]
-            for e in range(c):
-                for k in range(altitudes):
+        for k in range(y.shape[1]):
+            residual[beam, k] = y[beam, k] - f[_RIGHT, 0, k]
+        hat[beam], lever[beam] = f[_INVERSE, 0], 0.0
+        for c in range(1, len(q)):
+            for k in range(y.shape[1]):
+                q[c, k] = design[beam, c, k] - a[c, 0, k]
+            for e in range(1, c):
+                for k in range(y.shape[1]):
                     q[c, k] -= a[c, e, k] * q[e, k]
-            for k in range(altitudes):
-                part = f[_INVERSE, c, k] * q[c, k]
-                left[k] -= f[_RIGHT, c, k] * q[c, k]
-                own[k] += w[k] * part * q[c, k]
-                lever[k] += f[_SHARE, c, k] * part
-        for k in range(altitudes):
-            out[CHI2, k] += w[k] * left[k] * left[k]
-            out[TRACE, k] += w[k] * (1.0 - own[k])
-            lever[k] *= w[k] * scale[k]
-            out[AIR, k] += lever[k] * lever[k]
-        for k in range(altitudes - 1):
-            out[SHARED, k] += lever[k] * lever[k + 1]
+            for k in range(y.shape[1]):
+                residual[beam, k] -= f[_RIGHT, c, k] * q[c, k]
+            for k in range(y.shape[1]):
+                hat[beam, k] += f[_INVERSE, c, k] * q[c, k] * q[c, k]
+            for k in range(y.shape[1]):
+                lever[beam, k] += f[_SHARE, c, k] * q[c, k]
+        hat[beam] *= weights[beam]
+        lever[beam] *= weights[beam]
+
+
+@compiled
+def _add_squares(weights: Array, residual: Array, hat: Array, lever: Array, out: Array) -> None:
+    """Add up what residuals and parts of all beams tell."""
+    for beam in range(weights.shape[0]):
+        for k in range(weights.shape[1]):
+            out[CHI2, k] += weights[beam, k] * residual[beam, k] * residual[beam, k]
+        for k in range(weights.shape[1]):
+            out[TRACE, k] += weights[beam, k] * (1.0 - hat[beam, k])
+        for k in range(weights.shape[1]):
+            out[AIR, k] += lever[beam, k] * lever[beam, k]
+        for k in range(weights.shape[1] - 1):
+            out[SHARED, k] += lever[beam, k] * lever[beam, k + 1]
 
 
 @compiled
@@ -181,7 +197,7 @@ def fit_levels(
         Logarithms and their variances; 0 and inf where there is no sample.
     scatter : (altitude,) float
         Variance of the logarithms on top of the noise.
-    design : (column, angle, altitude) float
+    design : (angle, column, altitude) float
         Ones, slant path, and horizontal distances over altitude, minus their means over beams.
     centre : (column, altitude) float
         Those means.
@@ -194,20 +210,20 @@ def fit_levels(
         of the hat matrix.
     """
     angles, altitudes = y.shape[1:]
-    columns = design.shape[0]
+    columns = design.shape[1]
     used = columns if gradients else _PATH + 1
-    weights, spare = np.empty((angles, altitudes)), np.empty(altitudes)
+    weights, lever = np.empty((angles, altitudes)), np.empty((angles, altitudes))
+    spare = np.empty(altitudes)
     a, f = np.empty((columns, columns, altitudes)), np.empty((3, columns, altitudes))
     for t in range(y.shape[0]):
-        out[t], spare[:] = 0.0, 0.0
-        _sums(y[t], noise[t], scatter, design, weights, a, f[_RIGHT])
-        for beam in range(angles):
-            for k in range(altitudes):
-                spare[k] += 1.0 if weights[beam, k] > 0.0 else 0.0
+        out[t], spare[:], a[:], f[:] = 0.0, 0.0, 0.0, 0.0
+        _add_sums(y[t], noise[t], scatter, design, used, weights, spare, a, f)
         _factor(a, f, spare, gradients)
         _solve(a, f, centre, out[t])
-        _fill_residuals(y[t], weights, design, a, f[:, :used], residuals[t], leverages[t], out[t])
-        _clear(weights, f[_INVERSE, _PATH], spare, residuals[t], leverages[t], out[t])
+        own, hat = residuals[t], leverages[t]
+        _fill_residuals(y[t], weights, design, a, f[:, :used], own, hat, lever)
+        _add_squares(weights, own, hat, lever, out[t])
+        _clear(weights, f[_INVERSE, _PATH], spare, own, hat, out[t])
 
 
 @compiled

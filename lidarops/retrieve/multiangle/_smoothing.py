@@ -16,6 +16,8 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _PAD: Final = 2
 """Rows of zeros at the end, in place of values beyond the grid."""
+_LOGARITHM_EVERY: Final = 4
+"""Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
 _PER_DECADE: Final = 6
 _GRID: Final = 10.0 ** (np.arange(11 * _PER_DECADE + 1) / _PER_DECADE - 10.0)
 """Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
@@ -179,6 +181,28 @@ class Smoother(NamedTuple):
 # Choice of the weight by restricted likelihood on a fixed grid ------------------------------------
 
 
+@compiled
+def _misfits(
+    bands: Array, right: Array, estimates: Array, stiffness: Array, weight: Array
+) -> Array:
+    """Return the weighted sums of squares of `score_smoothing`, the first with determinants."""
+    altitudes, profiles = estimates.shape
+    out = np.zeros((2, weight.size))
+    for i in range(weight.size):
+        f = factor(bands, stiffness, np.full(profiles, weight[i]))
+        away = estimates - solve(f, right)
+        product = np.ones(profiles)
+        for k in range(altitudes):
+            product *= f[0, k]
+            if k % _LOGARITHM_EVERY == 0 or k == altitudes - 1:
+                out[0, i] -= np.log(product).sum()
+                product[:] = 1.0
+        out[0, i] += (right * away).sum()
+        out[1, i] = (away * away * bands[0]).sum()
+        out[1, i] += 2.0 * (away[1:] * away[:-1] * bands[1, :-1]).sum()
+    return out
+
+
 class Scores(NamedTuple):
     """The criteria for some weights, summed over the scored profiles of a block."""
 
@@ -207,15 +231,9 @@ def score_smoothing(
     stiffness : (3, altitude) float64
     weight : (smoothing,) float64
     """
-    right = multiply(bands, estimates)
     altitudes, profiles = estimates.shape
-    likelihood, risk = np.empty((2, weight.size))
-    with np.errstate(invalid="ignore"):
-        for i, lam in enumerate(weight):
-            f = factor(bands, stiffness, np.full(profiles, lam))
-            away = estimates - solve(f, right)
-            likelihood[i] = (right * away).sum() - np.log(f[0, :altitudes]).sum()
-            risk[i] = (away * multiply(bands, away)).sum()
+    right = multiply(bands, estimates)
+    likelihood, risk = _misfits(bands, right, estimates, stiffness, weight)
     likelihood -= (altitudes - 1) * profiles * np.log(weight)
     # Where a pivot lost all its digits, the weight is too large.
     likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)

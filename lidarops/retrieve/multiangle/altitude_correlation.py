@@ -59,7 +59,8 @@ def correlation_of_air(
     beams = on.sum(axis=1)
     pairs = (on[..., 1:] != on[..., :-1]).any(axis=1) & (norms > 0.0)
     pairs &= np.minimum(beams[:, 1:], beams[:, :-1]) > len(columns)
-    norms[pairs] *= _common_share(on, leverage, columns, *np.nonzero(pairs))
+    if pairs.any():
+        norms[pairs] *= _common_share(on, leverage, columns, *np.nonzero(pairs))
     norm = float(norms.sum())
     return min(max(float(products.sum()) / norm, 0.0), THRESHOLDS.most_correlated) if norm else 0.0
 

@@ -140,10 +140,11 @@ def smooth_optical_depth(
     shared, stiffness = noise.shared.T, _smoothing.penalty(altitude)
     bands = correlated_precision(precise, shared, noise.correlation)
     typical = typical_profile(precise, shared)
-    weight, share = _choose(bands, estimates, precise, altitude, typical, noise.correlation)
+    of_typical = correlated_precision(*typical, noise.correlation)
+    weight, share = _choose(bands, estimates, precise, altitude, of_typical)
     smoother = Smoother.of(bands, stiffness, weight, share)
     likeliest = float(weight[share.argmax()])
-    sandwich = Sandwich.of(typical, noise.correlation, stiffness, likeliest)
+    sandwich = Sandwich.of(typical, of_typical, noise.correlation, stiffness, likeliest)
     within = (np.cumsum(used[::-1], axis=0)[::-1] > 0).T
     change = None
     if len(within) >= THRESHOLDS.fewest_to_choose:
@@ -166,8 +167,7 @@ def _choose(
     estimates: Array,
     information: Array,
     altitude: Array,
-    typical: tuple[Array, Array],
-    correlation: float,
+    of_typical: Array,
 ) -> tuple[Array, Array]:
     """Return the weights of smoothness of a block, and their shares."""
     stiffness = _smoothing.penalty(altitude)
@@ -178,7 +178,6 @@ def _choose(
     largest = _largest_smoothing(estimates, information, altitude[:, np.newaxis])
     weight = _smoothing.weights_up_to(largest, unit, one=one)
     every = slice(None, None, -(-profiles // _SCORED))
-    of_typical = correlated_precision(*typical, correlation)
     scores = _smoothing.score_smoothing(
         bands[..., every].copy(), estimates[:, every], of_typical, stiffness, weight
     )

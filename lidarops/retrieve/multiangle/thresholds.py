@@ -74,7 +74,7 @@ class Thresholds(NamedTuple):
     optical depths in weak light are 15 percent less exact (`benchmarks.accuracy`, SNR 300), and
     fewer have a value."""
 
-    # Fit at single altitudes (`_block`, `_methods`).
+    # Fit at single altitudes (`_block`, `optical_depth`).
     pooled: int = 15
     """Altitudes over which the inhomogeneity is pooled; assumed."""
     fewest_freedom: float = 4.1

@@ -29,9 +29,10 @@ class Typical:
     def __post_init__(self):
         both = self.information[:, np.newaxis], self.shared[:, np.newaxis]
         self.stiffness = _smoothing.penalty(30.0 * np.arange(1, HEIGHTS + 1))
-        self.bands = correlated_precision(*both, self.correlation)[..., 0]
+        bands = correlated_precision(*both, self.correlation)
+        self.bands = bands[..., 0]
         self.sandwich = _calibration.Sandwich.of(
-            both, self.correlation, self.stiffness, self.smoothing
+            both, bands, self.correlation, self.stiffness, self.smoothing
         )
 
 

@@ -28,9 +28,9 @@ HEIGHT = np.arange(300.0, 2100.0, 30.0)
 
 def fit(y, variance, path, distance=None, *, sides=False):
     """Return table, residuals and leverages of a block of such beams."""
-    axes = np.empty((0, *path.shape)) if distance is None else _block.along_axes(distance)
+    columns = _block.fit_columns(path, np.zeros((2, *path.shape)) if distance is None else distance)
     alive = np.full((len(y), y.shape[2]), y.shape[1])
-    beams = _block.BeamBlock(y, variance, path, axes, alive, sides, 3)
+    beams = _block.BeamBlock(y, variance, columns, alive, sides, 3)
     nothing = np.zeros(y.shape[2])
     result = _block.refit(beams, nothing, nothing)
     return result.table, result.residual, result.leverage
