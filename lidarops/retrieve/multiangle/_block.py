@@ -26,7 +26,7 @@ _STEPS: Final = 2
 """Fits from which the inhomogeneity is estimated."""
 _TYPICAL: Final = 32
 """Most profiles from which what a block has in common is estimated: every n-th."""
-_LARGEST_RATIO: Final = 1.0 / 9.0
+_LARGEST_RATIO: Final = 1.0 / THRESHOLDS.unweighted_snr**2
 """Largest variance over squared signal for which the moments of the logarithm are corrected: their
 series diverges for larger ones."""
 _LEAST_NOISE: Final = 1e-12
@@ -70,7 +70,7 @@ class BeamBlock:
 
     def typical(self) -> BeamBlock:
         """Return the profiles from which what a block has in common is estimated."""
-        every = _every(len(self.noise))
+        every = every_nth(len(self.noise))
         return replace(
             self, logarithm=self.logarithm[every], noise=self.noise[every], alive=self.alive[every]
         )
@@ -97,7 +97,7 @@ class Regression:
 
     def typical(self) -> Regression:
         """Return the fit of `BeamBlock.typical`."""
-        every = _every(len(self.table))
+        every = every_nth(len(self.table))
         return replace(
             self, table=self.table[every], residual=self.residual[every],
             leverage=self.leverage[every],
@@ -118,7 +118,7 @@ class Regression:
         return np.asarray(np.clip(both, -1.0, 1.0))
 
 
-def _every(profiles: int) -> slice:
+def every_nth(profiles: int) -> slice:
     """Return every n-th profile, so that at most 32 are left."""
     return slice(None, None, max(-(-profiles // _TYPICAL), 1))
 
@@ -225,8 +225,15 @@ def student_factor(freedom: Array) -> Array:
     return np.where(freedom > 0, np.sqrt(nu / (nu - 2.0)), 1.0)
 
 
+def strong_samples(beams: BeamBlock) -> BeamBlock:
+    """Return only the samples that methods without weights can use."""
+    strong = beams.noise < _LARGEST_RATIO
+    return replace(beams, noise=np.where(strong, beams.noise, np.inf))
+
+
 def end_beams(beams: BeamBlock) -> BeamBlock:
     """Return only the beams with the shortest and the longest path at every altitude."""
+    beams = strong_samples(beams)
     on = beams.noise < np.inf
     shortest = np.where(on, beams.path, np.inf)
     longest = np.where(on, beams.path, -np.inf)

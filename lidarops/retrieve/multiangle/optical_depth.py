@@ -411,6 +411,8 @@ def _mld(
     beams: BeamBlock, fit: Regression, settings: BlockSettings, *, from_below: bool = False
 ) -> Values:
     """Differentiate along the slant path, each altitude on its own."""
+    beams = _block.strong_samples(beams)
+    fit = _block.refit(beams, fit.inhomogeneity, fit.freedom)
     own = mld.solve_mld(
         beams, fit.inhomogeneity, from_below=from_below, strength=settings.regularisation
     )

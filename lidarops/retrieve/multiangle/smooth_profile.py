@@ -15,6 +15,7 @@ import numpy as np
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.multiangle import _smoothing
+from lidarops.retrieve.multiangle._block import every_nth
 from lidarops.retrieve.multiangle._calibration import (
     Calibration,
     Sandwich,
@@ -28,8 +29,6 @@ from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _UNIFORM: Final = 1e-3
 """Largest relative deviation of a step from the mean step; allows for rounded altitudes."""
-_SCORED: Final = 32
-"""Most profiles of a block on which the weight is chosen: every n-th."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +176,7 @@ def _choose(
     one = profiles >= THRESHOLDS.fewest_to_choose
     largest = _largest_smoothing(estimates, information, altitude[:, np.newaxis])
     weight = _smoothing.weights_up_to(largest, unit, one=one)
-    every = slice(None, None, -(-profiles // _SCORED))
+    every = every_nth(profiles)
     scores = _smoothing.score_smoothing(
         bands[..., every].copy(), estimates[:, every], of_typical, stiffness, weight
     )

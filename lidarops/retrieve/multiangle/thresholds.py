@@ -74,6 +74,10 @@ class Thresholds(NamedTuple):
     optical depths in weak light are 15 percent less exact (`benchmarks.accuracy`, SNR 300), and
     fewer have a value."""
 
+    unweighted_snr: float = 3.0
+    """The same of a sample, below which methods without weights leave it out; with 1.5, optical
+    depths of "two_angle" and "mld_prior" are a fifth less exact (`benchmarks.accuracy`)."""
+
     # Fit at single altitudes (`_block`, `optical_depth`).
     pooled: int = 15
     """Altitudes over which the inhomogeneity is pooled; assumed."""
