@@ -40,6 +40,10 @@ def _nothing(*_: Any) -> None:
     return None
 
 
+def _zero(*_: Any) -> float:
+    return 0.0
+
+
 def _uncalibrated(
     sandwich: _calibration.Sandwich, inflation: Array, _: Any, scale: Array
 ) -> _calibration.Calibration:
@@ -49,6 +53,7 @@ def _uncalibrated(
 GUARDS: Final = (
     Guard("NO_RESIDUAL", int(MultiAngleQuality.NO_RESIDUAL)),
     Guard("INTERPOLATED", int(MultiAngleQuality.INTERPOLATED)),
+    Guard("gradients that residuals show", off=without((optical_depth, "visible_gradient", _zero))),
     Guard("path variation", off=without((optical_depth, "path_variation_from", _nothing))),
     Guard(
         "few residuals: inflation",

@@ -19,13 +19,13 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_746,
-    "lines of code alone": 45_542,
+    "lines": 69_981,
+    "lines of code alone": 45_680,
     "modules": 278,
     "dataclasses": 244,
-    "lines of dataclasses": 6_576,
-    "tuning numbers": 214,
-    "tuning numbers that are assumed": 64,
+    "lines of dataclasses": 6_586,
+    "tuning numbers": 219,
+    "tuning numbers that are assumed": 65,
     "copied thresholds": 0,
     "most parameters": 14,
     "lines of the largest package": 5_823,

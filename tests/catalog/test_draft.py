@@ -317,7 +317,7 @@ def test_files_of_real_archives_are_those_of_their_headers(
 
 
 def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path: Path) -> None:
-    """Its photon counts need a dead time, and one analog channel is distorted."""
+    """Without dead time, `poor_stratification` rejects all its cycles."""
     _, text = drafted(data_root / "savant", tmp_path / "campaign.yaml")
     assert "channels: [photon_355p, photon_355s, analog_355p, analog_355s]" in text
     # One temp.dat is the copy of a record, the other one the only copy, of a background.

@@ -204,7 +204,7 @@ def _gradient(case: Case, directions: Beams) -> Entry:
     """Include a horizontal gradient of backscatter in the error, unless that is excluded."""
     largest = case.request.largest_gradient
     if largest <= 0:
-        reason = "largest_gradient of the campaign is 0"
+        reason = "largest_gradient of the campaign is 0: only what the residuals show is included"
         return case.leave("gradient", reason, number=0.0)
     blind = case.request.method in _BLIND
     use = "part of the error" if blind else "retrieved, or part of the error"

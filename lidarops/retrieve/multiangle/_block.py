@@ -57,6 +57,8 @@ class BeamBlock:
     """Whether beams point to all sides, so that horizontal gradients are fitted."""
     needed: int
     """Beams that an altitude needs to be within the reach."""
+    dead_time_change: Array | None = None
+    """(profile, angle, altitude): of the signal, with one standard error of the dead time."""
 
     @property
     def path(self) -> Array:
@@ -70,10 +72,11 @@ class BeamBlock:
 
     def typical(self) -> BeamBlock:
         """Return the profiles from which what a block has in common is estimated."""
-        every = every_nth(len(self.noise))
+        every, change = every_nth(len(self.noise)), self.dead_time_change
         return replace(
-            self, logarithm=self.logarithm[every], noise=self.noise[every], alive=self.alive[every]
-        )
+            self, logarithm=self.logarithm[every], noise=self.noise[every],
+            alive=self.alive[every], dead_time_change=None if change is None else change[every],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +126,16 @@ def every_nth(profiles: int) -> slice:
     return slice(None, None, max(-(-profiles // _TYPICAL), 1))
 
 
-def make_beam_block(signal: Array, variance: Array, scan: Scan) -> BeamBlock:
+def make_beam_block(
+    signal: Array, variance: Array, scan: Scan, dead_time_change: Array | None = None
+) -> BeamBlock:
     """Return logarithms and geometry of one block.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
     scan : Scan
+    dead_time_change : (profile, angle, altitude) float, optional
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = np.log(signal)
@@ -144,6 +150,7 @@ def make_beam_block(signal: Array, variance: Array, scan: Scan) -> BeamBlock:
         alive,
         surrounds_zenith(scan.tilted_azimuths),
         min(3, max(int(scan.usable.sum()), 2)),
+        dead_time_change,
     )
 
 

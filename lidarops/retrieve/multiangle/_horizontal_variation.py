@@ -7,14 +7,24 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.special import polygamma
+from scipy.special import polygamma, stdtrit
 
-from lidarops.retrieve.common.arrays import Array, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression, refit
 from lidarops.retrieve.multiangle.altitude_correlation import windowed
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
+_UNKNOWNS: Final = 3
+"""Constant, optical depth and a gradient."""
+_LEAST_REST: Final = 1e-3
+"""Least share of an error that a fit leaves in a residual."""
+_DEPENDENT: Final = 1e-8
+"""Squared length of a column outside those before it, over its own, up to which it depends on
+them."""
+_SUMS: Final = 5
+"""Number of the sums of `_gradient_sums`."""
 _CLIPPED: Final = 3.0
 """Standard errors to which residuals are clipped in the test of growth."""
 _FEWEST_PROFILES: Final = 4
@@ -127,3 +137,162 @@ def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: 
     shown = unit > 0.0
     square = np.maximum(excess, 0.0) / np.where(shown, unit, 1.0)
     return np.where(shown, np.sqrt(square), 1.0)
+
+
+@compiled
+def _levers(
+    noise: Array, tested: Booleans, inhomogeneity: Array, limit: float, design: Array,
+    altitude: Array, lever: Array, arm: Array,
+) -> None:  # fmt: skip
+    """Fill what a residual adds to a gradient, and what a gradient adds to a residual.
+
+    Parameters
+    ----------
+    noise : (angle, altitude) float
+    tested : (altitude,) bool
+    inhomogeneity, altitude : (altitude,) float
+    limit : float
+        Noise from which a sample is left out.
+    design : (2, angle, altitude) float
+        Distance and path.
+    lever, arm : (angle, altitude) float
+        Outputs; 0 where the sample is too noisy, or constant and path explain the distance.
+    """
+    angles, altitudes = noise.shape
+    sums, least = np.zeros((6, altitudes)), np.zeros(altitudes)
+    for a in range(angles):
+        for k in range(altitudes):
+            clear = tested[k] and noise[a, k] < limit
+            w = 1.0 / (noise[a, k] + inhomogeneity[k]) if clear else 0.0
+            lever[a, k] = w
+            sums[0, k] += w
+            sums[1, k] += w * design[0, a, k]
+            sums[2, k] += w * design[1, a, k]
+            least[k] += w * design[0, a, k] * design[0, a, k]
+    for k in range(altitudes):
+        sums[1, k] /= sums[0, k]
+        sums[2, k] /= sums[0, k]
+    for a in range(angles):
+        for k in range(altitudes):
+            distance, path = design[0, a, k] - sums[1, k], design[1, a, k] - sums[2, k]
+            sums[3, k] += lever[a, k] * path * path
+            sums[4, k] += lever[a, k] * path * distance
+            sums[5, k] += lever[a, k] * distance * distance
+    for k in range(altitudes):
+        slope = sums[4, k] / sums[3, k]
+        left = sums[5, k] - slope * sums[4, k]
+        sums[4, k], sums[5, k] = slope, 1.0 if left > _DEPENDENT * least[k] else 0.0
+    for a in range(angles):
+        for k in range(altitudes):
+            distance, path = design[0, a, k] - sums[1, k], design[1, a, k] - sums[2, k]
+            own = altitude[k] * (distance - sums[4, k] * path)
+            arm[a, k] = own if sums[5, k] > 0.0 else 0.0
+            lever[a, k] *= arm[a, k]
+
+
+def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
+    """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
+
+    It is the largest that is shown in any window of 1000 m of the block, or of 500 m at its ends,
+    by all profiles, beyond what an error of the dead time explains; 0 if none is shown. It holds at
+    all altitudes: an optical depth is that of the air below, too.
+
+    Parameters
+    ----------
+    beams : BeamBlock
+    fit : Regression
+    altitude : (altitude,) float
+        m.
+    """
+    if not beams.noise.size:
+        return 0.0
+    beams, fit = beams.typical(), fit.typical()
+    # Empty blocks at both ends make windows of half the length there: near ranges are distorted.
+    block = 1 + (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
+    # Where none is fitted.
+    tested = (fit.table[:, kh.SLOPES :] != 0.0).any(axis=1) & (fit.column(kh.FREEDOM) > 0.0)
+    change = np.empty((0, *beams.noise.shape[1:]))
+    if beams.dead_time_change is not None:
+        expected = np.exp(beams.logarithm - np.nan_to_num(fit.residual))
+        change = beams.dead_time_change / expected
+    square = 0.0
+    for distance in beams.axes:
+        sums = np.zeros((_SUMS, *beams.noise.shape[:2], int(block[-1]) + 2))
+        _gradient_sums(
+            fit.residual, fit.leverage, beams.noise, tested, fit.inhomogeneity,
+            np.stack([distance, beams.path]), altitude, block, change, sums,
+        )  # fmt: skip
+        # Windows of two blocks each, every half a window.
+        windows = sums[..., :-1] + sums[..., 1:]
+        windows = np.moveaxis(windows, -1, 1).reshape(_SUMS, block[-1] + 1, -1)
+        square += _gradient_beyond_chance(windows) ** 2
+    return float(np.sqrt(square))
+
+
+@compiled
+def _gradient_sums(
+    residual: Array, leverage: Array, noise: Array, tested: Booleans, inhomogeneity: Array,
+    design: Array, altitude: Array, block: Integers, change: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Add what the beams of each profile show of a gradient along an axis, in blocks of altitudes.
+
+    Parameters
+    ----------
+    residual, leverage, noise : (profile, angle, altitude) float
+    tested : (profile, altitude) bool
+    inhomogeneity, altitude : (altitude,) float
+    design : (2, angle, altitude) float
+        Horizontal distance along the axis over altitude, and slant path.
+    block : (altitude,) int
+    change : (profile or 0, angle, altitude) float
+        Of the logarithm, with one standard error of the dead time.
+    sums : (5, profile, angle, block) float
+        Output: of lever times residual and arm; of both with the lever over what a fit leaves of an
+        error, because beams of large leverage keep less; and of lever times change.
+    """
+    lever, arm = np.empty(noise.shape[1:]), np.empty(noise.shape[1:])
+    for t in range(noise.shape[0]):
+        _levers(
+            noise[t], tested[t], inhomogeneity, THRESHOLDS.gradient_noise, design, altitude,
+            lever, arm,
+        )  # fmt: skip
+        for a in range(noise.shape[1]):
+            for k in range(altitude.size):
+                if lever[a, k] != 0.0:
+                    b, own, r = block[k], lever[a, k], residual[t, a, k]
+                    whole = own / math.sqrt(max(1.0 - leverage[t, a, k], _LEAST_REST))
+                    sums[0, t, a, b] += own * r
+                    sums[1, t, a, b] += own * arm[a, k]
+                    sums[2, t, a, b] += whole * r
+                    sums[3, t, a, b] += whole * arm[a, k]
+                    if change.shape[0] > 0:
+                        sums[4, t, a, b] += own * change[t, a, k]
+
+
+def _gradient_beyond_chance(sums: Array) -> float:
+    """Return the largest gradient along an axis that is beyond chance and the dead time, m-1.
+
+    The error by chance follows from the scatter of the beams of all profiles about the gradient,
+    whose altitudes may be correlated. An error of the dead time is common to all beams.
+
+    Parameters
+    ----------
+    sums : (5, window, profile times angle) float
+        From `_gradient_sums`.
+    """
+    total, weight, product, part, shift = sums
+    information = weight.sum(axis=1)
+    known = np.where(information > 0.0, information, np.inf)
+    gradient = total.sum(axis=1) / known
+    own = np.minimum(weight / known[:, np.newaxis], 1.0 - _LEAST_REST)
+    scatter = (((product - gradient[:, np.newaxis] * part) / (1.0 - own)) ** 2).sum(axis=1)
+    squares = (own**2).sum(axis=1)
+    # Beams with little weight do not tell the scatter of those that decide.
+    freedom = 1.0 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
+    tested = freedom >= 1.0
+    error = np.where(tested, np.sqrt(scatter) / known, np.inf)
+    chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(np.count_nonzero(tested)), 1)
+    limit = stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
+    size = np.abs(gradient)
+    explained = np.abs(shift.sum(axis=1)) / known
+    return float(np.max(size, where=size - explained > limit * error, initial=0.0))

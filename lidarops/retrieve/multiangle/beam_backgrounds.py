@@ -34,6 +34,9 @@ class ScanSignals:
     response: Array
     """(beam, altitude) m2: mean of the square of range over overlap, the change of the signal per
     change of the background."""
+    dead_time_change: Array | None = None
+    """(time, beam, altitude): of the signal, with one standard error of the dead time; None for
+    analog."""
 
     @classmethod
     def of(
@@ -43,6 +46,7 @@ class ScanSignals:
         left: Array,
         path: Array,
         response: Array,
+        dead_time_change: Array | None = None,
     ) -> Self:
         """Return the signals of beams.
 
@@ -54,6 +58,7 @@ class ScanSignals:
             (`Thresholds.common_background`, of the variance) is common to all beams; NaN for
             missing beams.
         path, response : (beam, altitude) float
+        dead_time_change : (time, beam, altitude) float, optional
         """
         left = np.nan_to_num(left)
         covariance = THRESHOLDS.common_background * left[:, :, np.newaxis] * left[:, np.newaxis]
@@ -61,10 +66,11 @@ class ScanSignals:
             (1.0 - THRESHOLDS.common_background) * left[:, np.newaxis] ** 2 * np.eye(left.shape[1])
         )
         variance = noise + (left[..., np.newaxis] * response) ** 2
-        return cls(signal, noise, variance, covariance, path, response)
+        return cls(signal, noise, variance, covariance, path, response, dead_time_change)
 
     def of_beams(self, beams: Integers) -> Self:
         """Return the signals of some beams."""
+        change = self.dead_time_change
         return replace(
             self,
             signal=self.signal[:, beams],
@@ -73,6 +79,7 @@ class ScanSignals:
             covariance=self.covariance[:, beams[:, np.newaxis], beams],
             path=self.path[beams],
             response=self.response[beams],
+            dead_time_change=None if change is None else change[:, beams],
         )
 
     def agreed(self, retrieval: MultiAngleResult) -> Self:

@@ -27,7 +27,11 @@ class MultiAngleQuality(FlagBit):
     POOR_STRATIFICATION = (
         FIRST_OWN + 4,
         Severity.REJECT,
-        "the signals of the slant paths differ by more than level layers allow",
+        (
+            "the signals of the slant paths differ by more than level layers allow: by the air, or"
+            " by distorted signals of near ranges, of an analog channel or of a dead time that is"
+            " wrong or stated too exactly"
+        ),
     )
     PRIOR_DOMINATED = FIRST_OWN + 5, *flags.PRIOR_DOMINATED
     EXTRAPOLATED = (

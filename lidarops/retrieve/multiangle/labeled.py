@@ -156,6 +156,7 @@ class _Scan(NamedTuple):
             variance=signals.variance,
             azimuth=self.azimuth,
             settings=self.settings,
+            dead_time_change=signals.dead_time_change,
             signal_quality=self.quality,
         )
 
@@ -184,6 +185,7 @@ def _agreed_signals(beams: xr.Dataset, scan: _Scan) -> ScanSignals:
         left,
         slant_paths.slant_path(scan.zenith_angle, scan.height),
         beams["response"].to_numpy(),
+        beams["dead_time_error"].to_numpy() if "dead_time_error" in beams else None,
     )
     for _ in range(_LINEARISATIONS if (left > 0.0).any() else 0):
         signals = prior.agreed(scan.solve(signals))

@@ -18,7 +18,7 @@ from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
 from lidarops.retrieve.multiangle import _block, mld, slant_paths
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression
-from lidarops.retrieve.multiangle._horizontal_variation import path_variation_from
+from lidarops.retrieve.multiangle._horizontal_variation import path_variation_from, visible_gradient
 from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, correlation_of_air
 from lidarops.retrieve.multiangle.flags import CARE, MultiAngleQuality
 from lidarops.retrieve.multiangle.slant_paths import Scan
@@ -130,7 +130,7 @@ class OpticalDepthSettings:
     """Standard deviation of the logarithms on top of the noise; estimated if not given."""
     largest_gradient: float = LARGEST_GRADIENT
     """m-1, horizontal gradient of ln backscatter covered by `optical_depth_gradient_error` and
-    `extinction_gradient_error`."""
+    `extinction_gradient_error`, unless the residuals show a larger one."""
     layers: Sequence[tuple[float, float]] = ()
     """m, bottom and top of layers whose optical depth is requested; moved to the nearest of the
     altitudes and the station, by at most half the distance to the next one."""
@@ -163,6 +163,7 @@ def retrieve_optical_depth(
     variance: npt.ArrayLike,
     azimuth: npt.ArrayLike | None = None,
     settings: OpticalDepthSettings = _DEFAULT,
+    dead_time_change: npt.ArrayLike | None = None,
     signal_quality: Flags | None = None,
 ) -> MultiAngleResult:
     """Retrieve optical depth and extinction from signals at several zenith angles.
@@ -184,6 +185,9 @@ def retrieve_optical_depth(
     azimuth : (angle,) float, optional
         degree; the same for all angles if not given.
     settings : OpticalDepthSettings
+    dead_time_change : (profile, angle, altitude) float, optional
+        Change of the signal with one standard error of the dead time, in all beams together, which
+        looks like a horizontal gradient near the lidar; NaN where there is no signal.
     signal_quality : (profile, altitude) int, optional
         Bits of the signals of all beams, which tell why values are missing; by default
         INPUT_MISSING where no beam has a signal and its variance.
@@ -215,7 +219,10 @@ def retrieve_optical_depth(
         scan=scan,
         levels=layer_levels(settings.layers, altitude, station_altitude=station)[0],
     )
-    beams = _block.make_beam_block(rows, noise, scan)
+    change = None
+    if dead_time_change is not None:
+        change = np.nan_to_num(_cube(dead_time_change, "dead_time_change", rows.shape))
+    beams = _block.make_beam_block(rows, noise, scan, change)
     fit = _block.regress(beams, settings.inhomogeneity)
     name, reason = _choose_method(beams, block)
     values = _METHODS[name](beams, fit, block)
@@ -310,7 +317,8 @@ def _mark_variation(values: Values, beams: BeamBlock, fit: Regression) -> None:
     lowest = path_variation_from(beams, fit)
     if lowest is not None:
         quality[:, lowest:] |= np.int32(MultiAngleQuality.POOR_STRATIFICATION)
-        _withhold_extinction(values, np.s_[:, lowest:])
+    poor = (quality & np.int32(MultiAngleQuality.POOR_STRATIFICATION)) != 0
+    _withhold_extinction(values, poor)
     untested = np.isfinite(values["optical_depth"]) & (_block.pooled_freedom(fit) == 0)
     _mark(quality, MultiAngleQuality.NO_RESIDUAL, untested)
 
@@ -333,7 +341,7 @@ def _mark(quality: Flags, bit: int, where: Booleans) -> None:
     quality |= np.where(where, np.int32(bit), np.int32(0))
 
 
-def _withhold_extinction(values: Values, where: Any) -> None:
+def _withhold_extinction(values: Values, where: Booleans) -> None:
     for error in ("", "_standard_error", "_gradient_error"):
         values[f"extinction{error}"][where] = np.nan
 
@@ -389,8 +397,10 @@ def _regression(
     """Return the estimates of single altitudes, with the correlation that residuals show."""
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(1.0 / fit.column(kh.INFORMATION)) * _block.student_factor(fit.freedom)
-    values = _common(beams, fit, settings) | _single_altitudes(
-        (fit.within(beams), fit.column(kh.TAU), error), _gradient_slopes(fit, settings), settings,
+    values = _common(beams, fit, settings)
+    slopes = _gradient_slopes(values, beams, fit, settings)
+    values |= _single_altitudes(
+        (fit.within(beams), fit.column(kh.TAU), error), slopes, settings,
         correlation=np.hstack([np.zeros((len(fit.table), 1)), correlation * fit.shared]),
     )  # fmt: skip
     share = np.sqrt(fit.column(kh.AIR) * fit.inhomogeneity)
@@ -471,10 +481,11 @@ def _single_altitudes(
 def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Values:
     """Combine the estimates of single altitudes into profiles with smooth extinction."""
     values, within = _common(beams, fit, settings), fit.within(beams)
+    slopes = _gradient_slopes(values, beams, fit, settings)
     rows = np.flatnonzero(within.any(axis=1))
     if rows.size == 0:
         nothing = within, fit.column(kh.TAU), fit.column(kh.TAU)
-        return values | _single_altitudes(nothing, _gradient_slopes(fit, settings), settings)
+        return values | _single_altitudes(nothing, slopes, settings)
     noise = AltitudeNoise(_correlation(beams, fit), fit.shared, _block.pooled_freedom(fit))
     smooth = smooth_optical_depth(
         np.where(within, fit.column(kh.TAU), np.nan)[rows],
@@ -482,10 +493,10 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Values
         settings.height,
         noise=noise.of(rows),
     )
-    single = np.where(within, _gradient_slopes(fit, settings), 0.0)[:, rows]
-    slopes = [smooth.respond(one) if one.any() else 0.0 * smooth.optical_depth for one in single]
+    single = np.where(within, slopes, 0.0)[:, rows]
+    of_smooth = [smooth.respond(one) if one.any() else 0.0 * smooth.optical_depth for one in single]
     own = {name: getattr(smooth, name) for name in _OF_SMOOTH}
-    own |= _gradient_errors(np.stack(slopes), settings) | _layers(smooth, settings)
+    own |= _gradient_errors(np.stack(of_smooth), settings) | _layers(smooth, settings)
     for name, part in own.items():
         values[name] = np.full((len(within), *part.shape[1:]), np.nan)
         values[name][rows] = part
@@ -538,10 +549,19 @@ def _common(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Value
     }
 
 
-def _gradient_slopes(fit: Regression, settings: BlockSettings) -> Array:
-    """Return the errors of optical depth by the declared gradient along the axes of the scan."""
-    slopes = fit.table[:, kh.SLOPES : kh.SLOPES + 2] * settings.largest_gradient * settings.height
-    return np.asarray(slopes.swapaxes(0, 1))
+def _gradient_slopes(
+    values: Values, beams: BeamBlock, fit: Regression, settings: BlockSettings
+) -> Array:
+    """Return the errors of optical depth by a gradient along the axes of the scan.
+
+    The gradient is the declared one, or that which the residuals show where it is larger. One that
+    is too large for air raises `POOR_STRATIFICATION`.
+    """
+    shown = visible_gradient(beams, fit, settings.height)
+    if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
+        _mark(values["quality"], MultiAngleQuality.POOR_STRATIFICATION, fit.within(beams))
+    scale = max(settings.largest_gradient, shown) * settings.height
+    return np.asarray((fit.table[:, kh.SLOPES : kh.SLOPES + 2] * scale).swapaxes(0, 1))
 
 
 def _gradient_errors(slopes: Array, settings: BlockSettings) -> Values:

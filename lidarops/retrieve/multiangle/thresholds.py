@@ -96,6 +96,20 @@ class Thresholds(NamedTuple):
     """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
     alone in 2.3 percent of the altitudes where the air is clear."""
 
+    # Horizontal gradient (`_horizontal_variation`, `optical_depth`).
+    gradient_window: float = 1000.0
+    """m, window in which the residuals are tested for a gradient; assumed."""
+    gradient_noise: float = 0.04
+    """Variance of a logarithm from which a sample is left out of that test. Noisier samples are
+    biased, and together look like a gradient: deviations from level air are 1.1 standard errors
+    without them, 1.4 with them (`test_level_air_shows_no_gradient`)."""
+    gradient_false_alarm: float = 1e-3
+    """Probability that chance shows a gradient along an axis at any altitude of a block; chosen."""
+    largest_gradient: float = 3e-4
+    """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
+    no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted
+    analog signals of scans up to 25 degrees of elevation show 2e-3 and more."""
+
     # Stratification (`_horizontal_variation`).
     growth: float = 1.5**2
     """Ratio of the variances in the upper and the lower third up to which they count as equal;

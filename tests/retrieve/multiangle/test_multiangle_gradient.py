@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from support.scan_arguments import retrieve_optical_depth
 
+from lidarops.retrieve.multiangle.flags import MultiAngleQuality
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
+from lidarops.retrieve.multiangle.slant_paths import slant_path
+
 ZENITH = np.array([-75.0, -60.0, -45.0, -30.0, 0.0, 30.0, 45.0, 60.0, 75.0])
 ALTITUDE = np.arange(100.0, 3000.0, 50.0)
 
@@ -34,3 +38,54 @@ def test_a_gradient_cancels_or_is_within_the_stated_error(method, cancels):
     assert np.all(error < stated + 0.01)
     assert (stated.max() < 1e-9) == cancels
     assert (error.max() < 0.01) == cancels
+
+
+LOW = np.arange(65.0, 85.1, 0.4)
+CELLS = np.arange(60.0, 3001.0, 60.0)
+
+
+def one_sided(
+    seed: int, *, gradient: float = 0.0, dead_time: float = 0.0, change: float = 0.0
+) -> MultiAngleResult:
+    """Retrieve ten cycles to one side, with an error by the dead time as of the real scans.
+
+    `dead_time` is the error of the signal at 1000 m; `change` that which is stated.
+    """
+    path = slant_path(LOW, CELLS)
+    depth = np.cumsum(np.where(CELLS < 1000.0, 2.2e-4, 6e-5) * 60.0)
+    aside = np.sqrt(path**2 - 1.0) * CELLS
+    near = (1000.0 / (path * CELLS)) ** 2
+    signal = np.where(CELLS < 1000.0, 1.0, 0.3) * np.exp(gradient * aside - 2.0 * path * depth)
+    noise = np.full(path.shape, 0.01) * (path * CELLS / 1500.0) ** 2
+    drawn = np.random.default_rng(seed).normal(size=(10, *signal.shape))
+    measured = signal * (1.0 + dead_time * near) + noise * drawn
+    measured[:, path * CELLS < 700.0] = np.nan
+    return retrieve_optical_depth(
+        measured,
+        LOW,
+        CELLS,
+        variance=np.where(np.isnan(measured), np.nan, noise**2),
+        azimuth=np.full(LOW.size, 90.0),
+        method="kano_hamilton",
+        dead_time_change=np.broadcast_to(signal * near * change, measured.shape),
+    )
+
+
+def rejected(result: MultiAngleResult) -> float:
+    """Return the share of optical depths that `poor_stratification` rejects."""
+    poor = result.raised(MultiAngleQuality.POOR_STRATIFICATION)
+    return float(poor[np.isfinite(result.optical_depth)].mean())
+
+
+def test_level_air_shows_no_gradient():
+    """Noisy samples are biased: with them, all altitudes of these scenes would be rejected."""
+    assert [rejected(one_sided(seed)) for seed in (56, 64, 74)] == [0.0, 0.0, 0.0]
+
+
+def test_what_the_dead_time_explains_is_no_gradient():
+    """The stated error of the dead time decides whether bent signals near the lidar reject."""
+    assert rejected(one_sided(1, dead_time=0.1)) == 1.0
+    assert rejected(one_sided(1, dead_time=0.1, change=0.1)) == 0.0
+    assert rejected(one_sided(1, gradient=1e-3, change=0.05)) == 1.0
+    # Several errors of the dead time would explain this one.
+    assert rejected(one_sided(1, gradient=5e-4, change=0.05)) == 1.0

@@ -173,6 +173,37 @@ def test_gradient_error_bounds_the_bias_by_the_declared_gradient():
     assert bias.max() > 5 * np.median(joint.optical_depth_standard_error)
 
 
+@pytest.mark.parametrize("gradient", [0.0, 0.05 / 1000, 0.2 / 1000])
+def test_a_gradient_that_residuals_show_is_part_of_the_error(gradient):
+    """Whatever the campaign declares; without one, nothing is added."""
+    atmosphere = clear(100)
+    signal, variance, tau = signals(
+        np.random.default_rng(7), 32, ANGLES, atmosphere, inhomogeneity=0.03, gradient=gradient
+    )
+    for method in ("joint", "kano_hamilton"):
+        result = retrieve_optical_depth(
+            signal, ANGLES, atmosphere[0], variance=variance, largest_gradient=0.0, method=method
+        )
+        bias = np.abs(np.mean(result.optical_depth - tau, axis=0))
+        error = result.optical_depth_gradient_error.mean(axis=0)
+        assert error[10:] == pytest.approx(bias[10:] if gradient else 0.0, rel=0.3, abs=0.01)
+        assert np.all((result.extinction_gradient_error > 0.0).any() == (gradient > 0.0))
+
+
+@pytest.mark.parametrize("method", ["joint", "kano_hamilton"])
+@pytest.mark.parametrize(("gradient", "rejected"), [(0.2 / 1000, False), (0.6 / 1000, True)])
+def test_a_gradient_too_large_for_air_rejects_all_values(method, gradient, rejected):
+    """Like a distorted analog signal, it hides what else curves the residuals."""
+    atmosphere = clear(100)
+    signal, variance, _ = signals(
+        np.random.default_rng(8), 32, ANGLES, atmosphere, inhomogeneity=0.01, gradient=gradient
+    )
+    result = retrieve_optical_depth(signal, ANGLES, atmosphere[0], variance=variance, method=method)
+    known = np.isfinite(result.optical_depth)
+    assert (result.raised(MultiAngleQuality.POOR_STRATIFICATION)[known] == rejected).all()
+    assert np.isfinite(result.extinction).any() != rejected
+
+
 def test_layers_are_far_more_certain_than_differences():
     atmosphere = clear(120)
     signal, variance, tau = signals(
