@@ -559,7 +559,9 @@ def _gradient_slopes(
     """
     shown = visible_gradient(beams, fit, settings.height)
     if shown > max(settings.largest_gradient, THRESHOLDS.largest_gradient):
-        _mark(values["quality"], MultiAngleQuality.POOR_STRATIFICATION, fit.within(beams))
+        # With the altitudes between, which have no estimate.
+        reached = np.maximum.accumulate(fit.within(beams)[:, ::-1], axis=1)[:, ::-1]
+        _mark(values["quality"], MultiAngleQuality.POOR_STRATIFICATION, reached)
     scale = max(settings.largest_gradient, shown) * settings.height
     return np.asarray((fit.table[:, kh.SLOPES : kh.SLOPES + 2] * scale).swapaxes(0, 1))
 
