@@ -206,7 +206,6 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     """
     if not beams.noise.size:
         return 0.0
-    beams, fit = beams.typical(), fit.typical()
     # Empty blocks at both ends make windows of half the length there: near ranges are distorted.
     block = 1 + (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
     # Where none is fitted.
