@@ -19,15 +19,15 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_443,
-    "lines of code alone": 46_018,
+    "lines": 70_423,
+    "lines of code alone": 45_983,
     "modules": 279,
-    "dataclasses": 250,
-    "lines of dataclasses": 6_688,
-    "tuning numbers": 220,
-    "tuning numbers that are assumed": 65,
+    "dataclasses": 245,
+    "lines of dataclasses": 6_531,
+    "tuning numbers": 216,
+    "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
-    "most parameters": 14,
+    "most parameters": 10,
     "lines of the largest package": 5_823,
 }
 MOST_OF_ONE_FILE = {
