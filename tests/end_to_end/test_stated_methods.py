@@ -42,8 +42,8 @@ RETRIEVAL = {
         "mld": "multiangle/optical_depth:_mld",
     },
     "visibility": {
-        "beams_with_prior": "network/_empirical_prior:solve_block",
-        "beams_without_prior": "network/extinction_field:_solve_network",
+        "beams_with_prior": "network/_block_solution:solve_block",
+        "beams_without_prior": "network/_block_solution:solve_alone",
         "triangles": "network/triangles:solve_triangles",
     },
 }

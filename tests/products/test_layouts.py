@@ -187,7 +187,6 @@ def test_variables_without_standard_name():
             "path_optical_depth",
             "reduced_chi2",
             "degrees_of_freedom",
-            "prior_deviation",
             "multiplier",
             "beam_range",
             "retrieval_method",

@@ -33,7 +33,7 @@ class VisibilityProductSettings(NetworkProduct):
         default=timedelta(minutes=10), description="interval over which signals are averaged"
     )
     block: PartOfDay = Field(
-        default=timedelta(hours=6), description="interval of averages that share one prior"
+        default=timedelta(hours=6), description="interval of averages that are one field"
     )
     prior: PriorName = Field(
         default="block",

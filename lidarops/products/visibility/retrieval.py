@@ -101,10 +101,7 @@ def _prior(case: Case) -> Entry:
     if settings.prior == "none":
         reason = "the campaign requests no prior: gradients along beams mimic attenuation"
         return case.leave("prior", reason)
-    reason = (
-        "decided from the data: the strongest prior about a linear field in a block that"
-        " agrees with its beams"
-    )
+    reason = "decided from the data: how much the field of a block changes"
     return case.run("prior", reason, number=settings.block / settings.average)
 
 

@@ -133,15 +133,15 @@ LAYOUT: Final = Layout(
     " crossing, both beams see the same extinction. Signals were averaged before the retrieval."
     " beam_latitude, beam_longitude and beam_altitude are the positions of the lidars. A gradient"
     " over the whole network mimics attenuation where the air is optically thin or the noise is"
-    " high, and no test detects it there: total_extinction_standard_error allows for twice the"
-    " typical gradient. More profiles in a block and more beams constrain the field better. In"
+    " high, and no test detects it there: total_extinction_standard_error allows for typical"
+    " gradients. More profiles in a block and more beams constrain the field better. In"
     " blocks of one profile, some simulated values without a flag deviate by more than 4 standard"
     " errors with a plume, or where extinction changes with height by a factor of e in 300 to"
     f" 3000 m: noise hides the field. {MEASURED_SHARES}"
-    " The error that the prior leaves is common to all profiles, so that a mean over"
-    " time does not reduce it. total_extinction_systematic_error includes a lidar ratio that varies"
-    " over the network as declared, by default by 7 percent (rms). Where it varies by more, some"
-    " values without a flag deviate by more than 4 standard errors.",
+    " The profiles of a block share most of their error, so that a mean over time does not reduce"
+    " it. total_extinction_systematic_error includes a lidar ratio that varies over the network as"
+    " declared, by default by 7 percent (rms). Where it varies by more, some values without a flag"
+    " deviate by more than 4 standard errors.",
     sampled="crossing",
     feature_type="timeSeries",
     coordinates=_COORDINATES,
@@ -187,19 +187,18 @@ LAYOUT: Final = Layout(
         ),
         retrieval_method(
             _METHODS,
-            "beams_with_prior: all beams, with a prior that the profiles of a block share."
+            "beams_with_prior: all beams, the profiles of a block as one field that changes slowly."
             " beams_without_prior: all beams alone. triangles: one triangle of beams at each"
             " crossing, with a multiplier.",
         ),
         replace(
             quality(FLAGS),
             comment="In this kind of product, poorly_determined means that the standard error,"
-            " without the uncertainty of the prior, exceeds a third of extinction, for the value or"
-            " as the median of its block, or that there are too few beams to determine a field that"
-            " departs from the prior. low_leverage: a beam is too noisy, or states a variance of"
-            " zero, and was left out; the value comes from the other beams. poor_fit: the beams"
-            " disagree by more than their noise explains, or a beam ends before the crossing at"
-            " bins that deviate from their neighbours. outlier: a beam has bins that deviate by"
+            " alone or with the systematic one, exceeds a third of extinction. low_leverage: a beam"
+            " is too noisy, or states a variance of zero, and was left out; the value comes from"
+            " the other beams. poor_fit: the beams disagree by more than their noise explains, or"
+            " with the other profiles of the block, or a beam ends before the crossing at bins that"
+            " deviate from their neighbours. outlier: a beam has bins that deviate by"
             " more than 6 standard errors from their neighbours. Single bins were replaced from"
             " their neighbours. Several adjacent bins, which may be the edges of a layer, were"
             " kept; the effect of these and of the bins between two edges is part of the standard"
@@ -219,11 +218,6 @@ LAYOUT: Final = Layout(
             "degrees_of_freedom",
             "number of equations of the network minus number of unknowns",
             "Missing where unknowns outnumber equations.",
-        ),
-        _tested(
-            "prior_deviation",
-            "prior standard deviation of ln(extinction) about a linear field",
-            "Most likely value for the block of profiles. Missing where there is no prior.",
         ),
         Row(
             "beam_range",

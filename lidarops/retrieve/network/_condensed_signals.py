@@ -10,12 +10,15 @@ profile does not depend on the other profiles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+import math
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Codes, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network.geometry import Network, Passages
 from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
@@ -26,6 +29,8 @@ NOT_POSITIVE: Final = 2
 OUTLYING: Final = 3
 """Reasons why a beam ends before its last bin."""
 _SMALLEST_STEP: Final = 1e-12
+_NEIGHBOURS: Final = 7
+"""Bins whose mean is the level of a bin that is not positive."""
 
 
 # Bins and weights --------------------------------------------------------------------------------
@@ -61,8 +66,6 @@ class FitLayout:
     """(beam, bin) m."""
     limits: Indices
     """(beam, 2) first usable bin, and the one behind the last."""
-    offset: Indices
-    """(beam + 1,) start of the packed covariance of each beam."""
 
 
 def lay_out_fits(
@@ -97,17 +100,14 @@ def lay_out_fits(
         net.passages.beam[keep], net.passages.crossing[keep], net.passages.range[keep]
     )
     first = np.searchsorted(measurable.beam, np.arange(net.beams + 1)).astype(np.intp)
-    count = np.diff(first)
     continues = np.zeros(net.crossings, dtype=np.bool_)
     continues[measurable.crossing[:-1][measurable.beam[:-1] == measurable.beam[1:]]] = True
     window, weights, cell, fraction = _fits(measurable, range_, limits, bins)
-    sizes = np.maximum(2 * count - 1, 0) ** 2
-    offset = np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
     bounds = np.array(limits, dtype=np.intp).reshape(-1, 2)
     return FitLayout(
         measurable, net.crossings, measured, continues, first, window, weights,
         _curvature_weights(measurable, range_, window, weights), cell, fraction,
-        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds, offset,
+        np.where(np.isfinite(log_factor), log_factor, 0.0), range_, bounds,
     )  # fmt: skip
 
 
@@ -154,42 +154,40 @@ def _curvature_weights(kept: Passages, range_: Array, window: Indices, weights: 
 # Signals -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CondensedSignals:
-    """Values at passages and integrals between them, for each profile.
+class Beams(NamedTuple):
+    """Condensed signals of beams with the same number of passages each; the last ones are empty.
 
     The signal is scaled to 1 at the first crossing of each beam.
     """
 
-    log_value: Array
-    """(profile, passage) logarithm of the signal."""
+    value: Array
+    """(profile, beam, passage) u."""
     integral: Array
-    """(profile, passage) m, 2 m times the integral from this to the next passage of the beam."""
-    usable: Booleans
-    """(profile, passage) True where all bins up to and around the passage are positive, and their
-    variances known."""
+    """(profile, beam, passage) I in m, 0 behind the last passage."""
     covariance: Array
-    """(profile, packed) for each beam, covariance of its log values, then its integrals."""
-    status: Codes
-    """(profile, beam) MISSING, NOT_POSITIVE or OUTLYING."""
-    bridged: Booleans
-    """(profile, beam) True where a beam has outlying bins."""
-    curvature_error: Array
-    """(profile, passage, 2) difference of line and polynomial, and its variance by noise."""
-
-    def take(self, profiles: Indices) -> CondensedSignals:
-        """Return the selected profiles."""
-        return CondensedSignals(*(getattr(self, name)[profiles] for name in self.__slots__))
+    """(profile, beam, 2 passage, 2 passage) of u, then of I."""
+    reach: Indices
+    """(profile, beam) number of passages in use; 0 where there is only one, or no known noise."""
+    crossing: Indices
+    """(beam, passage) number of the crossing, of those that are measured; 0 where empty."""
+    select: Array
+    """(beam, passage, crossing) 1 where a passage is at a crossing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Beam:
-    """Logarithms of the bins of one beam that are used, and of a margin."""
+class CleanBeam:
+    """Bins of one beam that are used, and of a margin, with single outlying bins bridged."""
 
+    number: int
     start: int
     """Number of the first bin."""
+    low: int
+    """Number of the first bin that a fit uses; those before it are a margin."""
+    power: Array
+    """(profile, bin) and its variance, as given, but for bridged bins."""
+    variance: Array
     logs: Array
-    """(profile, bin)."""
+    """(profile, bin) logarithms of the signal; 0 where it is not positive."""
     noise: Array
     """(profile, bin) their variances."""
     doubt: Array
@@ -198,138 +196,215 @@ class _Beam:
     """(profile, bin) codes of `outlying_bins`."""
     stops: Indices
     """(profile,) behind the last bin that can be used."""
+    status: Codes
+    """(profile,) why a beam ends before its last used bin."""
     exponent: float
 
-    def values(self, bins: slice, weights: Array) -> tuple[Array, Array]:
-        """Return sums of logarithms, corrected for their bias by noise, and their variances."""
-        inside = slice(bins.start - self.start, bins.stop - self.start)
-        noise = self.noise[:, inside]
-        # E ln(1 + e) = -e^2 / 2; the noise contains the square of the exponent.
-        logs = self.logs[:, inside] + 0.5 * noise / self.exponent
-        doubt = (weights * self.doubt[:, inside]).sum(axis=1)
-        return (weights * logs).sum(axis=1), (weights * weights * noise).sum(axis=1) + doubt**2
+    @property
+    def bridged(self) -> Booleans:
+        """(profile,) True where a beam has outlying bins."""
+        return np.asarray(((self.codes == BRIDGED) | (self.codes == KEPT)).any(axis=1))
+
+    def take(self, profiles: Indices) -> CleanBeam:
+        """Return the selected profiles."""
+        arrays = ("power", "variance", "logs", "noise", "doubt", "codes", "stops", "status")
+        return replace(self, **{name: getattr(self, name)[profiles] for name in arrays})
 
 
-def condense(power: Array, variance: Array, exponent: Array, layout: FitLayout) -> CondensedSignals:
-    """Condense power to values at crossings and integrals between them.
+def clean(
+    power: Array, variance: Array, exponent: Array, layout: FitLayout, *, together: bool
+) -> list[CleanBeam]:
+    """Return the beams that have passages, with outlying bins found.
 
-    Parameters
-    ----------
-    power, variance : (profile, beam, bin) float64
-        Bins are independent.
-    exponent : (beam,) float64
-        m of backscatter ~ extinction^(1/m).
-    layout : FitLayout
+    Where profiles are averaged together, a bin which noise makes negative is no end of a beam.
     """
-    profiles, total = power.shape[0], layout.passages.beam.size
-    out = CondensedSignals(
-        np.full((profiles, total), np.nan),
-        np.zeros((profiles, total)),
-        np.zeros((profiles, total), dtype=np.bool_),
-        np.zeros((profiles, int(layout.offset[-1]))),
-        np.zeros((profiles, power.shape[1]), dtype=np.uint8),
-        np.zeros((profiles, power.shape[1]), dtype=np.bool_),
-        np.zeros((profiles, total, 2)),
-    )
-    # Signals out of bounds have no value.
     with np.errstate(all="ignore"):
-        for beam in range(exponent.size):
-            if layout.first_passage[beam] < layout.first_passage[beam + 1]:
-                _condense_beam(
-                    beam, power[:, beam], variance[:, beam], float(exponent[beam]), layout, out
-                )
-    return out
+        beams = []
+        for beam in np.flatnonzero(np.diff(layout.first_passage)):
+            row = _take_logarithms(
+                int(beam), power[:, beam], variance[:, beam], float(exponent[beam]), layout,
+                together=together,
+            )  # fmt: skip
+            inside = slice(row.start, row.start + row.logs.shape[1])
+            _bridge(row, layout.range[beam, inside], layout.log_factor[beam, inside])
+            beams.append(row)
+    return beams
 
 
+class Condensed(NamedTuple):
+    """Condensed signals, and how they follow their bins."""
+
+    beams: Beams
+    derivatives: list[Array]
+    """For each beam, (profile, 2 passage, bin) derivatives of u and I by the logarithms."""
+    curvature: Array
+    """(profile, beam, passage, 2) difference of line and polynomial, and its variance by noise."""
+
+
+def condense(beams: list[CleanBeam], layout: FitLayout, reach: Indices | None = None) -> Condensed:
+    """Condense clean beams to values at crossings and integrals between them.
+
+    The (profile, beam) `reach` is the number of passages that are used at most.
+    """
+    beam, place = places(layout)
+    shape = len(beams[0].logs), len(beams), int(place.max(initial=0)) + 1
+    most = shape[2]
+    value, integral, curvature = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
+    covariance = np.zeros((*shape[:2], 2 * most, 2 * most))
+    reach, derivatives = np.full(shape[:2], most) if reach is None else reach.copy(), []
+    for b, row in enumerate(beams):
+        on_beam = slice(*layout.first_passage[row.number : row.number + 2])
+        ends = layout.window[on_beam] + layout.weights.shape[1]
+        usable = (ends[:, np.newaxis] <= row.stops).sum(axis=0)
+        reach[:, b] = np.minimum(reach[:, b], usable)
+        derivative = np.zeros((len(reach), 2 * most, row.logs.shape[1]))
+        inside = slice(row.start, row.start + row.logs.shape[1])
+        steps = np.diff(layout.range[row.number, inside])
+        _condense_beam(
+            (row.logs, row.noise, row.doubt, row.exponent),
+            (layout.window[on_beam] - row.start, layout.weights[on_beam],
+             layout.curvature_weights[on_beam]),
+            (layout.cell[on_beam] - row.start, layout.fraction[on_beam], steps),
+            reach[:, b],
+            (value[:, b], integral[:, b], derivative, curvature[:, b]),
+        )  # fmt: skip
+        _transfer_derivatives(derivative, row, layout.range[row.number, inside])
+        # The deviations of bins that stay are of one direction.
+        shift = (derivative * row.doubt[:, np.newaxis]).sum(axis=2)
+        spread = (derivative * row.noise[:, np.newaxis]) @ derivative.swapaxes(1, 2)
+        covariance[:, b] = spread + shift[:, :, np.newaxis] * shift[:, np.newaxis]
+        noise = np.diagonal(covariance[:, b], axis1=1, axis2=2)
+        known = np.isfinite(noise) & ((noise > 0.0) | (np.arange(2 * most) >= reach[:, b : b + 1]))
+        reach[:, b] = np.where(known.all(axis=1) & (reach[:, b] > 1), reach[:, b], 0)
+        derivatives.append(derivative)
+    crossing = np.zeros(shape[1:], dtype=np.intp)
+    crossing[beam, place] = number = (np.cumsum(layout.measured) - 1)[layout.passages.crossing]
+    select = np.zeros((*shape[1:], int(np.sum(layout.measured))))
+    select[beam, place, number] = 1.0
+    return Condensed(
+        Beams(value, integral, covariance, reach, crossing, select), derivatives, curvature
+    )
+
+
+def places(layout: FitLayout) -> tuple[Indices, Indices]:
+    """Return beam and place on the beam of each passage, with beams that have passages only."""
+    counts = np.diff(layout.first_passage)
+    beam = np.repeat(np.arange(np.sum(counts > 0)), counts[counts > 0])
+    place = np.arange(beam.size) - layout.first_passage[:-1][layout.passages.beam]
+    return beam, place
+
+
+@compiled
 def _condense_beam(
-    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout,
-    out: CondensedSignals,
-) -> None:  # fmt: skip
-    on_beam = slice(layout.first_passage[beam], layout.first_passage[beam + 1])
-    row, out.status[:, beam] = _take_logarithms(beam, power, variance, exponent, layout)
-    _bridge(row, layout.range[beam], out.status[:, beam], layout.window[on_beam.start])
-    outlying = (row.codes == BRIDGED) | (row.codes == KEPT)
-    out.bridged[:, beam] = outlying.any(axis=1)
-    bins = layout.weights.shape[1]
-    count = on_beam.stop - on_beam.start
-    derivatives = np.zeros((len(power), 2 * count - 1, row.logs.shape[1]))
-    for c in range(on_beam.start, on_beam.stop):
-        window = slice(layout.window[c], layout.window[c] + bins)
-        usable = window.stop <= row.stops
-        value, _ = row.values(window, layout.weights[c])
-        out.log_value[:, c] = np.where(usable, value, np.nan)
-        out.usable[:, c] = usable
-        inside = slice(window.start - row.start, window.stop - row.start)
-        derivatives[:, c - on_beam.start, inside] = usable[:, np.newaxis] * layout.weights[c]
-        for column, error in enumerate(row.values(window, layout.curvature_weights[c])):
-            out.curvature_error[:, c, column] = np.where(usable, error, 0.0)
-    scale = out.log_value[:, on_beam.start].copy()
-    for c in range(on_beam.start, on_beam.stop - 1):
-        usable = out.usable[:, c + 1]
-        cells = slice(layout.cell[c] - row.start, layout.cell[c + 1] - row.start + 1)
-        ends = layout.fraction[c], layout.fraction[c + 1]
-        steps = np.diff(layout.range[beam, layout.cell[c] : layout.cell[c + 1] + 2])
-        logs = row.logs[:, cells.start : cells.stop + 1] - scale[:, np.newaxis]
-        parts, centroid = _integrate_cells(logs, ends)
-        parts *= np.where(usable[:, np.newaxis], 2.0 * exponent * steps, 0.0)
-        parts = np.where(usable[:, np.newaxis], parts, 0.0)
-        out.integral[:, c] = parts.sum(axis=1)
-        derivative = derivatives[:, count + c - on_beam.start]
-        derivative[:, cells] += parts * (1.0 - centroid)
-        derivative[:, cells.start + 1 : cells.stop + 1] += parts * centroid
-    _transfer_derivatives(derivatives, row, layout.range[beam])
-    covariance = (derivatives * row.noise[:, np.newaxis]) @ derivatives.transpose(0, 2, 1)
-    # The deviations of bins that stay are of one direction.
-    shift = (derivatives * row.doubt[:, np.newaxis]).sum(axis=2)
-    covariance += shift[:, :, np.newaxis] * shift[:, np.newaxis]
-    packed = slice(layout.offset[beam], layout.offset[beam + 1])
-    out.covariance[:, packed] = covariance.reshape(len(power), covariance.shape[1] ** 2)
-    out.log_value[:, on_beam] -= scale[:, np.newaxis]
+    signal: tuple[Array, Array, Array, float],
+    fits: tuple[Indices, Array, Array],
+    cells: tuple[Indices, Array, Array],
+    reach: Indices,
+    out: tuple[Array, Array, Array, Array],
+) -> None:
+    """Fill u, I, their derivatives and the errors by curvature of one beam.
+
+    The signal is exponential within a cell, so that the integral is exact in homogeneous air. The
+    centroid of a cell is a series in the step, x / 12 - x^3 / 720 + x^5 / 30240 from the middle. It
+    only divides derivatives between the ends of a cell.
+    """
+    (logs, noise, doubt, exponent), (window, weights, curved) = signal, fits
+    (cell, fraction, steps), (value, integral, derivative, curvature) = cells, out
+    most = value.shape[1]
+    for t in range(reach.size):
+        for p in range(reach[t]):
+            shift = 0.0
+            for k in range(weights.shape[1]):
+                g = window[p] + k
+                # E ln(1 + e) = -e^2 / 2; the noise contains the square of the exponent.
+                log = logs[t, g] + 0.5 * noise[t, g] / exponent
+                value[t, p] += weights[p, k] * log
+                derivative[t, p, g] = weights[p, k]
+                curvature[t, p, 0] += curved[p, k] * log
+                curvature[t, p, 1] += curved[p, k] * curved[p, k] * noise[t, g]
+                shift += curved[p, k] * doubt[t, g]
+            curvature[t, p, 1] += shift * shift
+        scale = value[t, 0]
+        for p in range(reach[t]):
+            value[t, p] -= scale
+        for p in range(reach[t] - 1):
+            for g in range(cell[p], cell[p + 1] + 1):
+                start = fraction[p] if g == cell[p] else 0.0
+                width = (fraction[p + 1] if g == cell[p + 1] else 1.0) - start
+                step = logs[t, g + 1] - logs[t, g]
+                step = step if abs(step) >= _SMALLEST_STEP else _SMALLEST_STEP
+                part = math.exp(logs[t, g] - scale + step * start) * math.expm1(step * width) / step
+                part *= 2.0 * exponent * steps[g]
+                square = (step * width) ** 2
+                shift = step * width * (1.0 - square / 60.0 * (1.0 - square / 42.0)) / 12.0
+                centroid = start + width * (0.5 + min(max(shift, -0.5), 0.5))
+                integral[t, p] += part
+                derivative[t, most + p, g] += part * (1.0 - centroid)
+                derivative[t, most + p, g + 1] += part * centroid
 
 
 def _take_logarithms(
-    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout
-) -> tuple[_Beam, Codes]:
+    beam: int, power: Array, variance: Array, exponent: float, layout: FitLayout, *,
+    together: bool,
+) -> CleanBeam:  # fmt: skip
     """Return the logarithms of a beam, and why they end before its last used bin."""
     first, last = layout.first_passage[beam], layout.first_passage[beam + 1] - 1
     low, high = layout.window[first], layout.window[last] + layout.weights.shape[1]
     start = max(layout.limits[beam, 0], low - THRESHOLDS.margin)
     end = min(layout.limits[beam, 1], high + THRESHOLDS.margin)
-    power, variance = power[:, start:end], variance[:, start:end]
+    power, variance = power[:, start:end].copy(), variance[:, start:end].copy()
     positive = (power > 0.0) & (power < HUGE)
     safe = np.where(positive, power, 1.0)
     noise = exponent**2 * (variance / safe**2)
     known = positive & (noise < np.inf)
     logs = np.where(known, exponent * (np.log(safe) + layout.log_factor[beam, start:end]), 0.0)
-    lost = ~known[:, low - start : high - start]
+    used = slice(low - start, high - start)
+    lost = ~(known | _negative_by_noise(power, variance) if together else known)[:, used]
     stops = np.where(lost.any(axis=1), np.argmax(lost, axis=1) + low, high)
     at_stop = power[np.arange(len(power)), np.minimum(stops, end - 1) - start]
     reason = np.where((at_stop <= 0.0) & (at_stop > -HUGE), NOT_POSITIVE, MISSING)
     status = np.where(stops < high, reason, 0).astype(np.uint8)
     codes = np.where(known, GOOD, LOST).astype(np.uint8)
     noise = np.where(known, noise, 0.0)
-    return _Beam(start, logs, noise, np.zeros_like(noise), codes, stops, exponent), status
+    doubt = np.zeros_like(noise)
+    return CleanBeam(
+        beam, int(start), int(low), power, variance, logs, noise, doubt, codes, stops, status,
+        exponent,
+    )  # fmt: skip
 
 
-def _bridge(row: _Beam, grid: Array, status: Codes, low: int) -> None:
+def _negative_by_noise(power: Array, variance: Array) -> Booleans:
+    """Return (profile, bin) where a bin is not positive, but no outlier among its neighbours.
+
+    The beam as a whole has a signal.
+    """
+    known = np.isfinite(power) & np.isfinite(variance)
+    values, noise = np.where(known, power, 0.0), np.where(known, variance, 0.0)
+    level = uniform_filter1d(values, _NEIGHBOURS, axis=1, mode="nearest")
+    whole = values.sum(axis=1) > THRESHOLDS.outlier * np.sqrt(noise.sum(axis=1))
+    near = known & (level - power < THRESHOLDS.outlier * np.sqrt(noise))
+    return np.asarray(near & (power <= 0.0) & whole[:, np.newaxis])
+
+
+def _bridge(row: CleanBeam, grid: Array, factor: Array) -> None:
     """Replace single outlying bins by what their neighbours predict, in place."""
+    low = row.low - row.start
     if not grid[low + 1] - grid[low] <= THRESHOLDS.widest_bin:
         return
-    grid = np.ascontiguousarray(grid[row.start : row.start + row.logs.shape[1]])
     ends = row.stops - row.start
-    outlying_bins.search(
-        row.logs, row.noise, row.exponent, grid, int(low) - row.start, ends, row.codes, row.doubt
-    )
-    status[ends + row.start < row.stops] = OUTLYING
+    outlying_bins.search(row.logs, row.noise, row.exponent, grid, low, ends, row.codes, row.doubt)
+    row.status[ends + row.start < row.stops] = OUTLYING
     row.stops[:] = ends + row.start
     profiles, bins, nodes, weights = _bridged_bins(row, grid)
     noise = row.noise[profiles[:, np.newaxis], nodes]
     logs = row.logs[profiles[:, np.newaxis], nodes]
-    row.logs[profiles, bins] = (weights * logs).sum(axis=1)
-    row.noise[profiles, bins] = (weights * weights * noise).sum(axis=1)
+    row.logs[profiles, bins] = line = (weights * logs).sum(axis=1)
+    row.noise[profiles, bins] = noise = (weights * weights * noise).sum(axis=1)
+    row.power[profiles, bins] = power = np.exp(line / row.exponent - factor[bins])
+    row.variance[profiles, bins] = noise * (power / row.exponent) ** 2
 
 
-def _bridged_bins(row: _Beam, grid: Array) -> tuple[Indices, Indices, Indices, Array]:
+def _bridged_bins(row: CleanBeam, grid: Array) -> tuple[Indices, Indices, Indices, Array]:
     """Return profile and bin of each bridged bin, its neighbours and their weights."""
     profiles, bins = np.nonzero(row.codes == BRIDGED)
     nodes = np.zeros((bins.size, outlying_bins.NODES), dtype=np.intp)
@@ -338,10 +413,9 @@ def _bridged_bins(row: _Beam, grid: Array) -> tuple[Indices, Indices, Indices, A
     return profiles, bins, nodes, weights
 
 
-def _transfer_derivatives(derivatives: Array, row: _Beam, grid: Array) -> None:
+def _transfer_derivatives(derivatives: Array, row: CleanBeam, grid: Array) -> None:
     """Transfer the derivatives by bridged bins to the neighbours they come from, in place."""
     if np.any(row.codes == BRIDGED):
-        grid = np.ascontiguousarray(grid[row.start : row.start + row.logs.shape[1]])
         profiles, bins, nodes, weights = _bridged_bins(row, grid)
         own = derivatives[profiles, :, bins][:, np.newaxis]
         by_bin = derivatives.transpose(0, 2, 1)
@@ -349,26 +423,11 @@ def _transfer_derivatives(derivatives: Array, row: _Beam, grid: Array) -> None:
         by_bin[profiles, bins] = 0.0
 
 
-def _integrate_cells(logs: Array, ends: tuple[float, float]) -> tuple[Array, Array]:
-    """Return integrals over cells, in cells, and the places of their centroids, from 0 to 1.
-
-    The signal is exponential within a cell, so that the integral is exact in homogeneous air. The
-    centroid is a series in the step, x / 12 - x^3 / 720 + x^5 / 30240 from the middle. It only
-    divides derivatives between the ends of a cell.
-
-    Parameters
-    ----------
-    logs : (profile, cell + 1) float64
-        Logarithms of the signal at the ends of the cells.
-    ends : two float
-        Where the integral starts in the first cell, and stops in the last one.
-    """
-    step = np.diff(logs, axis=1)
-    step = np.where(np.abs(step) < _SMALLEST_STEP, _SMALLEST_STEP, step)
-    start, stop = np.zeros(step.shape[1]), np.ones(step.shape[1])
-    start[0], stop[-1] = ends
-    width = stop - start
-    whole = np.exp(logs[:, :-1] + step * start) * np.expm1(step * width) / step
-    square = (step * width) ** 2
-    shift = step * width * (1.0 - square / 60.0 * (1.0 - square / 42.0)) / 12.0
-    return whole, start + width * (0.5 + np.clip(shift, -0.5, 0.5))
+def median(values: Array, known: Booleans) -> Array:
+    """Return medians over profiles of the known values; NaN where there is none."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
+    number, columns = known.sum(axis=0), np.arange(values.shape[1])
+    ordered = np.sort(np.where(known, values, np.inf), axis=0)
+    low, high = (ordered[place, columns] for place in (np.maximum(number - 1, 0) // 2, number // 2))
+    return np.where(number > 0, 0.5 * (low + high), np.nan)

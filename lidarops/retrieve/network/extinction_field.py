@@ -10,16 +10,16 @@ far one v therefore
 No calibration is needed: the constant of a lidar multiplies the whole row. The overlap does not
 cancel.
 
-In thin air or high noise, a gradient over the whole network looks like attenuation, and no test
-can separate them. The standard error is then mostly what the prior allows and what the rest of
-the block shows (`lidarops.retrieve.network._block_errors`). Where the beams leave fewer equations
-than unknowns, values are flagged if the beams contradict the prior; a field so steep that few
-beams cannot show it goes undetected. ``docs/algorithms/network.md`` has the rates.
+The profiles of a block are one field that changes slowly
+(`lidarops.retrieve.network._block_solution`). In thin air or high noise, a gradient over the whole
+network looks like attenuation, and no test can separate them: the standard error is then mostly
+what the prior allows.
+``docs/algorithms/network.md`` has the rates of false values.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Final, Literal
 
@@ -31,11 +31,11 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
-from lidarops.retrieve.network import _beam_signals, _block_errors
-from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
+from lidarops.retrieve.network import _beam_signals
+from lidarops.retrieve.network._beam_signals import BeamSignals, Causes, Estimates, Response
+from lidarops.retrieve.network._block_solution import solve_alone, solve_block
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
-from lidarops.retrieve.network._empirical_prior import NO_PRIOR, Problem, solve_block
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.geometry import Network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -49,7 +49,7 @@ class FieldPrior(StrEnum):
     """Prior knowledge of the field that the network method uses."""
 
     BLOCK = "block"
-    """What the profiles of a block share: how much ln extinction deviates from a linear field."""
+    """The profiles of a block are one field that changes slowly."""
     NONE = "none"
 
 
@@ -60,10 +60,8 @@ class NetworkResult:
     extinction: Array
     """(..., crossing) m-1; NaN without a value, and at crossings that are far on all beams."""
     extinction_standard_error: Array
-    """m-1. From noise, from the error of a straight-line fit where the signal is curved, from a
-    field that deviates by twice the prior's standard deviation, or by four times the strongest
-    prior where the beams leave a crossing open, as far as the mean of a block allows, and from the
-    bias that noise gives all profiles of a block."""
+    """m-1. From noise and prior, widened by the misfit of the mean of a block, from the error of
+    fits where the signal is curved, and from an error of the overlap."""
     quality: Flags
     """(..., crossing) quality bits, by beams of the crossing or the whole network."""
     no_solution: Booleans
@@ -74,13 +72,19 @@ class NetworkResult:
     """(...) of the beams alone, without the prior; NaN without degrees of freedom."""
     degrees_of_freedom: Array
     """(...)."""
-    prior_deviation: Array
-    """(...) standard deviation of ln extinction about a linear field; inf without prior."""
+    overlap_error: Array
+    """(..., crossing) m-1, part of the standard error by `default_overlap_error` of the beams."""
+    overlap_response: Array
+    """(..., crossing) relative change of extinction by relative errors of 1 of the overlap at the
+    near ends of beams, which fall to 0 at their far ends."""
     multiplier: Array
     """(..., crossing) of the rows of triangles; NaN where all beams are solved together."""
     multiplier_error: Array
     """(..., crossing) m-1, systematic: what the multiplier adds to extinction in homogeneous air;
     0 where all beams are solved together."""
+    respond: Response
+    """From small changes of signals to linear changes of extinction, (profile, crossing, cause) in
+    m-1. Weights, priors and flags stay, so that no value is lost near a threshold."""
 
     def raised(self, bits: int) -> Booleans:
         """Return where any of the bits is raised."""
@@ -104,7 +108,6 @@ def retrieve_network(
     blocks: npt.ArrayLike | None = None,
     prior: str = "block",
     multiplier: npt.ArrayLike | Literal["chosen"] | None = None,
-    bins: int = THRESHOLDS.fit_bins,
 ) -> NetworkResult:
     """Retrieve extinction and visibility where the beams of several lidars cross.
 
@@ -129,16 +132,15 @@ def retrieve_network(
     exponent : float or (beam,) float
         m of backscatter ~ extinction^(1/m) along a beam.
     blocks : (...) int, optional
-        Numbers of the blocks of profiles that share a prior; by default, all. Results of a block
-        depend on its own profiles only.
+        Numbers of the blocks of profiles, in order of time, that are one field; by default, all.
+        Results of a block depend on its own profiles only. Profiles of a block are equally spaced
+        in time: give missing ones as NaN.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.
     multiplier : float or (..., crossing) float or "chosen", optional
         Lambda of the paper, 0 to 1: each crossing is solved by one triangle of beams
         (`lidarops.retrieve.network.triangles`), without prior, instead of all beams together.
         "chosen" is the one with the smallest expected error in the block.
-    bins : int
-        Number of bins of the fit that gives the signal at a crossing.
 
     Returns
     -------
@@ -160,51 +162,41 @@ def retrieve_network(
             field="network",
             remedy="point the lidars at common volumes, or widen the tolerance of the geometry",
         )
+    together = multiplier is None and field_prior is FieldPrior.BLOCK
     beams = _beam_signals.prepare_signals(
         power, range, network, variance=variance, overlap=overlap,
-        full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, bins=bins,
+        full_overlap_range=full_overlap_range, exponent=exponent, blocks=blocks, together=together,
     )  # fmt: skip
-    if multiplier is None:
-        return _flag_result(beams, _solve_network(beams, network.crossing, field_prior))
-    return _flag_result(beams, solve_triangles(beams, _multipliers(multiplier, beams)))
+    with np.errstate(all="ignore"):
+        estimate = _solve_blocks(beams, network.crossing, multiplier)
+    return _flag_result(beams, estimate)
 
 
-def _solve_network(beams: BeamSignals, position: Array, prior: FieldPrior) -> Estimates:
-    """Solve each block, and return its values with all their errors."""
-    layout, out = beams.layout, Estimates.missing(beams)
-    number = np.cumsum(layout.measured) - 1
-    crossing = number[layout.passages.crossing].astype(np.intp)
-    for block in np.unique(beams.block) if crossing.size else ():
-        rows = np.flatnonzero(beams.block == block)
-        data = beams.data.take(rows)
-        problem = Problem(data, layout, crossing, beams.exponent, position[layout.measured])
-        if prior is FieldPrior.NONE:
-            solution = problem.solve(NO_PRIOR)
-            variance = solution.variance
+def _solve_blocks(
+    beams: BeamSignals, position: Array, multiplier: npt.ArrayLike | str | None
+) -> Estimates:
+    """Solve each block, and return the values of all."""
+    out = Estimates.missing(beams.block.size, beams.layout)
+    given = None if multiplier is None else _multipliers(multiplier, beams)
+    responses = []
+    for rows, block in beams.blocks(position):
+        if multiplier is not None:
+            part = solve_triangles(block, None if given is None else given[rows])
         else:
-            solved = solve_block(problem)
-            solution = solved.profiles
-            variance = solution.variance - solution.prior_share
-            variance = variance + _block_errors.field_variance(solved, problem.position)
-            variance = variance + _block_errors.noise_bias_variance(solved)
-            out.prior_contradicted[rows] = solved.contradicted
-        curvature = _block_errors.curvature_variance(data, solution.carried)
-        here = np.ix_(rows, np.flatnonzero(layout.measured))
-        with np.errstate(over="ignore", under="ignore"):
-            extinction = np.exp(solution.logarithm)
-            variance = extinction**2 * variance
-            if prior is FieldPrior.BLOCK:
-                variance = _block_errors.at_least_typical(extinction, variance, data.usable)
-            out.extinction[here] = extinction
-            out.variance[here] = variance + extinction**2 * curvature
-            out.prior_true_variance[here] = extinction**2 * solution.variance
-        out.settled[rows], out.left_out[rows] = solution.settled, solution.left_out
-        out.chi_square[rows, 0] = solution.chi_square
-        out.chi_square[rows, 1] = solution.total_chi_square
-        out.degrees_of_freedom[rows, 0] = solution.degrees_of_freedom
-        out.degrees_of_freedom[rows, 1] = solution.total_degrees_of_freedom
-        out.deviation[rows] = solution.prior.strength * solution.prior.deviation
-    return out
+            part = solve_block(block) if beams.together else solve_alone(block)
+        responses.append((rows, part.respond))
+        for field in fields(Estimates):
+            if field.name != "respond":
+                getattr(out, field.name)[rows] = getattr(part, field.name)
+
+    def respond(causes: Causes) -> Array:
+        change = np.zeros((*out.extinction.shape, len(causes)))
+        for rows, each in responses:
+            of_block = [{k: one.take(rows) for k, one in cause.items()} for cause in causes]
+            change[rows] = each(of_block)
+        return change * out.extinction[..., np.newaxis]
+
+    return replace(out, respond=respond)
 
 
 def _multipliers(multiplier: npt.ArrayLike | str, beams: BeamSignals) -> Array | None:
@@ -225,34 +217,35 @@ def _multipliers(multiplier: npt.ArrayLike | str, beams: BeamSignals) -> Array |
 
 def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
-    shape, passages = estimate.extinction.shape, beams.layout.passages
+    shape = estimate.extinction.shape
     near = beams.layout.near_crossing
     with np.errstate(invalid="ignore"):
-        finite = np.isfinite(estimate.variance)
+        # Rounding of a singular system may make a variance negative.
+        finite = np.isfinite(np.sqrt(estimate.variance))
         finite &= np.abs(estimate.extinction) < air_visibility.LARGEST_EXTINCTION
         finite &= estimate.extinction > 0
-        uncertain = estimate.variance > estimate.extinction**2
-    # The stated doubt in the prior is no noise that makes values unreliable.
-    doubted = _poorly_determined(estimate.extinction, estimate.prior_true_variance, beams.block)
-    doubted |= estimate.prior_contradicted[:, np.newaxis]
-    poor = np.any(_improbable(estimate.chi_square, estimate.degrees_of_freedom), axis=1)
+        # Amplified noise hides the error of a profile alone.
+        limit = 1.0 if beams.together else THRESHOLDS.largest_relative_error
+        uncertain = estimate.variance > (limit * estimate.extinction) ** 2
+    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    poor = _improbable(chi_square, freedom).any(axis=1)
     converged = estimate.settled | ~np.isfinite(estimate.chi_square[:, 1])
-    too_weak = beams.weak | (estimate.left_out[:, passages.beam] & beams.data.usable)
+    too_weak = beams.weak | (estimate.left_out & beams.usable)
     quality = np.zeros(shape, dtype=np.int32)
     for bit, where in (
-        (NetworkQuality.POORLY_DETERMINED, (doubted & finite) | uncertain),
+        (NetworkQuality.POORLY_DETERMINED, uncertain),
         (Quality.LOW_SIGNAL, _lost_signal(beams, NOT_POSITIVE)),
         (Quality.INPUT_MISSING, _lost_signal(beams, MISSING)),
         (NetworkQuality.LOW_LEVERAGE, _by_crossing(beams, too_weak)),
-        (Quality.OUTLIER, _by_crossing(beams, beams.data.bridged[:, passages.beam])),
+        (Quality.OUTLIER, _by_crossing(beams, beams.bridged)),
         # Where so many bins deviate that the beam is left out, the stated noise is wrong.
         (NetworkQuality.POOR_FIT, _lost_signal(beams, OUTLYING)),
         (NetworkQuality.POOR_FIT, (poor | ~converged)[:, np.newaxis]),
-        (Quality.INPUT_MISSING, ~beams.layout.measured | estimate.open),
+        (Quality.INPUT_MISSING, estimate.open | ~beams.layout.measured),
     ):
         quality |= np.where(where, np.int32(bit), np.int32(0))
     crossings = (*beams.leading, shape[1])
-    freedom, chi_square = estimate.degrees_of_freedom[:, 0], estimate.chi_square[:, 0]
+    freedom, chi_square = freedom[:, 0], chi_square[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         reduced = np.where(freedom > 0, chi_square / freedom, np.nan)
     return NetworkResult(
@@ -263,35 +256,12 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
         near,
         reduced.reshape(beams.leading),
         freedom.reshape(beams.leading),
-        estimate.deviation.reshape(beams.leading),
+        np.where(finite & near, estimate.overlap_error, np.nan).reshape(crossings),
+        estimate.overlap.reshape(crossings),
         np.where(near, estimate.multiplier, np.nan).reshape(crossings),
         np.where(finite & near, estimate.multiplier_error, np.nan).reshape(crossings),
+        estimate.respond,
     )
-
-
-def _poorly_determined(extinction: Array, variance: Array, block: Indices) -> Booleans:
-    """Return where an error exceeds a third of the value, in the profile or its typical block.
-
-    With noise amplified beyond that, values and the errors computed from them are meaningless,
-    so all profiles of such a block are doubted.
-
-    Parameters
-    ----------
-    extinction, variance : (profile, crossing) float
-        m-1 and m-2; NaN where there is none.
-    block : (profile,) int
-    """
-    with np.errstate(invalid="ignore"):
-        doubted = np.asarray(variance > (THRESHOLDS.largest_relative_error * extinction) ** 2)
-    for number in np.unique(block):
-        profiles = np.flatnonzero(block == number)
-        known = np.isfinite(variance[profiles])
-        for crossing in np.flatnonzero(known.any(axis=0)):
-            rows = profiles[known[:, crossing]]
-            error = np.sqrt(np.median(variance[rows, crossing]))
-            typical = np.median(extinction[rows, crossing])
-            doubted[profiles, crossing] |= error > THRESHOLDS.largest_relative_error * typical
-    return doubted
 
 
 def _improbable(chi_square: Array, freedom: Array) -> Booleans:
@@ -305,8 +275,7 @@ def _improbable(chi_square: Array, freedom: Array) -> Booleans:
 
 def _lost_signal(beams: BeamSignals, reason: int) -> Booleans:
     """Return where a beam of a crossing lost its signal for the given reason."""
-    status = beams.data.status[:, beams.layout.passages.beam]
-    return _by_crossing(beams, (status == reason) & ~beams.data.usable & ~beams.weak)
+    return _by_crossing(beams, (beams.status == reason) & ~beams.usable & ~beams.weak)
 
 
 def _by_crossing(beams: BeamSignals, passages: Booleans) -> Booleans:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of
 from lidarops.retrieve.background.estimate import detected, from_tail, shifts
 from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers, root_sum_square
 from lidarops.retrieve.network import extinction_field
+from lidarops.retrieve.network._beam_signals import SignalChange
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
@@ -59,7 +60,7 @@ class NetworkSettings:
     """Settings of the retrieval, and relative errors for its systematic errors."""
 
     block_intervals: int
-    """Number of clock intervals that share a prior."""
+    """Number of clock intervals that are one field."""
     visibility: VisibilityDefinition
     prior: str = "block"
     multiplier: float | Literal["chosen"] | None = None
@@ -102,8 +103,8 @@ def retrieve_network(
 
     The background is subtracted from the averaged signals, and the network is solved
     (`lidarops.retrieve.network.extinction_field`). Errors that all bins of a beam share (from
-    background, overlap, signal in the tail, exponent) come from solving again with signals
-    changed by them.
+    background, overlap, signal in the tail, exponent) are carried by the linear response of the
+    solution.
 
     Parameters
     ----------
@@ -125,34 +126,37 @@ def retrieve_network(
     """
     if len(beams) != network.beams:
         raise RetrievalInputError(f"are {len(beams)} for {network.beams} beams", field="beams")
-    intervals = np.unique(np.concatenate([beam.interval for beam in beams]))
+    given = np.unique(np.concatenate([beam.interval for beam in beams]))
+    intervals = _without_gaps(given, settings.block_intervals)
     signals = _gather_signals(beams, intervals, network)
-    solver = _Solver(beams, network, settings, signals, intervals)
-    result = solver.solve(signals.power)
-    solver.keep_multiplier(result)
-    errors = _Errors.estimate(solver, result, settings)
+    result = extinction_field.retrieve_network(
+        signals.power, signals.range, network, variance=signals.variance,
+        overlap=signals.overlap, full_overlap_range=[beam.nearest for beam in beams],
+        exponent=[beam.exponent for beam in beams], prior=settings.prior,
+        blocks=intervals // settings.block_intervals, multiplier=settings.multiplier,
+    )  # fmt: skip
+    errors = _errors(result, signals, network, settings)
     near = np.flatnonzero(network.near_crossing)
     extinction = result.extinction[:, near]
     random, systematic = errors.random[:, near], errors.systematic[:, near]
-    freedom, deviation = result.degrees_of_freedom, result.prior_deviation
+    freedom = result.degrees_of_freedom
     dimensions = ("time", "crossing")
     visibility = visibility_of_extinction(extinction, random, systematic, settings.visibility)
     flags = _quality_flags(result, errors, signals, network)[:, near]
     multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
     if settings.multiplier is None:
         multiplier = {}
-    return xr.Dataset(
+    product = xr.Dataset(
         {
             **{name: (dimensions, values) for name, values in visibility.items()},
             "total_extinction": (dimensions, extinction),
             "total_extinction_standard_error": (dimensions, random),
             "total_extinction_systematic_error": (dimensions, systematic),
-            "condition": (dimensions, errors.condition[:, near]),
+            "condition": (dimensions, result.overlap_response[:, near]),
             "quality_flag": (dimensions, flags),
             "path_optical_depth": ("time", _optical_depth(extinction, network)),
             "reduced_chi2": ("time", result.reduced_chi_square),
             "degrees_of_freedom": ("time", np.where(freedom >= 0, freedom, np.nan)),
-            "prior_deviation": ("time", np.where(np.isfinite(deviation), deviation, np.nan)),
             "shots": ("time", _shots(beams, intervals)),
             "beam_range": (("beam", "crossing"), _distances(network)[:, near]),
             **multiplier,
@@ -160,6 +164,16 @@ def retrieve_network(
         coords=_coordinates(beams, intervals, network, near),
         attrs={"steps": _describe_steps(beams, network, settings)},
     )
+    return product.isel(time=np.isin(intervals, given))
+
+
+def _without_gaps(intervals: Integers, per_block: int) -> Integers:
+    """Return all intervals from the first to the last of each block: air changes in gaps too."""
+    block = intervals // per_block
+    last = np.flatnonzero(np.diff(block, append=block[-1:] + 1))
+    first = np.concatenate([[0], last[:-1] + 1])
+    runs = [np.arange(intervals[a], intervals[b] + 1) for a, b in zip(first, last, strict=True)]
+    return np.concatenate(runs)
 
 
 def _gather_signals(
@@ -196,7 +210,7 @@ def _gather_signals(
         passed = np.int32(_WARNINGS | Quality.NO_SIGNAL)
         warnings[rows, index] = np.bitwise_or.reduce(quality[:, used] & passed, axis=1)
         warnings[rows, index] |= sky.unjudged * np.int32(Quality.BACKGROUND_UNCERTAIN)
-    # Farther bins do not matter, and the network is solved many times.
+    # Farther bins do not matter.
     used_bins = slice(_bins_used(grid, network))
     return _Signals(
         np.ascontiguousarray(power[..., used_bins]),
@@ -216,138 +230,69 @@ def _bins_used(grid: Array, network: Network) -> int:
     return max(reached) + THRESHOLDS.bins_beyond
 
 
-class _Solver:
-    """Solves the network repeatedly for slightly changed signals."""
-
-    def __init__(
-        self,
-        beams: Sequence[BeamAverages],
-        network: Network,
-        settings: NetworkSettings,
-        signals: _Signals,
-        intervals: Integers,
-    ) -> None:
-        self.network, self.signals = network, signals
-        self.exponent = np.array([beam.exponent for beam in beams])
-        together = len(beams) > THRESHOLDS.most_separate_beams
-        groups: dict[int | str, list[int]] = {}
-        for index, beam in enumerate(beams):
-            groups.setdefault(beam.instrument if together else index, []).append(index)
-        self.beam_groups = list(groups.values())
-        """Beams that are changed together."""
-        self._arguments: dict[str, Any] = {
-            "prior": settings.prior,
-            "multiplier": settings.multiplier,
-            "variance": signals.variance,
-            "overlap": signals.overlap,
-            "full_overlap_range": np.array([beam.nearest for beam in beams]),
-            "blocks": intervals // settings.block_intervals,
-        }
-
-    def solve(self, power: Array, exponent: Array | None = None) -> NetworkResult:
-        """Solve for signals, optionally with other exponents."""
-        return extinction_field.retrieve_network(
-            power,
-            self.signals.range,
-            self.network,
-            exponent=self.exponent if exponent is None else exponent,
-            **self._arguments,
-        )
-
-    def keep_multiplier(self, result: NetworkResult) -> None:
-        """Use the multipliers of a result from now on, so that changes are those of signals."""
-        if self._arguments["multiplier"] is not None:
-            self._arguments["multiplier"] = result.multiplier
-
-    def near_end_weights(self) -> Array:
-        """Return (beam, bin) weights from 1 at the nearest crossing of a beam to 0 at its last."""
-        weights = np.zeros(self.signals.range.shape)
-        for index in range(self.network.beams):
-            ranges = self.network.on_beam(index)[1]
-            weights[index] = np.interp(
-                self.signals.range[index], [ranges[0], ranges[-1]], [1.0, 0.0]
-            )
-        return weights
-
-    def crossing_weights(self) -> Iterator[Array]:
-        """Yield, for each crossing, (beam, bin) weights: 1 there, 0 at its neighbours."""
-        for crossing in range(self.network.crossings):
-            weights = np.zeros(self.signals.range.shape)
-            for index in range(self.network.beams):
-                numbers, ranges = self.network.on_beam(index)
-                if crossing in numbers:
-                    peak = (numbers == crossing).astype(np.float64)
-                    weights[index] = np.interp(self.signals.range[index], ranges, peak)
-            yield weights
-
-    def extinction_changes(self, result: NetworkResult, change: Array) -> Iterator[Array]:
-        """Yield, for each group of beams, the change of extinction with the signals."""
-        for group in self.beam_groups:
-            if not change[:, group].any():
-                # Unchanged signals give unchanged values.
-                yield result.extinction - result.extinction
-                continue
-            power = self.signals.power.copy()
-            power[:, group] += change[:, group]
-            yield self.solve(power).extinction - result.extinction
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Errors:
+class _Errors(NamedTuple):
     """(interval, crossing) errors of extinction, m-1; NaN where there is no value."""
 
     random: Array
+    """From noise and background."""
     systematic: Array
     tail_signal: Array
     """Part of the systematic error from signal in the background."""
-    condition: Array
-    """Relative change of extinction over relative change of signals at the near ends of beams."""
 
-    @staticmethod
-    def estimate(solver: _Solver, result: NetworkResult, settings: NetworkSettings) -> _Errors:
-        """Return the errors from noise and background, and from the systematic effects."""
-        signals = solver.signals
-        shape = signals.power.shape
-        background = np.broadcast_to(
-            np.nan_to_num(signals.background_error)[..., np.newaxis], shape
-        )
-        by_background = solver.extinction_changes(result, background)
-        random = root_sum_square([result.extinction_standard_error, *by_background])
-        overlap = THRESHOLDS.relative_change * signals.power * solver.near_end_weights()
-        overlap_change = root_sum_square(solver.extinction_changes(result, overlap))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            condition = overlap_change / THRESHOLDS.relative_change / result.extinction
-        tail = np.broadcast_to(signals.tail_signal[..., np.newaxis], shape)
-        tail_signal = root_sum_square(solver.extinction_changes(result, tail))
-        exponent = _changed_exponents(solver.exponent, settings.exponent_relative_error)
-        by_exponent = solver.solve(signals.power, exponent).extinction - result.extinction
-        by_lidar_ratio = _lidar_ratio_error(solver, result, settings.lidar_ratio_relative_error)
-        contributions = [
-            by_exponent,
-            by_lidar_ratio,
-            tail_signal,
-            *solver.extinction_changes(result, signals.baseline),
-            condition * result.extinction * settings.overlap_relative_error,
-            result.multiplier_error,
+
+def _errors(
+    result: NetworkResult, signals: _Signals, network: Network, settings: NetworkSettings
+) -> _Errors:
+    def of_each_beam(error: Array) -> Array:
+        added = np.broadcast_to(np.nan_to_num(error), signals.power.shape)
+        beams = np.flatnonzero(added.any(axis=(0, 2)))
+        causes: list[dict[int, SignalChange]] = [
+            {int(beam): SignalChange(power=added[:, beam])} for beam in beams
         ]
-        return _Errors(random, root_sum_square(contributions), tail_signal, condition)
+        return np.asarray(np.sqrt((result.respond(causes) ** 2).sum(axis=2)))
+
+    # The declared error of the overlap replaces the default.
+    stated = result.extinction_standard_error**2 - result.overlap_error**2
+    by_background = of_each_beam(signals.background_error[..., np.newaxis])
+    tail_signal = of_each_beam(signals.tail_signal[..., np.newaxis])
+    exponent = SignalChange(exponent=settings.exponent_relative_error)
+    contributions = [
+        result.respond([dict.fromkeys(range(network.beams), exponent)])[..., 0],
+        lidar_ratio_error(result, network, signals.range, settings.lidar_ratio_relative_error),
+        tail_signal,
+        of_each_beam(signals.baseline),
+        result.overlap_response * result.extinction * settings.overlap_relative_error,
+        result.multiplier_error,
+    ]
+    random = root_sum_square([np.sqrt(np.maximum(stated, 0.0)), by_background])
+    return _Errors(random, root_sum_square(contributions), tail_signal)
 
 
-def _lidar_ratio_error(solver: _Solver, result: NetworkResult, relative_error: float) -> Array:
-    """Return the error from lidar ratios that differ between crossings, m-1."""
-    square_sum = np.zeros(result.extinction.shape)
-    if relative_error > 0.0:
-        for weights in solver.crossing_weights():
-            power = solver.signals.power * (1.0 + THRESHOLDS.relative_change * weights)
-            square_sum += (solver.solve(power).extinction - result.extinction) ** 2
-    return np.asarray(np.sqrt(square_sum) * relative_error / THRESHOLDS.relative_change)
+def lidar_ratio_error(
+    result: NetworkResult, network: Network, range_: Array, relative_error: float
+) -> Array:
+    """Return the (profile, crossing) error from lidar ratios that differ between crossings, m-1.
 
+    The signals at a crossing are changed by the relative error, and between it and its neighbours
+    by less.
 
-def _changed_exponents(exponent: Array, relative_error: float) -> Array:
-    """Return exponents off by one error; those that would be too large are off downwards."""
-    larger = exponent * (1.0 + relative_error)
-    smaller = exponent / (1.0 + relative_error)
-    return np.where(larger <= THRESHOLDS.exponents[1], larger, smaller)
+    Parameters
+    ----------
+    result : NetworkResult
+    network : Network
+    range_ : (beam, bin) or (bin,) float64
+        m.
+    relative_error : float
+    """
+    causes: list[dict[int, SignalChange]] = [{} for _ in range(network.crossings)]
+    along = np.broadcast_to(range_, (network.beams, range_.shape[-1]))
+    for beam in range(network.beams):
+        crossings, ranges = network.on_beam(beam)
+        for crossing in crossings:
+            peak = relative_error * (crossings == crossing)
+            weights = np.interp(along[beam], ranges, peak)
+            causes[crossing][beam] = SignalChange(relative=weights)
+    return np.asarray(np.sqrt((result.respond(causes) ** 2).sum(axis=2)))
 
 
 def _quality_flags(
@@ -360,7 +305,8 @@ def _quality_flags(
     # Light of other beams gives a value.
     bits[(bits & np.int32(Quality.INPUT_MISSING)) == 0] &= ~np.int32(Quality.NO_SIGNAL)
     with np.errstate(invalid="ignore"):
-        uncertain = ~(np.hypot(errors.random, errors.systematic) < result.extinction)
+        error = np.hypot(errors.random, errors.systematic)
+        uncertain = ~(error < THRESHOLDS.largest_relative_error * result.extinction)
     background_doubt = shifts(errors.tail_signal, errors.random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(

@@ -68,51 +68,59 @@ class Thresholds(NamedTuple):
     curvature_degree: int = 4
     """Degree of the polynomial. A parabola leaves half of the error from a layer of 10 m over 35 m;
     calculated."""
-    shared_noise: float = 4.0
-    """Noise variances subtracted from the square of the shared error. Noise alone then leaves 0.08
-    of one variance on average; normal distribution."""
+    curvature_left: float = 0.1
+    """Share of the error of a straight line that a polynomial may leave: 0.24 of a Gaussian layer
+    of 10 m, 0.05 of one of 15 m in bins of 5 m; calculated."""
     profile_noise: float = 9.0
-    """The same for a single profile, which leaves 0.005 of one variance; normal distribution."""
-    chance: float = 3.0
-    """Standard deviations by which a mean square of noise may be larger by chance; assumed."""
+    """Square of the difference of polynomial and line over its noise variance, beyond which a mean
+    signal is curved: 3 standard errors."""
 
-    # The prior: ablation
-    gradient: float = 0.15
-    """Standard deviation of ln extinction over the crossings by a gradient; simulations."""
-    deviations: tuple[float, ...] = tuple(np.geomspace(0.01, 1.0, 9).tolist())
-    """Standard deviations of ln extinction at single crossings that are tried; assumed."""
-    strengths: tuple[float, ...] = (1.0, 2.0, 4.0)
-    """Factors of the standard deviations that are tried before the prior is dropped; assumed."""
-    likelihood_tolerance: float = 4.0
-    """Difference in -2 ln likelihood from the minimum: two standard errors."""
-    doubt: float = 2.0
-    """Factor of the prior's standard deviation by which the stated error lets a field deviate;
-    assumed."""
-    well_determined: float = 0.15
-    """Standard error of ln extinction below which beams alone determine a crossing; assumed."""
-    determined_share: float = 0.9
-    """Share of the profiles in which a crossing that contradicts a prior is determined; assumed."""
-    contradiction: float = 3.5
-    """Standard errors of the difference at which beams contradict a prior; assumed."""
-    harmless: float = 0.5
-    """Share of the stated error that a difference may reach without effect; assumed."""
-    testing_quantile: float = 0.75
-    """Quantile of the degrees of freedom that decides whether profiles test the prior; assumed."""
-    least_probability_of_mean: float = 1e-2
-    """Probability of the chi-square of the mean with the prior, below which the prior is rejected;
-    chosen."""
-    open_in_mean: float = 1.0
-    """Standard error of ln extinction beyond which the mean leaves a crossing open; assumed."""
+    # The field: ablation
+    stratified: tuple[float, float] = (2.0, 300.0)
+    """Standard deviation of ln extinction over height, and its length in m; simulations."""
+    volumes: tuple[float, float] = (0.5, 500.0)
+    """The same of single volumes of air, over distance; assumed."""
+    least_deviation: float = 0.03
+    """The same at single crossings, added; simulations."""
+    lengths: tuple[float, ...] = (100.0, 500.0, 2500.0)
+    """m, lengths of changes that are tried; assumed."""
+    changes: tuple[float, ...] = tuple(np.geomspace(0.01, 0.32, 7).tolist())
+    """Standard deviations of ln extinction by changes within a block that are tried. Larger ones
+    follow the noise of triangles: errors in a drifting plume grow by a fifth; simulations."""
+    correlations: tuple[float, ...] = (0.3, 0.7, 0.95, 0.995)
+    """Correlations of changes from one profile to the next that are tried; assumed."""
+    least_change: float = 9.0
+    """Gain in -2 ln likelihood that tells changes, or changes from larger ones: 3 standard
+    errors."""
+    linear_change: float = 0.02
+    """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
+    its mean; simulations."""
+    linear_noise: float = 0.015
+    """Standard deviation by noise of the logarithm of a signal at a crossing, below which a profile
+    needs no running mean; simulations."""
+    least_profiles: int = 5
+    """Profiles below which a block has no changes: a bad one would make them; simulations."""
+    settled_share: float = 0.1
+    """Share of its error by which a field may change in the last pass; chosen."""
+    neighbours: int = 3
+    """Profiles before and after each one, with whose medians it is compared: one of three may be
+    unlike the others; assumed."""
+    least_neighbourly: float = 1e-9
+    """Probability of the chi-square of a beam about its neighbours, below which its profile is no
+    part of a block; chosen."""
+    default_overlap_error: float = 0.005
+    """Relative error of the overlap at the nearest crossing of each beam, which those of others do
+    not show where it is alike; products replace it by the declared one. Simulations."""
 
     # The solution
     longest_step: float = 1.5
     """Largest step of the logarithm of a constant in one pass; assumed."""
     converged_step: float = 1e-3
     """Largest change of a logarithm in the last pass of a converged solution; assumed."""
-    thinnest_beam: float = 1e-3
-    """Smallest optical depth of a beam for the start constants; assumed."""
-    thickest_beam: float = 30.0
-    """The largest one; assumed."""
+    least_fall: float = 1e-3
+    """Least fall of the signals along all beams, for the start constants; assumed."""
+    largest_rise: float = 30.0
+    """Largest rise of the logarithm along a beam, for these; assumed."""
     smallest_pivot: float = 1e-13
     """Smallest pivot of a regular matrix over its diagonal; rounding."""
     weak_precision: float = 1e-2
@@ -120,31 +128,14 @@ class Thresholds(NamedTuple):
     largest_variance: float = 4.0
     """Variance of ln extinction beyond which it is not determined; assumed."""
 
-    # Errors that the block shows: ablation
-    nonlinear_error: float = 0.1
-    """Typical relative error of a block, beyond which the error of a profile depends on its noise;
-    assumed."""
-    bend: float = 0.15
-    """Standard deviation of ln extinction over the crossings by the curvature of a field: that of a
-    gradient; the largest part of the errors of single profiles. With half of it and a `doubt` of
-    1.5, or with at most the deviation of the prior, fewer than 94 percent of the 95 percent
-    intervals of plumes hold the truth in blocks of 1 (``benchmarks stability``), and those of
-    homogeneous air are still too wide: what makes these right makes plumes false."""
-    largest_deviation: float = 8.0
-    """Limit of the deviation of a profile from the median, in median standard errors; assumed."""
-
-    # Flags and systematic errors
+    # Flags
     largest_relative_error: float = 1.0 / 3.0
     """Relative standard error beyond which a linear error does not describe a value: it is flagged;
     assumed."""
     least_probability: float = 1e-4
     """Probability of a chi-square below which a fit is poor; chosen."""
-    relative_change: float = 1e-2
-    """Relative change of signals for sensitivities; assumed."""
     bins_beyond: int = 200
     """Bins kept beyond the farthest crossing: over twice the widest window of a bin."""
-    most_separate_beams: int = 16
-    """Number of beams up to which their errors are computed one by one; assumed, for run time."""
 
 
 THRESHOLDS: Final = Thresholds()

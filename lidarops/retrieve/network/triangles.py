@@ -18,16 +18,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
-from lidarops.retrieve.network import _block_errors
-from lidarops.retrieve.network._beam_signals import BeamSignals, Estimates
-from lidarops.retrieve.network._condensed_signals import FitLayout
+from lidarops.retrieve.network import _block_solution
+from lidarops.retrieve.network._beam_signals import Block, Causes, Estimates
+from lidarops.retrieve.network._condensed_signals import Beams, FitLayout, places
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 
@@ -87,35 +87,35 @@ class Triangle:
     """(3,) m, exponent times length, negative towards the lidar."""
 
 
-def solve_triangles(beams: BeamSignals, multiplier: Array | None) -> Estimates:
+def solve_triangles(block: Block, multiplier: Array | None) -> Estimates:
     """Solve the triangle of each crossing, and return its values with their errors.
 
     Parameters
     ----------
-    beams : BeamSignals
+    block : Block
     multiplier : (profile, crossing) float, optional
-        Chosen for each block and crossing where not given.
+        Chosen for each crossing where not given.
     """
-    out = Estimates.missing(beams)
+    out = Estimates.missing(len(block.reach), block.layout)
     out.multiplier_error[:], out.open[:] = np.nan, True
-    # Change of the logarithm of extinction with that of the signals, (profile, crossing, passage).
-    carried = np.zeros((*out.extinction.shape, beams.layout.passages.beam.size))
-    for crossing, triangle in find_triangles(beams.layout, beams.exponent).items():
-        rows = _Rows.of(beams, triangle)
-        out.open[crossing] = False
-        for block in np.unique(beams.block):
-            members = np.flatnonzero((beams.block == block) & rows.usable)
-            if members.size:
-                given = None if multiplier is None else multiplier[members, crossing]
-                place = members, crossing
-                _solve_block(rows.take(members), triangle, given, out, carried, place)
-    for block in np.unique(beams.block):
-        members = np.flatnonzero(beams.block == block)
-        signals = beams.data.take(members)
-        out.variance[members] += _block_errors.curvature_variance(signals, carried[members])
+    condensed = _block_solution.condense_alone(block)
+    beams = condensed.beams
+    # Change of the logarithm of extinction with u and I, (profile, crossing, beam, 2 passage).
+    carried = np.zeros((*out.extinction.shape, *beams.covariance.shape[1:3]))
+    for crossing, triangle in find_triangles(block.layout, block.exponent).items():
+        out.open[:, crossing] = False
+        rows = _Rows.of(beams, block.layout, triangle)
+        members = np.flatnonzero(rows.usable)
+        if members.size:
+            given = None if multiplier is None else multiplier[members, crossing]
+            _solve(rows.take(members), triangle, given, out, carried, (members, crossing))
     out.variance[:] *= out.extinction**2
-    out.prior_true_variance[:] = out.variance
-    return out
+
+    def respond(causes: Causes) -> Array:
+        changes = _block_solution.bins_alone(block, condensed).changes(causes)
+        return np.asarray(np.einsum("tcbp,tbpk->tck", carried, changes))
+
+    return out.with_response(block, respond)
 
 
 def find_triangles(layout: FitLayout, exponent: Array) -> dict[int, Triangle]:
@@ -171,38 +171,38 @@ class _Rows:
     """(profile, row, 3, 3) of ln start, ln end and the integral of each row."""
     usable: Booleans
     """(profile,)."""
+    beam: Indices
+    """(row,) of the block."""
+    taken: Array
+    """(row, 3, 2 passage) which of u and I, with sign, are ln start, ln end and the integral."""
 
     @classmethod
-    def of(cls, beams: BeamSignals, triangle: Triangle) -> _Rows:
+    def of(cls, beams: Beams, layout: FitLayout, triangle: Triangle) -> _Rows:
         """Return the rows of all profiles."""
-        data, layout = beams.data, beams.layout
-        profiles = len(data.log_value)
-        integral, covariance = np.empty((profiles, _BEAMS)), np.empty((profiles, _BEAMS, 3, 3))
-        for row, (first, last) in enumerate(zip(triangle.first, triangle.last, strict=True)):
-            between = slice(min(first, last), max(first, last))
-            integral[:, row] = triangle.direction[row] * data.integral[:, between].sum(axis=1)
-            beam = layout.passages.beam[first]
-            own = layout.first_passage[beam]
-            count = int(layout.first_passage[beam + 1] - own)
-            taken = np.zeros((3, 2 * count - 1))
-            taken[0, first - own] = taken[1, last - own] = 1.0
-            steps = slice(count + between.start - own, count + between.stop - own)
-            taken[2, steps] = triangle.direction[row]
-            packed = data.covariance[:, layout.offset[beam] : layout.offset[beam + 1]]
-            square = packed.reshape(profiles, 2 * count - 1, 2 * count - 1)
-            covariance[:, row] = taken @ square @ taken.T
-        start, end = (np.exp(data.log_value[:, ends]) for ends in (triangle.first, triangle.last))
-        usable = data.usable[:, np.concatenate([triangle.first, triangle.last])].all(axis=1)
-        return cls(start, end, integral, covariance, np.asarray(usable))
+        beam, place = places(layout)
+        most = beams.value.shape[2]
+        taken = np.zeros((_BEAMS, 3, 2 * most))
+        own, first, last = beam[triangle.first], place[triangle.first], place[triangle.last]
+        for row in range(_BEAMS):
+            between = slice(most + min(first[row], last[row]), most + max(first[row], last[row]))
+            taken[row, 0, first[row]] = taken[row, 1, last[row]] = 1.0
+            taken[row, 2, between] = triangle.direction[row]
+        signal = np.concatenate([beams.value, beams.integral], axis=2)[:, own, :, np.newaxis]
+        start, end, integral = np.moveaxis((taken @ signal)[..., 0], 2, 0)
+        covariance = taken @ beams.covariance[:, own] @ taken.swapaxes(1, 2)
+        usable = np.asarray((beams.reach[:, own] > np.maximum(first, last)).all(axis=1))
+        return cls(np.exp(start), np.exp(end), integral, covariance, usable, own, taken)
 
     def take(self, profiles: Indices) -> _Rows:
         """Return the selected profiles."""
-        return _Rows(*(getattr(self, name)[profiles] for name in self.__slots__))
+        names = ("start", "end", "integral", "covariance", "usable")
+        return replace(self, **{name: getattr(self, name)[profiles] for name in names})
 
     def solve(self, multiplier: Array) -> tuple[Array, Array, Array]:
         """Return reciprocal extinction, the variance of its logarithm, and its derivatives.
 
-        The derivatives are those of the logarithm by ln start and ln end, (profile, 2, row).
+        The (profile, row, 3) derivatives are those of the logarithm by ln start, ln end and the
+        integral.
         """
         sums = _sum_rows(self.start, self.end, self.integral, multiplier)
         by_integral = sums.by_integral / sums.reciprocal[:, np.newaxis]
@@ -211,10 +211,10 @@ class _Rows:
             [-by_ratio - by_integral * self.integral, by_ratio, by_integral], axis=-1
         )
         variance = np.einsum("nri,nrij,nrj->n", derivative, self.covariance, derivative)
-        return sums.reciprocal, variance, derivative[..., :2].transpose(0, 2, 1)
+        return sums.reciprocal, variance, derivative
 
 
-def _solve_block(
+def _solve(
     rows: _Rows,
     triangle: Triangle,
     multiplier: Array | None,
@@ -222,7 +222,7 @@ def _solve_block(
     carried: Array,
     place: tuple[Indices, int],
 ) -> None:
-    """Solve the profiles of one block, in place; the variance is that of the logarithm."""
+    """Solve the triangle of one crossing, in place; the variance is that of the logarithm."""
     with np.errstate(all="ignore"):
         # The extinction of homogeneous air that the first beam shows.
         level = float(np.median((rows.start[:, 0] - rows.end[:, 0]) / rows.integral[:, 0]))
@@ -239,9 +239,9 @@ def _solve_block(
     # Where the block shows no attenuation, the error is unknown unless the rows cancel.
     out.multiplier_error[place] = np.where(multiplier == 1.0, 0.0, error) * extinction
     members, crossing = place
-    for values, ends in enumerate((triangle.first, triangle.last)):
-        for row, passage in enumerate(ends):
-            carried[members, crossing, passage] -= np.where(solved, derivative[:, values, row], 0.0)
+    by_signal = -np.where(solved[:, np.newaxis, np.newaxis], derivative, 0.0)
+    for row, beam in enumerate(rows.beam):
+        carried[members, crossing, beam] += by_signal[:, row] @ rows.taken[row]
 
 
 def _choose(rows: _Rows, depth: Array, level: float) -> float:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.stability import random_networks
 from benchmarks.stability.random_networks import score_networks
+from lidarops.retrieve.network import _block_solution, _changing_field
+from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 pytestmark = pytest.mark.slow
 
@@ -26,16 +29,25 @@ pytestmark = pytest.mark.slow
         (338, "plume that drifts within a block", 22),
     ],
 )
-def test_networks_with_once_too_small_errors_state_them(cluster, failure, false_before):
+def test_networks_with_once_too_small_errors_state_them(
+    cluster, failure, false_before, monkeypatch
+):
     """These random networks once had almost all false values of the benchmark."""
-    scored = next(
-        values for values in score_networks(cluster, 50) if values.failure.name == failure
-    )
+
+    def scored_values():
+        return next(
+            values for values in score_networks(cluster, 50) if values.failure.name == failure
+        )
+
+    scored = scored_values()
     kept = np.isfinite(scored.error) & (scored.bits == 0)
     false = kept & (np.abs(scored.error) > 4.0 * scored.random)
     assert false.sum() <= 0.01 * false_before
     if kept.sum() > 50:
-        # The stated errors are not much too large.
+        # The stated errors are not much too large, without the error of an overlap that is right.
+        known = THRESHOLDS._replace(default_overlap_error=0.0)
+        monkeypatch.setattr(_block_solution, "THRESHOLDS", known)
+        scored = scored_values()
         assert np.median((scored.random / np.abs(scored.error))[kept]) < 2.0
 
 
@@ -53,3 +65,21 @@ def test_random_networks_state_the_errors_of_thin_layers():
     )
     assert errors.size > 200
     assert np.mean(errors > 4.0) < 0.005
+
+
+@pytest.mark.parametrize("cluster", [3, 43])
+def test_the_errors_of_stratified_air_are_right(cluster, monkeypatch):
+    """Without a prior for it, values of layered air deviate by more than their errors."""
+
+    def covered():
+        (values,) = random_networks.score_short_blocks(
+            cluster, 6, draw_air=random_networks.layered, name="layered", length=3
+        )
+        kept = np.isfinite(values.error) & (values.bits == 0)
+        assert kept.mean() > 0.5
+        return np.mean((np.abs(values.error) < 1.96 * values.random)[kept])
+
+    assert covered() > 0.95
+    changed = THRESHOLDS._replace(stratified=(0.1, 400.0))
+    monkeypatch.setattr(_changing_field, "THRESHOLDS", changed)
+    assert covered() < 0.85

@@ -142,6 +142,17 @@ def test_intervals_are_joined_by_the_clock():
     np.testing.assert_array_equal(doubted, [True, False, False, False, True, True])
 
 
+def test_gaps_in_time_are_missing_profiles_of_the_block():
+    filled = labeled._without_gaps(np.array([0, 1, 5, 72, 75, 300]), 72)
+    assert filled.tolist() == [*range(6), *range(72, 76), 300]
+    beams = [beam(number) for number in range(3)]
+    given = np.array([100, 101, 102, 120, 121, 122])
+    result = solved([replace(each, interval=given) for each in beams])
+    assert result.sizes["time"] == 6
+    np.testing.assert_array_equal(result["time"], solved(beams)["time"])
+    assert (result["quality_flag"] == 0).all()
+
+
 def test_pile_up_is_kept_where_the_signal_is_used():
     beams = [beam(number) for number in range(3)]
     for far, stated in ((2000.0, True), (300.0, False)):

@@ -48,14 +48,25 @@ def solved(net, r, power, variance, **settings):
     return retrieve_network(power, r, net, variance=variance, **settings)
 
 
+class Condensed:
+    """Condensed signals with what is known about each beam."""
+
+    def __init__(self, data, beams):
+        self.log_value, self.integral, self.covariance, self.reach = data.beams[:4]
+        self.bridged = np.stack([beam.bridged for beam in beams], axis=1)
+        self.status = np.stack([beam.status for beam in beams], axis=1)
+
+
 def condensed(net, r, power, variance, *, screened=True, nearest=100.0):
     ranges = np.tile(r, (net.beams, 1))
     layout = _condensed_signals.lay_out_fits(net, ranges, None, np.full(net.beams, nearest), BINS)
     variances = np.broadcast_to(variance, power.shape)
     patched = nullcontext() if screened else patch.object(outlying_bins, "search")
     with patched:
-        data = _condensed_signals.condense(power, variances, np.ones(net.beams), layout)
-    return data, layout
+        beams = _condensed_signals.clean(
+            power, variances, np.ones(net.beams), layout, together=False
+        )
+    return Condensed(_condensed_signals.condense(beams, layout), beams), layout
 
 
 def hit(power, variance, profile, beam, index, size):
@@ -87,7 +98,7 @@ def test_air_and_noise_do_not_change_at_all(name, step):
         screened, _ = condensed(net, r, power, variance)
         unscreened, _ = condensed(net, r, power, variance, screened=False)
         assert not screened.bridged.any()
-        for quantity in ("log_value", "integral", "usable", "covariance", "status"):
+        for quantity in ("log_value", "integral", "reach", "covariance", "status"):
             np.testing.assert_array_equal(
                 getattr(screened, quantity), getattr(unscreened, quantity)
             )
@@ -151,7 +162,7 @@ def test_adjacent_spikes_are_flagged_and_left_in_place(sizes):
     result, _ = condensed(net, r, damaged, variance)
     unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     assert result.bridged[:, 0].mean() > 0.95
-    left = np.all(result.log_value == unscreened.log_value, axis=1)
+    left = np.all(result.log_value == unscreened.log_value, axis=(1, 2))
     assert left.mean() > 0.95
 
 
@@ -207,10 +218,7 @@ def layer(x, y, z):
 @pytest.mark.parametrize("step", [5.0, 2.0])
 @pytest.mark.parametrize(("field", "most"), [(ALL["plume"], 3.2), (layer, 5.0)])
 def test_single_outlying_bins_in_curved_air_change_little(field, most, step):
-    """Lines from one to the next would remove the plume and raise the errors.
-
-    They are compared with the scatter of clean signals about the truth, not with what is stated.
-    """
+    """Lines from one to the next would remove the plume and raise the errors."""
     net = three_by_two()
     r = grid(net, step)
     power, variance = noisy(net, r, signals(net, r, field), 0.01, 60, 3, 0.003)
@@ -221,8 +229,8 @@ def test_single_outlying_bins_in_curved_air_change_little(field, most, step):
         beam[rng.integers(5, 25) : -4 : 25] = True
     result = solved(net, r, power + outlying * 30.0 * np.sqrt(variance), variance)
     near = result.near_crossing
-    scatter = np.sqrt(np.nanmean((clean.extinction - field(*net.crossing.T))[:, near] ** 2))
-    assert np.nanmedian(result.extinction_standard_error[:, near]) < most * scatter
+    ratio = result.extinction_standard_error / clean.extinction_standard_error
+    assert np.nanmedian(ratio[:, near]) < most
 
 
 @pytest.mark.parametrize("share", [0.02, 0.04])
@@ -308,19 +316,17 @@ def test_variances_of_bridged_beams_agree_with_their_scatter(where, relative):
     data, layout = condensed(net, r, damaged, variance)
     unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     assert data.bridged[:, 0].all()
-    left = np.all(data.integral == unscreened.integral, axis=1)
+    left = np.all(data.integral == unscreened.integral, axis=(1, 2))
     assert left.mean() < 0.1
-    first, last = layout.first_passage[:2]
-    count = last - first
-    size = 2 * count - 1
-    stated = data.covariance[:, layout.offset[0] : layout.offset[1]].reshape(-1, size, size)
-    good = (data.usable[:, first:last] == 1).all(axis=1) & ~left
+    count = layout.first_passage[1]
+    stated = data.covariance[:, 0]
+    good = (data.reach[:, 0] == count) & ~left
     truth, _ = condensed(
         net, r, signals(net, r, ALL["homogeneous"])[None], variance, screened=False
     )
     for c in range(1, count):
         # The far value and the integral, relative to the near value.
-        difference = data.log_value[good, first + c] - truth.log_value[0, first + c]
+        difference = data.log_value[good, 0, c] - truth.log_value[0, 0, c]
         spread = stated[good, c, c] + stated[good, 0, 0] - 2 * stated[good, 0, c]
         assert np.std(difference / np.sqrt(spread)) == pytest.approx(1.0, abs=0.08)
         assert (
@@ -361,12 +367,12 @@ def test_results_do_not_depend_on_other_profiles():
     assert together.raised(Quality.OUTLIER).any()
     for n in (0, 11, 23):
         single = solved(net, r, damaged[n], variance, prior="none")
-        np.testing.assert_array_equal(single.extinction, together.extinction[n])
+        np.testing.assert_allclose(single.extinction, together.extinction[n], rtol=1e-9)
         np.testing.assert_array_equal(
             single.raised(Quality.OUTLIER), together.raised(Quality.OUTLIER)[n]
         )
     reversed_result = solved(net, r, damaged[::-1], variance, prior="none")
-    np.testing.assert_array_equal(reversed_result.extinction[::-1], together.extinction)
+    np.testing.assert_allclose(reversed_result.extinction[::-1], together.extinction, rtol=1e-9)
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.6])
@@ -391,20 +397,16 @@ def test_one_percent_of_outlying_bins_leaves_values_within_their_errors(exponent
 def test_spikes_left_in_place_are_part_of_the_standard_error(sizes):
     net, r, power, variance = scene(relative=0.02)
     damaged = spiked(net, r, power, variance, sizes)
-    result, layout = condensed(net, r, damaged, variance)
+    result, _ = condensed(net, r, damaged, variance)
     unscreened, _ = condensed(net, r, damaged, variance, screened=False)
     clean, _ = condensed(net, r, power, variance)
-    size = 2 * int(layout.first_passage[1]) - 1
-    reported, own = (
-        entry.covariance[:, : layout.offset[1]].reshape(-1, size, size)
-        for entry in (result, unscreened)
-    )
-    left = (result.bridged[:, 0] == 1) & np.all(result.log_value == unscreened.log_value, axis=1)
+    reported, own = result.covariance[:, 0], unscreened.covariance[:, 0]
+    left = result.bridged[:, 0] & np.all(result.log_value == unscreened.log_value, axis=(1, 2))
     assert left.all()
     added = (reported - own)[left]
     # One direction, by the shift of the beam through the spikes, except for noise.
     assert np.all(np.linalg.matrix_rank(added, tol=1e-9 * np.abs(added).max()) == 1)
-    shift = (unscreened.log_value - clean.log_value)[left, 1]
+    shift = (unscreened.log_value - clean.log_value)[left, 0, 1]
     stated = np.sqrt(added[:, 0, 0] + added[:, 1, 1] - 2.0 * added[:, 0, 1])
     np.testing.assert_allclose(stated, np.abs(shift), rtol=0.3)
     assert not np.allclose(reported[left], own[left], rtol=0.1)

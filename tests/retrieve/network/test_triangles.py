@@ -153,7 +153,7 @@ def test_the_chosen_multiplier_is_no_worse_than_any_fixed_one(relative):
 
 
 @pytest.mark.parametrize(
-    ("air", "share"), [(homogeneous(), 0.967), (gradient, 0.878), (plume, 0.976)]
+    ("air", "share"), [(homogeneous(), 0.967), (gradient, 0.907), (plume, 0.976)]
 )
 def test_all_beams_together_are_better_than_a_triangle(air, share):
     """The stated bias is that of homogeneous air, so that it falls short in a gradient."""

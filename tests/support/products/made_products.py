@@ -496,7 +496,6 @@ def visibility(
             **{name: (pair, np.where(lost, np.nan, found)) for name, found in values.items()},
             **{name: ("time", np.full(profiles, found)) for name, found in scalars.items()},
             "retrieval_method": 0,
-            "prior_deviation": ("time", np.full(profiles, np.nan)),
             "quality_flag": (pair, flags),
             "shots": ("time", np.full(profiles, 9000, np.int32)),
             "beam_range": (("beam", "crossing"), distance),

@@ -243,7 +243,6 @@ def _refused_cases() -> tuple[StiffCase, ...]:
         _refused("negative variance", "variance", variance=-1.0),
         _refused("neither overlap nor range of full overlap", None, full_overlap_range=None),
         _refused("exponent of zero", "exponent", exponent=0.0),
-        _refused("no bin in the fit", "bins", bins=0),
         _refused("unknown prior", "prior", prior="magic"),
     )  # fmt: skip
 
