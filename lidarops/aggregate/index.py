@@ -150,9 +150,10 @@ class KnownFacts:
         """Return the facts of a product that has not changed since; None where it may have."""
         row = self._rows.get(path)
         file = self._root / path
-        if row is None or file.lstat().st_size != row["size"]:
-            return None
+        # A file may vanish meanwhile.
         with suppress(OSError):
+            if row is None or file.lstat().st_size != row["size"]:
+                return None
             sha256 = sha256_of(file)
             if bytes.fromhex(sha256).startswith(row["sha256_prefix"]):
                 return _facts(row, sha256)

@@ -92,7 +92,7 @@ _WIDEST: Final = 5000.0
 """m, largest distance of sounding levels below 20 km: beyond, temperature is not linear."""
 _ZERO_CELSIUS: Final = 273.15
 _LARGEST: Final = 100_000_000
-"""Bytes; largest file, and largest variable in memory, that is read."""
+"""Bytes; largest file that is read, and most that its variables may take in memory."""
 # Not annotated by xarray. Unlike a dataset, it reads nothing of coordinates when it opens a file.
 _STORE: Final[Any] = xr.backends.NetCDF4DataStore
 
@@ -537,13 +537,15 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
     }
 
 
-def _column(stored: xr.Variable, file: str, name: str) -> tuple[str, Array]:
-    """Return the unit and the values of a variable."""
+def _refuse_large(variables: Mapping[str, xr.Variable], file: str) -> None:
     # HDF5 reads whole chunks.
-    chunk = math.prod(stored.encoding.get("chunksizes") or ())
-    if stored.dtype.itemsize * max(stored.size, chunk) > _LARGEST:
-        raise AncillaryError("is larger than any profile", file=file, field=name)
-    return str(stored.attrs.get("units", "")), stored.values.astype(float)
+    sizes = {
+        name: one.dtype.itemsize * max(one.size, math.prod(one.encoding.get("chunksizes") or ()))
+        for name, one in variables.items()
+    }
+    if sum(sizes.values()) > _LARGEST:
+        largest = max(sizes, key=lambda name: sizes[name])
+        raise AncillaryError("is larger than any profile", file=file, field=largest)
 
 
 def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
@@ -554,7 +556,11 @@ def _netcdf(path: Path, file: str) -> dict[str, tuple[str, Array]]:
                 stored, attributes, decode_times=False
             )
             numbers = {str(n): one for n, one in variables.items() if one.dtype.kind in "iuf"}
-            return {name: _column(one, file, name) for name, one in numbers.items()}
+            _refuse_large(numbers, file)
+            return {
+                name: (str(one.attrs.get("units", "")), one.values.astype(float))
+                for name, one in numbers.items()
+            }
     except AncillaryError:
         raise
     except (OSError, ValueError, RuntimeError, TypeError) as error:

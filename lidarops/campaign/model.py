@@ -492,6 +492,8 @@ class Scenes(SettingsModel):
 
     @model_validator(mode="after")
     def _divides_day(self) -> Self:
+        if self.time_limit is not None and self.time_limit < timedelta(seconds=1):
+            raise ValueError("time_limit must be at least 1 s")
         if isinstance(self.window, timedelta):
             seconds = self.window.total_seconds()
             if seconds < 60 or 86400 % seconds:

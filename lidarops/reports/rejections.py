@@ -17,7 +17,7 @@ from lidarops.units import written
 MANY: Final = 0.25
 """Least share of the values that a flag rejects to be named."""
 _STAGES: Final = {
-    "incomplete_overlap": "overlap", "unknown_overlap": "overlap", "saturated": "dead_time",
+    "incomplete_overlap": "overlap", "saturated": "dead_time",
     "negative_backscatter": "overlap", "poor_stratification": "dead_time",
     "no_gluing": "lag", "no_reference": "reference", "unstable_inversion": "reference",
     "low_signal": "average", "not_homogeneous": "homogeneous", "no_signal": "read",

@@ -398,6 +398,7 @@ REFUSED = [
     pytest.param(_link, "lies outside", id="link"),
     pytest.param(_loop, "o.csv", id="loop"),
     pytest.param(_pipe, "is no regular file", id="pipe"),
+    pytest.param(_bomb(2, 8_000_000), "range: is larger than any", id="variables together"),
     pytest.param(_bomb(2, 10**10), "range: is larger than any", id="bomb"),
     pytest.param(_bomb(10**8, 2), "overlap: is larger than any", id="bomb of a chunk"),
     pytest.param(lambda _: "a\0b", "cannot be read", id="nul"),

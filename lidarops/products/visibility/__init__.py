@@ -37,8 +37,8 @@ class VisibilityProductSettings(NetworkProduct):
     )
     prior: PriorName = Field(
         default="block",
-        description="block takes mean and spread of the extinction from the averages of the block"
-        " themselves; none solves each average alone",
+        description="block: the averages of a block are one field that changes slowly; none: each"
+        " average is solved alone",
     )
     multiplier: MultiplierValue | None = quantity(
         None,

@@ -278,7 +278,7 @@ def _end(sums: Array) -> int:
     for k in range(altitudes):
         # The window begins at the altitude, and is moved inside the grid.
         j = min(k + _PAD, max(altitudes - 1 - _PAD, (altitudes - 1) // 2))
-        least = 1.5**2 * sums[1, j] * sums[2, j]
+        least = THRESHOLDS.lowest_snr**2 * sums[1, j] * sums[2, j]
         if sums[2, j] > 0.0 and not (sums[0, j] > 0.0 and sums[0, j] * sums[0, j] > least):
             return k
     return int(altitudes)

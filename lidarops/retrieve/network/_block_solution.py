@@ -301,6 +301,8 @@ def solve_block(block: Block) -> Estimates:
     if mean is None:
         out = Estimates.missing(len(block.reach), block.layout)
         out.leave_out(block, np.where(odd[:, np.newaxis], block.reach, 0))
+        # They have signals, but no solution that converged.
+        out.chi_square[odd] = out.degrees_of_freedom[odd] = 0.0
         return out
     signals, field, settled = _solve_profiles(block, mean)
     out = _assess(block, signals, field, mean, settled & ~odd)

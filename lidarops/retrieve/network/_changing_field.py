@@ -63,7 +63,7 @@ class Change(NamedTuple):
     """From one profile to the next."""
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=4)
 def _modes(places: tuple[int, ...], correlations: tuple[float, ...]) -> tuple[Array, Array]:
     """Return (correlation, mode) variances and (correlation, mode, profile) vectors.
 

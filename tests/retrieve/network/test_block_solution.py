@@ -211,6 +211,8 @@ def test_a_bad_profile_makes_no_other_one_of_a_short_block_false(build, profiles
             # Of two profiles that disagree, either may be the bad one.
             lost = (np.arange(profiles) == bad) | (profiles == 2)
             np.testing.assert_array_equal(result.flagged[:, near].all(axis=1), lost)
+            poor = result.raised(NetworkQuality.POOR_FIT)[:, near].all(axis=1)
+            np.testing.assert_array_equal(poor, lost)
             score = (result.extinction[:, near] - truth) / result.extinction_standard_error[:, near]
             scores.append(score[~lost])
     assert np.all(np.abs(np.concatenate(scores)) < 4.0)
