@@ -144,7 +144,9 @@ class KnownFacts:
         with suppress(*NO_FILE, LidarOpsError):
             table = _read(index, EVERYTHING, None)
             if table.schema.metadata.get(_READ_BY) == _facts_version():
-                self._rows = {row["path"]: row for row in table.to_pylist()}
+                # A package that adds a kind may have gone.
+                rows = (row for row in table.to_pylist() if row["kind"] in kinds())
+                self._rows = {row["path"]: row for row in rows}
 
     def of(self, path: str) -> Facts | None:
         """Return the facts of a product that has not changed since; None where it may have."""

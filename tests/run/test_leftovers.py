@@ -325,7 +325,7 @@ def test_an_emptied_archive_fails_and_its_catalog_stays(archive: Archive, comman
     before = archive.contents("out/products")
     options = ["--remove-orphans"] if command == "reprocess" else []
     result = CliRunner().invoke(app, [command, str(archive.file), *options])
-    assert result.exit_code == 1
+    assert result.exit_code == 3
     for words in ("the catalog stays unchanged", "mounted", "on purpose", campaign.catalog_url):
         assert words in result.stderr
     with Store(campaign.catalog_url, campaign.name) as store:

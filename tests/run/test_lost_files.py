@@ -367,7 +367,8 @@ def test_listings_that_are_cut_anywhere_worsen_no_product(
         share = draw.random()
         server.damaged = lambda page, share=share: page[: int(share * len(page))]
         done = CliRunner().invoke(app, ["reprocess", str(archive.file)])
-        assert done.exit_code == 1
+        # The server gives no whole listing.
+        assert done.exit_code in {1, 3}
         assert archive.contents("out/products") == before
     server.damaged = bytes
     assert reprocess(archive.write()) is None

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from support.servers.ports import KEYS, free_port
 
-from lidarops.errors import CatalogError, ProductError
+from lidarops.errors import CatalogError, ProductError, UnavailableError
 from lidarops.system.stores import RemoteStore, without_keys
 
 
@@ -122,7 +122,7 @@ def test_a_failed_upload_leaves_the_old_object(
     for name in ("put", "mv"):
         monkeypatch.setattr(fs, name, broken)
     changed = products(root, a=b"another")
-    with pytest.raises(ProductError, match="cannot be written"):
+    with pytest.raises(UnavailableError, match="cannot be written"):
         store.publish(root, changed, journal)
     assert [(each.path, each.size) for each in store.files()] == [("coast/a.nc", 3)]
     monkeypatch.undo()
@@ -186,7 +186,7 @@ def test_a_store_that_does_not_answer_is_reported(
         list(store.files())
     with pytest.raises(CatalogError, match="cannot be read"):
         store.fetch(["a"], tmp_path)
-    with pytest.raises(ProductError, match="cannot be listed"):
+    with pytest.raises(UnavailableError, match="cannot be listed"):
         store.publish(tmp_path, products(tmp_path, a=b"1"), tmp_path / "journal")
     s3fs.S3FileSystem.clear_instance_cache()
 

@@ -212,6 +212,8 @@ def test_single_files_are_right_within_their_errors_or_have_no_reference(data_ro
         reference=labeled.Reference(**dict(reference)),
         overlap_is_stated=True,
     )
+    # Products end above all clouds.
+    true, compared = true[: result.sizes["range"]], compared[: result.sizes["range"]]
     score = (result["aerosol_backscatter"].values - true) / result[
         "aerosol_backscatter_standard_error"
     ].values

@@ -160,8 +160,10 @@ def _network_cases() -> tuple[StiffCase, ...]:
         *(
             _case(f"A h a beam of {value:g}", build=partial(_bad_beam, value), solve=_solve_network,
                   expected=(Rejected(),))
-            for value in (np.nan, 0.0, -1.0, np.inf)
+            for value in (np.nan, -1.0, np.inf)
         ),
+        _case("A h a beam of 0", build=partial(_bad_beam, 0.0), solve=_solve_network,
+              expected=(honest,)),
         *(
             _case(f"A h one bin of {value:g}", build=partial(_bad_bin, value), solve=_solve_network,
                   expected=(honest,))
