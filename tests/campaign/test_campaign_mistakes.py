@@ -188,6 +188,11 @@ def _message(folder: Path, text: str) -> str:
                 "lidra: not in instruments; did you mean 'lidar'?"
             ),
         ),
+        (
+            "scenes: {window: day}",
+            ("networks: {pair: {instruments: [lidar, b], visibility: {channel: a, average: 1s}}}"),
+            "line 19: networks.pair.visibility: block must hold at most 500 averages",
+        ),
     ],
 )
 def test_a_mistake_is_located_and_explained(

@@ -26,6 +26,10 @@ PriorName = Literal["block", "none"]
 MultiplierValue = Annotated[float, Field(ge=0, le=1)] | Literal["chosen"]
 
 
+_MOST_AVERAGES: Final = 500
+"""Averages of a block, whose memory and time grow with the square and the cube of their number."""
+
+
 class VisibilityProductSettings(NetworkProduct):
     """The ``visibility`` product: extinction and visibility where beams of lidars cross."""
 
@@ -92,6 +96,8 @@ class VisibilityProductSettings(NetworkProduct):
     def _consistent(self) -> Self:
         if self.block % self.average:
             raise ValueError("block must be a multiple of average")
+        if self.block > _MOST_AVERAGES * self.average:
+            raise ValueError(f"block must hold at most {_MOST_AVERAGES} averages")
         if self.multiplier is not None and "prior" in self.model_fields_set:
             raise located_error("is not used with a multiplier: leave one of them out", "prior")
         return self
