@@ -228,14 +228,25 @@ def test_the_network_reaches_the_required_accuracy(case):
         assert 0.7 < score["χ²/dof"].value < 1.3
 
 
-def test_unflagged_values_of_the_network_are_as_stated(case):
+@pytest.mark.parametrize(
+    "moving",
+    [
+        False,
+        pytest.param(
+            True,
+            marks=pytest.mark.xfail(
+                strict=True, reason="46 % of ten profiles of a drifting plume are flagged at 5 %"
+            ),
+        ),
+    ],
+)
+def test_unflagged_values_of_the_network_are_as_stated(case, moving):
     for lidars in network_cases.LIDAR_LINES:
-        for air in network_cases.AIRS[:4]:
+        for air in (air for air in network_cases.AIRS[:4] if air.moving is moving):
             for noise in network_cases.NOISES:
                 score = case(lidars, air.name, noise)[network_cases.NETWORK.name]
                 assert score["within 3"].value >= 0.98
-                # Air that moves may change too fast for ten profiles to tell how.
-                assert air.moving or score["flagged"].value < 0.1
+                assert score["flagged"].value < 0.1
 
 
 def test_the_network_agrees_with_a_plain_fit(accuracy):
