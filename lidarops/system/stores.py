@@ -48,6 +48,8 @@ _QUERY: Final = re.compile(
 )
 WITHOUT_KEYS: Final = rf"^(?!.*(?:{_KEYS.pattern}|{_QUERY.pattern}))"
 """Regular expression of texts that `without_keys` leaves as they are, for JSON schemas."""
+_LONGEST_SILENCE: Final = 30.0
+"""s after which a web server that sends nothing counts as unreachable; s3fs takes 5 and 15 s."""
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
 _NAMES_SHOWN: Final = 3
@@ -163,7 +165,7 @@ class RemoteStore:
         self._given = ""
         """Name of the last object of which the store gave the begin."""
         if self._scheme in _READ_ONLY:
-            self._fs.client_kwargs = {**self._fs.client_kwargs, "response_class": _whole_page()}
+            self._fs.client_kwargs = {**_client_options(), **self._fs.client_kwargs}
 
     def files(self, is_used: Callable[[str], bool] = lambda _: True) -> Iterator[Stored]:
         """List all objects below the URL, sorted by path.
@@ -469,6 +471,15 @@ class RemoteStore:
                 file=self.url,
                 remedy="check address, network and keys",
             ) from error
+
+
+def _client_options() -> dict[str, Any]:
+    """Return how web servers are asked: a page that is cut, and silence, raise an error."""
+    from aiohttp import ClientTimeout  # noqa: PLC0415 - the driver of http and https
+
+    # Large files may take longer than the 5 min that the driver allows, but not without any byte.
+    silence = ClientTimeout(total=None, sock_connect=_LONGEST_SILENCE, sock_read=_LONGEST_SILENCE)
+    return {"response_class": _whole_page(), "timeout": silence}
 
 
 @cache

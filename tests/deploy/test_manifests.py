@@ -106,6 +106,23 @@ def rendered() -> list[dict[str, Any]]:
     return list(yaml.safe_load_all(done.stdout))
 
 
+def test_what_reads_the_archive_on_kubernetes_has_the_keys_of_its_store() -> None:
+    folder = Path(__file__).parents[2] / "deploy" / "kubernetes"
+    containers = {}
+    for file in ("dask.yaml", "prefect.yaml"):
+        for item in yaml.safe_load_all((folder / file).read_text()):
+            if item["kind"] == "Deployment":
+                (container,) = item["spec"]["template"]["spec"]["containers"]
+                containers[item["metadata"]["name"]] = container
+    keys = {"secretRef": {"name": "lidarops-store", "optional": True}}
+    reading = {
+        name: keys in container["envFrom"]
+        for name, container in containers.items()
+        if "data" in {mount["name"] for mount in container["volumeMounts"]}
+    }
+    assert reading == {"lidarops-worker": True, "lidarops-prefect-worker": True}
+
+
 def of_kind(rendered: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
     return {item["metadata"]["name"]: item for item in rendered if item["kind"] == kind}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,10 +14,11 @@ from support.servers.stand_ins import SCHEMES, StandIn, served
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import Status
 from lidarops.run.scenes import cut_scenes
 from lidarops.scene.input_files import check_files, local_files
+from lidarops.system import stores
 from lidarops.system.stores import RemoteStore
 
 FILES = 4
@@ -126,6 +128,22 @@ def test_a_store_that_gives_no_file_ends_the_scan(
         with pytest.raises(CatalogError, match=f"gives none of its {FILES} files"):
             scan_archive(campaign, store)
         assert store.granules() == []
+
+
+def test_a_web_server_that_never_answers_ends_the_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    http = pytest.importorskip("fsspec.implementations.http").HTTPFileSystem
+    monkeypatch.setattr(stores, "_LONGEST_SILENCE", 0.2)
+    http.clear_instance_cache()
+    # The system accepts connections that no program takes.
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        campaign = _campaign(f"http://127.0.0.1:{silent.getsockname()[1]}", tmp_path)
+        with Store(campaign.catalog_url, campaign.name) as store:
+            with pytest.raises(UnavailableError, match=r"cannot be listed: .*Timeout"):
+                scan_archive(campaign, store)
+            assert store.granules() == []
+    http.clear_instance_cache()
 
 
 @pytest.mark.parametrize(
