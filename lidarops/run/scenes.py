@@ -527,12 +527,15 @@ def name_unused(
         of_instrument[file.granule.instrument].append(file)
     named = []
     for scene in scenes:
-        unused = {*scene.unused, *lost.get(scene.id, ())} | {
+        unused = {*scene.unused} | {
             UnusedFile.of(file.granule)
             for member in scene.members or (scene,)
             for file in of_instrument[member.instrument]
             if _belongs(file, member)
         }
+        # One that is empty or cannot be read is refused, and no longer gives what it gave.
+        paths = {file.path for file in unused}
+        unused |= {file for file in lost.get(scene.id, ()) if file.path not in paths}
         named.append(replace(scene, unused=tuple(sorted(unused))) if unused else scene)
     return tuple(named)
 
