@@ -36,7 +36,7 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
     block : UUID
         Id of the notification block to use.
     within : timedelta
-        Time within which a nightly run must be completed.
+        Time after a completed nightly run within which the next one must be completed.
     failures : bool
         Whether to report also runs that were completed with failures.
 
@@ -44,8 +44,13 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
     -------
     list of Automation
     """
+    completed = _events("Completed", WITH_FAILURES)
+    # After each completed run of an archive the next one is expected: time counts from that run,
+    # and another archive that runs hides nothing.
     absent = EventTrigger(
-        expect=_events("Completed", WITH_FAILURES),
+        after=completed,
+        expect=completed,
+        for_each={"related:deployment:prefect.resource.id"},
         match_related=_tagged("nightly"),
         posture=Posture.Proactive,
         threshold=1,
@@ -62,7 +67,8 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
                 SendNotification(
                     block_document_id=block,
                     subject=ABSENT,
-                    body=f"No nightly run was completed for {within}: check that a worker runs.",
+                    body="{{ deployment.name }} completed no run for "
+                    f"{within} after {{{{ flow_run.name }}}}: check that a worker runs.",
                 )
             ],
         ),

@@ -16,6 +16,8 @@ from support import factories
 from support.archives import raw_archives
 from support.servers import loopback
 
+from flows import WITH_FAILURES, notifications
+
 pytestmark = [pytest.mark.deployment, pytest.mark.timeout(900)]
 
 
@@ -37,6 +39,27 @@ class Api:
     def pools(self) -> set[str]:
         answer = self._client.post("/work_pools/filter", json={})
         return {each["name"] for each in answer.raise_for_status().json()}
+
+    def ended(self, deployment: str, state: str) -> None:
+        """Let a run of a nightly deployment end at once in a state."""
+        tags = {"tags": ["lidarops", "nightly"]}
+        flow = self._client.post("/flows/", json={"name": "stand-in"}).raise_for_status().json()
+        made = {"name": deployment, "flow_id": flow["id"], **tags}
+        id_ = self._client.post("/deployments/", json=made).raise_for_status().json()["id"]
+        run = self._client.post(f"/deployments/{id_}/create_flow_run", json=tags)
+        path = f"/flow_runs/{run.raise_for_status().json()['id']}/set_state"
+        type_ = "FAILED" if state == "Failed" else "COMPLETED"
+        for each in ({"type": "RUNNING"}, {"type": type_, "name": state}):
+            self._client.post(path, json={"state": each, "force": True}).raise_for_status()
+
+    def hasten(self, automation: str, within: float) -> None:
+        """Let an automation wait for so many seconds only."""
+        known = self._client.post("/automations/filter", json={}).raise_for_status().json()
+        (found,) = [each for each in known if each["name"] == automation]
+        found["trigger"]["within"] = within
+        kept = ("name", "description", "enabled", "trigger", "actions", "tags")
+        changed = {name: found[name] for name in kept if name in found}
+        self._client.put(f"/automations/{found['id']}", json=changed).raise_for_status()
 
     def artifacts(self) -> set[str]:
         answer = self._client.post("/artifacts/filter", json={})
@@ -167,3 +190,39 @@ def test_on_postgresql(tmp_path: Path, postgresql: str, record_testsuite_propert
     with loopback.prefect_site(tmp_path, **urls) as site:
         scheduled_run_starts_and_dead_run_is_ended(site, record_testsuite_property)
         assert not (tmp_path / "prefect" / "prefect.db").exists()
+
+
+def test_an_archive_that_stops_is_reported_though_another_runs_and_each_end_with_failures(
+    tmp_path: Path,
+) -> None:
+    with (
+        http.server.ThreadingHTTPServer(("127.0.0.1", 0), Sink) as sink,
+        loopback.prefect_site(tmp_path) as site,
+    ):
+        threading.Thread(target=sink.serve_forever, daemon=True).start()
+        site.call("flows.notifications", f"http://127.0.0.1:{sink.server_port}/", "--failures")
+        api = Api(site)
+        api.hasten(notifications.ABSENT, 30.0)
+
+        def told(subject: str) -> list[str]:
+            return [each for each in Sink.posted if subject in each]
+
+        def both_run() -> bool:
+            for name in ("runs on", "stops"):
+                api.ended(name, "Completed")
+            api.ended("runs on", WITH_FAILURES)
+            return bool(told(notifications.COMPLETED_WITH_FAILURES))
+
+        loopback.wait_until(both_run, 400, "the automations were not activated", every=5.0)
+        Sink.posted.clear()
+        both_run()
+        for _ in range(20):
+            api.ended("runs on", WITH_FAILURES)
+            time.sleep(4.0)
+        loopback.wait_until(lambda: bool(told(notifications.ABSENT)), 60, "no alarm")
+        (alarm,) = told(notifications.ABSENT)
+        assert "stops completed no run" in alarm
+        loopback.wait_until(
+            lambda: len(told(notifications.COMPLETED_WITH_FAILURES)) >= 21, 60, "one was lost"
+        )
+        sink.shutdown()

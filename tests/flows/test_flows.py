@@ -579,6 +579,9 @@ def test_a_run_with_failures_counts_as_completed() -> None:
     assert [each.name for each in plain] == [notifications.FAILED, notifications.ABSENT]
     event = f"prefect.flow-run.{WITH_FAILURES}"
     assert event in plain[1].trigger.expect
+    # Time counts from the last run of the same archive.
+    assert plain[1].trigger.after == plain[1].trigger.expect
+    assert plain[1].trigger.for_each == {"related:deployment:prefect.resource.id"}
     assert event not in plain[0].trigger.expect
     automations = notifications.automations(uuid4(), within=within, failures=True)
     (has_failures,) = [
