@@ -35,6 +35,10 @@ _CODES_OF_STORE: Final = frozenset(
      "RequestTimeout", "SignatureDoesNotMatch"}
 )  # fmt: skip
 """Errors of S3 that concern the whole store though its answer is of another 4xx."""
+_STAMPS: Final = (
+    "mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag", "Last-Modified"
+)  # fmt: skip
+"""What drivers call the time or tag by which a file of the same size shows that it has changed."""
 _NO_SUCH_RANGE: Final = 416
 """Answer where a file has none of the bytes, as an empty one."""
 # Schemes by which an object appears only when its upload is complete.
@@ -563,7 +567,7 @@ def _status(error: Exception) -> int | None:
 
 
 def _stamp(info: dict[str, Any]) -> int:
-    for key in ("mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag"):
+    for key in _STAMPS:
         value = info.get(key)
         if isinstance(value, int | float):
             return int(value * 1e9)

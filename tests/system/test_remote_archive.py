@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import http.server
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -123,6 +124,20 @@ def test_a_store_that_is_lost_while_headers_are_compared_ends_the_run(
     monkeypatch.setattr(RemoteStore, "head", lost)
     with pytest.raises(CatalogError, match="cut") if ends else nullcontext():
         assert list(assess(campaign, update=False, everything=True))
+
+
+def test_a_file_of_a_web_server_that_is_replaced_by_one_of_the_same_size_is_seen(
+    campaign: Campaign, tmp_path: Path
+) -> None:
+    """By the time of its last change: a plain server gives no tag."""
+    file = tmp_path / "raw" / "coast" / "h1"
+    with Store(campaign.catalog_url, campaign.name) as store:
+        scan_archive(campaign, store)
+        assert scan_archive(campaign, store).unchanged == 2
+        file.write_bytes(raw_archives.content(1, seed=1))
+        os.utime(file, (1.0, 1.0))
+        summary = scan_archive(campaign, store)
+        assert (summary.changed, summary.unchanged) == (1, 1)
 
 
 ESCAPES = ["../../x", "%2e%2e/x", "coast/../../x", "..%5Cx", "coast//x"]
