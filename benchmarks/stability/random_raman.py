@@ -102,7 +102,7 @@ def along(values: Array, step: float) -> Array:
 
 
 def mean_over(
-    profile: Array, step: float, middle: Array, length: Array, nearest: float = 0.0
+    profile: Array, step: float, middle: Array, length: Array, nearest: Array | float = 0.0
 ) -> Array:
     """Return means of a profile of bins over lengths around heights, from `nearest` on."""
     whole = np.concatenate([[0.0], np.cumsum(profile)]) * step
@@ -235,7 +235,8 @@ def _scored(failure: Failure, sky: Sky, result: RamanResult) -> Iterator[ScoredV
     """Yield the values of each quantity, which flags of others should not doubt."""
     inside = sky.cells.range < _COMPARED
     full = sky.quality == 0
-    nearest = float(sky.cells.range[np.argmax(full)]) - 0.5 * _CELL
+    first = np.isfinite(result.extinction).argmax(axis=1)
+    nearest = sky.cells.range[first, np.newaxis] - 0.5 * _CELL
     length = np.where(np.isnan(result.vertical_resolution), _CELL, result.vertical_resolution)
     none = np.zeros_like(result.quality)
     extinction = mean_over(sky.extinction, _STEP, sky.cells.range, length, nearest)

@@ -394,7 +394,11 @@ def _profile_weights(raw: Table, total: Array) -> Array:
 
 
 def _as_resolved(raw: Table) -> Array:
-    """Return backscatter over the air of extinction, m-1 sr-1, NaN where it has none."""
+    """Return backscatter over the air of extinction, m-1 sr-1, NaN where it has none.
+
+    The mean over the resolution begins at the first value with extinction where it would reach
+    before it.
+    """
     ranges = raw["range"][1]
     step = float(np.median(np.diff(ranges)))
     edges = np.append(ranges - 0.5 * step, ranges[-1] + 0.5 * step)

@@ -81,6 +81,19 @@ class DepthFit:
     What is decided by it is not decided by the noise of the cell: by its own standard error, cells
     that noise makes bright would be kept, and the depth there biased."""
 
+    @property
+    def certain(self) -> Booleans:
+        """Whether first-order errors hold for the depth, (cell,)."""
+        return np.asarray(self.expected_error <= THRESHOLDS.most_uncertain)
+
+    @property
+    def first(self) -> int:
+        """First cell with extinction: it has data, and its depth is certain.
+
+        Nearer ones have none: the signal shows nothing of the air before its data.
+        """
+        return int(np.argmax(self.certain & (self.information > 0.0)))
+
     def respond(self, relative: Array) -> Array:
         """Return the change of the depth when the signal changes by shares of it.
 
@@ -353,7 +366,9 @@ class Extinction:
     kernel: Array
     """(cell, cell): weights of the true extinction of each cell in the value, 1 in total."""
     vertical_resolution: Array
-    """m along the beam: length over which a mean has the sum of squared weights of the kernel."""
+    """m along the beam: length over which a mean has the sum of squared weights of the kernel. The
+    mean is centred on the cell, but begins at the first one with extinction where it would reach
+    before it."""
     noise: Array
     """(cell, noise of a cell): response in m-1 to independent unit noise."""
     resolution_error: Array
@@ -404,7 +419,7 @@ def extinction_of(fit: DepthFit, step: float, ratio: float) -> Extinction:
     kernel = step * (beyond - 0.5 * weights)
     resolution = step / root_of_squares(kernel) ** 2
     walk = np.sqrt(1.0 / fit.walk) / (step * both)
-    away = kernel - mean_weights(resolution, step, step * int(np.argmax(fit.information > 0.0)))
+    away = kernel - mean_weights(resolution, step, fit.first)
     return Extinction(
         value=slope(fit.depth, step) / both,
         kernel=kernel,
@@ -420,15 +435,19 @@ def _summed(weights: Array) -> Array:
     return root_of_squares(np.cumsum(weights[:, :0:-1], axis=1))
 
 
-def mean_weights(length: Array, step: float, nearest: float = 0.0) -> Array:
+def mean_weights(length: Array, step: float, first: int = 0) -> Array:
     """Return the weights of cells in means over a length around each cell, within the profile.
+
+    Means begin at the first cell with extinction where they would reach before it.
 
     Parameters
     ----------
     length : (cell,) float
         m.
-    step, nearest : float
-        m, length of a cell; first range with data: means that would begin before it begin there.
+    step : float
+        m, length of a cell.
+    first : int
+        First cell with extinction.
 
     Returns
     -------
@@ -436,7 +455,7 @@ def mean_weights(length: Array, step: float, nearest: float = 0.0) -> Array:
         Rows have the sum 1.
     """
     edges = np.arange(length.size + 1) * step
-    low = np.maximum(edges[:-1] + 0.5 * (step - length), nearest)
+    low = np.maximum(edges[:-1] + 0.5 * (step - length), edges[first])
     high = np.minimum((low + length)[:, np.newaxis], edges[1:])
     inside = np.maximum(high - np.maximum(low[:, np.newaxis], edges[:-1]), 0.0)
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))

@@ -55,16 +55,16 @@ class RamanQuality(FlagBit):
         FIRST_OWN + 4,
         Severity.CARE,
         (
-            f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or within the"
-            " vertical resolution: the mean is that of cloudy and clear air"
+            f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or in the mean"
+            " over vertical_resolution: the value is that of cloudy and clear air"
         ),
     )
     CLOUD = (
         FIRST_OWN + 5,
         Severity.CARE,
         (
-            f"the mean of the profiles shows a cloud within {_MARGIN} or within the vertical"
-            " resolution:"
+            f"the mean of the profiles shows a cloud within {_MARGIN} or in the mean over"
+            " vertical_resolution:"
             " multiple scattering makes extinction too small, by more than its error states"
         ),
     )

@@ -189,7 +189,7 @@ def _solved(
     calibrated = calibrated_backscatter(ratio, profile.elastic.noise, fit.noise, assumed, window)
     effects = Effects(profile, calibrated, air, cells.step, settings, reference_error, partial)
     causes, of_overlap = list(effects.causes()), effects.overlap()
-    usable = ~partial & (fit.expected_error <= THRESHOLDS.most_uncertain)
+    usable = ~partial & fit.certain
     # It is a finding that overlap is not full where it is stated to be.
     known = of_overlap if effects.knows_overlap else []
     negative = _negative(fit, [cause.depth for cause in (*causes, *known)], usable)
@@ -244,9 +244,10 @@ def _joined(
         return np.where(hidden, np.nan, np.reshape(rows, quality.shape))
 
     nothing = np.zeros(quality.shape, dtype=np.bool_)
-    expected = stacked(lambda one: one.profile.fit.expected_error, nothing)
-    weak = ~(expected <= THRESHOLDS.most_uncertain)
+    weak = stacked(lambda one: one.profile.fit.certain, nothing) != 1.0
+    first = np.array([0 if one is None else one.profile.fit.first for one in solved])
     no_slope = weak | ((quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0)
+    no_slope |= np.arange(missing.size) < first[:, np.newaxis]
 
     def budget(
         causes: Sequence[str], row: Callable[[_Solution], dict[str, Array]], hidden: Booleans

@@ -249,11 +249,13 @@ def largest_of_cells(values: Array, cells: Cells) -> Array:
 def touched(mask: Booleans, resolution: Array, step: float) -> Booleans:
     """Return the cells in whose values a marked cell takes part.
 
+    A mean begins at the first cell with extinction where it would reach before it.
+
     Parameters
     ----------
     mask : (profile, cell) bool
     resolution : (profile, cell) float
-        m, length over which a value is a mean of cells that have one; NaN for the cell itself.
+        m, length over which extinction is a mean; NaN where there is none, for the cell itself.
     step : float
         m, length of a cell.
     """

@@ -170,7 +170,7 @@ KNOWN = verdicts.above_target()
             partial(random_scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
         ),
         pytest.param(random_raman.score_raman, 1000, 4, 0.0, id="Raman"),
-        pytest.param(networks, 1200, 50, CONFINED, id="network"),
+        pytest.param(networks, 1500, 50, CONFINED, id="network"),
     ],
 )
 def test_where_the_model_holds_few_values_of_each_class_are_false(

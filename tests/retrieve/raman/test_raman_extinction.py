@@ -75,7 +75,7 @@ def test_weights_of_means_are_those_of_the_cells_that_overlap():
     np.testing.assert_allclose(weights[1], [0.25, 0.5, 0.25, 0.0])
     np.testing.assert_allclose(weights[2], [0.0, 1 / 3, 1 / 3, 1 / 3])
     # Where the signal shows no extinction before the second cell.
-    weights = mean_weights(np.full(4, 20.0), 10.0, 10.0)
+    weights = mean_weights(np.full(4, 20.0), 10.0, 1)
     np.testing.assert_allclose(weights[1], [0.0, 0.5, 0.5, 0.0])
     np.testing.assert_allclose(weights[2], [0.0, 0.25, 0.5, 0.25])
 

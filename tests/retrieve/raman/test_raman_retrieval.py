@@ -80,6 +80,18 @@ def test_partial_overlap_cancels_in_backscatter(sky):
     np.testing.assert_allclose(found.backscatter[0, near], HAZE[near] / 50.0, rtol=2e-3)
 
 
+def test_extinction_begins_with_the_data(sky):
+    """What smoothness says of the air before them is no value, even where its error is small."""
+    power, near = sky.raman[np.newaxis].copy(), R < 1000.0
+    power[:, R < 600.0] = np.nan
+    found = retrieved(sky, raman={"power": power})
+    for name in ("extinction", "vertical_resolution", "lidar_ratio"):
+        known = np.isfinite(getattr(found, name)[0])
+        np.testing.assert_array_equal(known[near], R[near] > 600.0)
+    between = (R > 300.0) & (R < 600.0)
+    assert np.all(found.raman_depth_error[0, between] < THRESHOLDS.most_uncertain)
+
+
 @pytest.mark.parametrize(
     ("cause", "settings", "changed"),
     [
