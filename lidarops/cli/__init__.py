@@ -1,6 +1,6 @@
 """The command line: each command calls one function of the library.
 
-Exit codes: 0 success, 1 something was refused or failed, 2 wrong use.
+Exit codes: 0 success, 1 something was refused or failed, 2 wrong use, 3 something does not serve.
 """
 
 # ruff: noqa: E402 - the number of threads is set before numpy is loaded

@@ -329,7 +329,7 @@ def test_the_password_of_a_catalog_is_not_stored_by_the_server(
     url = f"postgresql+psycopg://user:{SECRET}@127.0.0.1:1/name"
     for command in (flows.catalog.main, flows.reprocess.main):
         result = called(command, str(campaign_file), "--catalog", url)
-        assert result.exit_code == 1
+        assert result.exit_code == 3
         assert "the catalog cannot be used" in result.output
         assert SECRET not in result.output
     database = get_current_settings().server.database.connection_url
@@ -346,7 +346,7 @@ def test_a_missing_archive_is_reported_before_any_server_is_started(
 ) -> None:
     (campaign_file.parent / "raw").rename(campaign_file.parent / "away")
     result = called(command, str(campaign_file))
-    assert result.exit_code == 1
+    assert result.exit_code == 3
     assert result.output.startswith("error: ")
     assert "not a folder" in result.output
 
@@ -373,7 +373,7 @@ def test_the_catalog_flow_waits_for_a_run_for_the_given_time(
     with Store(url, "test") as store, Lock(store) as held:
         held.acquire()
         refused = called(flows.catalog.main, *words)
-        assert refused.exit_code == 1
+        assert refused.exit_code == 3
         assert isinstance(refused.exception, SystemExit)
         assert "error: " in refused.output
         assert "held by" in refused.output
