@@ -79,7 +79,7 @@ NONLINEAR: Final = 0.01
 _RECORDS: Final = {"linear analog record": 0.0, "analog record nonlinear by 1 %": NONLINEAR}
 _ERRORS: Final = 2.0
 """Stated errors beyond which a dead time is false."""
-_MOST: Final = Target(2.5e-2)
+_MOST: Final = Target(1e-2)
 """Largest share of false ones; normal errors would leave 4.6 % of them."""
 
 

@@ -160,7 +160,7 @@ OTHERS: Final = (
     Other("flags", "flags", FLAGS, lambda quick: flag_rates.flag_rates(2 if quick else 60),
           ("flag", "condition")),
     Other("dead times", "signal", DEAD_TIMES,
-          lambda quick: random_dead_times.dead_time_scores(2 if quick else 120),
+          lambda quick: random_dead_times.dead_time_scores(2 if quick else 310),
           ("record", "scene")),
     Other("light", "light", LIGHT, lambda quick: random_light.light_scores(10 if quick else 200),
           ("profiles", "condition")),
