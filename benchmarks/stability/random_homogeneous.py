@@ -165,13 +165,6 @@ def _with_outliers(power: Array, rng: Random) -> Array:
     return np.asarray(power + hit * size * rng.choice([-1.0, 1.0], power.shape))
 
 
-_SAME_SHAPE: Final = (
-    "an exponential of range has the shape of extinction itself: only the stated model error"
-    " can cover it"
-)
-_SHORT_SCALE: Final = (
-    "a change over the whole section has nearly the shape of extinction and background"
-)
 _WITH_GAPS: Final = Failure("gaps", satisfied=True)
 _NOISE_NOT_STATED: Final = Failure("none, noise not stated", satisfied=True)
 _OUTLIERS: Final = Failure("outliers")
@@ -181,12 +174,12 @@ FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
     (_NOISE_NOT_STATED, _none),
     (_WITH_GAPS, _none),
     (_OUTLIERS, _none),
-    (Failure("slope of the backscatter along the section", unseen=_SAME_SHAPE), _slope),
+    (Failure("slope of the backscatter along the section"), _slope),
     (Failure("bent backscatter"), _curved),
     (_PLUME, _none),
-    (Failure("overlap error", unseen=_SHORT_SCALE), _overlap),
+    (Failure("overlap error"), _overlap),
     (Failure("eddies"), _turbulent),
-    (Failure("afterpulse", unseen=_SHORT_SCALE), _afterpulse),
+    (Failure("afterpulse"), _afterpulse),
     (Failure("saturated"), _saturated),
     (Failure("detector not linear"), _bent),
 )
@@ -282,10 +275,6 @@ _SHORT_STEP: Final = 37.5
 """m."""
 _FALLS: Final = (1.0, 6.0)
 """Decades by which a signal falls from bin to bin."""
-_UNKNOWN: Final = (
-    "noise whose bins are correlated looks like less noise: without the length of the correlation,"
-    " the stated errors are too small"
-)
 
 
 def _fitted(paths: Paths, deviations: Array, **options: Any) -> Any:
@@ -308,10 +297,8 @@ def score_correlated_noise(cluster: int, profiles: int) -> Iterator[ScoredValues
             ("stated", {"noise": path_fit.Noise(correlation_length=length)}),
             ("estimated, as in products", {"noise": path_fit.Noise(correlation_length=estimated)}),
         ):
-            failure = Failure(
-                f"AR(1) {correlation:g}, correlation {words}", satisfied=bool(options),
-                unseen="" if options else _UNKNOWN,
-            )  # fmt: skip
+            name = f"AR(1) {correlation:g}, correlation {words}"
+            failure = Failure(name, satisfied=bool(options))
             yield _scored(
                 failure, "extinction", paths.extinction[:, 0], _fitted(paths, noise, **options)
             )

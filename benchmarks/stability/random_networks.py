@@ -180,8 +180,6 @@ def _with_a_bad_profile(measurement: _Measurement, clean: Signals, rng: Random) 
     return _Measurement(power, measurement.variance)
 
 
-_UNKNOWN_EXPONENT: Final = "the signals do not determine the exponent: the user declares it"
-_NOT_CANCELLED: Final = "overlap errors do not cancel, and beams that agree may share them"
 FAILURES: Final[tuple[tuple[Failure, DrawAir, Damage], ...]] = (
     (Failure("none, homogeneous", satisfied=True), homogeneous, _undamaged),
     (Failure("none, layered", satisfied=True), layered, _undamaged),
@@ -189,8 +187,8 @@ FAILURES: Final[tuple[tuple[Failure, DrawAir, Damage], ...]] = (
     (Failure("plume that drifts within a block"), _drifting_plume, _undamaged),
     (Failure("gaps", satisfied=True), layered, _with_gaps),
     (Failure("outliers"), layered, _with_outliers),
-    (Failure("overlap error", unseen=_NOT_CANCELLED), layered, _with_overlap),
-    (Failure("wrong exponent", unseen=_UNKNOWN_EXPONENT), layered, _with_exponent),
+    (Failure("overlap error"), layered, _with_overlap),
+    (Failure("wrong exponent"), layered, _with_exponent),
     (Failure("background left in the signals"), layered, _with_offset),
     (Failure("layer of a few bins"), _thin_layer, _with_little_noise),
     (Failure("air that changes everywhere"), changing, _undamaged),
@@ -264,7 +262,6 @@ _VARIED: Final = {
     0.1: {"the default declared": _DEFAULT, "10 % declared": 0.1},
 }
 """What is declared, by the rms variation of the lidar ratio within a network and words."""
-_NOT_SHOWN: Final = "the signals do not show how the lidar ratio varies: the user declares it"
 
 
 def _drawn(rng: Random, draw_air: DrawAir) -> tuple[Signals, float] | None:
@@ -331,5 +328,5 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
             name = f"lidar ratio varies by {100.0 * varied:g} %, {words}"
             # As products state it.
             systematic = labeled.lidar_ratio_error(result, net, clean.range, error)
-            failure = Failure(name, unseen=_NOT_SHOWN)
+            failure = Failure(name)
             yield scored(failure, result, clean.truth(profiles), systematic)

@@ -48,8 +48,6 @@ class Failure:
     name: str
     satisfied: bool = False
     """Whether the model holds, so that random errors alone must cover the truth."""
-    unseen: str = ""
-    """Reason why the data cannot reveal the violation; empty where they can."""
 
 
 _Class = TypeVar("_Class", bound=tuple[Any, ...])
@@ -179,7 +177,6 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
         "without any flag": part("false bare", "bare"),
         NEEDLESS: flagged,
         NEEDLESS_TARGET: _judged(flagged, needless),
-        "detectable in the data": f"no: {failure.unseen}" if failure.unseen else "yes",
     }
 
 
