@@ -36,16 +36,12 @@ class Effort:
     """Size of a run, its stated date, its inputs, and the progress callback."""
 
     quick: bool = False
-    repeats: int | None = None
-    """Repeats of each timing; None for the default of the benchmark."""
     date: str = ""
     """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
     data: Path | None = None
     """Folder of published signals, for the accuracy of the elastic retrieval."""
-    files: Sequence[Path] = ()
-    """Raw files of one layout, for the reader."""
 
 
 def frame(scores: Scores) -> pd.DataFrame:

@@ -1,5 +1,5 @@
-"""Time and memory of retrievals, readers and whole campaigns.
+"""Time and memory of retrievals and whole campaigns.
 
-`retrievals`, `raman_night` and `readers` time single functions. `campaigns` times all stages of
-simulated campaigns, and `memory` measures the peak of processes.
+`retrievals` times single functions. `campaigns` times all stages of processing and their growth
+with the size of a campaign, `memory` measures peaks of processes.
 """

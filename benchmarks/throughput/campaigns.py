@@ -61,8 +61,6 @@ class CampaignSize:
     profiles: int = 30
     """Files per scene; must divide 1440."""
     bins: int = 1000
-    angles: int = 0
-    """Directions of a scan; 0 for a horizontal lidar."""
     retrieved: bool = True
     """Whether homogeneous paths are retrieved, or only signals kept."""
 
@@ -75,12 +73,10 @@ class CampaignSize:
 _ALONG: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
     "scenes": tuple(CampaignSize(scenes=n) for n in (2, 4, 8, 16)),
     "profiles": tuple(CampaignSize(profiles=n) for n in (15, 30, 60, 120)),
-    "bins": tuple(CampaignSize(bins=n) for n in (500, 1000, 2000, 4000)),
-    "angles": tuple(CampaignSize(angles=n, profiles=120, bins=2000) for n in (5, 9, 17)),
     "files": tuple(CampaignSize(n, 480, 200, retrieved=False) for n in (2, 20, 200)),
 }
 _QUICK: Final[Mapping[str, tuple[CampaignSize, ...]]] = {
-    **{name: _ALONG[name][:3] for name in ("scenes", "profiles", "bins")},
+    **{name: _ALONG[name][:3] for name in ("scenes", "profiles")},
     "files": tuple(CampaignSize(n, 480, 200, retrieved=False) for n in (1, 2, 4)),
 }
 Cost = tuple[CampaignSize, dict[str, float]]
@@ -169,60 +165,40 @@ def campaign_settings(name: str, instruments: Mapping[str, Any], **others: Any) 
 
 
 def _settings(size: CampaignSize) -> dict[str, Any]:
-    scans = size.angles > 0
     channel = "photon_532o"
     products: dict[str, Any] = {"signal": {}}
-    if scans:
-        products["multiangle"] = {"channels": [channel], "highest": 6000, "step": 60}
-    elif size.retrieved:
-        products["homogeneous"] = {
-            "channels": [channel],
-            "sections": [[750, 0.9 * 7.5 * size.bins]],
-        }
-    facts_of_lidar = {"full_overlap_range": 300, "channels": {channel: {"dead_time": 3e-9}}}
+    if size.retrieved:
+        sections = [[750, 0.9 * 7.5 * size.bins]]
+        products["homogeneous"] = {"channels": [channel], "sections": sections}
+    channels = {channel: {"dead_time": 3e-9}}
     lidar = {
         "station": "here",
         "files": "here/h*",
-        "facts": [facts_of_lidar if scans else facts_of_lidar | {"zenith_angle": 90}],
+        "facts": [{"full_overlap_range": 300, "channels": channels, "zenith_angle": 90}],
         "products": products,
     }
+    simulated = {
+        "kind": "horizontal",
+        "aerosol_extinction": {"minimum": 5e-5, "maximum": 2e-4, "hour_of_maximum": 18},
+        "aerosol": {"lidar_ratio": 50},
+        "acquisition": {
+            "interval": _INTERVAL, "shots": 1000, "repetition_rate": 20, "bins": size.bins,
+        },
+        "detectors": [
+            {
+                "wavelength": 532, "signal_rate": 5.0, "background": {"night": 0.05, "day": 0.5},
+                "photon": {},
+            }
+        ],
+    }  # fmt: skip
     simulation = {
         "seed": 7,
         "start": _DAY,
         "duration": size.files * _INTERVAL,
-        "instruments": {"lidar": _scanning(size) if scans else _level(size)},
+        "instruments": {"lidar": simulated},
     }
     window = {"window": f"{size.profiles}min"}
     return campaign_settings("measured", {"lidar": lidar}, scenes=window, simulation=simulation)
-
-
-def _level(size: CampaignSize) -> dict[str, Any]:
-    return {
-        "kind": "horizontal",
-        "aerosol_extinction": {"minimum": 5e-5, "maximum": 2e-4, "hour_of_maximum": 18},
-        "aerosol": {"lidar_ratio": 50},
-    } | _recorded(size)
-
-
-def _scanning(size: CampaignSize) -> dict[str, Any]:
-    angles = np.degrees(np.arccos(1.0 / np.linspace(1.0, 4.0, size.angles)))
-    return {
-        "kind": "lidar",
-        "atmosphere": {
-            "boundary_layer": {
-                "extinction": 1.5e-4,
-                "height": {"minimum": 600, "maximum": 1500, "hour_of_maximum": 14},
-                "aerosol": {"lidar_ratio": 50, "angstrom_exponent": 1.2},
-            }
-        },
-        "scan": {"zenith_angles": [round(float(angle), 1) for angle in angles], "azimuth": 90},
-    } | _recorded(size)
-
-
-def _recorded(size: CampaignSize) -> dict[str, Any]:
-    detector = {"wavelength": 532, "signal_rate": 5.0, "background": {"night": 0.05, "day": 0.5}}
-    acquisition = {"interval": _INTERVAL, "shots": 1000, "repetition_rate": 20, "bins": size.bins}
-    return {"acquisition": acquisition, "detectors": [detector | {"photon": {}}]}
 
 
 def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
@@ -251,9 +227,8 @@ def growth(along: str, costs: Sequence[Cost]) -> Results:
         f"By number of {along}; times at {getattr(size, along)}",
         scores,
         "Simulated campaigns of one lidar on a local disk, which TMPDIR selects, in one process: "
-        f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins"
-        + (f", {size.angles} directions. " if size.angles else ". ")
-        + "CPU time; that of a run is divided among its stages in proportion to wall time. Slope: "
+        f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins. "
+        "CPU time; that of a run is divided among its stages in proportion to wall time. Slope: "
         "of the logarithm of time against that of the size, with its 95 % interval; 1 is linear.",
         method="stage",
     )

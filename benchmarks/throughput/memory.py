@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -12,7 +14,6 @@ import numpy as np
 import yaml
 
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.harness.timing import in_fresh_process, peak_memory
 from benchmarks.harness.verdicts import Scores
 from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
@@ -153,9 +154,16 @@ def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
             write_files(root / str(size), size)
         for name in cases:
             # The first process compiles what is not cached, which takes memory of its own.
-            in_fresh_process(_peak, root, name, _TINY)
+            _peak_of_process(root, name, _TINY)
             for size in sizes:
-                yield in_fresh_process(_peak, root, name, size)
+                yield _peak_of_process(root, name, size)
+
+
+def _peak_of_process(root: Path, case: str, size: int) -> Peak:
+    """Return the peak of a new process, whose memory holds nothing else."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_peak, root, case, size).result()
 
 
 def _peak(root: Path, case: str, size: int) -> Peak:
@@ -170,7 +178,10 @@ def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
     record = archive.reprocess(campaign_of(folder, case, out))
     if record is None or any(scene.error for scene in record.scenes):
         raise CampaignError("a scene of the benchmark gave no product", field=case)
-    return peak_memory() / 1e6
+    # The maximum of `resource` includes the memory of the parent process.
+    status = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    kibibytes = next(line for line in status if line.startswith("VmHWM")).split()[1]
+    return 1024.0 * float(kibibytes) / 1e6
 
 
 def campaign_of(folder: Path, case: str, out: Path) -> Campaign:

@@ -21,7 +21,7 @@ PROFILES = 3 * network_cases.BLOCK
 @pytest.fixture(scope="module")
 def accuracy():
     return network_benchmark.measure_network(
-        Effort(date="2024-01-01", repeats=1), profiles=PROFILES, peer_profiles=10
+        Effort(date="2024-01-01"), profiles=PROFILES, peer_profiles=10
     )
 
 
