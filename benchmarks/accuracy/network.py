@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any, Final
@@ -14,19 +15,18 @@ from benchmarks.accuracy import network_cases as cases
 from benchmarks.accuracy.comparison import comparison
 from benchmarks.accuracy.network_cases import BLOCK, LidarLine, Signals
 from benchmarks.accuracy.network_peers import network_by_scipy, network_by_scipy_of_means
-from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share
+from benchmarks.harness.figure import Array, Figure, Mask, Unit, cpu_time, share
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.statistics import SIGMAS, mean_by_block, root_by_block, share_by_block
-from benchmarks.harness.timing import CPU_TIME, READ, READS, timed
+from benchmarks.harness.statistics import TWO_SIDED, root_by_block, share_by_block
+from benchmarks.harness.timing import CPU_TIME, timed
 from benchmarks.harness.verdicts import Score, Scores
-from lidarops.retrieve.network.extinction_field import NetworkResult
 
 PROFILES: Final = 3000
 QUICK_PROFILES: Final = 500
 """Profiles of each case, and of a quick run."""
 CLIPPED: Final = 3.0
 """Limit of relative errors: a quotient of noise has no variance."""
-_WITHIN: Final = {"within 1": SIGMAS[0], "within 1.96": SIGMAS[1], "within 3": 3.0}
+_WITHIN: Final = {"within 1.96": TWO_SIDED, "within 3": 3.0}
 """Numbers of standard errors."""
 _PEER_PROFILES: Final = 1500
 _QUICK_PEER_PROFILES: Final = 500
@@ -51,30 +51,17 @@ def measure_network(
     peer_profiles : int, optional
         Number of profiles of each comparison with a plain fit.
     """
-    blocks = -(-(profiles or (QUICK_PROFILES if effort.quick else PROFILES)) // BLOCK)
-    chunks = (-(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * BLOCK)
+    chunks = _chunks(profiles or (QUICK_PROFILES if effort.quick else PROFILES))
     fitted = peer_profiles or (_QUICK_PEER_PROFILES if effort.quick else _PEER_PROFILES)
     comparisons = compare_with_scipy(fitted)
-    tables: list[Results] = []
     works: list[Work] = []
     for lidars in cases.LIDAR_LINES:
         scores: Scores = {}
-        signals = {air.name: cases.signals(lidars.network(), air) for air in cases.AIRS}
         for index, (air, noise) in enumerate(product(cases.AIRS, cases.NOISES)):
-            for method, score in _measure_case(noise, signals[air.name], chunks, index).items():
+            clean = cases.signals(lidars.network(), air)
+            for method, score in measure_case(clean, noise, math.prod(chunks), index).items():
                 scores[_case(air.name, noise), method] = score
             effort.progress(1)
-        tables.append(
-            Results(
-                f"{lidars.name.capitalize()}: all methods",
-                scores,
-                "Of extinction and visibility over the truth. Solved: share of values that are not "
-                "withheld. Within: share of unflagged values within this number of stated standard "
-                "errors. Median crossing: median over the crossings of the RMS error of "
-                f"visibility. CPU time per profile, and in multiples of {READ}. In brackets: "
-                "Monte Carlo standard error of the last digit, from block to block.",
-            )
-        )
         works += _works(lidars, scores, comparisons)
     beside = Results(
         "Networks and scipy, the same profiles and crossings",
@@ -97,7 +84,7 @@ def measure_network(
         f"{BLOCK} profiles. Errors are relative and clipped at 300 %, because a quotient of noise "
         "has no variance."
     )
-    return comparison("networks of lidars", effort, works, note, [*tables, beside])
+    return comparison("networks of lidars", effort, works, note, [beside])
 
 
 def _percent(part: float) -> str:
@@ -108,35 +95,29 @@ def _case(air: str, noise: float) -> str:
     return f"{air}, noise {_percent(noise)}"
 
 
-def _measure_case(
-    noise: float, signals: Signals, chunks: tuple[int, int], seed: int
-) -> dict[str, Score]:
+def _chunks(profiles: int) -> tuple[int, int]:
+    """Return the number of chunks that are solved together, and their size, of whole blocks."""
+    blocks = -(-profiles // BLOCK)
+    return -(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * BLOCK
+
+
+def measure_case(clean: Signals, noise: float, profiles: int, seed: int) -> dict[str, Score]:
     """Return the scores of every solver."""
-    number, size = chunks
-    results: dict[str, list[NetworkResult]] = {each.name: [] for each in cases.NETWORK_SOLVERS}
-    least = dict.fromkeys((READ, *results), math.inf)
-    for chunk in range(number):
-        power, variance = signals.draw(noise, size, len(signals.network.origin), seed, chunk)
-        least[READ] = min(least[READ], timed(partial(np.max, power))[0])
-        for solver in cases.NETWORK_SOLVERS:
-            if chunk == 0:
-                # The first call compiles and fills caches.
-                solver(power[:BLOCK], variance[:BLOCK], signals)
-            seconds, result = timed(partial(solver, power, variance, signals))
-            least[solver.name] = min(least[solver.name], seconds)
-            results[solver.name].append(result)
-    truth = np.concatenate([signals.truth(size)] * number)
-    return {
-        name: score_crossings(_joined(parts), truth, signals.network.near_crossing)
-        | {CPU_TIME: cpu_time(1e9 * least[name] / size), READS: least[name] / least[READ]}
-        for name, parts in results.items()
-    }
-
-
-def _joined(results: Sequence[NetworkResult]) -> dict[str, Any]:
-    """Return the arrays of several results as one, by name."""
-    names = ("extinction", "extinction_standard_error", "flagged", "reduced_chi_square")
-    return {name: np.concatenate([getattr(each, name) for each in results]) for name in names}
+    number, size = _chunks(profiles)
+    beams = len(clean.network.origin)
+    drawn = [clean.draw(noise, size, beams, seed, chunk) for chunk in range(number)]
+    truth = np.concatenate([clean.truth(size)] * number)
+    scores = {}
+    for name, solve in cases.SOLVERS.items():
+        # The first call compiles and fills caches.
+        solve(*(each[:BLOCK] for each in drawn[0]), clean)
+        solved = [timed(partial(solve, *each, clean)) for each in drawn]
+        names = ("extinction", "extinction_standard_error", "flagged", "reduced_chi_square")
+        whole = {key: np.concatenate([getattr(one, key) for _, one in solved]) for key in names}
+        spent = min(seconds for seconds, _ in solved)
+        scores[name] = score_crossings(whole, truth, clean.network.near_crossing)
+        scores[name][CPU_TIME] = cpu_time(1e9 * spent / size)
+    return scores
 
 
 def score_crossings(result: dict[str, Any], truth: Array, near: Mask) -> Score:
@@ -159,51 +140,41 @@ def score_crossings(result: dict[str, Any], truth: Array, near: Mask) -> Score:
     visibility = np.clip(truth / extinction - 1.0, -CLIPPED, CLIPPED)
     solved = np.isfinite(extinction) & np.isfinite(deviation)
     trusted = solved & ~flagged[:, near]
-    columns = list(zip(visibility.T, solved.T, strict=True))
-    fitted = result["reduced_chi_square"][np.isfinite(result["reduced_chi_square"])]
-    crossings = [rmse.value for v, k in columns if (rmse := root_by_block(v, k, BLOCK))]
+    chi = result["reduced_chi_square"]
+    of_visibility = [
+        root_by_block(values, kept, BLOCK)
+        for values, kept in zip(visibility.T, solved.T, strict=True)
+    ]
+    crossings = [rmse.value for rmse in of_visibility if rmse]
     return {
-        "mean error at the first crossing": _share(mean_by_block(*columns[0], BLOCK)),
-        "RMSE at the first crossing": _share(root_by_block(*columns[0], BLOCK)),
+        "RMSE at the first crossing": of_visibility[0],
         "solved": share(float(solved.mean())),
         "flagged": share_by_block(flagged[:, near], np.ones_like(solved), BLOCK),
-        "mean error": _share(mean_by_block(relative, solved, BLOCK)),
-        _RMSE: _share(root_by_block(relative, solved, BLOCK)),
-        "RMSE unflagged": _share(root_by_block(relative, trusted, BLOCK)),
+        _RMSE: root_by_block(relative, solved, BLOCK),
         **{
             name: share_by_block(np.abs(deviation) <= sigmas, trusted, BLOCK)
             for name, sigmas in _WITHIN.items()
         },
-        "χ²/dof": float(fitted.mean()) if fitted.size else None,
+        "χ²/dof": float(np.nanmean(chi)) if np.isfinite(chi).any() else None,
         "median crossing": share(float(np.median(crossings))) if crossings else None,
     }
-
-
-def _share(figure: Figure | None) -> Figure | None:
-    return None if figure is None else share(figure)
 
 
 def _works(lidars: LidarLine, scores: Scores, comparisons: Scores) -> Iterator[Work]:
     # On the same profiles and crossings as the peer, where there is one.
     common: Scores = {}
     for (place, air), score in comparisons.items():
-        for method in (*(solver.name for solver in cases.NETWORK_SOLVERS), *PEERS):
+        for method in (*cases.SOLVERS, *PEERS) if place == lidars.name else ():
             key = (_case(air, cases.PEER_NOISE), method)
             own = {_RMSE: score[f"{method}, RMSE"], CPU_TIME: score[f"{method}, CPU time"]}
-            if place == lidars.name:
-                common[key] = {**scores.get(key, {}), **own}
+            common[key] = scores.get(key, {}) | own
     for (case, method), score in (scores | common).items():
-        error, coverage, spent = score[_RMSE], score.get("within 1.96"), score[CPU_TIME]
-        if isinstance(error, Figure) and isinstance(spent, Figure):
+        if score[_RMSE] is not None:
             yield Work(
-                f"{lidars.name}, {case}",
-                "extinction, relative",
-                method,
-                Figure(error.value, error.error),
-                coverage if isinstance(coverage, Figure) else None,
-                spent,
+                f"{lidars.name}, {case}", "extinction, relative", method,
+                replace(score[_RMSE], unit=Unit.NUMBER), score.get("within 1.96"), score[CPU_TIME],
                 ours=method not in PEERS,
-            )
+            )  # fmt: skip
 
 
 def compare_with_scipy(profiles: int) -> Scores:
@@ -214,16 +185,16 @@ def compare_with_scipy(profiles: int) -> Scores:
     airs = [air for air in cases.AIRS if air is not cases.THIN]
     scores: Scores = {}
     for seed, (lidars, air) in enumerate(product(cases.LIDAR_LINES, airs)):
-        signals = cases.signals(lidars.network(), air)
-        power, variance = signals.draw(cases.PEER_NOISE, profiles, 99, seed)
-        near = signals.network.near_crossing
-        truth = signals.truth(profiles)[:, near]
+        clean = cases.signals(lidars.network(), air)
+        power, variance = clean.draw(cases.PEER_NOISE, profiles, 99, seed)
+        near = clean.network.near_crossing
+        truth = clean.truth(profiles)[:, near]
         ours = {
-            solver.name: timed(partial(solver, power, variance, signals))
-            for solver in cases.NETWORK_SOLVERS
+            name: timed(partial(solve, power, variance, clean))
+            for name, solve in cases.SOLVERS.items()
         }
         fitted = {
-            name: timed(partial(peer, power, variance, signals)) for name, peer in PEERS.items()
+            name: timed(partial(peer, power, variance, clean)) for name, peer in PEERS.items()
         }
         values = {name: result.extinction[:, near] for name, (_, result) in ours.items()}
         values |= {name: extinction[:, near] for name, (_, extinction) in fitted.items()}
@@ -232,13 +203,16 @@ def compare_with_scipy(profiles: int) -> Scores:
         errors = {
             name: np.clip(value / truth - 1.0, -CLIPPED, CLIPPED) for name, value in values.items()
         }
-        plain, network = cases.NETWORK_WITHOUT_PRIOR.name, cases.NETWORK.name
+        plain, network = cases.NO_PRIOR, cases.NETWORK
         stated = ours[plain][1].extinction_standard_error[:, near]
         apart = ((values[_SCIPY] - values[plain]) / stated)[solved]
         scores[lidars.name, air.name] = {
             "profiles": profiles,
             "compared": share(float(solved.mean())),
-            **{f"{name}, RMSE": _clipped_rms(error, solved) for name, error in errors.items()},
+            **{
+                f"{name}, RMSE": share(root_by_block(error, solved, BLOCK) or math.nan)
+                for name, error in errors.items()
+            },
             "network / scipy": _ratio(errors[network], errors[_SCIPY], solved),
             f"network / scipy of means of {BLOCK}": _ratio(
                 errors[network], errors[_SCIPY_MEAN], solved
@@ -250,12 +224,6 @@ def compare_with_scipy(profiles: int) -> Scores:
             },
         }
     return scores
-
-
-def _clipped_rms(errors: Array, kept: Mask) -> Figure:
-    """Return the root mean square of kept errors, from block to block."""
-    rmse = root_by_block(errors, kept, BLOCK)
-    return share(math.nan) if rmse is None else share(rmse)
 
 
 def _ratio(ours: Array, peers: Array, kept: Mask) -> Figure:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from benchmarks.harness.figure import Array
 from lidarops.retrieve.network import geometry
 from lidarops.retrieve.network.extinction_field import (
     FieldPrior,
@@ -16,8 +17,6 @@ from lidarops.retrieve.network.extinction_field import (
     retrieve_network,
 )
 from lidarops.simulate.signal import backscatter_signal
-
-Array = npt.NDArray[np.float64]
 
 STEP: Final = 5.0
 """m, of the range bins."""
@@ -197,26 +196,23 @@ def _power(net: geometry.Network, bins: Array, extinction: Extinction) -> Array:
 # Solvers --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class NetworkSolver:
-    """The retrieval with one of its priors."""
-
-    name: str
-    prior: FieldPrior
-
-    def __call__(self, power: Array, variance: Array, signals: Signals) -> NetworkResult:
-        """Solve profiles (profile, beam, range), block by block."""
-        return retrieve_network(
-            power,
-            signals.range,
-            signals.network,
-            variance=variance,
-            full_overlap_range=FULL_OVERLAP,
-            blocks=np.arange(len(power)) // BLOCK,
-            prior=self.prior.value,
-        )
+def _solve(power: Array, variance: Array, signals: Signals, prior: FieldPrior) -> NetworkResult:
+    """Solve profiles (profile, beam, range), block by block."""
+    return retrieve_network(
+        power,
+        signals.range,
+        signals.network,
+        variance=variance,
+        full_overlap_range=FULL_OVERLAP,
+        blocks=np.arange(len(power)) // BLOCK,
+        prior=prior.value,
+    )
 
 
-NETWORK_WITHOUT_PRIOR: Final = NetworkSolver("network, no prior", FieldPrior.NONE)
-NETWORK: Final = NetworkSolver("network", FieldPrior.BLOCK)
-NETWORK_SOLVERS: Final = (NETWORK_WITHOUT_PRIOR, NETWORK)
+NO_PRIOR: Final = "network, no prior"
+NETWORK: Final = "network"
+SOLVERS: Final = {
+    NO_PRIOR: partial(_solve, prior=FieldPrior.NONE),
+    NETWORK: partial(_solve, prior=FieldPrior.BLOCK),
+}
+"""The retrieval with its priors, by name."""

@@ -69,6 +69,11 @@ def without(*patches: Patch) -> Context:
     return lambda: replaced(*patches)
 
 
+def with_thresholds(module: Any, **changes: Any) -> Context:
+    """Return the context in which the thresholds that a module reads have other values."""
+    return without((module, "THRESHOLDS", module.THRESHOLDS._replace(**changes)))
+
+
 def measure(
     score: Callable[[int], Iterable[ScoredValues]],
     clusters: Sequence[int],
