@@ -11,19 +11,11 @@ from scipy.integrate import quad
 
 from benchmarks.accuracy import network as network_benchmark
 from benchmarks.accuracy import network_cases, network_peers
-from benchmarks.harness.results import Effort
 from benchmarks.harness.statistics import mean_by_block, share_by_block
 
 pytestmark = pytest.mark.slow
 
 PROFILES = 3 * network_cases.BLOCK
-
-
-@pytest.fixture(scope="module")
-def accuracy():
-    return network_benchmark.measure_network(
-        Effort(date="2024-01-01"), profiles=network_cases.BLOCK, peer_profiles=10
-    )
 
 
 @pytest.fixture(scope="module")
@@ -240,20 +232,18 @@ def test_unflagged_values_of_the_network_are_as_stated(cases, moving):
                 assert score["flagged"].value < 0.1
 
 
-def test_the_network_agrees_with_a_plain_fit(accuracy):
-    rows = accuracy.figures("Networks and scipy, the same profiles and crossings")
-    pairs = list(dict.fromkeys((place, air) for place, air, _ in rows))
-    assert len(pairs) == 8
-    for pair in pairs:
-        assert rows[*pair, "profiles"].value == 10
-        assert rows[*pair, "difference / stated"].value < 1.0
+def test_the_network_agrees_with_a_plain_fit():
+    rows = network_benchmark.compare_with_scipy(10)
+    assert len(rows) == 8
+    for row in rows.values():
+        assert row["profiles"] == 10
+        assert row["difference / stated"] < 1.0
         ours, plain, peer = (
-            rows[*pair, f"{method}, RMSE"].value
+            row[f"{method}, RMSE"].value
             for method in ("network", "network, no prior", "scipy least_squares")
         )
         assert peer == pytest.approx(plain, rel=0.5)
-        assert rows[*pair, "network / scipy"].value == pytest.approx(ours / peer)
+        assert row["network / scipy"].value == pytest.approx(ours / peer)
         # 10 profiles are one block.
-        mean = rows[*pair, "scipy least_squares, mean of 50 profiles, RMSE"].value
-        ratio = rows[*pair, "network / scipy of means of 50"].value
-        assert ratio == pytest.approx(ours / mean)
+        mean = row["scipy least_squares, mean of 50 profiles, RMSE"].value
+        assert row["network / scipy of means of 50"].value == pytest.approx(ours / mean)
