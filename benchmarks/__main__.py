@@ -15,8 +15,8 @@ from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_row
 
 # isort: split
 from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle, network
+from benchmarks.harness.figure import cpu_seconds
 from benchmarks.harness.results import Effort, Study
-from benchmarks.harness.timing import cpu_seconds
 from benchmarks.stability import study
 from benchmarks.throughput import campaigns, memory, retrievals
 from lidarops.errors import CampaignError

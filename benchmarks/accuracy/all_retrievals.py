@@ -8,9 +8,8 @@ from dataclasses import replace
 
 from benchmarks.accuracy import elastic, homogeneous, multiangle, network
 from benchmarks.accuracy.comparison import drawn_setting, method_name, score_of
-from benchmarks.harness.figure import Figure
+from benchmarks.harness.figure import Figure, Score, Scores
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.verdicts import Score, Scores
 
 Works = Mapping[str, Sequence[Work]]
 """Works by retrieval."""

@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final, TypeVar
 
-from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    SIGMAS,
+    Array,
+    Figure,
+    Mask,
+    Score,
+    cpu_time,
+    mean_by_block,
+    root_by_block,
+    share,
+    share_by_block,
+    timed,
+)
 from benchmarks.harness.plots import Chart
 from benchmarks.harness.results import Effort, Results, Study, Work, frame
-from benchmarks.harness.statistics import SIGMAS, mean_by_block, root_by_block, share_by_block
-from benchmarks.harness.timing import CPU_TIME, timed
-from benchmarks.harness.verdicts import Score
 
 RMSE: Final = "RMSE"
 BIAS: Final = "mean error"

@@ -22,9 +22,8 @@ from benchmarks.accuracy.comparison import (
 )
 from benchmarks.accuracy.elastic_cases import SimulatedSky
 from benchmarks.accuracy.elastic_peers import KLETT, LINEAR, klett_numpy, linear_backgrounds
-from benchmarks.harness.figure import Array, Figure, Mask, share
+from benchmarks.harness.figure import Array, Figure, Mask, Score, Scores, share
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.verdicts import Score, Scores
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.elastic.flags import ElasticQuality
 

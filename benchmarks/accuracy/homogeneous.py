@@ -27,11 +27,16 @@ from benchmarks.accuracy.homogeneous_cases import (
     scenarios,
 )
 from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
-from benchmarks.harness.figure import Figure, cpu_time, share
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    Figure,
+    Score,
+    Scores,
+    cpu_time,
+    mean_by_block,
+    share,
+)
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.statistics import mean_by_block
-from benchmarks.harness.timing import CPU_TIME
-from benchmarks.harness.verdicts import Score, Scores
 from lidarops.retrieve.background.cubic_and_tail import cubic
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 

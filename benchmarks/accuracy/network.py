@@ -15,11 +15,22 @@ from benchmarks.accuracy import network_cases as cases
 from benchmarks.accuracy.comparison import comparison
 from benchmarks.accuracy.network_cases import BLOCK, LidarLine, Signals
 from benchmarks.accuracy.network_peers import network_by_scipy, network_by_scipy_of_means
-from benchmarks.harness.figure import Array, Figure, Mask, Unit, cpu_time, share
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    TWO_SIDED,
+    Array,
+    Figure,
+    Mask,
+    Score,
+    Scores,
+    Unit,
+    cpu_time,
+    root_by_block,
+    share,
+    share_by_block,
+    timed,
+)
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.statistics import TWO_SIDED, root_by_block, share_by_block
-from benchmarks.harness.timing import CPU_TIME, timed
-from benchmarks.harness.verdicts import Score, Scores
 
 PROFILES: Final = 3000
 QUICK_PROFILES: Final = 500

@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchmarks.harness.figure import Unit
-from benchmarks.harness.timing import CPU_TIME
+from benchmarks.harness.figure import CPU_TIME, Unit
 
 _DRAWN: Final = {Unit.NUMBER: (1.0, ""), Unit.SHARE: (100.0, " (%)"), Unit.TIME: (1e-3, " (µs)")}
 """Factor and unit in which values are drawn."""

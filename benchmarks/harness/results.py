@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 
-from benchmarks.harness.figure import Figure, Unit, format_time, with_error
+from benchmarks.harness.figure import (
+    Figure,
+    Judgement,
+    Score,
+    Scores,
+    Unit,
+    format_time,
+    with_error,
+)
 from benchmarks.harness.plots import Chart, draw
-from benchmarks.harness.timing import machine
-from benchmarks.harness.verdicts import Judgement, Score, Scores
 from lidarops.errors import CatalogError
+from lidarops.system.code_version import source_version
 from lidarops.system.files import write_atomically
 
 INDEX: Final = "index.html"
@@ -24,6 +34,7 @@ RESULT: Final = "result.json"
 COLUMNS: Final = ["case", "method", "quantity", "value", "error", "unit"]
 """Columns of a table of results; an error of 0 is none."""
 _NONE: Final = "-"
+_PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
 _STYLE: Final = (
     ":root{color-scheme:light dark} body{max-width:80rem;margin:auto;padding:1rem;"
     "font:1rem/1.5 system-ui} table{border-collapse:collapse} td,th{text-align:right;"
@@ -42,6 +53,22 @@ class Effort:
     """Called with 1 after each scenario or setting."""
     data: Path | None = None
     """Folder of published signals, for the accuracy of the elastic retrieval."""
+
+
+def machine() -> dict[str, Any]:
+    """Return processor, cores, versions of Python and packages, and the digest of the code."""
+    models = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        if line.startswith("model name")
+    ]
+    return {
+        "processor": models[0] if models else platform.machine(),
+        "cores": os.cpu_count() or 1,
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
+        "code": source_version(),
+    }
 
 
 def frame(scores: Scores) -> pd.DataFrame:

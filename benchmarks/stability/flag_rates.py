@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.harness.verdicts import Scores, Target
+from benchmarks.harness.figure import Scores, Target
 from benchmarks.stability.random_homogeneous import random_paths
 from benchmarks.stability.random_scenes import Part, shares
 from lidarops.flags import Quality, rejecting

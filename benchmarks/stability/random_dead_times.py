@@ -8,12 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks.harness.figure import Array
-from benchmarks.harness.verdicts import Scores, Target
+from benchmarks.harness.figure import Array, Random, Scores, Target
 from benchmarks.stability.random_scenes import shares
 from lidarops.retrieve.signal.dead_time import ProfileGroup, estimate_dead_time
-
-Random = np.random.Generator
 
 DISTANCE: Final = 7.5 * (np.arange(4000) + 0.5)
 LIGHT: Final = 400.0 * (300.0 / DISTANCE) ** 2 * np.exp(-2e-4 * DISTANCE)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from benchmarks.accuracy import elastic_cases
 from benchmarks.accuracy.elastic_cases import LIDAR_RATIO
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, Random
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.netcdf.variables import ErrorKind
 from lidarops.products.elastic.variables import sources
@@ -20,8 +20,6 @@ from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import constant_ratio
 from lidarops.settings import ReferenceSettings
-
-Random = np.random.Generator
 
 _RATIO_ERROR: Final = 0.2
 """Stated relative standard error of the lidar ratio."""

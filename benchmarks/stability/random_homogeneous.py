@@ -11,14 +11,12 @@ from scipy import stats
 
 from benchmarks.accuracy.homogeneous_cases import least_errors, relative_signal
 from benchmarks.accuracy.multiangle_cases import correlated
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, Random
 from benchmarks.stability.random_scenes import COVERED, Failure, ScoredValues
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
-
-Random = np.random.Generator
 
 _EXTINCTIONS: Final = (1e-7, 6e-2)
 """m-1."""

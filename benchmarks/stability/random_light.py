@@ -8,12 +8,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.harness.figure import Array, Mask
-from benchmarks.harness.verdicts import Scores, Target
+from benchmarks.harness.figure import Array, Mask, Random, Scores, Target
 from benchmarks.stability.random_scenes import Part, shares
 from lidarops.retrieve.signal.light import excess_over_far, light_of, lightless
-
-Random = np.random.Generator
 
 RANGE: Final = 7.5 * (np.arange(2000) + 0.5)
 SHAPE: Final = np.minimum(RANGE / 300.0, 1.0) ** 2 * (300.0 / RANGE) ** 2

@@ -10,14 +10,12 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.accuracy.network_cases import BLOCK, Air, LidarLine, Signals, signals
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, Random
 from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.errors import LidarOpsError
 from lidarops.products.visibility import VisibilityProductSettings
 from lidarops.retrieve.network import extinction_field, labeled
 from lidarops.retrieve.network.flags import NetworkQuality
-
-Random = np.random.Generator
 
 _FULL_OVERLAP: Final = 100.0
 _DOUBTED: Final = np.int32(NetworkQuality.POORLY_DETERMINED)

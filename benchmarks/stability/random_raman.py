@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, Random
 from benchmarks.stability.random_scenes import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
@@ -23,8 +23,6 @@ from lidarops.retrieve.raman.signals import (
     ChannelSignal,
     make_cells,
 )
-
-Random = np.random.Generator
 
 LASER: Final = 354.7e-9
 RAMAN: Final = 386.7e-9

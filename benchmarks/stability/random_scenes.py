@@ -14,9 +14,17 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from benchmarks.harness.figure import Array, Figure, Mask
-from benchmarks.harness.statistics import clustered_share, design_effect
-from benchmarks.harness.verdicts import Judgement, Score, Scores, Target
+from benchmarks.harness.figure import (
+    Array,
+    Figure,
+    Judgement,
+    Mask,
+    Score,
+    Scores,
+    Target,
+    clustered_share,
+    design_effect,
+)
 from lidarops.flags import FlagBit, Quality, rejecting
 
 FALSE: Final = 4.0

@@ -9,15 +9,13 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.accuracy import elastic_cases
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, Random
 from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail, estimate, known_shape
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.signal import counts_to_signal
 from lidarops.simulate import counting
-
-Random = np.random.Generator
 
 _BINS: Final = 400
 _BIN_WIDTH: Final = 7.5

@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
-from benchmarks.harness.verdicts import Judgement
+from benchmarks.harness.figure import Judgement
 
 FILE: Final = Path(__file__).parents[2] / "docs/results/reasons.json"
 Reason = dict[str, str]

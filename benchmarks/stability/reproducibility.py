@@ -13,8 +13,7 @@ import numpy as np
 
 from benchmarks.accuracy import multiangle_cases
 from benchmarks.accuracy.network_cases import signals
-from benchmarks.harness.figure import Array
-from benchmarks.harness.verdicts import Scores
+from benchmarks.harness.figure import Array, Scores
 from benchmarks.stability import random_networks
 from lidarops.retrieve.network import extinction_field
 

@@ -7,10 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from benchmarks.harness.figure import cpu_time, share_text
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    Judgement,
+    Scores,
+    Verdict,
+    cpu_seconds,
+    cpu_time,
+    share_text,
+)
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.harness.timing import CPU_TIME, cpu_seconds
-from benchmarks.harness.verdicts import Judgement, Scores, Verdict
 from benchmarks.stability import (
     flag_rates,
     random_dead_times,

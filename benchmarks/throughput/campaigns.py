@@ -18,10 +18,8 @@ import numpy as np
 import yaml
 from scipy import stats
 
-from benchmarks.harness.figure import share
+from benchmarks.harness.figure import Scores, share, timed
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.harness.timing import timed
-from benchmarks.harness.verdicts import Scores
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.netcdf.write import write_plain

@@ -13,8 +13,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import yaml
 
+from benchmarks.harness.figure import Scores
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.harness.verdicts import Scores
 from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError

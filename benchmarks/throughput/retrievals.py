@@ -11,11 +11,9 @@ import numpy as np
 
 from benchmarks.accuracy.homogeneous_cases import Scenario, method_arguments
 from benchmarks.accuracy.homogeneous_peers import iterative_peers
-from benchmarks.harness.figure import cpu_time
+from benchmarks.harness.figure import CPU_TIME, Scores, cpu_time, timed
 from benchmarks.harness.plots import Chart
 from benchmarks.harness.results import Effort, Results, Study, frame
-from benchmarks.harness.timing import CPU_TIME, timed
-from benchmarks.harness.verdicts import Scores
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)

@@ -11,8 +11,7 @@ import tables
 import verdicts
 from benchmark_results import Row
 
-from benchmarks.harness.figure import Figure, Unit, format_time, with_error
-from benchmarks.harness.verdicts import Judgement, Target
+from benchmarks.harness.figure import Figure, Judgement, Target, Unit, format_time, with_error
 from benchmarks.stability.random_scenes import TARGETS
 from benchmarks.stability.reasons import Unmet
 

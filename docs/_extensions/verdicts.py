@@ -9,10 +9,8 @@ import benchmark_results
 import tables
 from benchmark_results import Row
 
-from benchmarks.harness.figure import share_text
+from benchmarks.harness.figure import CPU_TIME, Judgement, Verdict, share_text
 from benchmarks.harness.results import cell
-from benchmarks.harness.timing import CPU_TIME
-from benchmarks.harness.verdicts import Judgement, Verdict
 from benchmarks.stability import reasons
 from benchmarks.stability.random_scenes import SATISFIED, SHARE, TARGET, TARGETS
 from benchmarks.stability.reasons import Unmet

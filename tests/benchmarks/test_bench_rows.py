@@ -6,10 +6,9 @@ import json
 
 import pytest
 
-from benchmarks.harness.figure import Figure, cpu_time, share, with_error
+from benchmarks.harness.figure import CPU_TIME, Figure, cpu_time, share, with_error
 from benchmarks.harness.plots import Chart, draw, pareto
 from benchmarks.harness.results import Results, Study, frame, table
-from benchmarks.harness.timing import CPU_TIME
 from lidarops.errors import CatalogError
 
 pytestmark = pytest.mark.slow

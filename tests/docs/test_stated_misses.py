@@ -5,7 +5,7 @@ from __future__ import annotations
 import verdicts
 from support.cases import each
 
-from benchmarks.harness.verdicts import Verdict
+from benchmarks.harness.figure import Verdict
 from benchmarks.stability.random_scenes import POOLED, TARGET
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import MEASURED_SHARES

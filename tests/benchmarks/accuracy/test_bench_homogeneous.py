@@ -23,8 +23,8 @@ from benchmarks.accuracy.homogeneous_cases import (
     scenarios,
 )
 from benchmarks.accuracy.homogeneous_peers import PROJECTION, iterative_peers
+from benchmarks.harness.figure import CPU_TIME
 from benchmarks.harness.results import Effort, Study
-from benchmarks.harness.timing import CPU_TIME
 from benchmarks.throughput import retrievals
 from benchmarks.throughput.retrievals import READ, least_times
 from lidarops.errors import CampaignError

@@ -12,7 +12,7 @@ from support.scan_arguments import retrieve_optical_depth
 
 from benchmarks.accuracy import multiangle, multiangle_cases, multiangle_peers
 from benchmarks.accuracy.multiangle import StudySize
-from benchmarks.harness import statistics
+from benchmarks.harness import figure as statistics
 from benchmarks.harness.figure import Figure
 from benchmarks.harness.results import Effort
 from lidarops.retrieve.multiangle import mld

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 
 from benchmarks.accuracy import network as network_benchmark
 from benchmarks.accuracy import network_cases, network_peers
-from benchmarks.harness.statistics import mean_by_block, share_by_block
+from benchmarks.harness.figure import mean_by_block, share_by_block
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ import pytest
 import verdicts
 from scipy import stats
 
-from benchmarks.harness.statistics import design_effect
+from benchmarks.harness.figure import design_effect
 from benchmarks.stability import (
     random_elastic,
     random_homogeneous,

@@ -14,10 +14,8 @@ from typer.testing import CliRunner
 
 from benchmarks.__main__ import app
 from benchmarks.accuracy.homogeneous_cases import Scenario
+from benchmarks.harness.figure import CPU_TIME, Verdict, clustered_share, cpu_seconds, design_effect
 from benchmarks.harness.results import Effort
-from benchmarks.harness.statistics import clustered_share, design_effect
-from benchmarks.harness.timing import CPU_TIME, cpu_seconds
-from benchmarks.harness.verdicts import Verdict
 from benchmarks.stability import (
     random_dead_times,
     random_elastic,
