@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.accuracy import multiangle_cases
 from benchmarks.accuracy.multiangle_cases import Scan, Scene
 from benchmarks.harness.figure import Array
-from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first, joined
+from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 
@@ -186,7 +186,7 @@ def score_short_scans(cluster: int, profiles: int, *, length: int) -> Iterator[S
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)
         scan = scene.draw(profiles, cluster, 0, 87)
         failure = Failure(f"{words}blocks of {length}", satisfied=True)
-        blocks = []
+        # Blocks of one geometry are one cluster.
         for first in range(0, profiles, length):
             some = slice(first, first + length)
             part = replace(
@@ -194,10 +194,7 @@ def score_short_scans(cluster: int, profiles: int, *, length: int) -> Iterator[S
             )
             block = Scan(part, scan.signal[some], scan.variance[some])
             result = multiangle_cases.retrieve(block, multiangle_cases.AUTO)
-            blocks.append([*_score_quantities(failure, part, result)])
-        # Blocks of one geometry are one cluster.
-        for of_blocks in zip(*blocks, strict=True):
-            yield joined(of_blocks)
+            yield from _score_quantities(failure, part, result)
 
 
 def score_counted_scans(cluster: int, profiles: int) -> Iterator[ScoredValues]:

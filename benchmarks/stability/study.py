@@ -39,9 +39,12 @@ from benchmarks.stability.random_scenes import (
     VIOLATED,
     VISIBLE,
     ScoredValues,
+    Unmet,
     collect,
+    rates,
+    read_reasons,
+    why,
 )
-from benchmarks.stability.reasons import Unmet, read_reasons, why
 
 LONGEST: Final = 1200.0
 """s, most CPU time of the whole benchmark."""
@@ -101,8 +104,8 @@ class Draws:
     def measure(self, effort: Effort) -> Results:
         """Return the rates of false values."""
         clusters = self.quick if effort.quick else self.clusters
-        tally = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
-        scores = tally.rates(self.needless, pooled=self.pooled)
+        counted = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
+        scores = rates(counted, self.needless, pooled=self.pooled)
         return Results(self.title, scores, _NOTE, case="quantity", method="class")
 
 

@@ -166,4 +166,6 @@ def _row(name: str, of_class: str, changed: pd.DataFrame, base: pd.DataFrame) ->
 
 if __name__ == "__main__":
     counts = measure(score, range(requested_number(__doc__, NETWORKS)), GUARDS)
-    write_table(PAGES / "network.md", "ablation", table(counts.droplevel("quantity")))
+    write_table(
+        PAGES / "network.md", "ablation", table(counts.droplevel(["quantity", "satisfied"]))
+    )

@@ -11,9 +11,8 @@ from benchmark_results import Row
 
 from benchmarks.harness.figure import CPU_TIME, Judgement, Verdict, share_text
 from benchmarks.harness.results import cell
-from benchmarks.stability import reasons
-from benchmarks.stability.random_scenes import SATISFIED, SHARE, TARGET, TARGETS
-from benchmarks.stability.reasons import Unmet
+from benchmarks.stability import random_scenes
+from benchmarks.stability.random_scenes import SATISFIED, SHARE, TARGET, TARGETS, Unmet
 
 _WORDS: Final = {TARGET: "false", "needless target": "needless"}
 
@@ -95,11 +94,11 @@ def _rows() -> Iterator[Row]:
         yield from rows
 
 
-def stated_reasons() -> list[reasons.Reason]:
+def stated_reasons() -> list[random_scenes.Reason]:
     """Return the reasons for targets that are not met, the most special ones first."""
-    return reasons.read_reasons(benchmark_results.RESULTS / reasons.FILE.name)
+    return random_scenes.read_reasons()
 
 
 def why(one: Unmet) -> str:
     """Return the reason of a target that is not met; empty if none is stated."""
-    return reasons.why(one, stated_reasons())
+    return random_scenes.why(one, stated_reasons())

@@ -15,8 +15,7 @@ from support.cases import each
 from benchmarks.__main__ import BENCHMARKS, app
 from benchmarks.harness.figure import Figure, Judgement, Target, Unit, Verdict
 from benchmarks.stability import study
-from benchmarks.stability.random_scenes import TARGETS
-from benchmarks.stability.reasons import Unmet
+from benchmarks.stability.random_scenes import TARGETS, Unmet
 
 
 @pytest.fixture

@@ -25,7 +25,6 @@ from benchmarks.stability import (
     random_raman,
     random_scans,
     random_signals,
-    reasons,
     reproducibility,
     study,
 )
@@ -36,9 +35,10 @@ from benchmarks.stability.random_scenes import (
     VISIBLE,
     Failure,
     ScoredValues,
-    Tally,
     collect,
     held_first,
+    rates,
+    read_reasons,
 )
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import path_fit
@@ -61,10 +61,8 @@ def scored(failure, error, bits=0, **more):
 
 
 def counted(*chunks, needless=0.05):
-    tally = Tally()
-    for chunk in chunks:
-        tally.add(chunk)
-    return {failure: score for (_, failure), score in tally.rates(needless).items()}
+    scores = rates(collect(lambda number: [chunks[number]], len(chunks)), needless)
+    return {failure: score for (_, failure), score in scores.items()}
 
 
 def test_a_value_is_false_beyond_four_errors_and_not_before():
@@ -251,12 +249,12 @@ def test_a_signal_that_dies_within_a_bin_is_not_solvable():
 def test_the_same_numbers_give_the_same_scenes(draws, repository):
     profiles = min(draws.profiles, 20)
 
-    def rates():
-        tally = collect(lambda cluster: draws.score(cluster, profiles), 2)
-        return tally.rates(draws.needless, pooled=draws.pooled)
+    def scores():
+        counted = collect(lambda cluster: draws.score(cluster, profiles), 2)
+        return rates(counted, draws.needless, pooled=draws.pooled)
 
-    first = rates()
-    assert first == rates()
+    first = scores()
+    assert first == scores()
     assert sum(score["values"] for score in first.values()) > 0
     assert draws.pooled == any(failure in {HELD, BROKEN} for _, failure in first)
     published = json.loads((repository / "docs/results/stability.json").read_text())["tables"]
@@ -265,14 +263,13 @@ def test_the_same_numbers_give_the_same_scenes(draws, repository):
 
 
 def test_scans_where_the_model_holds_are_of_calm_air_and_of_a_layer_too():
-    scored = list(random_scans.score_short_scans(0, 4, length=2))
-    assert [(values.failure.name, values.quantity) for values in scored] == [
+    counted = collect(lambda _: random_scans.score_short_scans(0, 4, length=2), 1)
+    # The blocks of one geometry are one cluster.
+    assert [*counted[["class", "quantity"]].itertuples(index=False, name=None)] == [
         (f"{words}blocks of 2", quantity)
         for words in ("", "calm air, ", "layer of a few altitudes, ")
         for quantity in ("optical depth", "extinction")
     ]
-    # The blocks of one geometry are one cluster.
-    assert all(len(values.error) == len(values.bits) == 4 for values in scored)
 
 
 @pytest.mark.parametrize("retrieval", ["multi-angle", "network"])
@@ -287,11 +284,10 @@ def test_classes_where_the_model_holds_come_first(retrieval):
 
 def test_tests_reject_more_paths_with_a_plume_than_paths_where_the_model_holds():
     draws = next(draw for draw in study.DRAWS if draw.name == "homogeneous")
-    tally = collect(lambda cluster: draws.score(cluster, 300), 6)
-    rates = tally.rates(1e-3)
-    held = rates["extinction", "none"]
+    scores = rates(collect(lambda cluster: draws.score(cluster, 300), 6), 1e-3)
+    held = scores["extinction", "none"]
     assert 0.2 < held["not rejected"].value < 0.8
-    bent = rates["extinction", "plume"]
+    bent = scores["extinction", "plume"]
     assert bent["not rejected"].value < 0.5 * held["not rejected"].value
     assert bent["and not uncertain"].value > held["and not uncertain"].value
 
@@ -343,7 +339,7 @@ def test_missed_targets_without_a_reason_are_told_apart(monkeypatch, tmp_path):
 
     draws = (study.Draws("paths", "own", score, 500, 20, 20),)
     file = tmp_path / "reasons.json"
-    monkeypatch.setattr(study, "read_reasons", lambda: reasons.read_reasons(file))
+    monkeypatch.setattr(study, "read_reasons", lambda: read_reasons(file))
     both = [f"paths: hidden ({quantity}), target 0.5 % MISSED" for quantity in "xy"]
     measured = study.measure_stability(Effort(), draws, "own")
     assert (measured.missed, measured.unnamed) == (both, [])
@@ -401,7 +397,7 @@ def test_values_doubted_for_another_quantity_are_counted(monkeypatch):
     """Lidar ratios are missing in most of these skies."""
 
     def doubted():
-        scores = collect(lambda k: random_raman.score_raman(k, 4), 6).rates(0.05)
+        scores = rates(collect(lambda k: random_raman.score_raman(k, 4), 6), 0.05)
         return scores["extinction", "none"]["needlessly flagged"].value
 
     assert doubted() == 0.0
@@ -486,7 +482,7 @@ def test_outlying_bins_cost_few_elastic_values():
             if values.failure.name == "outliers":
                 yield values
 
-    rates = collect(scenes_with_outliers, 8).rates(None)
-    score = rates["backscatter", "outliers"]
+    scores = rates(collect(scenes_with_outliers, 8), None)
+    score = scores["backscatter", "outliers"]
     assert score["and not uncertain"].value < VIOLATED
     assert score["not rejected"].value > 0.5
