@@ -22,8 +22,6 @@ def measure_all(effort: Effort) -> Study:
     ------
     CampaignError
         If the folder of published signals holds no such files.
-    RawFormatError
-        If a published file cannot be read.
     """
     studies = {
         "homogeneous path": homogeneous.measure_homogeneous(effort),

@@ -17,15 +17,6 @@ from benchmarks.accuracy.comparison import (
     score_errors,
     time_profiles,
 )
-from benchmarks.accuracy.homogeneous_cases import (
-    BACKGROUND,
-    QUANTITIES,
-    TAIL_MEAN,
-    PathSolver,
-    Scenario,
-    methods,
-    scenarios,
-)
 from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
 from benchmarks.harness.figure import (
     CPU_TIME,
@@ -37,6 +28,15 @@ from benchmarks.harness.figure import (
     share,
 )
 from benchmarks.harness.results import Effort, Results, Study, Work
+from benchmarks.scenes.homogeneous_paths import (
+    BACKGROUND,
+    QUANTITIES,
+    TAIL_MEAN,
+    PathSolver,
+    Scenario,
+    methods,
+    scenarios,
+)
 from lidarops.retrieve.background.cubic_and_tail import cubic
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 

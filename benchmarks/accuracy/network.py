@@ -11,9 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.accuracy import network_cases as cases
 from benchmarks.accuracy.comparison import comparison
-from benchmarks.accuracy.network_cases import BLOCK, LidarLine, Signals
 from benchmarks.accuracy.network_peers import network_by_scipy, network_by_scipy_of_means
 from benchmarks.harness.figure import (
     CPU_TIME,
@@ -31,6 +29,8 @@ from benchmarks.harness.figure import (
     timed,
 )
 from benchmarks.harness.results import Effort, Results, Study, Work
+from benchmarks.scenes import lidar_networks as cases
+from benchmarks.scenes.lidar_networks import BLOCK, LidarLine, Signals
 
 PROFILES: Final = 3000
 QUICK_PROFILES: Final = 500

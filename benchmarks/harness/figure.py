@@ -253,6 +253,20 @@ def _sums(values: Array) -> Array:
     return np.asarray(values.reshape(len(values), -1).sum(axis=1))
 
 
+def log_uniform(rng: Random, low: float, high: float, size: tuple[int, ...] | None = None) -> Any:
+    """Return random numbers, or one, whose logarithm is uniform."""
+    return np.exp(rng.uniform(np.log(low), np.log(high), size))
+
+
+def correlated(rng: Random, shape: tuple[int, ...], correlation: float) -> Array:
+    """Return unit normal numbers, correlated along the last axis."""
+    out = rng.normal(size=shape)
+    rest = np.sqrt(1.0 - correlation**2)
+    for k in range(1, shape[-1] if correlation else 0):
+        out[..., k] = correlation * out[..., k - 1] + rest * out[..., k]
+    return out
+
+
 # Times ----------------------------------------------------------------------------------------
 
 

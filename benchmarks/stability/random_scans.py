@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.accuracy import multiangle_cases
 from benchmarks.accuracy.multiangle_cases import Scan, Scene
 from benchmarks.harness.figure import Array
-from benchmarks.stability.random_scenes import Failure, ScoredValues, held_first
+from benchmarks.harness.rates import Failure, ScoredValues, held_first
 from lidarops.retrieve.multiangle import optical_depth
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 

@@ -18,9 +18,9 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
+from benchmarks.harness import rates
 from benchmarks.harness.figure import Array
-from benchmarks.stability import random_scenes
-from benchmarks.stability.random_scenes import ScoredValues
+from benchmarks.harness.rates import ScoredValues
 
 PAGES: Final = Path(__file__).resolve().parents[2] / "docs/algorithms"
 """Of the tables."""
@@ -92,12 +92,12 @@ def measure(
             for cluster in clusters:
                 for values in score(cluster):
                     rows += [
-                        random_scenes.counts(_without_bits(values, guard.bits))
+                        rates.counts(_without_bits(values, guard.bits))
                         | {"guard": guard.name, "cluster": cluster}
                         for guard in variants
                     ]
     counted = pd.DataFrame(rows).drop(columns="sizes")
-    return counted.groupby(["guard", *random_scenes.KEYS], sort=False).sum()
+    return counted.groupby(["guard", *rates.KEYS], sort=False).sum()
 
 
 def _without_bits(values: ScoredValues, bits: int) -> ScoredValues:

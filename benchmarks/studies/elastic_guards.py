@@ -13,7 +13,7 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from benchmarks.stability import random_elastic
+from benchmarks.scenes import elastic_skies
 from benchmarks.studies.ablation import (
     PAGES,
     Guard,
@@ -124,5 +124,5 @@ GUARDS: Final = (
 
 if __name__ == "__main__":
     clusters = range(requested_number(__doc__, CLUSTERS))
-    counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), clusters, GUARDS)
+    counts = measure(lambda k: elastic_skies.score_elastic(k, PROFILES), clusters, GUARDS)
     write_table(PAGES / "elastic.md", "guards", table(counts))

@@ -1,6 +1,6 @@
 """Ablation of the guards of networks: ``python -m benchmarks.studies.network_guards [NETWORKS]``.
 
-Every variant solves the same random networks (`benchmarks.stability.random_networks`) and blocks
+Every variant solves the same random networks (`benchmarks.stability.lidar_networks`) and blocks
 in which noise rises, in steep fields, and with outliers in curved air. The table in
 ``docs/algorithms/network.md`` states shares with all guards, then the differences without one of
 them, in percent, each with its Monte Carlo error from the scatter between networks.
@@ -14,9 +14,10 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from benchmarks.accuracy.network_cases import Air, signals
-from benchmarks.stability import random_networks
-from benchmarks.stability.random_scenes import Failure, ScoredValues
+from benchmarks.harness.figure import log_uniform
+from benchmarks.harness.rates import Failure, ScoredValues
+from benchmarks.scenes import lidar_networks
+from benchmarks.scenes.lidar_networks import Air, signals
 from benchmarks.studies.ablation import (
     BASE,
     PAGES,
@@ -68,15 +69,15 @@ def _rising_noise(cluster: int) -> ScoredValues | None:
     """Return the values of a block in which noise rises by a factor of 5, as at dawn."""
     rng = np.random.default_rng((74, cluster))
     factor = np.where(np.arange(PROFILES) < rng.integers(10, 40), 1.0, 5.0)[:, None, None]
-    return _solved(RISING, rng, random_networks.layered, (3e-3, 0.1), factor=factor)
+    return _solved(RISING, rng, lidar_networks.layered, (3e-3, 0.1), factor=factor)
 
 
 def _steep_field(cluster: int) -> ScoredValues | None:
     """Return the values of a block in a field with a scale height of 80 to 300 m."""
 
     def steep(rng: Any) -> Air:
-        value = float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))
-        scale = float(np.exp(rng.uniform(np.log(80.0), np.log(300.0))))
+        value = log_uniform(rng, 3e-4, 5e-3)
+        scale = log_uniform(rng, 80.0, 300.0)
         return Air("steep", lambda _: lambda __, up: value * np.exp(-(up - 500.0) / scale))
 
     return _solved(STEEP, np.random.default_rng((75, cluster)), steep, (1e-3, 0.1))
@@ -85,7 +86,7 @@ def _steep_field(cluster: int) -> ScoredValues | None:
 def _curved_outliers(cluster: int) -> ScoredValues | None:
     """Return the values of a block with 0.5 to 4 percent of outlying bins in plumes and layers."""
     rng = np.random.default_rng((76, cluster))
-    air = random_networks.plume if cluster % 2 else random_networks._thin_layer
+    air = lidar_networks.plume if cluster % 2 else lidar_networks._thin_layer
     outlying = float(rng.uniform(0.005, 0.04))
     return _solved(CURVED, rng, air, (1e-3, 0.1), outlying=outlying)
 
@@ -94,11 +95,11 @@ def _solved(
     name: str, rng: Any, air: Any, noises: tuple[float, float], *, factor: Any = 1.0,
     outlying: float = 0.0,
 ) -> ScoredValues | None:  # fmt: skip
-    net = random_networks.random_network(rng).network()
+    net = lidar_networks.random_network(rng).network()
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return None
     clean = signals(net, air(rng))
-    noise = float(np.exp(rng.uniform(*np.log(noises))))
+    noise = float(log_uniform(rng, *noises))
     power, variance = clean.draw(noise, PROFILES, int(rng.integers(2**31)), additive=noise / 3.0)
     mean = clean.power[np.arange(PROFILES) % len(clean.power)]
     power, variance = mean + factor * (power - mean), factor**2 * variance
@@ -107,7 +108,7 @@ def _solved(
     result = extinction_field.retrieve_network(
         power, clean.range, net, variance=variance, full_overlap_range=100.0
     )
-    return random_networks.scored(Failure(name), result, clean.truth(PROFILES), 0.0)
+    return lidar_networks.scored(Failure(name), result, clean.truth(PROFILES), 0.0)
 
 
 SHARES: Final = {
@@ -121,7 +122,7 @@ SHARES: Final = {
 
 def score(cluster: int) -> Iterator[ScoredValues]:
     """Yield the values of a random network by class."""
-    yield from random_networks.score_networks(cluster, PROFILES)
+    yield from lidar_networks.score_networks(cluster, PROFILES)
     for draw in (_rising_noise, _steep_field, _curved_outliers):
         values = draw(cluster)
         if values is not None:

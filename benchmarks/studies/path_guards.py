@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.stability import random_homogeneous
+from benchmarks.scenes import homogeneous_paths
 from benchmarks.studies.ablation import (
     PAGES,
     Guard,
@@ -62,8 +62,8 @@ TABLES: Final = {"guards": ((8, 800), GUARDS), "guards of 4 to 7 bins": ((4, 7),
 if __name__ == "__main__":
     clusters = range(requested_number(__doc__, CLUSTERS))
     for mark, (bins, guards) in TABLES.items():
-        with replaced((random_homogeneous, "_BINS", bins)):
+        with replaced((homogeneous_paths, "RANDOM_BINS", bins)):
             counts = measure(
-                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), clusters, guards
+                lambda k: homogeneous_paths.score_homogeneous(k, PROFILES), clusters, guards
             )
         write_table(PAGES / "homogeneous.md", mark, table(counts))

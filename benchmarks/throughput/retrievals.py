@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.accuracy.homogeneous_cases import Scenario, method_arguments
 from benchmarks.accuracy.homogeneous_peers import iterative_peers
 from benchmarks.harness.figure import CPU_TIME, Scores, cpu_time, timed
 from benchmarks.harness.plots import Chart
 from benchmarks.harness.results import Effort, Results, Study, frame
+from benchmarks.scenes.homogeneous_paths import Scenario, method_arguments
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, fit_homogeneous_path
 
 PATH: Final = Scenario(start=2500.0, length=8000.0, extinction=3e-5, signal=1000.0)

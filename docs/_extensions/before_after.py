@@ -12,7 +12,7 @@ import verdicts
 from benchmark_results import Row
 
 from benchmarks.harness.figure import Figure, Judgement, Target, Unit, format_time, with_error
-from benchmarks.stability.random_scenes import TARGETS, Unmet
+from benchmarks.harness.rates import TARGETS, Unmet
 
 RATIO: Final = "ratio"
 """Beginning of a place that names two figures, of which the first is divided by the second."""

@@ -9,10 +9,10 @@ import benchmark_results
 import tables
 from benchmark_results import Row
 
+from benchmarks.harness import rates
 from benchmarks.harness.figure import CPU_TIME, Judgement, Verdict, share_text
+from benchmarks.harness.rates import SATISFIED, SHARE, TARGET, TARGETS, Unmet
 from benchmarks.harness.results import cell
-from benchmarks.stability import random_scenes
-from benchmarks.stability.random_scenes import SATISFIED, SHARE, TARGET, TARGETS, Unmet
 
 _WORDS: Final = {TARGET: "false", "needless target": "needless"}
 
@@ -94,11 +94,11 @@ def _rows() -> Iterator[Row]:
         yield from rows
 
 
-def stated_reasons() -> list[random_scenes.Reason]:
+def stated_reasons() -> list[rates.Reason]:
     """Return the reasons for targets that are not met, the most special ones first."""
-    return random_scenes.read_reasons()
+    return rates.read_reasons()
 
 
 def why(one: Unmet) -> str:
     """Return the reason of a target that is not met; empty if none is stated."""
-    return random_scenes.why(one, stated_reasons())
+    return rates.why(one, stated_reasons())

@@ -14,8 +14,8 @@ from support.cases import each
 
 from benchmarks.__main__ import BENCHMARKS, app
 from benchmarks.harness.figure import Figure, Judgement, Target, Unit, Verdict
+from benchmarks.harness.rates import TARGETS, Unmet
 from benchmarks.stability import study
-from benchmarks.stability.random_scenes import TARGETS, Unmet
 
 
 @pytest.fixture

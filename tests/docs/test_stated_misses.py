@@ -6,7 +6,7 @@ import verdicts
 from support.cases import each
 
 from benchmarks.harness.figure import Verdict
-from benchmarks.stability.random_scenes import POOLED, TARGET
+from benchmarks.harness.rates import POOLED, TARGET
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import MEASURED_SHARES
 

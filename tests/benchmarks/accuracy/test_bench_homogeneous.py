@@ -14,7 +14,10 @@ from typer.testing import CliRunner
 
 from benchmarks.__main__ import BENCHMARKS, app, measure
 from benchmarks.accuracy import homogeneous
-from benchmarks.accuracy.homogeneous_cases import (
+from benchmarks.accuracy.homogeneous_peers import PROJECTION, iterative_peers
+from benchmarks.harness.figure import CPU_TIME
+from benchmarks.harness.results import Effort, Study
+from benchmarks.scenes.homogeneous_paths import (
     QUANTITIES,
     TAIL_MEAN,
     Estimates,
@@ -22,9 +25,6 @@ from benchmarks.accuracy.homogeneous_cases import (
     methods,
     scenarios,
 )
-from benchmarks.accuracy.homogeneous_peers import PROJECTION, iterative_peers
-from benchmarks.harness.figure import CPU_TIME
-from benchmarks.harness.results import Effort, Study
 from benchmarks.throughput import retrievals
 from benchmarks.throughput.retrievals import READ, least_times
 from lidarops.errors import CampaignError

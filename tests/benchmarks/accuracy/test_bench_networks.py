@@ -10,23 +10,24 @@ import pytest
 from scipy.integrate import quad
 
 from benchmarks.accuracy import network as network_benchmark
-from benchmarks.accuracy import network_cases, network_peers
+from benchmarks.accuracy import network_peers
 from benchmarks.harness.figure import mean_by_block, share_by_block
+from benchmarks.scenes import lidar_networks
 
 pytestmark = pytest.mark.slow
 
-PROFILES = 3 * network_cases.BLOCK
+PROFILES = 3 * lidar_networks.BLOCK
 
 
 @pytest.fixture(scope="module")
 def cases():
     """Return the scores by network, air, noise and method."""
-    numbered = list(enumerate(product(network_cases.AIRS, network_cases.NOISES)))
+    numbered = list(enumerate(product(lidar_networks.AIRS, lidar_networks.NOISES)))
     return {
         (lidars.name, air.name, noise): network_benchmark.measure_case(
-            network_cases.signals(lidars.network(), air), noise, PROFILES, number
+            lidar_networks.signals(lidars.network(), air), noise, PROFILES, number
         )
-        for lidars in network_cases.LIDAR_LINES
+        for lidars in lidar_networks.LIDAR_LINES
         for number, (air, noise) in numbered
     }
 
@@ -35,7 +36,7 @@ def cases():
 
 
 def test_the_triangle_is_the_one_of_the_paper():
-    network = network_cases.TRIANGLE.network()
+    network = lidar_networks.TRIANGLE.network()
     assert (network.beams, network.crossings) == (3, 3)
     # Beams 1 and 3 cross above lidar 3; the other crossings follow from the lines.
     expected = {
@@ -46,15 +47,15 @@ def test_the_triangle_is_the_one_of_the_paper():
     crossings = {(round(x, 6) + 0.0, round(up, 6)) for x, _, up in network.crossing}
     assert crossings == {(x, round(up, 6)) for x, up in expected}
     assert network.near_crossing.tolist() == [True, True, False]
-    six_beams = network_cases.THREE_BY_TWO.network()
+    six_beams = lidar_networks.THREE_BY_TWO.network()
     assert (six_beams.beams, six_beams.crossings, six_beams.passages.beam.size) == (6, 8, 16)
 
 
-@pytest.mark.parametrize("air", network_cases.AIRS, ids=lambda air: air.name)
+@pytest.mark.parametrize("air", lidar_networks.AIRS, ids=lambda air: air.name)
 def test_signals_obey_the_lidar_equation(air):
     """Compare with adaptive quadrature of the optical depth along a beam."""
-    network = network_cases.TRIANGLE.network()
-    signals = network_cases.signals(network, air)
+    network = lidar_networks.TRIANGLE.network()
+    signals = lidar_networks.signals(network, air)
     for number, extinction in list(enumerate(air.fields()))[:: max(len(air.fields()) - 1, 1)]:
         for beam in range(network.beams):
             origin, direction = network.origin[beam], network.direction[beam]
@@ -73,16 +74,16 @@ def test_signals_obey_the_lidar_equation(air):
 
 def test_fields_of_extinction_are_as_described():
     signals_of = {
-        air.name: network_cases.signals(network_cases.TRIANGLE.network(), air)
-        for air in network_cases.AIRS
+        air.name: lidar_networks.signals(lidar_networks.TRIANGLE.network(), air)
+        for air in lidar_networks.AIRS
     }
     assert np.all(signals_of["homogeneous"].extinction == 2e-3)
-    assert np.all(signals_of[network_cases.THIN.name].extinction == 2e-4)
+    assert np.all(signals_of[lidar_networks.THIN.name].extinction == 2e-4)
     gradient = signals_of["gradient"].extinction[0]
     height = signals_of["gradient"].network.crossing[:, 2]
     np.testing.assert_allclose(np.diff(np.log(gradient)), -np.diff(height) / 1010.0)
     drift = signals_of["drifting plume"].extinction
-    assert len(drift) == network_cases.BLOCK
+    assert len(drift) == lidar_networks.BLOCK
     assert drift[:, 0].max() > 1.3 * drift[:, 0].min()
     signals = signals_of["drifting plume"]
     np.testing.assert_array_equal(signals.truth(120)[50:100], drift)
@@ -90,7 +91,7 @@ def test_fields_of_extinction_are_as_described():
 
 
 def test_noise_is_as_stated_and_reproducible():
-    signals = network_cases.signals(network_cases.TRIANGLE.network(), network_cases.AIRS[1])
+    signals = lidar_networks.signals(lidar_networks.TRIANGLE.network(), lidar_networks.AIRS[1])
     power, variance = signals.draw(0.05, 2000, 3)
     assert np.array_equal(power, signals.draw(0.05, 2000, 3)[0])
     assert not np.array_equal(power[:5], signals.draw(0.05, 5, 4)[0])
@@ -108,15 +109,15 @@ def test_noise_is_as_stated_and_reproducible():
 # Peers ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", network_cases.LIDAR_LINES, ids=lambda place: place.name)
+@pytest.mark.parametrize("place", lidar_networks.LIDAR_LINES, ids=lambda place: place.name)
 def test_a_plain_fit_finds_the_same_network(place):
-    signals = network_cases.signals(place.network(), network_cases.AIRS[1])
+    signals = lidar_networks.signals(place.network(), lidar_networks.AIRS[1])
     clean = network_peers.network_by_scipy(signals.power, 1e-10 * signals.power**2, signals)[0]
     # Error of trapezoids of 5 m.
     np.testing.assert_allclose(clean, signals.extinction[0], rtol=0.01)
     power, variance = signals.draw(0.01, 6, 1)
     ours, near = (
-        network_cases.SOLVERS[network_cases.NO_PRIOR](power, variance, signals),
+        lidar_networks.SOLVERS[lidar_networks.NO_PRIOR](power, variance, signals),
         signals.network.near_crossing,
     )
     difference = (network_peers.network_by_scipy(power, variance, signals) - ours.extinction)[
@@ -126,11 +127,11 @@ def test_a_plain_fit_finds_the_same_network(place):
 
 
 def test_a_plain_fit_of_means_has_one_value_for_the_profiles_of_a_block():
-    signals = network_cases.signals(network_cases.TRIANGLE.network(), network_cases.AIRS[0])
-    profiles = network_cases.BLOCK + 7
+    signals = lidar_networks.signals(lidar_networks.TRIANGLE.network(), lidar_networks.AIRS[0])
+    profiles = lidar_networks.BLOCK + 7
     power, variance = signals.draw(0.05, profiles, 2)
     fitted = network_peers.network_by_scipy_of_means(power, variance, signals)
-    for block in (slice(network_cases.BLOCK), slice(network_cases.BLOCK, None)):
+    for block in (slice(lidar_networks.BLOCK), slice(lidar_networks.BLOCK, None)):
         count = len(power[block])
         mean, of_mean = power[block].mean(axis=0), variance[block].sum(axis=0) / count**2
         expected = network_peers.network_by_scipy(mean[np.newaxis], of_mean[np.newaxis], signals)
@@ -145,7 +146,7 @@ def test_a_plain_fit_of_means_has_one_value_for_the_profiles_of_a_block():
 
 def test_errors_of_means_come_from_the_scatter_of_blocks():
     random = np.random.default_rng(1)
-    blocks, block = 400, network_cases.BLOCK
+    blocks, block = 400, lidar_networks.BLOCK
     shared = np.repeat(random.standard_normal(blocks), block)
     values = 2.0 + shared + 0.1 * random.standard_normal(shared.size)
     mean = mean_by_block(values, np.ones(values.size, dtype=bool), block)
@@ -193,17 +194,17 @@ def test_scores_of_known_errors():
 def test_every_case_is_scored_with_every_solver(cases):
     assert len(cases) == 2 * 5 * 3
     for scores in cases.values():
-        assert list(scores) == list(network_cases.SOLVERS)
+        assert list(scores) == list(lidar_networks.SOLVERS)
         assert all(0.0 <= score["solved"].value <= 1.0 for score in scores.values())
 
 
 def test_the_network_reaches_the_required_accuracy(cases):
     """The first crossing of the triangle and the median one of 3 x 2 beams: within 8 percent."""
-    network = network_cases.NETWORK
+    network = lidar_networks.NETWORK
     for air, noise in (("homogeneous", 0.1), ("plume", 0.05), ("gradient", 0.05)):
         scores = cases["triangle", air, noise]
         assert scores[network]["RMSE at the first crossing"].value <= 0.08
-        exact = scores[network_cases.NO_PRIOR]
+        exact = scores[lidar_networks.NO_PRIOR]
         assert exact["RMSE at the first crossing"].value > 0.12
     for air in ("homogeneous", "gradient", "plume"):
         score = cases["3 x 2 beams", air, 0.05][network]
@@ -224,10 +225,10 @@ def test_the_network_reaches_the_required_accuracy(cases):
     ],
 )
 def test_unflagged_values_of_the_network_are_as_stated(cases, moving):
-    for lidars in network_cases.LIDAR_LINES:
-        for air in (air for air in network_cases.AIRS[:4] if air.moving is moving):
-            for noise in network_cases.NOISES:
-                score = cases[lidars.name, air.name, noise][network_cases.NETWORK]
+    for lidars in lidar_networks.LIDAR_LINES:
+        for air in (air for air in lidar_networks.AIRS[:4] if air.moving is moving):
+            for noise in lidar_networks.NOISES:
+                score = cases[lidars.name, air.name, noise][lidar_networks.NETWORK]
                 assert score["within 3"].value >= 0.98
                 assert score["flagged"].value < 0.1
 

@@ -11,15 +11,15 @@ import verdicts
 from scipy import stats
 
 from benchmarks.harness.figure import design_effect
-from benchmarks.stability import (
-    random_elastic,
-    random_homogeneous,
-    random_networks,
-    random_raman,
-    random_scans,
-    random_signals,
+from benchmarks.harness.rates import COVERED, FALSE, SATISFIED
+from benchmarks.scenes import (
+    elastic_skies,
+    homogeneous_paths,
+    lidar_networks,
+    raman_skies,
+    recorded_signals,
 )
-from benchmarks.stability.random_scenes import COVERED, FALSE, SATISFIED
+from benchmarks.stability import random_scans
 from lidarops.flags import Quality, rejecting
 
 pytestmark = pytest.mark.slow
@@ -28,7 +28,7 @@ FOUND = 0.95
 """Probability that twice the target is found."""
 CONFINED = 0.3
 """Share of the values that are false in a network that has false ones: as large as in the random
-networks of `test_bench_random_networks.py`. Of other retrievals, values beyond 1.96 errors show how
+networks of `test_bench_lidar_networks.py`. Of other retrievals, values beyond 1.96 errors show how
 those of one geometry depend on each other."""
 
 
@@ -125,7 +125,7 @@ def where_the_model_holds(score, clusters, profiles):
         yield from chunks
 
 
-HOMOGENEOUS = (random_homogeneous.score_homogeneous, 50, 200)
+HOMOGENEOUS = (homogeneous_paths.score_homogeneous, 50, 200)
 """Score, clusters and profiles of the check of the default suite. Clusters take the time."""
 
 
@@ -147,7 +147,7 @@ def test_twice_the_target_in_one_class_of_homogeneous_paths_is_found():
 
 def networks(cluster, profiles):
     """Yield networks without missing bins, with which one of seven is accepted: too few to tell."""
-    chunks = random_networks.score_networks(cluster, profiles)
+    chunks = lidar_networks.score_networks(cluster, profiles)
     yield from takewhile(lambda chunk: chunk.failure.name != "gaps", chunks)
 
 
@@ -158,10 +158,10 @@ KNOWN = verdicts.above_target()
 @pytest.mark.parametrize(
     ("score", "clusters", "profiles", "confined"),
     [
-        pytest.param(random_homogeneous.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
-        pytest.param(random_homogeneous.score_short_sections, 600, 300, 0.0, id="short sections"),
-        pytest.param(random_signals.score_signals, 200, 50, 0.0, id="signal chain"),
-        pytest.param(random_elastic.score_elastic, 400, 20, 0.0, id="elastic"),
+        pytest.param(homogeneous_paths.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
+        pytest.param(homogeneous_paths.score_short_sections, 600, 300, 0.0, id="short sections"),
+        pytest.param(recorded_signals.score_signals, 200, 50, 0.0, id="signal chain"),
+        pytest.param(elastic_skies.score_elastic, 400, 20, 0.0, id="elastic"),
         pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
         pytest.param(
             partial(random_scans.score_short_scans, length=1), 400, 4, 0.0, id="scans, blocks of 1"
@@ -169,7 +169,7 @@ KNOWN = verdicts.above_target()
         pytest.param(
             partial(random_scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
         ),
-        pytest.param(random_raman.score_raman, 1000, 4, 0.0, id="Raman"),
+        pytest.param(raman_skies.score_raman, 1000, 4, 0.0, id="Raman"),
         pytest.param(networks, 1200, 50, CONFINED, id="network"),
     ],
 )

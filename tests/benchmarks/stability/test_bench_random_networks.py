@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.stability import random_networks
-from benchmarks.stability.random_networks import score_networks
+from benchmarks.scenes import lidar_networks
+from benchmarks.scenes.lidar_networks import score_networks
 from lidarops.retrieve.network import _block_solution, _changing_field
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -51,7 +51,7 @@ def test_networks_with_once_too_small_errors_state_them(
         assert np.median((scored.random / np.abs(scored.error))[kept]) < 2.0
 
 
-def test_random_networks_state_the_errors_of_thin_layers():
+def test_lidar_networks_state_the_errors_of_thin_layers():
     scored = [
         values
         for cluster in range(24)
@@ -72,8 +72,8 @@ def test_the_errors_of_stratified_air_are_right(cluster, monkeypatch):
     """Without a prior for it, values of layered air deviate by more than their errors."""
 
     def covered():
-        (values,) = random_networks.score_short_blocks(
-            cluster, 6, draw_air=random_networks.layered, name="layered", length=3
+        (values,) = lidar_networks.score_short_blocks(
+            cluster, 6, draw_air=lidar_networks.layered, name="layered", length=3
         )
         kept = np.isfinite(values.error) & (values.bits == 0)
         assert kept.mean() > 0.5
