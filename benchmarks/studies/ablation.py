@@ -41,6 +41,7 @@ stated errors.
 `needless`: flagged or withheld though determinable. `lost`: flagged or withheld."""
 
 Context = Callable[[], AbstractContextManager[object]]
+ScoreCluster = Callable[[int], Iterable[ScoredValues]]
 Patch = tuple[Any, str, Any]
 """Owner, name of its attribute, and what stands there instead."""
 
@@ -75,11 +76,7 @@ def with_thresholds(module: Any, **changes: Any) -> Context:
     return without((module, "THRESHOLDS", module.THRESHOLDS._replace(**changes)))
 
 
-def measure(
-    score: Callable[[int], Iterable[ScoredValues]],
-    clusters: Sequence[int],
-    guards: Sequence[Guard],
-) -> pd.DataFrame:
+def measure(score: ScoreCluster, clusters: Sequence[int], guards: Sequence[Guard]) -> pd.DataFrame:
     """Return counts by guard, quantity, class and cluster."""
     contexts: list[tuple[Context, list[Guard]]] = [
         (nullcontext, [Guard(BASE), *(guard for guard in guards if guard.off is None)]),
@@ -111,23 +108,21 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
     yield "| guard off | value | " + " | ".join(RATES) + " | moves |"
     yield "| --- | --- |" + " --- |" * (len(RATES) + 1)
     places = ["guard", "quantity", "cluster"]
-    sides = counts.groupby(places, sort=False).sum()
-    of_model = {
-        holds: counts[counts.index.isin(holds, level="satisfied")]
-        .groupby(places, sort=False)
-        .sum()
-        .reindex(sides.index, fill_value=0.0)
-        for holds in {rate[2] for rate in RATES.values()}
-    }
-    names = [sides.index.unique(level) for level in ("guard", "quantity")]
+    every = counts.groupby(places, sort=False).sum()
+    sides = {}
+    for holds in {rate[2] for rate in RATES.values()}:
+        side = counts[counts.index.isin(holds, level="satisfied")].groupby(places, sort=False).sum()
+        side = side.reindex(every.index, fill_value=0.0)
+        sides |= {(holds, *key): own for key, own in side.groupby(places[:2], sort=False)}
+    names = [every.index.unique(level) for level in places[:2]]
     for guard, quantity in product(*names):
-        if (guard, quantity) not in sides.index:
+        if ((True,), guard, quantity) not in sides:
             continue
         cells, moves = [], []
         for name, (events, trials, holds) in RATES.items():
             (value, left), (of_base, base_left) = (
-                _jackknife(*of_model[holds].loc[key][[events, trials]].to_numpy().T)
-                for key in ((guard, quantity), (BASE, quantity))
+                _jackknife(*sides[holds, of, quantity][[events, trials]].to_numpy().T)
+                for of in (guard, BASE)
             )
             if guard != BASE:
                 value, left = value - of_base, left - base_left
@@ -154,6 +149,13 @@ def write_table(page: Path, mark: str, lines: Iterable[str]) -> None:
     if not (begin and end):
         raise ValueError(f"{page} has no marks of the name {mark!r}")
     page.write_text("".join((before, begin, *(f"{line}\n" for line in lines), end, after)), "utf-8")
+
+
+def write_guards(
+    page: str, score: ScoreCluster, clusters: int, guards: Sequence[Guard], mark: str = "guards"
+) -> None:
+    """Write the table of guards into a page, between two marks of that name."""
+    write_table(PAGES / page, mark, table(measure(score, range(clusters), guards)))
 
 
 def requested_number(description: str | None, default: int) -> int:

@@ -15,15 +15,12 @@ import numpy as np
 
 from benchmarks.scenes import elastic_skies
 from benchmarks.studies.ablation import (
-    PAGES,
     Guard,
-    measure,
     replaced,
     requested_number,
-    table,
     with_thresholds,
     without,
-    write_table,
+    write_guards,
 )
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import Rejection
@@ -123,6 +120,5 @@ GUARDS: Final = (
 )
 
 if __name__ == "__main__":
-    clusters = range(requested_number(__doc__, CLUSTERS))
-    counts = measure(lambda k: elastic_skies.score_elastic(k, PROFILES), clusters, GUARDS)
-    write_table(PAGES / "elastic.md", "guards", table(counts))
+    score = partial(elastic_skies.score_elastic, profiles=PROFILES)
+    write_guards("elastic.md", score, requested_number(__doc__, CLUSTERS), GUARDS)

@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,16 +22,22 @@ from benchmarks.harness.figure import Scores, share, timed
 from benchmarks.harness.results import Effort, Results, Study
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
-from lidarops.netcdf.write import write_plain
+from lidarops.raw import licel
+from lidarops.raw.licel import DatasetKind, Laser
 from lidarops.records import RunRecord
 from lidarops.run import archive
-from lidarops.simulate.campaign import plan_simulation, write_simulation
 
 CAMPAIGN_FILE: Final = "campaign.yaml"
-"""Name of the campaign file in the folder of each simulated campaign."""
+"""Name of the campaign file in the folder of each campaign."""
 _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
-_INTERVAL: Final = 60
-"""s; duration of a file."""
+_INTERVAL: Final = timedelta(minutes=1)
+"""Duration of a file."""
+BIN_WIDTH: Final = 3.75
+_SHOTS: Final = 400
+_VARIANTS: Final = 4
+"""Number of different profiles; files repeat them."""
+_ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
+"""degree, in the headers of consecutive files: one cycle of a scan."""
 _SHORTEST: Final = 1e-4
 """s; least time, because a coarse clock may not advance during a fast call."""
 STAGES: Final = {
@@ -53,7 +59,7 @@ _AGAIN: Final = ("scan, all known", "all unchanged")
 
 @dataclass(frozen=True, slots=True)
 class CampaignSize:
-    """Size of a simulated campaign."""
+    """Size of a campaign."""
 
     scenes: int = 2
     profiles: int = 30
@@ -86,7 +92,7 @@ def measure_campaigns(
     *,
     along: Mapping[str, Sequence[CampaignSize]] | None = None,
 ) -> Study:
-    """Simulate campaigns of several sizes in temporary folders, and time their processing.
+    """Write campaigns of several sizes in temporary folders, and time their processing.
 
     Parameters
     ----------
@@ -107,13 +113,13 @@ def measure_campaigns(
 
 def _cost(size: CampaignSize, effort: Effort) -> Cost:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-        campaign = simulate_campaign(size, Path(folder))
+        campaign = write_campaign(size, Path(folder))
         seconds = {"scan": _timed(lambda: archive.update_catalog(campaign))}
         started = time.perf_counter()
         cpu, record = timed(lambda: archive.reprocess(campaign))
         wall = time.perf_counter() - started
         if record is None:
-            raise CampaignError("the simulated campaign has nothing to process", field="simulation")
+            raise CampaignError("the campaign has nothing to process", field="archive")
         seconds |= _stage_times(record, cpu, wall)
         seconds["report"] = _timed(lambda: archive.report_run(campaign, record))
         again, unchanged = _AGAIN
@@ -138,14 +144,24 @@ def _timed(call: Callable[[], object]) -> float:
     return max(timed(call)[0], _SHORTEST)
 
 
-def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
-    """Return a simulated campaign of this size, whose raw files are written."""
-    path = folder / CAMPAIGN_FILE
-    path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
-    campaign = load_campaign(path)
-    written = write_simulation(plan_simulation(campaign))
-    write_plain(written.truth, campaign.truth_path)
-    return campaign
+def write_campaign(size: CampaignSize, folder: Path) -> Campaign:
+    """Return a campaign of this size, whose raw files are written."""
+    write_files(folder / "raw", size.files, size.bins, _INTERVAL)
+    products: dict[str, Any] = {"signal": {"channels": ["photon_532o"]}}
+    if size.retrieved:
+        sections = [[750, 0.9 * BIN_WIDTH * size.bins]]
+        products["homogeneous"] = {"channels": ["photon_532o"], "sections": sections}
+    facts = {
+        "full_overlap_range": 300,
+        "zenith_angle": 90,
+        "channels": {"photon_532o": {"dead_time": 3e-9}},
+    }
+    lidar = {"station": "here", "files": "h*", "facts": [facts], "products": products}
+    window = {"window": f"{size.profiles}min"}
+    file = folder / CAMPAIGN_FILE
+    settings = campaign_settings("measured", {"lidar": lidar}, scenes=window)
+    file.write_text(yaml.safe_dump(settings), encoding="utf-8")
+    return load_campaign(file)
 
 
 def campaign_settings(name: str, instruments: Mapping[str, Any], **others: Any) -> dict[str, Any]:
@@ -162,41 +178,33 @@ def campaign_settings(name: str, instruments: Mapping[str, Any], **others: Any) 
     }
 
 
-def _settings(size: CampaignSize) -> dict[str, Any]:
-    channel = "photon_532o"
-    products: dict[str, Any] = {"signal": {}}
-    if size.retrieved:
-        sections = [[750, 0.9 * 7.5 * size.bins]]
-        products["homogeneous"] = {"channels": [channel], "sections": sections}
-    channels = {channel: {"dead_time": 3e-9}}
-    lidar = {
-        "station": "here",
-        "files": "here/h*",
-        "facts": [{"full_overlap_range": 300, "channels": channels, "zenith_angle": 90}],
-        "products": products,
-    }
-    simulated = {
-        "kind": "horizontal",
-        "aerosol_extinction": {"minimum": 5e-5, "maximum": 2e-4, "hour_of_maximum": 18},
-        "aerosol": {"lidar_ratio": 50},
-        "acquisition": {
-            "interval": _INTERVAL, "shots": 1000, "repetition_rate": 20, "bins": size.bins,
-        },
-        "detectors": [
-            {
-                "wavelength": 532, "signal_rate": 5.0, "background": {"night": 0.05, "day": 0.5},
-                "photon": {},
-            }
-        ],
+def write_files(
+    folder: Path, number: int, bins: int, interval: timedelta, dark_files: int = 0
+) -> None:
+    """Write raw files ``h*`` of an analog and a photon-counting channel, and dark files ``d*``."""
+    folder.mkdir(parents=True)
+    layout: dict[str, Any] = {
+        "wavelength": 532e-9, "bins": bins, "bin_width": BIN_WIDTH, "shots": _SHOTS,
     }  # fmt: skip
-    simulation = {
-        "seed": 7,
-        "start": _DAY,
-        "duration": size.files * _INTERVAL,
-        "instruments": {"lidar": simulated},
-    }
-    window = {"window": f"{size.profiles}min"}
-    return campaign_settings("measured", {"lidar": lidar}, scenes=window, simulation=simulation)
+    kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
+    datasets = [licel.new_dataset(licel.Recorder(kind), **layout) for kind in kinds]
+    distance = BIN_WIDTH * (np.arange(bins) + 0.5)
+    expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
+    counts = np.random.default_rng(7).poisson(expected, (_VARIANTS, bins))
+    for index in range(-dark_files, number):
+        start = _DAY + index * interval
+        name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
+        header = licel.new_header(
+            name=name,
+            place=licel.Place("Here", 100, 10, 50, _ZENITH_ANGLES[index % len(_ZENITH_ANGLES)]),
+            start=start,
+            stop=start + interval,
+            datasets=datasets,
+            lasers=[Laser(_SHOTS, 20), Laser(0, 0)],
+        )
+        signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
+        values = {dataset.name: signal for dataset in header.datasets}
+        (folder / name).write_bytes(licel.encode(header, values))
 
 
 def slope(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
@@ -224,7 +232,7 @@ def growth(along: str, costs: Sequence[Cost]) -> Results:
     return Results(
         f"By number of {along}; times at {getattr(size, along)}",
         scores,
-        "Simulated campaigns of one lidar on a local disk, which TMPDIR selects, in one process: "
+        "Campaigns of one lidar on a local disk, which TMPDIR selects, in one process: "
         f"{size.scenes} scenes of {size.profiles} files, {size.bins} bins. "
         "CPU time; that of a run is divided among its stages in proportion to wall time. Slope: "
         "of the logarithm of time against that of the size, with its 95 % interval; 1 is linear.",

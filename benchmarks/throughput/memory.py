@@ -6,20 +6,17 @@ import multiprocessing
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
 import yaml
 
 from benchmarks.harness.figure import Scores
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings
+from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings, write_files
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
-from lidarops.raw import licel
-from lidarops.raw.licel import DatasetKind, Laser
 from lidarops.run import archive
 
 BINS: Final = 16_000
@@ -27,14 +24,7 @@ SIZES: Final = (26, 101, 400)
 """MB of raw counts of a scene."""
 _TINY: Final = 1
 """MB of the scene that loads the code of a process before the measurement."""
-_SHOTS: Final = 400
 _INTERVAL: Final = timedelta(seconds=20)
-_DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
-_BIN_WIDTH: Final = 3.75
-_VARIANTS: Final = 4
-"""Number of different profiles; files repeat them."""
-_ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
-"""degree, in the headers of consecutive files: one cycle of a scan."""
 _SLANTED: Final = 80.0
 """degree; sections may be retrieved, and the beam reaches the reference window of ``elastic``."""
 _DARK_SHARE: Final = 0.1
@@ -151,7 +141,7 @@ def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         root = Path(folder)
         for size in (_TINY, *sizes):
-            write_files(root / str(size), size)
+            write_scene(root / str(size), size)
         for name in cases:
             # The first process compiles what is not cached, which takes memory of its own.
             _peak_of_process(root, name, _TINY)
@@ -193,39 +183,7 @@ def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     return load_campaign(file, archive=str(folder), output=str(out))
 
 
-def write_files(folder: Path, size: float) -> int:
-    """Write raw files with `size` MB of counts, and dark files; return the number without these."""
-    folder.mkdir(parents=True)
-    layout: dict[str, Any] = {
-        "wavelength": 532e-9,
-        "bins": BINS,
-        "bin_width": _BIN_WIDTH,
-        "shots": _SHOTS,
-    }
-    kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
-    datasets = [licel.new_dataset(licel.Recorder(kind), **layout) for kind in kinds]
-    counts = _counts()
-    number = round(size * 1e6 / (4 * BINS * len(kinds)))
-    dark = max(1, round(_DARK_SHARE * number))
-    for index in range(-dark, number):
-        start = _DAY + index * _INTERVAL
-        name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
-        header = licel.new_header(
-            name=name,
-            place=licel.Place("Here", 100, 10, 50, _ZENITH_ANGLES[index % len(_ZENITH_ANGLES)]),
-            start=start,
-            stop=start + _INTERVAL,
-            datasets=datasets,
-            lasers=[Laser(_SHOTS, 20), Laser(0, 0)],
-        )
-        signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
-        values = {dataset.name: signal for dataset in header.datasets}
-        (folder / name).write_bytes(licel.encode(header, values))
-    return number
-
-
-def _counts() -> np.ndarray[Any, Any]:
-    """Return noisy counts of a decaying signal, (profile, bin)."""
-    distance = _BIN_WIDTH * (np.arange(BINS) + 0.5)
-    expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
-    return np.random.default_rng(7).poisson(expected, (_VARIANTS, BINS))
+def write_scene(folder: Path, size: float) -> None:
+    """Write raw files with `size` MB of counts, and dark files."""
+    number = round(size * 1e6 / (4 * BINS * 2))
+    write_files(folder, number, BINS, _INTERVAL, max(1, round(_DARK_SHARE * number)))

@@ -35,7 +35,7 @@ def test_every_stage_has_a_time(study):
 
 
 def test_campaigns_have_the_requested_size(tmp_path):
-    campaign = campaigns.simulate_campaign(SMALL, tmp_path)
+    campaign = campaigns.write_campaign(SMALL, tmp_path)
     record = reprocess(campaign)
     assert [scene.error for scene in record.scenes] == [""] * SMALL.scenes
     assert [scene.granules for scene in record.scenes] == [SMALL.profiles] * SMALL.scenes
