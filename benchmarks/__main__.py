@@ -57,7 +57,8 @@ def main(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Measure less.")] = False,
     out: Annotated[
-        str | None, typer.Option("--out", help="Folder for the page and its JSON.", callback=no_url)
+        str | None,
+        typer.Option("--out", help="Folder for all numbers as JSON, and charts.", callback=no_url),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -80,7 +81,7 @@ def main(
     with progress_bar("bench", None) as bar:
         effort = Effort(quick, today, bar.advance, data)
         measured = measure(what, case, effort)
-    page = None if out is None else measured.write(Path(out))
+    written = None if out is None else measured.write(Path(out))
     if as_json:
         typer.echo(measured.json())
     else:
@@ -88,8 +89,8 @@ def main(
             if not results.folded:
                 table = results.table
                 show_rows(results.title, table.columns, table.itertuples(index=False, name=None))
-        if page is not None:
-            typer.echo(f"report: {page}")
+        if written is not None:
+            typer.echo(f"all numbers: {written}")
     for target in measured.missed:
         typer.echo(f"missed: {target}", err=True)
     for target in measured.unnamed:

@@ -108,9 +108,6 @@ def methods_chart(retrieval: str, works: Sequence[Work]) -> Chart:
     return Chart(
         "all-" + retrieval.replace(" ", "-"),
         f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time",
-        "Bars of 2 Monte Carlo standard errors. Hollow: peers, and methods that know more than the "
-        "profile or solve only a part. The steps join the methods that no other beats in both "
-        "error and time.",
         frame(scores),
         RMSE,
         {work.method for work in drawn if not work.ours or work.informed},

@@ -1,1 +1,1 @@
-"""Shared by all benchmarks: `figure` (numbers), `plots`, `results` (tables, JSON, page)."""
+"""Shared by all benchmarks: `figure` (numbers), `rates`, `plots`, `results` (tables, JSON)."""

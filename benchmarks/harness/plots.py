@@ -34,7 +34,6 @@ class Chart:
     name: str
     """Of the file, without suffix."""
     title: str
-    caption: str
     rows: pd.DataFrame
     """Results with the columns of `benchmarks.harness.results.COLUMNS`."""
     quantity: str

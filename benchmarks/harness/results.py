@@ -1,4 +1,4 @@
-"""Results of benchmarks: tables of (case, method, quantity, value), their JSON and page."""
+"""Results of benchmarks: tables of (case, method, quantity, value), and their JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -28,18 +27,12 @@ from lidarops.errors import CatalogError
 from lidarops.system.code_version import source_version
 from lidarops.system.files import write_atomically
 
-INDEX: Final = "index.html"
 RESULT: Final = "result.json"
-"""Names of the page and of the file of all numbers in the folder of a benchmark."""
+"""Name of the file of all numbers in the folder of a benchmark."""
 COLUMNS: Final = ["case", "method", "quantity", "value", "error", "unit"]
 """Columns of a table of results; an error of 0 is none."""
 _NONE: Final = "-"
 _PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
-_STYLE: Final = (
-    ":root{color-scheme:light dark} body{max-width:80rem;margin:auto;padding:1rem;"
-    "font:1rem/1.5 system-ui} table{border-collapse:collapse} td,th{text-align:right;"
-    "padding:.2rem .6rem;border-bottom:1px solid #8888} img{max-width:100%;background:#fff}"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +129,7 @@ class Results:
     """Heading of the column of cases."""
     method: str = "method"
     folded: bool = False
-    """Whether the table is folded on the page and left out in a terminal."""
+    """Whether the table is left out in a terminal."""
 
     @property
     def table(self) -> pd.DataFrame:
@@ -202,7 +195,7 @@ class Study:
         return json.dumps(document, indent=1, allow_nan=False)
 
     def write(self, folder: Path) -> Path:
-        """Write the page with its charts, and the JSON; return the path of the page.
+        """Write the charts and the JSON; return the path of the JSON.
 
         Raises
         ------
@@ -213,7 +206,6 @@ class Study:
             folder.mkdir(parents=True, exist_ok=True)
             for chart in self.charts:
                 write_atomically(folder / f"{chart.name}.svg", draw(chart))
-            write_atomically(folder / INDEX, "\n".join(self._page()).encode())
             write_atomically(folder / RESULT, self.json().encode())
         except OSError as error:
             raise CatalogError(
@@ -221,21 +213,4 @@ class Study:
                 file=folder,
                 remedy="choose a folder you can write to",
             ) from error
-        return folder / INDEX
-
-    def _page(self) -> list[str]:
-        facts = escape(f"{self.date}, {', '.join(f'{k}: {v}' for k, v in machine().items())}")
-        lines = [
-            f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{self.title}</title>',
-            f"<style>{_STYLE}</style><h1>{escape(self.title)}</h1>",
-            f'<p>{facts}. <a href="{RESULT}">All numbers</a></p>',
-        ]
-        for chart in self.charts:
-            image = f'<img src="{chart.name}.svg" alt="{escape(chart.title)}">'
-            lines += [f"<figure>{image}<figcaption>{escape(chart.caption)}</figcaption></figure>"]
-        for results in self.results:
-            state = "" if results.folded else " open"
-            lines += [f"<details{state}><summary>{escape(results.title)}</summary>"]
-            lines += [results.table.to_html(index=False, border=0)]
-            lines += [f"<p>{escape(results.note)}</p></details>"]
-        return lines
+        return folder / RESULT

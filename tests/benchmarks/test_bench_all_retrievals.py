@@ -99,13 +99,10 @@ def test_where_a_peer_is_ahead_the_table_says_so():
     assert beside(ours) == {}
 
 
-def test_page_and_figures_are_written_once_each(study, tmp_path):
-    page = study.write(tmp_path)
-    text = page.read_text(encoding="utf-8")
+def test_tables_and_figures_are_written_once_each(study, tmp_path):
+    study.write(tmp_path)
     charts = [chart.name for chart in study.charts]
     tables = [results.title for results in study.results]
     assert len(set(charts)) == len(charts)
     assert len(set(tables)) == len(tables)
-    assert all(f"{name}.svg" in text and (tmp_path / f"{name}.svg").is_file() for name in charts)
-    assert "http://" not in text
-    assert "https://" not in text
+    assert all((tmp_path / f"{name}.svg").is_file() for name in charts)

@@ -285,6 +285,6 @@ def test_the_command_prints_writes_and_dates(monkeypatch, accuracy, tmp_path):
     assert passed[0].quick
     assert len(passed[0].date) == len("2024-01-01")
     assert "direct" in result.stdout
-    assert "index.html" in result.stdout.replace("\n", "")
+    assert "result.json" in result.stdout.replace("\n", "")
     printed = CliRunner().invoke(app, [*words, "--json"])
     assert json.loads(printed.stdout) == json.loads((tmp_path / "result.json").read_text())

@@ -306,13 +306,13 @@ def stability():
     return measured
 
 
-def test_command_prints_json_and_writes_the_page(stability, monkeypatch, tmp_path):
+def test_command_prints_json_and_writes_it(stability, monkeypatch, tmp_path):
     monkeypatch.setitem(study.CASES, "all", lambda _: stability)
     folder = tmp_path / "out"
     result = CliRunner().invoke(app, ["stability", "--quick", "--json", "--out", str(folder)])
     assert result.exit_code == bool(stability.missed), result.output
     assert json.loads(result.stdout) == json.loads(stability.json())
-    assert (folder / "index.html").is_file()
+    assert (folder / "result.json").is_file()
 
 
 def test_command_fails_where_a_target_is_missed(stability, monkeypatch):
