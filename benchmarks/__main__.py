@@ -18,7 +18,7 @@ from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle
 from benchmarks.harness.figure import cpu_seconds
 from benchmarks.harness.results import Effort, Study
 from benchmarks.stability import study
-from benchmarks.throughput import campaigns, memory, retrievals
+from benchmarks.throughput import memory, retrievals
 from lidarops.errors import CampaignError
 
 app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
@@ -32,7 +32,6 @@ BENCHMARKS: Final[dict[str, dict[str, Callable[[Effort], Study]]]] = {
     },
     "throughput": {
         "homogeneous": retrievals.measure_solvers,
-        "campaigns": campaigns.measure_campaigns,
         "memory": memory.measure_memory,
     },
     "stability": study.CASES,
@@ -47,9 +46,7 @@ def main(
     what: Annotated[str, typer.Argument(help="accuracy, throughput or stability", metavar="WHAT")],
     case: Annotated[
         str | None,
-        typer.Option(
-            help="all, campaigns, elastic, homogeneous, memory, multiangle, network or raman."
-        ),
+        typer.Option(help="all, elastic, homogeneous, memory, multiangle, network or raman."),
     ] = None,
     data: Annotated[
         Path | None,

@@ -1,5 +1,1 @@
-"""Time and memory of retrievals and whole campaigns.
-
-`retrievals` times single functions. `campaigns` times all stages of processing and their growth
-with the size of a campaign, `memory` measures peaks of processes.
-"""
+"""Time of retrievals (`retrievals`), and peak memory of processes (`memory`)."""

@@ -6,17 +6,19 @@ import multiprocessing
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import yaml
 
 from benchmarks.harness.figure import Scores
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings, write_files
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
+from lidarops.raw import licel
+from lidarops.raw.licel import DatasetKind, Laser
 from lidarops.run import archive
 
 BINS: Final = 16_000
@@ -24,7 +26,14 @@ SIZES: Final = (26, 101, 400)
 """MB of raw counts of a scene."""
 _TINY: Final = 1
 """MB of the scene that loads the code of a process before the measurement."""
+_DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
 _INTERVAL: Final = timedelta(seconds=20)
+_SHOTS: Final = 400
+_BIN_WIDTH: Final = 3.75
+_VARIANTS: Final = 4
+"""Number of different profiles; files repeat them."""
+_ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
+"""degree, in the headers of consecutive files: one cycle of a scan."""
 _SLANTED: Final = 80.0
 """degree; sections may be retrieved, and the beam reaches the reference window of ``elastic``."""
 _DARK_SHARE: Final = 0.1
@@ -141,7 +150,7 @@ def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
     with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
         root = Path(folder)
         for size in (_TINY, *sizes):
-            write_scene(root / str(size), size)
+            write_files(root / str(size), size)
         for name in cases:
             # The first process compiles what is not cached, which takes memory of its own.
             _peak_of_process(root, name, _TINY)
@@ -176,14 +185,43 @@ def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
 
 def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
+    settings = {
+        "name": "memory",
+        "title": "Campaign of a benchmark",
+        "archive": str(folder),
+        "output": str(out),
+        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
+        **CASES[case],
+    }
     out.mkdir()
-    file = out / CAMPAIGN_FILE
-    settings = campaign_settings("memory", **CASES[case])
+    file = out / "campaign.yaml"
     file.write_text(yaml.safe_dump(settings), encoding="utf-8")
-    return load_campaign(file, archive=str(folder), output=str(out))
+    return load_campaign(file)
 
 
-def write_scene(folder: Path, size: float) -> None:
+def write_files(folder: Path, size: float) -> None:
     """Write raw files with `size` MB of counts, and dark files."""
-    number = round(size * 1e6 / (4 * BINS * 2))
-    write_files(folder, number, BINS, _INTERVAL, max(1, round(_DARK_SHARE * number)))
+    folder.mkdir(parents=True)
+    layout: dict[str, Any] = {
+        "wavelength": 532e-9, "bins": BINS, "bin_width": _BIN_WIDTH, "shots": _SHOTS,
+    }  # fmt: skip
+    kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
+    datasets = [licel.new_dataset(licel.Recorder(kind), **layout) for kind in kinds]
+    distance = _BIN_WIDTH * (np.arange(BINS) + 0.5)
+    expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
+    counts = np.random.default_rng(7).poisson(expected, (_VARIANTS, BINS))
+    number = round(size * 1e6 / (4 * BINS * len(kinds)))
+    for index in range(-max(1, round(_DARK_SHARE * number)), number):
+        start = _DAY + index * _INTERVAL
+        name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
+        header = licel.new_header(
+            name=name,
+            place=licel.Place("Here", 100, 10, 50, _ZENITH_ANGLES[index % len(_ZENITH_ANGLES)]),
+            start=start,
+            stop=start + _INTERVAL,
+            datasets=datasets,
+            lasers=[Laser(_SHOTS, 20), Laser(0, 0)],
+        )
+        signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
+        values = {dataset.name: signal for dataset in header.datasets}
+        (folder / name).write_bytes(licel.encode(header, values))

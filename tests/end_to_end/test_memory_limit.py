@@ -127,7 +127,7 @@ def test_a_worker_of_700_mib_processes_a_scene_of_101_mb(tmp_path: Path) -> None
     campaign = peaks.campaign_of(
         tmp_path / "raw", "signal, homogeneous and elastic", tmp_path / "out"
     )
-    peaks.write_scene(tmp_path / "raw", 101)
+    peaks.write_files(tmp_path / "raw", 101)
     with local_client(1, memory="700MiB") as client:
         record = reprocess(campaign, client=client)
     assert record is not None

@@ -262,8 +262,8 @@ def test_calls_alternate_and_the_least_time_counts(monkeypatch):
     [
         ("luck", None, "throughput"),
         ("accuracy", "weather", "multiangle or network"),
-        ("accuracy", "campaigns", "'campaigns' of accuracy"),
-        ("throughput", "weather", "campaigns or memory"),
+        ("accuracy", "memory", "'memory' of accuracy"),
+        ("throughput", "weather", "homogeneous or memory"),
     ],
 )
 def test_wrong_use_is_refused(quantity, case, message):
