@@ -188,15 +188,15 @@ def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     settings = {
         "name": "memory",
         "title": "Campaign of a benchmark",
-        "archive": str(folder),
-        "output": str(out),
+        "archive": "raw",
+        "output": "out",
         "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
         **CASES[case],
     }
     out.mkdir()
     file = out / "campaign.yaml"
     file.write_text(yaml.safe_dump(settings), encoding="utf-8")
-    return load_campaign(file)
+    return load_campaign(file, archive=str(folder), output=str(out))
 
 
 def write_files(folder: Path, size: float) -> None:
