@@ -255,7 +255,8 @@ def _sums(values: Array) -> Array:
 
 def log_uniform(rng: Random, low: float, high: float, size: tuple[int, ...] | None = None) -> Any:
     """Return random numbers, or one, whose logarithm is uniform."""
-    return np.exp(rng.uniform(np.log(low), np.log(high), size))
+    values = np.exp(rng.uniform(np.log(low), np.log(high), size))
+    return float(values) if size is None else values
 
 
 def correlated(rng: Random, shape: tuple[int, ...], correlation: float) -> Array:

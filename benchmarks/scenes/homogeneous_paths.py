@@ -280,8 +280,8 @@ Violation = Callable[[Paths, Random], Array]
 def random_paths(cluster: int, profiles: int) -> tuple[Paths, Random]:
     """Return random paths of one geometry."""
     rng = np.random.default_rng((71, cluster))
-    start = float(log_uniform(rng, *_RANDOM_STARTS))
-    length, step = float(log_uniform(rng, *_RANDOM_LENGTHS)), float(rng.choice(_STEPS))
+    start = log_uniform(rng, *_RANDOM_STARTS)
+    length, step = log_uniform(rng, *_RANDOM_LENGTHS), float(rng.choice(_STEPS))
     bins = int(np.clip(round(length / step) + 1, *RANDOM_BINS))
     background = log_uniform(rng, *_BACKGROUNDS, (profiles, 1))
     background[rng.random(profiles) < _NO_BACKGROUND] = 0.0

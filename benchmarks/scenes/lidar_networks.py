@@ -251,20 +251,20 @@ def random_network(rng: Random) -> LidarLine:
 
 def homogeneous(rng: Random) -> Air:
     """Return air of one random extinction."""
-    value = float(log_uniform(rng, 1e-5, 6e-2))
+    value = log_uniform(rng, 1e-5, 6e-2)
     return Air("homogeneous", lambda _: _homogeneous(value))
 
 
 def layered(rng: Random) -> Air:
     """Return air whose extinction falls or grows with height."""
-    value = float(log_uniform(rng, 1e-5, 1e-2))
+    value = log_uniform(rng, 1e-5, 1e-2)
     scale = float(rng.uniform(300.0, 3000.0) * rng.choice([-1.0, 1.0]))
     return Air("layered", lambda _: lambda __, up: value * np.exp(-up / scale))
 
 
 def plume(rng: Random, *, drift: float = 0.0) -> Air:
     """Return air with a plume, which drifts by `drift` m in a block."""
-    value = float(log_uniform(rng, 1e-4, 5e-3))
+    value = log_uniform(rng, 1e-4, 5e-3)
     excess, width = rng.uniform(0.3, 3.0), rng.uniform(50.0, 300.0)
     centre = rng.uniform([-300.0, 300.0], [300.0, 900.0])
 
@@ -282,7 +282,7 @@ def plume(rng: Random, *, drift: float = 0.0) -> Air:
 
 def _thin_layer(rng: Random) -> Air:
     """Return a layer of a few bins, in which the signal is curved within a fit."""
-    value = float(log_uniform(rng, 1e-4, 5e-3))
+    value = log_uniform(rng, 1e-4, 5e-3)
     excess, depth = rng.uniform(0.3, 3.0), rng.uniform(10.0, 60.0)
     height = rng.uniform(300.0, 900.0)
 
@@ -322,7 +322,7 @@ def _undamaged(_: Array, __: Array, ___: Signals, ____: Random) -> dict[str, Any
 
 def _with_little_noise(power: Array, _: Array, clean: Signals, rng: Random) -> dict[str, Any]:
     """Draw again with the noise of long averages, which does not hide curved signals."""
-    noise, seed = float(log_uniform(rng, 1e-3, 3e-2)), int(rng.integers(2**31))
+    noise, seed = log_uniform(rng, 1e-3, 3e-2), int(rng.integers(2**31))
     power, variance = clean.draw(noise, len(power), seed, additive=0.0)
     return {"power": power, "variance": variance}
 
@@ -422,7 +422,7 @@ def _solve_damaged(
     rng: Random, draw_air: DrawAir, damage: Damage, profiles: int
 ) -> tuple[NetworkResult, Array] | None:
     """Return the result and the truth; None where the beams do not meet."""
-    noise = float(log_uniform(rng, 1e-3, 0.3))
+    noise = log_uniform(rng, 1e-3, 0.3)
     net = random_network(rng).network()
     if net.crossings < 2 or not np.all(np.diff(np.bincount(net.passages.beam)) == 0):
         return None
@@ -454,7 +454,7 @@ _VARIED: Final = {
 
 def _drawn(rng: Random, draw_air: DrawAir) -> tuple[Signals, float] | None:
     """Return clean signals of a random network, and the noise; None where beams do not meet."""
-    noise = float(log_uniform(rng, 1e-3, 0.3))
+    noise = log_uniform(rng, 1e-3, 0.3)
     net = random_network(rng).network()
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return None

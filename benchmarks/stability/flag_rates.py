@@ -30,7 +30,7 @@ def few_counts(cluster: int, *, counts: float) -> Iterator[Part]:
     """Yield how many profiles of few photon counts are flagged although the model holds."""
     rng = np.random.default_rng((82, cluster))
     distance = 2500.0 + 37.5 * np.arange(225)
-    signal = float(log_uniform(rng, 3.0, 100.0))
+    signal = log_uniform(rng, 3.0, 100.0)
     fall = (distance[0] / distance) ** 2 * np.exp(-2e-4 * (distance - distance[0]))
     mean = counts * (1.0 + signal * fall)
     drawn = rng.poisson(mean, (_COUNTED, mean.size)).astype(float)

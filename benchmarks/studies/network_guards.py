@@ -99,7 +99,7 @@ def _solved(
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return None
     clean = signals(net, air(rng))
-    noise = float(log_uniform(rng, *noises))
+    noise = log_uniform(rng, *noises)
     power, variance = clean.draw(noise, PROFILES, int(rng.integers(2**31)), additive=noise / 3.0)
     mean = clean.power[np.arange(PROFILES) % len(clean.power)]
     power, variance = mean + factor * (power - mean), factor**2 * variance
