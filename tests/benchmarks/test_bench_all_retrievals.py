@@ -40,7 +40,7 @@ def study():
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
         effort = Effort(quick=True, date="2024-01-01", progress=steps.append)
         result = all_retrievals.measure_all(effort)
-    assert len(steps) > 35
+    assert len(steps) == 20
     return result
 
 
