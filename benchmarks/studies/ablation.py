@@ -109,7 +109,7 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
     yield "| --- | --- |" + " --- |" * (len(RATES) + 1)
     places = ["guard", "quantity", "cluster"]
     every = counts.groupby(places, sort=False).sum()
-    sides = {}
+    sides: dict[tuple[Any, ...], pd.DataFrame] = {}
     for holds in {rate[2] for rate in RATES.values()}:
         side = counts[counts.index.isin(holds, level="satisfied")].groupby(places, sort=False).sum()
         side = side.reindex(every.index, fill_value=0.0)
