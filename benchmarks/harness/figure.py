@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Self, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -253,10 +253,16 @@ def _sums(values: Array) -> Array:
     return np.asarray(values.reshape(len(values), -1).sum(axis=1))
 
 
-def log_uniform(rng: Random, low: float, high: float, size: tuple[int, ...] | None = None) -> Any:
+@overload
+def log_uniform(rng: Random, low: float, high: float) -> float: ...
+@overload
+def log_uniform(rng: Random, low: float, high: float, size: tuple[int, ...]) -> Array: ...
+def log_uniform(
+    rng: Random, low: float, high: float, size: tuple[int, ...] | None = None
+) -> float | Array:
     """Return random numbers, or one, whose logarithm is uniform."""
     values = np.exp(rng.uniform(np.log(low), np.log(high), size))
-    return float(values) if size is None else values
+    return float(values) if size is None else np.asarray(values)
 
 
 def correlated(rng: Random, shape: tuple[int, ...], correlation: float) -> Array:
