@@ -301,14 +301,14 @@ def _none(paths: Paths, _: Random) -> Array:
 def _slope(paths: Paths, rng: Random) -> Array:
     of_path = paths.signal.shape
     scale = log_uniform(rng, 1e3, 1e5, of_path) * rng.choice([-1.0, 1.0], of_path)
-    return paths.clean * np.exp(-paths.depth / scale)
+    return np.asarray(paths.clean * np.exp(-paths.depth / scale))
 
 
 def _curved(paths: Paths, rng: Random) -> Array:
     of_path = paths.signal.shape
     amount = log_uniform(rng, 1e-3, 1.0, of_path) * rng.choice([-1.0, 1.0], of_path)
     position = paths.depth / paths.depth[:, -1:] - 0.5
-    return paths.clean * np.exp(amount * position**2)
+    return np.asarray(paths.clean * np.exp(amount * position**2))
 
 
 def _excess(paths: Paths, rng: Random) -> Array:

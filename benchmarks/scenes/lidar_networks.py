@@ -428,7 +428,8 @@ def _solve_damaged(
         return None
     clean = signals(net, draw_air(rng))
     power, variance = clean.draw(noise, profiles, int(rng.integers(2**31)))
-    given = {"power": power, "variance": variance} | damage(power, variance, clean, rng)
+    given: dict[str, Any] = {"power": power, "variance": variance}
+    given |= damage(power, variance, clean, rng)
     try:
         result = extinction_field.retrieve_network(
             range=clean.range, network=net, full_overlap_range=FULL_OVERLAP,
