@@ -65,18 +65,14 @@ def comparison(
     retrieval: str, effort: Effort, works: Sequence[Work], note: str, others: Sequence[Results] = ()
 ) -> Study:
     """Return the study of the methods of one retrieval, with other tables of it."""
-    title = f"{retrieval.capitalize()}: error against CPU time"
-    table = methods_table(retrieval, works, note)
-    return Study(title, effort.date, [table, *others], [methods_chart(retrieval, works)], works)
-
-
-def methods_table(retrieval: str, works: Sequence[Work], note: str) -> Results:
-    """Return the table of all methods of a retrieval in all settings."""
+    name = retrieval.capitalize()
     scores = {
         (f"{work.quantity}; {work.setting}", method_name(work)): score_of(work) | work.more
         for work in works
     }
-    return Results(f"{retrieval.capitalize()}: all methods", scores, note, case="error of")
+    table = Results(f"{name}: all methods", scores, note, case="error of")
+    charts = [methods_chart(retrieval, works)]
+    return Study(f"{name}: error against CPU time", effort.date, [table, *others], charts, works)
 
 
 def method_name(work: Work) -> str:

@@ -49,7 +49,6 @@ percent if the sign is known as well). A test that does not know the shape misse
 HELD: Final = "all where the model holds"
 BROKEN: Final = "all violations"
 """Classes of all scenes of a retrieval."""
-POOLED: Final = frozenset({HELD, BROKEN})
 
 
 @dataclass(frozen=True, slots=True)
