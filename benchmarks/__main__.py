@@ -30,10 +30,7 @@ BENCHMARKS: Final[dict[str, dict[str, Callable[[Effort], Study]]]] = {
         "multiangle": multiangle.measure_multiangle,
         "network": network.measure_network,
     },
-    "throughput": {
-        "homogeneous": retrievals.measure_solvers,
-        "memory": memory.measure_memory,
-    },
+    "throughput": {"homogeneous": retrievals.measure_solvers, "memory": memory.measure_memory},
     "stability": study.CASES,
 }
 """Benchmarks by what they measure and case; the first case is the default."""

@@ -478,10 +478,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
         Failure("cloud in the far range"),
         lambda sky, rng: replace(sky, cloud=log_uniform(rng, 0.01, 3.0)),
     ),
-    (
-        Failure("overlap error"),
-        lambda sky, rng: replace(sky, overlap=rng.uniform(50.0, 300.0)),
-    ),
+    (Failure("overlap error"), lambda sky, rng: replace(sky, overlap=rng.uniform(50.0, 300.0))),
     (Failure("more haze than stated"), _hazy(1e-8)),
     (Failure("outliers"), lambda sky, rng: replace(sky, outlying=rng.uniform(0.0, 0.02))),
     (Failure("particles in the reference window"), lambda sky, _: sky),

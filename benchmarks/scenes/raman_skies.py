@@ -16,12 +16,7 @@ from lidarops.retrieve.common.arrays import Flags
 from lidarops.retrieve.raman.flags import RamanQuality, concerning
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
-from lidarops.retrieve.raman.signals import (
-    AirColumn,
-    Cells,
-    ChannelSignal,
-    make_cells,
-)
+from lidarops.retrieve.raman.signals import AirColumn, Cells, ChannelSignal, make_cells
 
 LASER: Final = 354.7e-9
 RAMAN: Final = 386.7e-9

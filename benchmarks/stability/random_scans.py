@@ -118,11 +118,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
     (Failure("gradient up to twice the declared one, two sides"), _two_sided, _plain),
     (Failure("extinction that varies along the paths"), _variation, _plain),
     (Failure("the same, two sides"), partial(_variation, two_sided=True), _plain),
-    (
-        Failure("overlap error"),
-        _level,
-        _with_overlap,
-    ),
+    (Failure("overlap error"), _level, _with_overlap),
     (Failure("background error of each beam"), _level, _with_background),
     (Failure("everything at once"), _as_drawn, _plain),
     (Failure("calm air", satisfied=True), _calm, _plain),

@@ -78,10 +78,7 @@ def _network() -> dict[str, Any]:
             for name, (digits, _, _, azimuth) in _NETWORK.items()
         },
         "networks": {
-            "valley": {
-                "instruments": list(_NETWORK),
-                "visibility": {"channel": "photon_532o"},
-            }
+            "valley": {"instruments": list(_NETWORK), "visibility": {"channel": "photon_532o"}}
         },
     }
 
