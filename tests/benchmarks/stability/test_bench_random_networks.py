@@ -51,7 +51,7 @@ def test_networks_with_once_too_small_errors_state_them(
         assert np.median((scored.random / np.abs(scored.error))[kept]) < 2.0
 
 
-def test_lidar_networks_state_the_errors_of_thin_layers():
+def test_random_networks_state_the_errors_of_thin_layers():
     scored = [
         values
         for cluster in range(24)
