@@ -92,18 +92,19 @@ def test_few_networks_are_too_few_whatever_their_number_of_values():
 
 
 def counts_of(scored):
-    """Return false values, those beyond 1.96 errors and all by class and quantity.
+    """Return false values, those beyond 1.96 errors and all by class and quantity, (3, cluster).
 
     They are those of the target: of all values that no flag rejects, by random errors.
     """
     counts = {}
-    for values in scored:
+    for cluster, values in scored:
         rejected = (values.bits & rejecting((*Quality, *values.own))) != 0
         kept = np.isfinite(values.error) & ~rejected
         sizes = np.abs(values.error)[kept] / np.broadcast_to(values.random, kept.shape)[kept]
         part = (np.sum(~(sizes <= FALSE)), np.sum(~(sizes <= COVERED)), sizes.size)
-        counts.setdefault((values.failure.name, values.quantity), []).append(part)
-    return {key: np.array(rows, dtype=float).T for key, rows in counts.items()}
+        of_class = counts.setdefault((values.failure.name, values.quantity), {})
+        of_class[cluster] = of_class.get(cluster, 0.0) + np.array(part, dtype=float)
+    return {key: np.stack([*rows.values()], axis=1) for key, rows in counts.items()}
 
 
 def with_few_together(counts, confined):
@@ -119,10 +120,10 @@ def with_few_together(counts, confined):
 
 
 def where_the_model_holds(score, clusters, profiles):
-    """Yield the values of the first classes, which are those where the model holds."""
+    """Yield cluster and values of the first classes, which are those where the model holds."""
     for cluster in range(clusters):
         chunks = takewhile(lambda chunk: chunk.failure.satisfied, score(cluster, profiles))
-        yield from chunks
+        yield from ((cluster, chunk) for chunk in chunks)
 
 
 HOMOGENEOUS = (homogeneous_paths.score_homogeneous, 50, 200)
