@@ -7,7 +7,7 @@ import json
 import pytest
 
 from benchmarks.harness.figure import CPU_TIME, Figure, cpu_time, share, with_error
-from benchmarks.harness.plots import Chart, draw, pareto
+from benchmarks.harness.plots import Chart, draw
 from benchmarks.harness.results import Results, Study, frame, table
 from lidarops.errors import CatalogError
 
@@ -88,12 +88,6 @@ def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time(quantity):
     text = drawn.decode()
     assert all(f">{word}<" in text for word in ("ours", "peer", "clear", "cloud"))
     assert "Errors &amp; times" in text
-
-
-def test_the_pareto_front_holds_the_unbeaten_points():
-    points = [(3.0, 1.0), (1.0, 4.0), (2.0, 4.0), (2.0, 2.0), (4.0, 1.0), (1.0, 5.0)]
-    assert pareto(points) == ((1.0, 4.0), (2.0, 2.0), (3.0, 1.0))
-    assert pareto([]) == ()
 
 
 def test_a_study_writes_its_json_and_charts(tmp_path):
