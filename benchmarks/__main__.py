@@ -71,9 +71,8 @@ def main(
 
     Example: python -m benchmarks stability --case raman
     """
-    today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as bar:
-        effort = Effort(quick, today, bar.advance, data)
+        effort = Effort(quick, bar.advance, data)
         measured = measure(what, case, effort)
     written = None if out is None else measured.write(Path(out))
     if as_json:
@@ -94,7 +93,7 @@ def main(
 
 
 def measure(what: str, case: str | None, effort: Effort) -> Study:
-    """Run a benchmark, and measure its CPU time.
+    """Run a benchmark, and state its date and CPU time.
 
     Raises
     ------
@@ -112,8 +111,8 @@ def measure(what: str, case: str | None, effort: Effort) -> Study:
             f"is no option of {what} {case}", field="data",
             remedy=f"leave it out, or choose: {' or '.join(_OF_PUBLISHED)}",
         )  # fmt: skip
-    begin = cpu_seconds()
-    return replace(cases[case](effort), cpu_seconds=cpu_seconds() - begin)
+    begin, today = cpu_seconds(), datetime.now(UTC).date().isoformat()
+    return replace(cases[case](effort), date=today, cpu_seconds=cpu_seconds() - begin)
 
 
 if __name__ == "__main__":

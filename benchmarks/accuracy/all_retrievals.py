@@ -53,9 +53,8 @@ def measure_all(effort: Effort) -> Study:
         for results in study.results[1:]
     ]
     charts = [chart for study in studies.values() for chart in study.charts]
-    title = "All retrievals: error against run time"
     every = [work for group in works.values() for work in group]
-    return Study(title, effort.date, [best, beside, *tables, *others], charts, every)
+    return Study([best, beside, *tables, *others], charts, every)
 
 
 def best_methods(works: Works) -> Scores:

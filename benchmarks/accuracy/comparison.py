@@ -20,7 +20,7 @@ from benchmarks.harness.figure import (
     timed,
 )
 from benchmarks.harness.plots import Chart
-from benchmarks.harness.results import Effort, Results, Study, Work, frame
+from benchmarks.harness.results import Results, Study, Work, frame
 
 RMSE: Final = "RMSE"
 BIAS: Final = "mean error"
@@ -62,17 +62,15 @@ def time_profiles(
 
 
 def comparison(
-    retrieval: str, effort: Effort, works: Sequence[Work], note: str, others: Sequence[Results] = ()
+    retrieval: str, works: Sequence[Work], note: str, others: Sequence[Results] = ()
 ) -> Study:
     """Return the study of the methods of one retrieval, with other tables of it."""
-    name = retrieval.capitalize()
     scores = {
         (f"{work.quantity}; {work.setting}", method_name(work)): score_of(work) | work.more
         for work in works
     }
-    table = Results(f"{name}: all methods", scores, note, case="error of")
-    charts = [methods_chart(retrieval, works)]
-    return Study(f"{name}: error against CPU time", effort.date, [table, *others], charts, works)
+    table = Results(f"{retrieval.capitalize()}: all methods", scores, note, case="error of")
+    return Study([table, *others], [methods_chart(retrieval, works)], works)
 
 
 def method_name(work: Work) -> str:

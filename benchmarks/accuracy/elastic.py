@@ -78,7 +78,7 @@ def measure_elastic_accuracy(effort: Effort, *, draws: int | None = None) -> Stu
     for decade in elastic_skies.DECADES:
         works += measure_level(decade, draws or (QUICK_DRAWS if effort.quick else DRAWS))
         effort.progress(1)
-    return comparison("elastic inversion", effort, works, _NOTE, published)
+    return comparison("elastic inversion", works, _NOTE, published)
 
 
 def measure_level(decade: int, draws: int) -> Iterator[Work]:

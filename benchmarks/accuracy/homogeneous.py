@@ -89,7 +89,7 @@ def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study
         case="section",
         method="mean of",
     )
-    return comparison("homogeneous path", effort, list(_works(scores)), _NOTE, [offsets])
+    return comparison("homogeneous path", list(_works(scores)), _NOTE, [offsets])
 
 
 def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int = 1) -> Score:

@@ -67,7 +67,7 @@ def measure_multiangle(effort: Effort, *, size: StudySize | None = None) -> Stud
     for number, scene in enumerate(cases.scan_scenes()):
         works += compare(scene, size or (QUICK if effort.quick else FULL), number)
         effort.progress(1)
-    return comparison("scans over zenith angle", effort, works, _NOTE)
+    return comparison("scans over zenith angle", works, _NOTE)
 
 
 def compare(scene: Scene, size: StudySize, number: int) -> Iterator[Work]:

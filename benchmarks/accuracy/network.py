@@ -101,7 +101,7 @@ def measure_network(
         "clipped at 300 %, because a quotient of noise has no variance. Coverage: of "
         f"{math.prod(_chunks(profiles)):,} other profiles."
     )
-    return comparison("networks of lidars", effort, works, note, [beside])
+    return comparison("networks of lidars", works, note, [beside])
 
 
 def _chunks(profiles: int) -> tuple[int, int]:

@@ -37,11 +37,9 @@ _PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Size of a run, its stated date, its inputs, and the progress callback."""
+    """Size of a run, its inputs, and the progress callback."""
 
     quick: bool = False
-    date: str = ""
-    """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
     data: Path | None = None
@@ -163,8 +161,6 @@ class Work:
 class Study:
     """All results of one benchmark."""
 
-    title: str
-    date: str
     results: Sequence[Results]
     charts: Sequence[Chart] = ()
     works: Sequence[Work] = ()
@@ -172,6 +168,7 @@ class Study:
     """Targets that are missed; the command fails where there is one."""
     unnamed: Sequence[str] = ()
     """Those of them for which no reason is stated."""
+    date: str = ""
     cpu_seconds: float = 0.0
     """CPU time of the whole benchmark, with its child processes."""
 
@@ -184,7 +181,6 @@ class Study:
     def json(self) -> str:
         """Return all rows, by the headings of their tables, and the machine as JSON."""
         document = {
-            "title": self.title,
             "date": self.date,
             "machine": machine(),
             "cpu_seconds": round(self.cpu_seconds, 1),

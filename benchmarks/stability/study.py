@@ -205,10 +205,10 @@ def measure_stability(
     missed = [one for one in unmet if one.judgement.verdict is Verdict.MISSED]
     reasons = read_reasons()
     return Study(
-        "Stability: false values without a flag", effort.date, results,
+        results,
         missed=[str(one) for one in missed],
         unnamed=[str(one) for one in missed if reasons and not why(one, reasons)],
-    )  # fmt: skip
+    )
 
 
 def _measured(case: str) -> Callable[[Effort], Study]:

@@ -138,8 +138,7 @@ def measure_memory(effort: Effort) -> Study:
         "compiled code. Slope: growth above the base from the smallest scene, MB for 1 MB of raw "
         "counts."
     )
-    results = Results("Peak memory", scores, note, method="raw MB")
-    return Study("Memory of a process, by size of the scene", effort.date, [results])
+    return Study([Results("Peak memory", scores, note, method="raw MB")])
 
 
 def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:

@@ -63,7 +63,7 @@ def measure_solvers(
     results = [Results(case, of_case, note) for case, of_case in scores.items()]
     every = {key: score for of_case in scores.values() for key, score in of_case.items()}
     chart = Chart("time", "CPU time per profile", frame(every), CPU_TIME)
-    return Study("Homogeneous path: time per profile", effort.date, results, [chart])
+    return Study(results, [chart])
 
 
 def _solvers(variance: float | None, missing: float) -> dict[str, Solver]:

@@ -38,7 +38,7 @@ def study():
             patch.setattr(module, name, partial(getattr(module, name), **size))
         scenes = (multiangle_cases.clear(3000.0, bins=25), multiangle_cases.cloud())
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
-        effort = Effort(quick=True, date="2024-01-01", progress=steps.append)
+        effort = Effort(quick=True, progress=steps.append)
         result = all_retrievals.measure_all(effort)
     assert len(steps) == 20
     return result

@@ -93,12 +93,12 @@ def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time(quantity):
 def test_a_study_writes_its_json_and_charts(tmp_path):
     tables = [Results("Shown", results()), Results("Folded", results(), "A note.", folded=True)]
     charts = [Chart("work", "Errors", frame(results()), "RMSE")]
-    study = Study("Title", "2024-01-01", tables, charts)
+    study = Study(tables, charts, date="2024-01-01")
     assert study.figures("Shown")["cloud", "peer", "RMSE"].value == 4e3
     written = study.write(tmp_path / "sub")
     assert (written.parent / "work.svg").is_file()
     content = json.loads(written.read_text())
-    assert (content["title"], content["date"]) == ("Title", "2024-01-01")
+    assert content["date"] == "2024-01-01"
     assert content["notes"] == {"Shown": "", "Folded": "A note."}
     row = content["tables"]["Folded"][1]
     assert (row["case"], row["method"], row["quantity"]) == ("clear", "ours", "RMSE")

@@ -36,7 +36,7 @@ def accuracy(request):
         folder = request.getfixturevalue("data_root") / "synthetic" / "boeckmann"
     except pytest.skip.Exception:
         folder = None
-    effort = Effort(quick=True, date="2024-01-01")
+    effort = Effort(quick=True)
     return elastic.measure_elastic_accuracy(replace(effort, data=folder), draws=DRAWS)
 
 

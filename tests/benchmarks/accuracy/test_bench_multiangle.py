@@ -29,9 +29,7 @@ def study():
     scenes = (SHORT, multiangle_cases.cloud())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
-        result = multiangle.measure_multiangle(
-            Effort(date="2024-01-01", progress=steps.append), size=SMALL
-        )
+        result = multiangle.measure_multiangle(Effort(progress=steps.append), size=SMALL)
     assert steps == [1] * len(scenes)
     return result
 
