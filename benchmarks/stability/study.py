@@ -211,14 +211,10 @@ def measure_stability(
     )
 
 
-def _measured(case: str) -> Callable[[Effort], Study]:
-    return lambda effort: measure_stability(effort, case=case)
-
-
 CASES: Final[dict[str, Callable[[Effort], Study]]] = {
     "all": measure_stability,
-    **{part.case: _measured(part.case) for part in (*DRAWS, *OTHERS)},
-    **{part.name: _measured(part.name) for part in (*DRAWS, *OTHERS)},
+    **{part.case: partial(measure_stability, case=part.case) for part in (*DRAWS, *OTHERS)},
+    **{part.name: partial(measure_stability, case=part.name) for part in (*DRAWS, *OTHERS)},
 }
 """The benchmark of all parts, of those of a case, and of each."""
 
