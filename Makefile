@@ -35,7 +35,7 @@ golden: .venv/.dev
 docs: .venv/.dev
 	$(BIN)/python -m sphinx --fail-on-warning --quiet -b html docs docs/_build/html
 
-# Error against run time of every retrieval, one page: bench/index.html.
+# Error against run time of every retrieval: bench/result.json, and charts.
 bench: .venv/.dev
 	$(BIN)/python -m benchmarks accuracy --out bench
 

@@ -15,10 +15,10 @@ from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_row
 
 # isort: split
 from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle, network
+from benchmarks.harness.figure import cpu_seconds
 from benchmarks.harness.results import Effort, Study
-from benchmarks.harness.timing import cpu_seconds
 from benchmarks.stability import study
-from benchmarks.throughput import campaigns, memory, raman_night, readers, retrievals
+from benchmarks.throughput import memory, retrievals
 from lidarops.errors import CampaignError
 
 app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
@@ -30,47 +30,29 @@ BENCHMARKS: Final[dict[str, dict[str, Callable[[Effort], Study]]]] = {
         "multiangle": multiangle.measure_multiangle,
         "network": network.measure_network,
     },
-    "throughput": {
-        "homogeneous": retrievals.measure_solvers,
-        "campaigns": campaigns.measure_campaigns,
-        "memory": memory.measure_memory,
-        "raman": raman_night.measure_raman,
-        "reader": readers.measure_readers,
-    },
+    "throughput": {"homogeneous": retrievals.measure_solvers, "memory": memory.measure_memory},
     "stability": study.CASES,
 }
 """Benchmarks by what they measure and case; the first case is the default."""
-_OPTIONS: Final = {
-    "data": {"accuracy elastic", "accuracy all"},
-    "files": {"throughput reader"},
-    "repeats": {"throughput homogeneous", "throughput raman", "throughput reader"},
-}
-"""Options of a few benchmarks only."""
+_OF_PUBLISHED: Final = ("accuracy elastic", "accuracy all")
+"""Benchmarks that take the folder of published signals."""
 
 
 @command(program=app)
 def main(
     what: Annotated[str, typer.Argument(help="accuracy, throughput or stability", metavar="WHAT")],
-    files: Annotated[
-        list[Path] | None, typer.Argument(help="Raw files of one layout, for the case reader.")
-    ] = None,
     case: Annotated[
         str | None,
-        typer.Option(
-            help="all, campaigns, elastic, homogeneous, memory, multiangle, network, raman or "
-            "reader."
-        ),
+        typer.Option(help="all, elastic, homogeneous, memory, multiangle, network or raman."),
     ] = None,
     data: Annotated[
         Path | None,
         typer.Option(help="Folder of the EARLINET elastic intercomparison, for the case elastic."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Measure less.")] = False,
-    repeats: Annotated[
-        int | None, typer.Option(min=1, max=100, help="Number of repeats of each timing.")
-    ] = None,
     out: Annotated[
-        str | None, typer.Option("--out", help="Folder for the page and its JSON.", callback=no_url)
+        str | None,
+        typer.Option("--out", help="Folder for all numbers as JSON, and charts.", callback=no_url),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -85,17 +67,14 @@ def main(
 
     Example: python -m benchmarks accuracy --case elastic --quick --data boeckmann
 
-    Example: python -m benchmarks throughput demo/raw/coast/h*.*0
-
     Example: python -m benchmarks stability --quick --out bench
 
     Example: python -m benchmarks stability --case raman
     """
-    today = datetime.now(UTC).date().isoformat()
     with progress_bar("bench", None) as bar:
-        effort = Effort(quick, repeats, today, bar.advance, data, files or [])
+        effort = Effort(quick, bar.advance, data)
         measured = measure(what, case, effort)
-    page = None if out is None else measured.write(Path(out))
+    written = None if out is None else measured.write(Path(out))
     if as_json:
         typer.echo(measured.json())
     else:
@@ -103,8 +82,8 @@ def main(
             if not results.folded:
                 table = results.table
                 show_rows(results.title, table.columns, table.itertuples(index=False, name=None))
-        if page is not None:
-            typer.echo(f"report: {page}")
+        if written is not None:
+            typer.echo(f"all numbers: {written}")
     for target in measured.missed:
         typer.echo(f"missed: {target}", err=True)
     for target in measured.unnamed:
@@ -114,29 +93,26 @@ def main(
 
 
 def measure(what: str, case: str | None, effort: Effort) -> Study:
-    """Run a benchmark, and measure its CPU time.
+    """Run a benchmark, and state its date and CPU time.
 
     Raises
     ------
     CampaignError
-        If there is no such benchmark, or it has no such option.
-    RawFormatError
-        If the reader gets no file, or one that cannot be read.
+        If there is no such benchmark, or it takes no folder of published signals.
     """
     if what not in BENCHMARKS:
         raise CampaignError(f"no benchmark {what!r}", remedy=f"choose: {' or '.join(BENCHMARKS)}")
     cases = BENCHMARKS[what]
-    case = case or ("reader" if effort.files and "reader" in cases else next(iter(cases)))
+    case = case or next(iter(cases))
     if case not in cases:
         raise CampaignError(f"no case {case!r} of {what}", remedy=f"choose: {' or '.join(cases)}")
-    for option, places in _OPTIONS.items():
-        if getattr(effort, option) and f"{what} {case}" not in places:
-            raise CampaignError(
-                f"is no option of {what} {case}", field=option,
-                remedy=f"leave it out, or choose: {' or '.join(sorted(places))}",
-            )  # fmt: skip
-    begin = cpu_seconds()
-    return replace(cases[case](effort), cpu_seconds=cpu_seconds() - begin)
+    if effort.data and f"{what} {case}" not in _OF_PUBLISHED:
+        raise CampaignError(
+            f"is no option of {what} {case}", field="data",
+            remedy=f"leave it out, or choose: {' or '.join(_OF_PUBLISHED)}",
+        )  # fmt: skip
+    begin, today = cpu_seconds(), datetime.now(UTC).date().isoformat()
+    return replace(cases[case](effort), date=today, cpu_seconds=cpu_seconds() - begin)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,8 @@ from dataclasses import replace
 
 from benchmarks.accuracy import elastic, homogeneous, multiangle, network
 from benchmarks.accuracy.comparison import drawn_setting, method_name, score_of
-from benchmarks.harness.figure import Figure
+from benchmarks.harness.figure import Figure, Score, Scores
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.verdicts import Score, Scores
 
 Works = Mapping[str, Sequence[Work]]
 """Works by retrieval."""
@@ -23,8 +22,6 @@ def measure_all(effort: Effort) -> Study:
     ------
     CampaignError
         If the folder of published signals holds no such files.
-    RawFormatError
-        If a published file cannot be read.
     """
     studies = {
         "homogeneous path": homogeneous.measure_homogeneous(effort),
@@ -56,9 +53,8 @@ def measure_all(effort: Effort) -> Study:
         for results in study.results[1:]
     ]
     charts = [chart for study in studies.values() for chart in study.charts]
-    title = "All retrievals: error against run time"
     every = [work for group in works.values() for work in group]
-    return Study(title, effort.date, [best, beside, *tables, *others], charts, every)
+    return Study([best, beside, *tables, *others], charts, every)
 
 
 def best_methods(works: Works) -> Scores:

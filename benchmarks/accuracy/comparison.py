@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final, TypeVar
 
-from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    SIGMAS,
+    Array,
+    Figure,
+    Mask,
+    Score,
+    cpu_time,
+    mean_by_block,
+    root_by_block,
+    share,
+    share_by_block,
+    timed,
+)
 from benchmarks.harness.plots import Chart
-from benchmarks.harness.results import Effort, Results, Study, Work, frame
-from benchmarks.harness.statistics import SIGMAS, mean_by_block, root_by_block, share_by_block
-from benchmarks.harness.timing import CPU_TIME, timed
-from benchmarks.harness.verdicts import Score
+from benchmarks.harness.results import Results, Study, Work, frame
 
 RMSE: Final = "RMSE"
 BIAS: Final = "mean error"
@@ -52,21 +62,15 @@ def time_profiles(
 
 
 def comparison(
-    retrieval: str, effort: Effort, works: Sequence[Work], note: str, others: Sequence[Results] = ()
+    retrieval: str, works: Sequence[Work], note: str, others: Sequence[Results] = ()
 ) -> Study:
     """Return the study of the methods of one retrieval, with other tables of it."""
-    title = f"{retrieval.capitalize()}: error against CPU time"
-    table = methods_table(retrieval, works, note)
-    return Study(title, effort.date, [table, *others], [methods_chart(retrieval, works)], works)
-
-
-def methods_table(retrieval: str, works: Sequence[Work], note: str) -> Results:
-    """Return the table of all methods of a retrieval in all settings."""
     scores = {
         (f"{work.quantity}; {work.setting}", method_name(work)): score_of(work) | work.more
         for work in works
     }
-    return Results(f"{retrieval.capitalize()}: all methods", scores, note, case="error of")
+    table = Results(f"{retrieval.capitalize()}: all methods", scores, note, case="error of")
+    return Study([table, *others], [methods_chart(retrieval, works)], works)
 
 
 def method_name(work: Work) -> str:
@@ -98,9 +102,6 @@ def methods_chart(retrieval: str, works: Sequence[Work]) -> Chart:
     return Chart(
         "all-" + retrieval.replace(" ", "-"),
         f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time",
-        "Bars of 2 Monte Carlo standard errors. Hollow: peers, and methods that know more than the "
-        "profile or solve only a part. The steps join the methods that no other beats in both "
-        "error and time.",
         frame(scores),
         RMSE,
         {work.method for work in drawn if not work.ours or work.informed},

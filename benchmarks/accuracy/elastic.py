@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from benchmarks.accuracy import elastic_cases
 from benchmarks.accuracy.comparison import (
     BIAS,
     COVERAGE,
@@ -20,11 +19,11 @@ from benchmarks.accuracy.comparison import (
     score_errors,
     time_profiles,
 )
-from benchmarks.accuracy.elastic_cases import SimulatedSky
 from benchmarks.accuracy.elastic_peers import KLETT, LINEAR, klett_numpy, linear_backgrounds
-from benchmarks.harness.figure import Array, Figure, Mask, share
+from benchmarks.harness.figure import Array, Figure, Mask, Score, Scores, share
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.verdicts import Score, Scores
+from benchmarks.scenes import elastic_skies
+from benchmarks.scenes.elastic_skies import SimulatedSky
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.elastic.flags import ElasticQuality
 
@@ -37,9 +36,9 @@ _REJECTING: Final = rejecting((*Quality, *ElasticQuality))
 _ROUNDS: Final = 3
 """Timed calls of the first block, of which the least counts."""
 _COMPARED: Final = (
-    elastic_cases.KNOWN_SHAPE,
-    elastic_cases.KNOWN_CLEAN_RANGE,
-    elastic_cases.TAIL_MEAN,
+    elastic_skies.KNOWN_SHAPE,
+    elastic_skies.KNOWN_CLEAN_RANGE,
+    elastic_skies.TAIL_MEAN,
     LINEAR,
 )
 _NOTE: Final = (
@@ -52,9 +51,9 @@ _NOTE: Final = (
 )
 
 
-def background_methods() -> dict[str, elastic_cases.BackgroundMethod]:
+def background_methods() -> dict[str, elastic_skies.BackgroundMethod]:
     """Return the methods of the background and their peer by name."""
-    return {**elastic_cases.background_methods(), LINEAR: linear_backgrounds}
+    return {**elastic_skies.background_methods(), LINEAR: linear_backgrounds}
 
 
 def measure_elastic_accuracy(effort: Effort, *, draws: int | None = None) -> Study:
@@ -63,23 +62,23 @@ def measure_elastic_accuracy(effort: Effort, *, draws: int | None = None) -> Stu
     Parameters
     ----------
     effort : Effort
-        With the folder of the published files (`elastic_cases.read_published_profiles`).
+        With the folder of the published files (`elastic_skies.read_published_profiles`).
     draws : int, optional
         Profiles per level, at least 2.
 
     Raises
     ------
-    CampaignError, RawFormatError
-        If the published files cannot be read.
+    CampaignError
+        If the folder holds no published files.
     """
     published = []
     if effort.data is not None:
-        published = published_tables(*elastic_cases.read_published_profiles(effort.data))
+        published = published_tables(*elastic_skies.read_published_profiles(effort.data))
     works: list[Work] = []
-    for decade in elastic_cases.DECADES:
+    for decade in elastic_skies.DECADES:
         works += measure_level(decade, draws or (QUICK_DRAWS if effort.quick else DRAWS))
         effort.progress(1)
-    return comparison("elastic inversion", effort, works, _NOTE, published)
+    return comparison("elastic inversion", works, _NOTE, published)
 
 
 def measure_level(decade: int, draws: int) -> Iterator[Work]:
@@ -92,7 +91,7 @@ def measure_level(decade: int, draws: int) -> Iterator[Work]:
     draws : int
         Number of profiles.
     """
-    level, sky = 10.0**decade, elastic_cases.simulated_sky()
+    level, sky = 10.0**decade, elastic_skies.simulated_sky()
     counts = [
         sky.counts(level, min(BLOCK, draws - first), decade, k)
         for k, first in enumerate(range(0, draws, BLOCK))
@@ -100,18 +99,15 @@ def measure_level(decade: int, draws: int) -> Iterator[Work]:
     work = partial(Work, f"background of {level:.0f} counts")
     for name in _COMPARED:
         spent, parts = _solved(background_methods()[name], counts, sky)
-        error, stated, rejected = (
-            np.concatenate([getattr(part, field) for part in parts])
-            for field in ("background", "standard_error", "rejected")
-        )
+        error, stated, rejected = map(np.concatenate, zip(*parts, strict=True))
         score = background_score(error - level, stated, rejected)
         if score:
-            score |= {"bound": elastic_cases.least_error(sky, level)}
-            ours = name not in {elastic_cases.TAIL_MEAN, LINEAR}
-            informed = name == elastic_cases.KNOWN_CLEAN_RANGE
+            score |= {"bound": elastic_skies.least_error(sky, level)}
+            ours = name not in {elastic_skies.TAIL_MEAN, LINEAR}
+            informed = name == elastic_skies.KNOWN_CLEAN_RANGE
             yield work("background, counts", name, score.pop(RMSE), score.pop(COVERAGE), spent,
                        ours, informed, score)  # fmt: skip
-    for name, invert in ((ALL_STEPS, elastic_cases.invert), (KLETT, klett_numpy)):
+    for name, invert in ((ALL_STEPS, elastic_skies.invert), (KLETT, klett_numpy)):
         spent, inverted = _solved(invert, counts, sky)
         score = inversion_score(np.concatenate([_errors(one, sky) for one in inverted], 1), sky)
         if score:
@@ -170,7 +166,7 @@ def inversion_score(errors: Array, sky: SimulatedSky) -> Score:
     return score | {name: share(figure) for name, figure in scored.items()}
 
 
-def published_tables(sky: SimulatedSky, files: list[elastic_cases.Published]) -> list[Results]:
+def published_tables(sky: SimulatedSky, files: list[elastic_skies.Published]) -> list[Results]:
     """Return the errors of all methods and chains for the files of the intercomparison."""
     backgrounds: Scores = {}
     inversions: Scores = {}
@@ -184,8 +180,8 @@ def published_tables(sky: SimulatedSky, files: list[elastic_cases.Published]) ->
                 "error / stated": error / float(estimate.standard_error[0]),
                 "error of the truth": file.background_error,
             }
-        for name, chain in elastic_cases.CHAINS.items():
-            solved = elastic_cases.invert(file.counts, sky, **chain)
+        for name, chain in elastic_skies.CHAINS.items():
+            solved = elastic_skies.invert(file.counts, sky, **chain)
             score = inversion_score(_errors(solved, sky), sky)
             names = ("solved", BIAS, RMSE, "stated", WITHIN_1, COVERAGE)
             # Of one profile, there is no scatter.

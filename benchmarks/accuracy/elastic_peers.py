@@ -7,22 +7,22 @@ from typing import Final
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from benchmarks.accuracy.elastic_cases import (
+from benchmarks.harness.figure import Array
+from benchmarks.scenes.elastic_skies import (
     CLEAN_FROM,
     GIVEN_WINDOW,
     LIDAR_RATIO,
-    BackgroundEstimates,
+    Backgrounds,
     SimulatedSky,
     count_weight,
 )
-from benchmarks.harness.figure import Array
 
 LINEAR: Final = "least squares {1, shape}"
 """The range from 6 km is given, and the weights are those of the mean profile."""
 KLETT: Final = "Klett, numpy"
 
 
-def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
+def linear_backgrounds(counts: Array, sky: SimulatedSky) -> Backgrounds:
     """Return backgrounds by linear least squares with a constant and the shape of air."""
     first = int(np.searchsorted(sky.range, CLEAN_FROM))
     shape = sky.shape[first:] / sky.shape[first]
@@ -31,7 +31,7 @@ def linear_backgrounds(counts: Array, sky: SimulatedSky) -> BackgroundEstimates:
     covariance = np.linalg.inv(weighted.T @ slopes)
     background = counts[:, first:] @ (weighted @ covariance[:, 0])
     error = np.full(len(counts), np.sqrt(covariance[0, 0]))
-    return BackgroundEstimates(background, error, np.zeros(len(counts), dtype=np.bool_))
+    return Backgrounds(background, error, np.zeros(len(counts), dtype=np.bool_))
 
 
 def klett_numpy(counts: Array, sky: SimulatedSky) -> Array:

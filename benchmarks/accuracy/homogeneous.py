@@ -17,7 +17,18 @@ from benchmarks.accuracy.comparison import (
     score_errors,
     time_profiles,
 )
-from benchmarks.accuracy.homogeneous_cases import (
+from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    Figure,
+    Score,
+    Scores,
+    cpu_time,
+    mean_by_block,
+    share,
+)
+from benchmarks.harness.results import Effort, Results, Study, Work
+from benchmarks.scenes.homogeneous_paths import (
     BACKGROUND,
     QUANTITIES,
     TAIL_MEAN,
@@ -26,12 +37,6 @@ from benchmarks.accuracy.homogeneous_cases import (
     methods,
     scenarios,
 )
-from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
-from benchmarks.harness.figure import Figure, cpu_time, share
-from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.statistics import mean_by_block
-from benchmarks.harness.timing import CPU_TIME
-from benchmarks.harness.verdicts import Score, Scores
 from lidarops.retrieve.background.cubic_and_tail import cubic
 from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
@@ -84,7 +89,7 @@ def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study
         case="section",
         method="mean of",
     )
-    return comparison("homogeneous path", effort, list(_works(scores)), _NOTE, [offsets])
+    return comparison("homogeneous path", list(_works(scores)), _NOTE, [offsets])
 
 
 def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int = 1) -> Score:

@@ -14,8 +14,8 @@ import numba
 import numpy as np
 from scipy.optimize import curve_fit
 
-from benchmarks.accuracy.homogeneous_cases import Estimates, PathSolver, Scenario
 from benchmarks.harness.figure import Array
+from benchmarks.scenes.homogeneous_paths import Estimates, PathSolver, Scenario
 
 KILOMETRE: Final = 1e3
 _UNKNOWNS: Final = 3

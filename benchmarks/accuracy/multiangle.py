@@ -21,9 +21,8 @@ from benchmarks.accuracy.comparison import (
 )
 from benchmarks.accuracy.multiangle_cases import Scan, ScanEstimates, ScanSolver, Scene
 from benchmarks.accuracy.multiangle_peers import SLOW, scan_peers
-from benchmarks.harness.figure import Array, Figure, cpu_time, share
+from benchmarks.harness.figure import Array, Figure, cpu_time, root_by_block, share
 from benchmarks.harness.results import Effort, Study, Work
-from benchmarks.harness.statistics import root_by_block
 
 DEPTH: Final = "RMSE where kano_hamilton has a value"
 SLOPE: Final = "RMSE of extinction (km⁻¹)"
@@ -68,7 +67,7 @@ def measure_multiangle(effort: Effort, *, size: StudySize | None = None) -> Stud
     for number, scene in enumerate(cases.scan_scenes()):
         works += compare(scene, size or (QUICK if effort.quick else FULL), number)
         effort.progress(1)
-    return comparison("scans over zenith angle", effort, works, _NOTE)
+    return comparison("scans over zenith angle", works, _NOTE)
 
 
 def compare(scene: Scene, size: StudySize, number: int) -> Iterator[Work]:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.harness.figure import Array
+from benchmarks.harness.figure import Array, correlated
 from lidarops.retrieve.multiangle.optical_depth import (
     MultiAngleResult,
     OpticalDepthSettings,
@@ -138,15 +138,6 @@ class ScanEstimates:
 
 ScanSolver = Callable[[Scan], ScanEstimates]
 """A method to retrieve optical depth, ours or a peer."""
-
-
-def correlated(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> Array:
-    """Return unit normal numbers, correlated along the last axis."""
-    out = rng.normal(size=shape)
-    rest = np.sqrt(1.0 - correlation**2)
-    for k in range(1, shape[-1] if correlation else 0):
-        out[..., k] = correlation * out[..., k - 1] + rest * out[..., k]
-    return out
 
 
 # Scenes ---------------------------------------------------------------------------------------

@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.accuracy import network_cases as cases
 from benchmarks.accuracy.comparison import comparison
-from benchmarks.accuracy.network_cases import BLOCK, LidarLine, Signals
 from benchmarks.accuracy.network_peers import network_by_scipy, network_by_scipy_of_means
-from benchmarks.harness.figure import Array, Figure, Mask, cpu_time, share
+from benchmarks.harness.figure import (
+    TWO_SIDED,
+    Array,
+    Figure,
+    Mask,
+    Score,
+    Scores,
+    cpu_time,
+    root_by_block,
+    share,
+    share_by_block,
+    timed,
+)
 from benchmarks.harness.results import Effort, Results, Study, Work
-from benchmarks.harness.statistics import SIGMAS, mean_by_block, root_by_block, share_by_block
-from benchmarks.harness.timing import CPU_TIME, READ, READS, timed
-from benchmarks.harness.verdicts import Score, Scores
-from lidarops.retrieve.network.extinction_field import NetworkResult
+from benchmarks.scenes import lidar_networks as scenes
+from benchmarks.scenes.lidar_networks import BLOCK, PEER_NOISE, Signals
 
 PROFILES: Final = 3000
 QUICK_PROFILES: Final = 500
 """Profiles of each case, and of a quick run."""
 CLIPPED: Final = 3.0
 """Limit of relative errors: a quotient of noise has no variance."""
-_WITHIN: Final = {"within 1": SIGMAS[0], "within 1.96": SIGMAS[1], "within 3": 3.0}
-"""Numbers of standard errors."""
 _PEER_PROFILES: Final = 1500
 _QUICK_PEER_PROFILES: Final = 500
 _CHUNK_BLOCKS: Final = 5
@@ -35,51 +40,50 @@ _SCIPY: Final = "scipy least_squares"
 _SCIPY_MEAN: Final = f"{_SCIPY}, mean of {BLOCK} profiles"
 PEERS: Final = {_SCIPY: network_by_scipy, _SCIPY_MEAN: network_by_scipy_of_means}
 """The second one is given what the network with its prior is: the profiles of a block."""
-_RMSE: Final = "RMSE of extinction"
+CASES: Final = tuple(enumerate(product(scenes.AIRS, scenes.NOISES)))
+"""Air and noise, each with its number, which is part of the seed."""
 
 
 def measure_network(
     effort: Effort, *, profiles: int | None = None, peer_profiles: int | None = None
 ) -> Study:
-    """Retrieve extinction in every network, air and noise, with every solver.
+    """Retrieve extinction in every network and air that peers solve too.
 
     Parameters
     ----------
     effort : Effort
     profiles : int, optional
-        Number of profiles of each case, rounded up to whole blocks.
+        Number of profiles of which the coverage is that, rounded up to whole blocks.
     peer_profiles : int, optional
         Number of profiles of each comparison with a plain fit.
     """
-    blocks = -(-(profiles or (QUICK_PROFILES if effort.quick else PROFILES)) // BLOCK)
-    chunks = (-(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * BLOCK)
+    profiles = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
     fitted = peer_profiles or (_QUICK_PEER_PROFILES if effort.quick else _PEER_PROFILES)
-    comparisons = compare_with_scipy(fitted)
-    tables: list[Results] = []
+    cases = [
+        (number, air)
+        for number, (air, noise) in CASES
+        if noise == PEER_NOISE and air is not scenes.THIN
+    ]
+    comparisons: Scores = {}
     works: list[Work] = []
-    for lidars in cases.LIDAR_LINES:
-        scores: Scores = {}
-        signals = {air.name: cases.signals(lidars.network(), air) for air in cases.AIRS}
-        for index, (air, noise) in enumerate(product(cases.AIRS, cases.NOISES)):
-            for method, score in _measure_case(noise, signals[air.name], chunks, index).items():
-                scores[_case(air.name, noise), method] = score
-            effort.progress(1)
-        tables.append(
-            Results(
-                f"{lidars.name.capitalize()}: all methods",
-                scores,
-                "Of extinction and visibility over the truth. Solved: share of values that are not "
-                "withheld. Within: share of unflagged values within this number of stated standard "
-                "errors. Median crossing: median over the crossings of the RMS error of "
-                f"visibility. CPU time per profile, and in multiples of {READ}. In brackets: "
-                "Monte Carlo standard error of the last digit, from block to block.",
+    for seed, (lidars, (number, air)) in enumerate(product(scenes.LIDAR_LINES, cases)):
+        clean = scenes.signals(lidars.network(), air)
+        score = comparisons[lidars.name, air.name] = compare_with_scipy(clean, fitted, seed)
+        coverage = _coverage(clean, profiles, number)
+        works += [
+            Work(
+                f"{lidars.name}, {air.name}, noise {100.0 * PEER_NOISE:g} %",
+                "extinction, relative", method, Figure(error.value, error.error),
+                coverage.get(method), score[f"{method}, CPU time"], ours=method not in PEERS,
             )
-        )
-        works += _works(lidars, scores, comparisons)
+            for method in (*scenes.SOLVERS, *PEERS)
+            for error in [score[f"{method}, RMSE"]]
+        ]  # fmt: skip
+        effort.progress(1)
     beside = Results(
         "Networks and scipy, the same profiles and crossings",
         comparisons,
-        f"Noise {_percent(cases.PEER_NOISE)}: extinctions and beam constants by "
+        f"Noise {100.0 * PEER_NOISE:g} %: extinctions and beam constants by "
         "scipy.optimize.least_squares, weighted as if point values were independent, without "
         "errors or flags, and with all points; lidarops leaves out those that are too noisy. Of "
         "single profiles, and of the mean of a block, whose extinction is taken for all of its "
@@ -92,170 +96,86 @@ def measure_network(
         method="air",
     )
     note = (
-        f"{math.prod(chunks):,} profiles of each case, bins of {cases.STEP:g} m, relative noise of "
-        "each bin as given, plus 1 % of the power at the first crossing of the beam; blocks of "
-        f"{BLOCK} profiles. Errors are relative and clipped at 300 %, because a quotient of noise "
-        "has no variance."
+        f"Bins of {scenes.STEP:g} m, relative noise of each bin as given, plus 1 % of the power at "
+        f"the first crossing of the beam; blocks of {BLOCK} profiles. Errors are relative and "
+        "clipped at 300 %, because a quotient of noise has no variance. Coverage: of "
+        f"{math.prod(_chunks(profiles)):,} other profiles."
     )
-    return comparison("networks of lidars", effort, works, note, [*tables, beside])
+    return comparison("networks of lidars", works, note, [beside])
 
 
-def _percent(part: float) -> str:
-    return f"{100.0 * part:g} %"
+def _chunks(profiles: int) -> tuple[int, int]:
+    """Return the number of chunks that are solved together, and their size, of whole blocks."""
+    blocks = -(-profiles // BLOCK)
+    return -(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * BLOCK
 
 
-def _case(air: str, noise: float) -> str:
-    return f"{air}, noise {_percent(noise)}"
-
-
-def _measure_case(
-    noise: float, signals: Signals, chunks: tuple[int, int], seed: int
-) -> dict[str, Score]:
-    """Return the scores of every solver."""
-    number, size = chunks
-    results: dict[str, list[NetworkResult]] = {each.name: [] for each in cases.NETWORK_SOLVERS}
-    least = dict.fromkeys((READ, *results), math.inf)
-    for chunk in range(number):
-        power, variance = signals.draw(noise, size, len(signals.network.origin), seed, chunk)
-        least[READ] = min(least[READ], timed(partial(np.max, power))[0])
-        for solver in cases.NETWORK_SOLVERS:
-            if chunk == 0:
-                # The first call compiles and fills caches.
-                solver(power[:BLOCK], variance[:BLOCK], signals)
-            seconds, result = timed(partial(solver, power, variance, signals))
-            least[solver.name] = min(least[solver.name], seconds)
-            results[solver.name].append(result)
-    truth = np.concatenate([signals.truth(size)] * number)
-    return {
-        name: score_crossings(_joined(parts), truth, signals.network.near_crossing)
-        | {CPU_TIME: cpu_time(1e9 * least[name] / size), READS: least[name] / least[READ]}
-        for name, parts in results.items()
-    }
-
-
-def _joined(results: Sequence[NetworkResult]) -> dict[str, Any]:
-    """Return the arrays of several results as one, by name."""
+def solve_case(clean: Signals, noise: float, profiles: int, seed: int) -> dict[str, dict[str, Any]]:
+    """Return the results of every solver by name: arrays by the names of their fields."""
+    number, size = _chunks(profiles)
+    beams = len(clean.network.origin)
+    drawn = [clean.draw(noise, size, beams, seed, chunk) for chunk in range(number)]
     names = ("extinction", "extinction_standard_error", "flagged", "reduced_chi_square")
-    return {name: np.concatenate([getattr(each, name) for each in results]) for name in names}
+    results = {}
+    for method, solve in scenes.SOLVERS.items():
+        solved = [solve(power, variance, clean) for power, variance in drawn]
+        results[method] = {
+            name: np.concatenate([getattr(one, name) for one in solved]) for name in names
+        }
+    return results
 
 
-def score_crossings(result: dict[str, Any], truth: Array, near: Mask) -> Score:
-    """Return the score of one solver in one case, relative to the truth; None without values.
-
-    Monte Carlo errors come from the scatter between blocks, whose profiles share a field.
-
-    Parameters
-    ----------
-    result : mapping of str to array
-        ``extinction``, its ``extinction_standard_error`` and ``flagged``, (profile, crossing), and
-        ``reduced_chi_square``, (profile,).
-    truth : (profile, crossing) float
-        Extinction, m-1.
-    near : (crossing,) bool
-    """
-    extinction, truth, flagged = result["extinction"][:, near], truth[:, near], result["flagged"]
-    deviation = (extinction - truth) / result["extinction_standard_error"][:, near]
-    relative = np.clip(extinction / truth - 1.0, -CLIPPED, CLIPPED)
-    visibility = np.clip(truth / extinction - 1.0, -CLIPPED, CLIPPED)
-    solved = np.isfinite(extinction) & np.isfinite(deviation)
-    trusted = solved & ~flagged[:, near]
-    columns = list(zip(visibility.T, solved.T, strict=True))
-    fitted = result["reduced_chi_square"][np.isfinite(result["reduced_chi_square"])]
-    crossings = [rmse.value for v, k in columns if (rmse := root_by_block(v, k, BLOCK))]
-    return {
-        "mean error at the first crossing": _share(mean_by_block(*columns[0], BLOCK)),
-        "RMSE at the first crossing": _share(root_by_block(*columns[0], BLOCK)),
-        "solved": share(float(solved.mean())),
-        "flagged": share_by_block(flagged[:, near], np.ones_like(solved), BLOCK),
-        "mean error": _share(mean_by_block(relative, solved, BLOCK)),
-        _RMSE: _share(root_by_block(relative, solved, BLOCK)),
-        "RMSE unflagged": _share(root_by_block(relative, trusted, BLOCK)),
-        **{
-            name: share_by_block(np.abs(deviation) <= sigmas, trusted, BLOCK)
-            for name, sigmas in _WITHIN.items()
-        },
-        "χ²/dof": float(fitted.mean()) if fitted.size else None,
-        "median crossing": share(float(np.median(crossings))) if crossings else None,
-    }
+def _coverage(clean: Signals, profiles: int, seed: int) -> dict[str, Figure | None]:
+    """Return the share of unflagged values within 1.96 stated errors, by solver."""
+    near, shares = clean.network.near_crossing, {}
+    for method, result in solve_case(clean, PEER_NOISE, profiles, seed).items():
+        values = result["extinction"][:, near]
+        deviation = values - clean.truth(len(values))[:, near]
+        deviation /= result["extinction_standard_error"][:, near]
+        trusted = np.isfinite(deviation) & ~result["flagged"][:, near]
+        shares[method] = share_by_block(np.abs(deviation) <= TWO_SIDED, trusted, BLOCK)
+    return shares
 
 
-def _share(figure: Figure | None) -> Figure | None:
-    return None if figure is None else share(figure)
-
-
-def _works(lidars: LidarLine, scores: Scores, comparisons: Scores) -> Iterator[Work]:
-    # On the same profiles and crossings as the peer, where there is one.
-    common: Scores = {}
-    for (place, air), score in comparisons.items():
-        for method in (*(solver.name for solver in cases.NETWORK_SOLVERS), *PEERS):
-            key = (_case(air, cases.PEER_NOISE), method)
-            own = {_RMSE: score[f"{method}, RMSE"], CPU_TIME: score[f"{method}, CPU time"]}
-            if place == lidars.name:
-                common[key] = {**scores.get(key, {}), **own}
-    for (case, method), score in (scores | common).items():
-        error, coverage, spent = score[_RMSE], score.get("within 1.96"), score[CPU_TIME]
-        if isinstance(error, Figure) and isinstance(spent, Figure):
-            yield Work(
-                f"{lidars.name}, {case}",
-                "extinction, relative",
-                method,
-                Figure(error.value, error.error),
-                coverage if isinstance(coverage, Figure) else None,
-                spent,
-                ours=method not in PEERS,
-            )
-
-
-def compare_with_scipy(profiles: int) -> Scores:
-    """Return errors and times of our methods and of a plain fit, by network and air.
+def compare_with_scipy(clean: Signals, profiles: int, seed: int) -> Score:
+    """Return errors and times of our methods and of a plain fit of a network.
 
     Of the same profiles, and of the near crossings that all of them solve.
     """
-    airs = [air for air in cases.AIRS if air is not cases.THIN]
-    scores: Scores = {}
-    for seed, (lidars, air) in enumerate(product(cases.LIDAR_LINES, airs)):
-        signals = cases.signals(lidars.network(), air)
-        power, variance = signals.draw(cases.PEER_NOISE, profiles, 99, seed)
-        near = signals.network.near_crossing
-        truth = signals.truth(profiles)[:, near]
-        ours = {
-            solver.name: timed(partial(solver, power, variance, signals))
-            for solver in cases.NETWORK_SOLVERS
-        }
-        fitted = {
-            name: timed(partial(peer, power, variance, signals)) for name, peer in PEERS.items()
-        }
-        values = {name: result.extinction[:, near] for name, (_, result) in ours.items()}
-        values |= {name: extinction[:, near] for name, (_, extinction) in fitted.items()}
-        seconds = {name: spent for name, (spent, _) in (*ours.items(), *fitted.items())}
-        solved = np.all([np.isfinite(value) for value in values.values()], axis=0)
-        errors = {
-            name: np.clip(value / truth - 1.0, -CLIPPED, CLIPPED) for name, value in values.items()
-        }
-        plain, network = cases.NETWORK_WITHOUT_PRIOR.name, cases.NETWORK.name
-        stated = ours[plain][1].extinction_standard_error[:, near]
-        apart = ((values[_SCIPY] - values[plain]) / stated)[solved]
-        scores[lidars.name, air.name] = {
-            "profiles": profiles,
-            "compared": share(float(solved.mean())),
-            **{f"{name}, RMSE": _clipped_rms(error, solved) for name, error in errors.items()},
-            "network / scipy": _ratio(errors[network], errors[_SCIPY], solved),
-            f"network / scipy of means of {BLOCK}": _ratio(
-                errors[network], errors[_SCIPY_MEAN], solved
-            ),
-            "difference / stated": float(np.sqrt(np.mean(apart**2))),
-            **{
-                f"{name}, CPU time": cpu_time(1e9 * spent / profiles)
-                for name, spent in seconds.items()
-            },
-        }
-    return scores
-
-
-def _clipped_rms(errors: Array, kept: Mask) -> Figure:
-    """Return the root mean square of kept errors, from block to block."""
-    rmse = root_by_block(errors, kept, BLOCK)
-    return share(math.nan) if rmse is None else share(rmse)
+    power, variance = clean.draw(PEER_NOISE, profiles, 99, seed)
+    near = clean.network.near_crossing
+    truth = clean.truth(profiles)[:, near]
+    ours = {
+        name: timed(partial(solve, power, variance, clean))
+        for name, solve in scenes.SOLVERS.items()
+    }
+    fitted = {name: timed(partial(peer, power, variance, clean)) for name, peer in PEERS.items()}
+    values = {name: result.extinction[:, near] for name, (_, result) in ours.items()}
+    values |= {name: extinction[:, near] for name, (_, extinction) in fitted.items()}
+    seconds = {name: spent for name, (spent, _) in (*ours.items(), *fitted.items())}
+    solved = np.all([np.isfinite(value) for value in values.values()], axis=0)
+    errors = {
+        name: np.clip(value / truth - 1.0, -CLIPPED, CLIPPED) for name, value in values.items()
+    }
+    plain, network = scenes.NO_PRIOR, scenes.NETWORK
+    stated = ours[plain][1].extinction_standard_error[:, near]
+    apart = ((values[_SCIPY] - values[plain]) / stated)[solved]
+    return {
+        "profiles": profiles,
+        "compared": share(float(solved.mean())),
+        **{
+            f"{name}, RMSE": share(root_by_block(error, solved, BLOCK) or math.nan)
+            for name, error in errors.items()
+        },
+        "network / scipy": _ratio(errors[network], errors[_SCIPY], solved),
+        f"network / scipy of means of {BLOCK}": _ratio(
+            errors[network], errors[_SCIPY_MEAN], solved
+        ),
+        "difference / stated": float(np.sqrt(np.mean(apart**2))),
+        **{
+            f"{name}, CPU time": cpu_time(1e9 * spent / profiles) for name, spent in seconds.items()
+        },
+    }
 
 
 def _ratio(ours: Array, peers: Array, kept: Mask) -> Figure:

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.accuracy.network_cases import BLOCK, Signals
 from benchmarks.harness.figure import Array
+from benchmarks.scenes.lidar_networks import BLOCK, Signals
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _LEAST_SLOPE: Final = 1e-6

@@ -1,1 +1,1 @@
-"""Shared by all benchmarks: `results` (tables, JSON, page), `plots`, `statistics`, `timing`."""
+"""Shared by all benchmarks: `figure` (numbers), `rates`, `plots`, `results` (tables, JSON)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchmarks.harness.figure import Unit
-from benchmarks.harness.timing import CPU_TIME
+from benchmarks.harness.figure import CPU_TIME, Unit
 
 _DRAWN: Final = {Unit.NUMBER: (1.0, ""), Unit.SHARE: (100.0, " (%)"), Unit.TIME: (1e-3, " (µs)")}
 """Factor and unit in which values are drawn."""
@@ -35,7 +34,6 @@ class Chart:
     name: str
     """Of the file, without suffix."""
     title: str
-    caption: str
     rows: pd.DataFrame
     """Results with the columns of `benchmarks.harness.results.COLUMNS`."""
     quantity: str
@@ -53,15 +51,6 @@ def draw(chart: Chart) -> bytes:
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Title": chart.title})
     return stream.getvalue()
-
-
-def pareto(points: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Return the points with no other point below and to the left of them, from left to right."""
-    front: list[tuple[float, float]] = []
-    for x, y in sorted(points):
-        if not front or y < front[-1][1]:
-            front.append((x, y))
-    return tuple(front)
 
 
 def _wide(chart: Chart, quantity: str) -> pd.DataFrame:
@@ -90,9 +79,10 @@ def _draw_errors(chart: Chart, figure: Figure) -> None:
             axes.errorbar([row["value_of_time"]], [row["value"]], bar, label=method, ls="",
                           marker=mark, color=colour, markerfacecolor=fill)  # fmt: skip
         solid = drawn[[method not in chart.hollow for method in drawn.index]]
-        front = pareto([(row.value_of_time, row.value) for row in solid.itertuples()])
-        corners = np.reshape(front, (-1, 2)).T
-        axes.step(corners[0], corners[1], where="post", color="0.5", lw=0.8, zorder=0)
+        ranked = solid.sort_values(["value_of_time", "value"])[["value_of_time", "value"]]
+        # Of the front, no faster method has as small an error.
+        front = ranked[ranked["value"] < ranked["value"].cummin().shift(fill_value=np.inf)]
+        axes.step(*front.to_numpy(float).T, where="post", color="0.5", lw=0.8, zorder=0)
         axes.set(xscale="log", yscale="log", title=case, xlabel=f"{CPU_TIME} (µs)")
     panels[0].set_ylabel(chart.quantity + _DRAWN[Unit(both["unit"].iloc[0])][1])
     _add_legend(figure, panels)

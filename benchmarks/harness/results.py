@@ -1,51 +1,65 @@
-"""Results of benchmarks: tables of (case, method, quantity, value), their JSON and page."""
+"""Results of benchmarks: tables of (case, method, quantity, value), and their JSON."""
 
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from html import escape
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 
-from benchmarks.harness.figure import Figure, Unit, format_time, with_error
+from benchmarks.harness.figure import (
+    Figure,
+    Judgement,
+    Score,
+    Scores,
+    Unit,
+    format_time,
+    with_error,
+)
 from benchmarks.harness.plots import Chart, draw
-from benchmarks.harness.timing import machine
-from benchmarks.harness.verdicts import Judgement, Score, Scores
 from lidarops.errors import CatalogError
+from lidarops.system.code_version import source_version
 from lidarops.system.files import write_atomically
 
-INDEX: Final = "index.html"
 RESULT: Final = "result.json"
-"""Names of the page and of the file of all numbers in the folder of a benchmark."""
+"""Name of the file of all numbers in the folder of a benchmark."""
 COLUMNS: Final = ["case", "method", "quantity", "value", "error", "unit"]
 """Columns of a table of results; an error of 0 is none."""
 _NONE: Final = "-"
-_STYLE: Final = (
-    ":root{color-scheme:light dark} body{max-width:80rem;margin:auto;padding:1rem;"
-    "font:1rem/1.5 system-ui} table{border-collapse:collapse} td,th{text-align:right;"
-    "padding:.2rem .6rem;border-bottom:1px solid #8888} img{max-width:100%;background:#fff}"
-)
+_PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Size of a run, its stated date, its inputs, and the progress callback."""
+    """Size of a run, its inputs, and the progress callback."""
 
     quick: bool = False
-    repeats: int | None = None
-    """Repeats of each timing; None for the default of the benchmark."""
-    date: str = ""
-    """Date stated in the result."""
     progress: Callable[[int], object] = lambda _: None
     """Called with 1 after each scenario or setting."""
     data: Path | None = None
     """Folder of published signals, for the accuracy of the elastic retrieval."""
-    files: Sequence[Path] = ()
-    """Raw files of one layout, for the reader."""
+
+
+def machine() -> dict[str, Any]:
+    """Return processor, cores, versions of Python and packages, and the digest of the code."""
+    models = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        if line.startswith("model name")
+    ]
+    return {
+        "processor": models[0] if models else platform.machine(),
+        "cores": os.cpu_count() or 1,
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
+        "code": source_version(),
+    }
 
 
 def frame(scores: Scores) -> pd.DataFrame:
@@ -113,7 +127,7 @@ class Results:
     """Heading of the column of cases."""
     method: str = "method"
     folded: bool = False
-    """Whether the table is folded on the page and left out in a terminal."""
+    """Whether the table is left out in a terminal."""
 
     @property
     def table(self) -> pd.DataFrame:
@@ -147,8 +161,6 @@ class Work:
 class Study:
     """All results of one benchmark."""
 
-    title: str
-    date: str
     results: Sequence[Results]
     charts: Sequence[Chart] = ()
     works: Sequence[Work] = ()
@@ -156,6 +168,7 @@ class Study:
     """Targets that are missed; the command fails where there is one."""
     unnamed: Sequence[str] = ()
     """Those of them for which no reason is stated."""
+    date: str = ""
     cpu_seconds: float = 0.0
     """CPU time of the whole benchmark, with its child processes."""
 
@@ -168,7 +181,6 @@ class Study:
     def json(self) -> str:
         """Return all rows, by the headings of their tables, and the machine as JSON."""
         document = {
-            "title": self.title,
             "date": self.date,
             "machine": machine(),
             "cpu_seconds": round(self.cpu_seconds, 1),
@@ -179,7 +191,7 @@ class Study:
         return json.dumps(document, indent=1, allow_nan=False)
 
     def write(self, folder: Path) -> Path:
-        """Write the page with its charts, and the JSON; return the path of the page.
+        """Write the charts and the JSON; return the path of the JSON.
 
         Raises
         ------
@@ -190,7 +202,6 @@ class Study:
             folder.mkdir(parents=True, exist_ok=True)
             for chart in self.charts:
                 write_atomically(folder / f"{chart.name}.svg", draw(chart))
-            write_atomically(folder / INDEX, "\n".join(self._page()).encode())
             write_atomically(folder / RESULT, self.json().encode())
         except OSError as error:
             raise CatalogError(
@@ -198,21 +209,4 @@ class Study:
                 file=folder,
                 remedy="choose a folder you can write to",
             ) from error
-        return folder / INDEX
-
-    def _page(self) -> list[str]:
-        facts = escape(f"{self.date}, {', '.join(f'{k}: {v}' for k, v in machine().items())}")
-        lines = [
-            f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{self.title}</title>',
-            f"<style>{_STYLE}</style><h1>{escape(self.title)}</h1>",
-            f'<p>{facts}. <a href="{RESULT}">All numbers</a></p>',
-        ]
-        for chart in self.charts:
-            image = f'<img src="{chart.name}.svg" alt="{escape(chart.title)}">'
-            lines += [f"<figure>{image}<figcaption>{escape(chart.caption)}</figcaption></figure>"]
-        for results in self.results:
-            state = "" if results.folded else " open"
-            lines += [f"<details{state}><summary>{escape(results.title)}</summary>"]
-            lines += [results.table.to_html(index=False, border=0)]
-            lines += [f"<p>{escape(results.note)}</p></details>"]
-        return lines
+        return folder / RESULT

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.harness.verdicts import Scores, Target
-from benchmarks.stability.random_homogeneous import random_paths
-from benchmarks.stability.random_scenes import Part, shares
+from benchmarks.harness.figure import Scores, Target, log_uniform
+from benchmarks.harness.rates import Part, shares
+from benchmarks.scenes.homogeneous_paths import random_paths
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -30,7 +30,7 @@ def few_counts(cluster: int, *, counts: float) -> Iterator[Part]:
     """Yield how many profiles of few photon counts are flagged although the model holds."""
     rng = np.random.default_rng((82, cluster))
     distance = 2500.0 + 37.5 * np.arange(225)
-    signal = float(np.exp(rng.uniform(np.log(3.0), np.log(100.0))))
+    signal = log_uniform(rng, 3.0, 100.0)
     fall = (distance[0] / distance) ** 2 * np.exp(-2e-4 * (distance - distance[0]))
     mean = counts * (1.0 + signal * fall)
     drawn = rng.poisson(mean, (_COUNTED, mean.size)).astype(float)

@@ -12,10 +12,9 @@ from typing import Final
 import numpy as np
 
 from benchmarks.accuracy import multiangle_cases
-from benchmarks.accuracy.network_cases import signals
-from benchmarks.harness.figure import Array
-from benchmarks.harness.verdicts import Scores
-from benchmarks.stability import random_networks
+from benchmarks.harness.figure import Array, Scores
+from benchmarks.scenes import lidar_networks
+from benchmarks.scenes.lidar_networks import signals
 from lidarops.retrieve.network import extinction_field
 
 CHANGE: Final = "largest change, in stated errors"
@@ -34,10 +33,10 @@ def profile_order(cluster: int) -> Iterator[tuple[str, float]]:
     change = np.abs(first.optical_depth[order] - second.optical_depth)
     yield "scan, order of profiles", _largest(change / second.optical_depth_standard_error)
     rng = np.random.default_rng((73, cluster))
-    net = random_networks.random_network(rng).network()
+    net = lidar_networks.random_network(rng).network()
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return
-    clean = signals(net, random_networks.layered(rng))
+    clean = signals(net, lidar_networks.layered(rng))
     power, variance = clean.draw(0.03, _PROFILES, cluster)
     one, two = (
         extinction_field.retrieve_network(
@@ -57,7 +56,7 @@ def network_values(clusters: int) -> Array:
     """Return errors of extinction of networks and their stated ones, NaN where flagged."""
     values = []
     for cluster in range(clusters):
-        for scored in random_networks.score_networks(cluster, _NETWORK_PROFILES):
+        for scored in lidar_networks.score_networks(cluster, _NETWORK_PROFILES):
             kept = np.where(scored.bits == 0, scored.error, np.nan)
             columns = (kept, np.broadcast_to(scored.random, kept.shape))
             values.append(np.stack([column.ravel() for column in columns]))

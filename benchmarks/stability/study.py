@@ -7,23 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from benchmarks.harness.figure import cpu_time, share_text
-from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.harness.timing import CPU_TIME, cpu_seconds
-from benchmarks.harness.verdicts import Judgement, Scores, Verdict
-from benchmarks.stability import (
-    flag_rates,
-    random_dead_times,
-    random_elastic,
-    random_homogeneous,
-    random_light,
-    random_networks,
-    random_raman,
-    random_scans,
-    random_signals,
-    reproducibility,
+from benchmarks.harness.figure import (
+    CPU_TIME,
+    Judgement,
+    Scores,
+    Verdict,
+    cpu_seconds,
+    cpu_time,
+    share_text,
 )
-from benchmarks.stability.random_scenes import (
+from benchmarks.harness.rates import (
     COVERED,
     FALSE,
     HALF,
@@ -33,9 +26,21 @@ from benchmarks.stability.random_scenes import (
     VIOLATED,
     VISIBLE,
     ScoredValues,
+    Unmet,
     collect,
+    rates,
+    read_reasons,
+    why,
 )
-from benchmarks.stability.reasons import Unmet, read_reasons, why
+from benchmarks.harness.results import Effort, Results, Study
+from benchmarks.scenes import (
+    elastic_skies,
+    homogeneous_paths,
+    lidar_networks,
+    raman_skies,
+    recorded_signals,
+)
+from benchmarks.stability import flag_rates, random_scans, reproducibility
 
 LONGEST: Final = 1200.0
 """s, most CPU time of the whole benchmark."""
@@ -95,8 +100,8 @@ class Draws:
     def measure(self, effort: Effort) -> Results:
         """Return the rates of false values."""
         clusters = self.quick if effort.quick else self.clusters
-        tally = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
-        scores = tally.rates(self.needless, pooled=self.pooled)
+        counted = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
+        scores = rates(counted, self.needless, pooled=self.pooled)
         return Results(self.title, scores, _NOTE, case="quantity", method="class")
 
 
@@ -118,10 +123,10 @@ class Other:
 
 
 def _blocks(
-    draw_air: random_networks.DrawAir, air: str, length: int, clusters: int, profiles: int = 6
+    draw_air: lidar_networks.DrawAir, air: str, length: int, clusters: int, profiles: int = 6
 ) -> Draws:
     name = f"{air}, blocks of {length}"
-    score = partial(random_networks.score_short_blocks, draw_air=draw_air, name=name, length=length)
+    score = partial(lidar_networks.score_short_blocks, draw_air=draw_air, name=name, length=length)
     return Draws(f"networks, {name}", "network", score, profiles, clusters, 4)
 
 
@@ -130,22 +135,22 @@ def _scans(length: int) -> Draws:
     return Draws(f"scans, blocks of {length}", "multiangle", score, 8, 400, 4)
 
 
-_paths, _scanned, _networks = random_homogeneous, random_scans, random_networks
+_paths, _scanned, _networks = homogeneous_paths, random_scans, lidar_networks
 DRAWS: Final = (
     Draws("homogeneous", "homogeneous", _paths.score_homogeneous, 1000, 400, 4, 1e-3, pooled=True),
-    Draws("signal chain", "signal", random_signals.score_signals, 50, 500, 20, 0.05, pooled=True),
-    Draws("elastic", "elastic", random_elastic.score_elastic, 20, 400, 6, 0.05, pooled=True),
+    Draws("signal chain", "signal", recorded_signals.score_signals, 50, 500, 20, 0.05, pooled=True),
+    Draws("elastic", "elastic", elastic_skies.score_elastic, 20, 400, 6, 0.05, pooled=True),
     Draws("multi-angle", "multiangle", _scanned.score_scans, 8, 400, 6, 0.13, pooled=True),
     Draws("scans of any and of calm air", "multiangle", _scanned.score_scan_methods, 8, 400, 6,
           pooled=True),
     Draws("network", "network", partial(_networks.score_networks, of_all=300), 50, 700, 4, 0.05,
           pooled=True),
-    Draws("Raman", "raman", random_raman.score_raman, 8, 500, 6, 0.05, pooled=True),
+    Draws("Raman", "raman", raman_skies.score_raman, 8, 500, 6, 0.05, pooled=True),
     Draws("short sections", "homogeneous", _paths.score_short_sections, 300, 600, 6),
     Draws("correlated noise", "homogeneous", _paths.score_correlated_noise, 60, 400, 6),
     Draws("near the cut", "homogeneous", _paths.score_near_the_cut, 1000, 400, 6),
     Draws("dying signals", "homogeneous", _paths.score_dying_signals, 300, 2500, 6),
-    Draws("quiet digitizers", "signal", random_signals.score_digitizers, 5, 60, 6),
+    Draws("quiet digitizers", "signal", recorded_signals.score_digitizers, 5, 60, 6),
     _scans(1),
     _scans(2),
     Draws("scans of photon counts", "multiangle", _scanned.score_counted_scans, 8, 250, 6),
@@ -160,9 +165,10 @@ OTHERS: Final = (
     Other("flags", "flags", FLAGS, lambda quick: flag_rates.flag_rates(2 if quick else 60),
           ("flag", "condition")),
     Other("dead times", "signal", DEAD_TIMES,
-          lambda quick: random_dead_times.dead_time_scores(2 if quick else 310),
+          lambda quick: recorded_signals.dead_time_scores(2 if quick else 310),
           ("record", "scene")),
-    Other("light", "light", LIGHT, lambda quick: random_light.light_scores(10 if quick else 200),
+    Other("light", "light", LIGHT,
+          lambda quick: recorded_signals.light_scores(10 if quick else 200),
           ("profiles", "condition")),
     Other("order and machine", "order", REPRODUCIBLE,
           lambda quick: reproducibility.measure_reproducibility(*((2, 1) if quick else (60, 6))),
@@ -199,20 +205,16 @@ def measure_stability(
     missed = [one for one in unmet if one.judgement.verdict is Verdict.MISSED]
     reasons = read_reasons()
     return Study(
-        "Stability: false values without a flag", effort.date, results,
+        results,
         missed=[str(one) for one in missed],
         unnamed=[str(one) for one in missed if reasons and not why(one, reasons)],
-    )  # fmt: skip
-
-
-def _measured(case: str) -> Callable[[Effort], Study]:
-    return lambda effort: measure_stability(effort, case=case)
+    )
 
 
 CASES: Final[dict[str, Callable[[Effort], Study]]] = {
     "all": measure_stability,
-    **{part.case: _measured(part.case) for part in (*DRAWS, *OTHERS)},
-    **{part.name: _measured(part.name) for part in (*DRAWS, *OTHERS)},
+    **{part.case: partial(measure_stability, case=part.case) for part in (*DRAWS, *OTHERS)},
+    **{part.name: partial(measure_stability, case=part.name) for part in (*DRAWS, *OTHERS)},
 }
 """The benchmark of all parts, of those of a case, and of each."""
 

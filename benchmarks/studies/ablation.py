@@ -18,28 +18,30 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
+from benchmarks.harness import rates
 from benchmarks.harness.figure import Array
-from benchmarks.stability import random_scenes
-from benchmarks.stability.random_scenes import ScoredValues
+from benchmarks.harness.rates import ScoredValues
 
 PAGES: Final = Path(__file__).resolve().parents[2] / "docs/algorithms"
 """Of the tables."""
 BASE: Final = "all guards"
-RATES: Final = {
-    "false, model holds": ("false plain where satisfied", "plain where satisfied"),
-    "false, model violated": ("false plain where violated", "plain where violated"),
-    "false, no bit": ("false bare", "bare"),
-    "covered, model holds": ("plain covered where satisfied", "plain where satisfied"),
-    "covered, model violated": ("plain covered where violated", "plain where violated"),
-    "needless": ("solvable rejected where satisfied", "solvable where satisfied"),
-    "lost, model holds": ("lost where satisfied", "scored where satisfied"),
-    "lost, model violated": ("lost where violated", "scored where violated"),
+RATES: Final[dict[str, tuple[str, str, tuple[bool, ...]]]] = {
+    "false, model holds": ("false plain", "plain", (True,)),
+    "false, model violated": ("false plain", "plain", (False,)),
+    "false, no bit": ("false bare", "bare", (True, False)),
+    "covered, model holds": ("plain covered", "plain", (True,)),
+    "covered, model violated": ("plain covered", "plain", (False,)),
+    "needless": ("solvable rejected", "solvable", (True,)),
+    "lost, model holds": ("lost", "scored", (True,)),
+    "lost, model violated": ("lost", "scored", (False,)),
 }
-"""Rate -> numerator and denominator. `false`: beyond 4 stated errors though not rejected,
-or though no bit is raised, whether it rejects or not. `covered`: within 1.96 stated errors.
+"""Rate -> numerator, denominator, and whether the model holds. `false`: beyond 4 stated errors
+though not rejected, or though no bit is raised, whether it rejects or not. `covered`: within 1.96
+stated errors.
 `needless`: flagged or withheld though determinable. `lost`: flagged or withheld."""
 
 Context = Callable[[], AbstractContextManager[object]]
+ScoreCluster = Callable[[int], Iterable[ScoredValues]]
 Patch = tuple[Any, str, Any]
 """Owner, name of its attribute, and what stands there instead."""
 
@@ -69,11 +71,12 @@ def without(*patches: Patch) -> Context:
     return lambda: replaced(*patches)
 
 
-def measure(
-    score: Callable[[int], Iterable[ScoredValues]],
-    clusters: Sequence[int],
-    guards: Sequence[Guard],
-) -> pd.DataFrame:
+def with_thresholds(module: Any, **changes: Any) -> Context:
+    """Return the context in which the thresholds that a module reads have other values."""
+    return without((module, "THRESHOLDS", module.THRESHOLDS._replace(**changes)))
+
+
+def measure(score: ScoreCluster, clusters: Sequence[int], guards: Sequence[Guard]) -> pd.DataFrame:
     """Return counts by guard, quantity, class and cluster."""
     contexts: list[tuple[Context, list[Guard]]] = [
         (nullcontext, [Guard(BASE), *(guard for guard in guards if guard.off is None)]),
@@ -85,44 +88,41 @@ def measure(
         with context():
             for cluster in clusters:
                 for values in score(cluster):
-                    rows += [_counts(values, guard) | {"cluster": cluster} for guard in variants]
-    keys = ["guard", "quantity", "class", "cluster"]
-    return pd.DataFrame(rows).groupby(keys, sort=False).sum()
+                    rows += [
+                        rates.counts(_without_bits(values, guard.bits))
+                        | {"guard": guard.name, "cluster": cluster}
+                        for guard in variants
+                    ]
+    counted = pd.DataFrame(rows).drop(columns="sizes")
+    return counted.groupby(["guard", *rates.KEYS], sort=False).sum()
 
 
-def _counts(values: ScoredValues, guard: Guard) -> dict[str, Any]:
-    freed = (np.asarray(values.bits) & guard.bits) != 0
+def _without_bits(values: ScoredValues, bits: int) -> ScoredValues:
+    freed = (np.asarray(values.bits) & bits) != 0
     uncertain = None if values.uncertain is None else values.uncertain & ~freed
-    counts = random_scenes.counts(
-        replace(values, bits=values.bits & ~np.int32(guard.bits), uncertain=uncertain)
-    )
-    del counts["sizes"]
-    counts |= {"scored": float(values.error.size), "lost": values.error.size - counts["plain"]}
-    kind = "satisfied" if values.failure.satisfied else "violated"
-    return {
-        "guard": guard.name,
-        "quantity": values.quantity,
-        "class": values.failure.name,
-        **counts,
-        **{f"{name} where {kind}": number for name, number in counts.items()},
-    }
+    return replace(values, bits=values.bits & ~np.int32(bits), uncertain=uncertain)
 
 
 def table(counts: pd.DataFrame) -> Iterator[str]:
     """Yield the lines of a Markdown table: rates with all guards, then changes without each."""
     yield "| guard off | value | " + " | ".join(RATES) + " | moves |"
     yield "| --- | --- |" + " --- |" * (len(RATES) + 1)
-    parts = [*dict.fromkeys(name for pair in RATES.values() for name in pair)]
-    sides = counts.reindex(columns=parts).fillna(0.0)
-    sides = sides.groupby(["guard", "quantity", "cluster"], sort=False).sum()
-    names = [sides.index.unique(level) for level in ("guard", "quantity")]
-    parts_of = dict(list(sides.groupby(["guard", "quantity"], sort=False)))
-    for guard, quantity in (key for key in product(*names) if key in parts_of):
-        own, base = parts_of[guard, quantity], parts_of[BASE, quantity]
+    places = ["guard", "quantity", "cluster"]
+    every = counts.groupby(places, sort=False).sum()
+    sides: dict[tuple[Any, ...], pd.DataFrame] = {}
+    for holds in {rate[2] for rate in RATES.values()}:
+        side = counts[counts.index.isin(holds, level="satisfied")].groupby(places, sort=False).sum()
+        side = side.reindex(every.index, fill_value=0.0)
+        sides |= {(holds, *key): own for key, own in side.groupby(places[:2], sort=False)}
+    names = [every.index.unique(level) for level in places[:2]]
+    for guard, quantity in product(*names):
+        if ((True,), guard, quantity) not in sides:
+            continue
         cells, moves = [], []
-        for name, pair in RATES.items():
+        for name, (events, trials, holds) in RATES.items():
             (value, left), (of_base, base_left) = (
-                _jackknife(*side[list(pair)].to_numpy().T) for side in (own, base)
+                _jackknife(*sides[holds, of, quantity][[events, trials]].to_numpy().T)
+                for of in (guard, BASE)
             )
             if guard != BASE:
                 value, left = value - of_base, left - base_left
@@ -149,6 +149,13 @@ def write_table(page: Path, mark: str, lines: Iterable[str]) -> None:
     if not (begin and end):
         raise ValueError(f"{page} has no marks of the name {mark!r}")
     page.write_text("".join((before, begin, *(f"{line}\n" for line in lines), end, after)), "utf-8")
+
+
+def write_guards(
+    page: str, score: ScoreCluster, clusters: int, guards: Sequence[Guard], mark: str = "guards"
+) -> None:
+    """Write the table of guards into a page, between two marks of that name."""
+    write_table(PAGES / page, mark, table(measure(score, range(clusters), guards)))
 
 
 def requested_number(description: str | None, default: int) -> int:

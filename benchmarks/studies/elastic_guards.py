@@ -13,23 +13,20 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from benchmarks.stability import random_elastic
+from benchmarks.scenes import elastic_skies
 from benchmarks.studies.ablation import (
-    PAGES,
     Guard,
-    measure,
     replaced,
     requested_number,
-    table,
+    with_thresholds,
     without,
-    write_table,
+    write_guards,
 )
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import Rejection
 from lidarops.retrieve.clouds import layers, outlying_bins
 from lidarops.retrieve.elastic import inversion
 from lidarops.retrieve.elastic.flags import ElasticQuality
-from lidarops.retrieve.elastic.inversion import THRESHOLDS
 
 CLUSTERS: Final = 60
 PROFILES: Final = 10
@@ -94,11 +91,6 @@ def without_rejection(bit: Rejection) -> Iterator[None]:
         yield
 
 
-def threshold(**changes: Any) -> Any:
-    """Return the context in which thresholds have other values."""
-    return without((inversion, "THRESHOLDS", THRESHOLDS._replace(**changes)))
-
-
 GUARDS: Final = (
     Guard("CLOUD", int(ElasticQuality.CLOUD)),
     Guard("NEGATIVE_BACKSCATTER", int(ElasticQuality.NEGATIVE_BACKSCATTER)),
@@ -114,9 +106,9 @@ GUARDS: Final = (
             (reference_window.ReferenceWindow, "undetected_particles", property(_no_error))
         ),
     ),
-    Guard("least certainty", off=threshold(least_certainty=0.0)),
-    Guard("skewed errors", off=threshold(skewed=0.0)),
-    Guard("longest gap", off=threshold(longest_gap=np.inf)),
+    Guard("least certainty", off=with_thresholds(inversion, least_certainty=0.0)),
+    Guard("skewed errors", off=with_thresholds(inversion, skewed=0.0)),
+    Guard("longest gap", off=with_thresholds(inversion, longest_gap=np.inf)),
     Guard("bridging of outliers", off=without((outlying_bins, "bridge_outliers", _same))),
     Guard("outlier: contrast", off=partial(bridges, "THRESHOLDS.least_contrast", "0.0")),
     Guard("outlier: step", off=partial(bridges, "if not step <= allowed:", "if False:")),
@@ -128,6 +120,5 @@ GUARDS: Final = (
 )
 
 if __name__ == "__main__":
-    clusters = range(requested_number(__doc__, CLUSTERS))
-    counts = measure(lambda k: random_elastic.score_elastic(k, PROFILES), clusters, GUARDS)
-    write_table(PAGES / "elastic.md", "guards", table(counts))
+    score = partial(elastic_skies.score_elastic, profiles=PROFILES)
+    write_guards("elastic.md", score, requested_number(__doc__, CLUSTERS), GUARDS)

@@ -1,56 +1,46 @@
-"""Ablation of the guards of networks: what changes when each of them is switched off.
+"""Ablation of the guards of networks: ``python -m benchmarks.studies.network_guards [NETWORKS]``.
 
-Every variant solves the same random networks (`benchmarks.stability.random_networks`), blocks
-in which noise rises, and simulated campaigns from raw files to products::
-
-    python -m benchmarks.studies.network_guards [NETWORKS] [--only VARIANT ...]
-
-It writes a table into ``docs/algorithms/network.md``: shares with all guards, then the differences
-without one of them, in percent, each with its Monte Carlo error from the scatter between networks.
+Every variant solves the same random networks (`benchmarks.stability.lidar_networks`) and blocks
+in which noise rises, in steep fields, and with outliers in curved air. The table in
+``docs/algorithms/network.md`` states shares with all guards, then the differences without one of
+them, in percent, each with its Monte Carlo error from the scatter between networks.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any, Final
-from unittest import mock
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
-# Its campaigns are those of tests.
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-
-from support.archives import network_campaigns
-
-from benchmarks.accuracy.network_cases import Air, signals
-from benchmarks.stability import random_networks
-from benchmarks.stability.random_scenes import Failure, ScoredValues
-from benchmarks.studies.ablation import BASE, Context, Guard, measure, without, write_table
-from lidarops.flags import Quality, rejecting
+from benchmarks.harness.figure import log_uniform
+from benchmarks.harness.rates import Failure, ScoredValues
+from benchmarks.scenes import lidar_networks
+from benchmarks.scenes.lidar_networks import Air, signals
+from benchmarks.studies.ablation import (
+    BASE,
+    PAGES,
+    Guard,
+    measure,
+    requested_number,
+    with_thresholds,
+    without,
+    write_table,
+)
 from lidarops.retrieve.network import (
     _beam_signals,
     _block_solution,
     _changing_field,
     extinction_field,
-    labeled,
     outlying_bins,
 )
-from lidarops.retrieve.network.flags import NetworkQuality
-from lidarops.retrieve.network.thresholds import THRESHOLDS
-from lidarops.run.archive import Options, Selection, reprocess
 
+NETWORKS: Final = 20
 PROFILES: Final = 50
 """Profiles of a random network: one block."""
-REJECTING: Final = rejecting((*Quality, *NetworkQuality))
-CAMPAIGNS, RISING = "campaigns", "noise that rises"
-STEEP, CURVED = "steep field", "outliers in curved air"
-OWN = {
+RISING, STEEP, CURVED = "noise that rises", "steep field", "outliers in curved air"
+OWN: Final = {
     "outlying bins": "outliers",
     "noisy profiles": RISING,
     "curvature errors": "layer of a few bins",
@@ -58,23 +48,17 @@ OWN = {
     "profiles that disagree": "one bad profile",
 }
 """Class of scenes that a guard is for."""
-PAGE = Path(__file__).resolve().parents[2] / "docs/algorithms/network.md"
-
-
-def _at(module: Any, **changes: Any) -> Context:
-    return without((module, "THRESHOLDS", THRESHOLDS._replace(**changes)))
-
 
 GUARDS: Final = (
-    Guard("stratified air", off=_at(_changing_field, stratified=(0.1, 400.0))),
-    Guard("changes in time", off=_at(_changing_field, least_change=1e30)),
-    Guard("running means", off=_at(_block_solution, linear_change=1e30)),
-    Guard("profiles that disagree", off=_at(_block_solution, least_neighbourly=0.0)),
-    Guard("default overlap error", off=_at(_block_solution, default_overlap_error=0.0)),
-    Guard("curvature errors", off=_at(_block_solution, profile_noise=1e30)),
+    Guard("stratified air", off=with_thresholds(_changing_field, stratified=(0.1, 400.0))),
+    Guard("changes in time", off=with_thresholds(_changing_field, least_change=1e30)),
+    Guard("running means", off=with_thresholds(_block_solution, linear_change=1e30)),
+    Guard("profiles that disagree", off=with_thresholds(_block_solution, least_neighbourly=0.0)),
+    Guard("default overlap error", off=with_thresholds(_block_solution, default_overlap_error=0.0)),
+    Guard("curvature errors", off=with_thresholds(_block_solution, profile_noise=1e30)),
     Guard("outlying bins", off=without((outlying_bins, "search", lambda *_: None))),
-    Guard("weak signals", off=_at(_beam_signals, largest_bin_error=1e6)),
-    Guard("noisy profiles", off=_at(_beam_signals, noisy_profile=1e30)),
+    Guard("weak signals", off=with_thresholds(_beam_signals, largest_bin_error=1e6)),
+    Guard("noisy profiles", off=with_thresholds(_beam_signals, noisy_profile=1e30)),
 )
 
 
@@ -85,15 +69,15 @@ def _rising_noise(cluster: int) -> ScoredValues | None:
     """Return the values of a block in which noise rises by a factor of 5, as at dawn."""
     rng = np.random.default_rng((74, cluster))
     factor = np.where(np.arange(PROFILES) < rng.integers(10, 40), 1.0, 5.0)[:, None, None]
-    return _solved(RISING, rng, random_networks.layered, (3e-3, 0.1), factor=factor)
+    return _solved(RISING, rng, lidar_networks.layered, (3e-3, 0.1), factor=factor)
 
 
 def _steep_field(cluster: int) -> ScoredValues | None:
     """Return the values of a block in a field with a scale height of 80 to 300 m."""
 
     def steep(rng: Any) -> Air:
-        value = float(np.exp(rng.uniform(np.log(3e-4), np.log(5e-3))))
-        scale = float(np.exp(rng.uniform(np.log(80.0), np.log(300.0))))
+        value = log_uniform(rng, 3e-4, 5e-3)
+        scale = log_uniform(rng, 80.0, 300.0)
         return Air("steep", lambda _: lambda __, up: value * np.exp(-(up - 500.0) / scale))
 
     return _solved(STEEP, np.random.default_rng((75, cluster)), steep, (1e-3, 0.1))
@@ -102,7 +86,7 @@ def _steep_field(cluster: int) -> ScoredValues | None:
 def _curved_outliers(cluster: int) -> ScoredValues | None:
     """Return the values of a block with 0.5 to 4 percent of outlying bins in plumes and layers."""
     rng = np.random.default_rng((76, cluster))
-    air = random_networks.plume if cluster % 2 else random_networks._thin_layer
+    air = lidar_networks.plume if cluster % 2 else lidar_networks._thin_layer
     outlying = float(rng.uniform(0.005, 0.04))
     return _solved(CURVED, rng, air, (1e-3, 0.1), outlying=outlying)
 
@@ -111,11 +95,11 @@ def _solved(
     name: str, rng: Any, air: Any, noises: tuple[float, float], *, factor: Any = 1.0,
     outlying: float = 0.0,
 ) -> ScoredValues | None:  # fmt: skip
-    net = random_networks.random_network(rng).network()
+    net = lidar_networks.random_network(rng).network()
     if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
         return None
     clean = signals(net, air(rng))
-    noise = float(np.exp(rng.uniform(*np.log(noises))))
+    noise = log_uniform(rng, *noises)
     power, variance = clean.draw(noise, PROFILES, int(rng.integers(2**31)), additive=noise / 3.0)
     mean = clean.power[np.arange(PROFILES) % len(clean.power)]
     power, variance = mean + factor * (power - mean), factor**2 * variance
@@ -124,53 +108,8 @@ def _solved(
     result = extinction_field.retrieve_network(
         power, clean.range, net, variance=variance, full_overlap_range=100.0
     )
-    return random_networks.scored(Failure(name), result, clean.truth(PROFILES), 0.0)
+    return lidar_networks.scored(Failure(name), result, clean.truth(PROFILES), 0.0)
 
-
-# Campaigns ------------------------------------------------------------------------------------
-
-
-def _campaign_inputs(folder: Path) -> Iterator[tuple[Any, Any]]:
-    """Yield arguments of the retrieval, and the truth, of campaigns from raw files."""
-    airs = (network_campaigns.HOMOGENEOUS, network_campaigns.GRADIENT, network_campaigns.PLUME)
-    for number, (air, six_beams, rate) in enumerate(
-        (air, six_beams, rate) for rate in (4.0, 0.5) for air in airs for six_beams in (False, True)
-    ):
-        campaign, truth = network_campaigns.written(
-            folder / str(number), network_campaigns.tree(air, six_beams=six_beams, rate=rate)
-        )
-        calls: list[tuple[tuple[Any, ...], xr.Dataset]] = []
-
-        def record(
-            *arguments: Any,
-            retrieve: Callable[..., xr.Dataset] = labeled.retrieve_network,
-            calls: list[tuple[tuple[Any, ...], xr.Dataset]] = calls,
-        ) -> xr.Dataset:
-            calls.append((arguments, retrieve(*arguments)))
-            return calls[-1][1]
-
-        with mock.patch.object(labeled, "retrieve_network", record):
-            reprocess(
-                campaign, selection=Selection(kinds=("visibility",)), options=Options(force=True)
-            )
-        for arguments, product in calls:
-            names = [beam.instrument for beam in arguments[0]]
-            yield arguments, network_campaigns.truth_at(product, truth, names)
-
-
-def _campaign(arguments: tuple[Any, ...], truth: Any) -> ScoredValues:
-    """Return the values of a campaign."""
-    product = labeled.retrieve_network(*arguments)
-    names = ("total_extinction", "total_extinction_standard_error",
-             "total_extinction_systematic_error", "quality_flag")  # fmt: skip
-    extinction, stated, systematic, bits = (product[name].to_numpy() for name in names)
-    return ScoredValues(
-        Failure(CAMPAIGNS), "extinction", extinction - truth, np.hypot(stated, systematic), 0.0,
-        bits & REJECTING, NetworkQuality,
-    )  # fmt: skip
-
-
-# Table ----------------------------------------------------------------------------------------
 
 SHARES: Final = {
     "false": ("false random", "kept"),
@@ -181,15 +120,13 @@ SHARES: Final = {
 """Column -> numerator and denominator."""
 
 
-def score(cluster: int, inputs: Sequence[Any]) -> Iterator[ScoredValues]:
-    """Yield the values of a random network by class, and of the campaign of this number."""
-    yield from random_networks.score_networks(cluster, PROFILES)
+def score(cluster: int) -> Iterator[ScoredValues]:
+    """Yield the values of a random network by class."""
+    yield from lidar_networks.score_networks(cluster, PROFILES)
     for draw in (_rising_noise, _steep_field, _curved_outliers):
         values = draw(cluster)
         if values is not None:
             yield values
-    for arguments, truth in inputs[cluster : cluster + 1]:
-        yield _campaign(arguments, truth)
 
 
 def table(counts: pd.DataFrame) -> Iterator[str]:
@@ -200,23 +137,20 @@ def table(counts: pd.DataFrame) -> Iterator[str]:
     names = counts.index.unique("guard")
     for name in [BASE, *sorted(names.drop(BASE))]:
         own = [OWN[name]] if name in OWN else []
-        classes = [*dict.fromkeys(OWN.values()), CURVED, CAMPAIGNS] if name == BASE else own
+        classes = [*dict.fromkeys(OWN.values()), CURVED] if name == BASE else own
         for of_class in ("all", *classes):
             changed, base = (
                 each if of_class == "all" else each[each.index.isin([of_class], level="class")]
                 for each in (counts.loc[name], counts.loc[BASE])
             )
-            # A table of one class only needs no row of all.
-            if len(changed) and (of_class != "all" or len(changed.index.unique("class")) > 1):
+            if len(changed):
                 yield _row(name, of_class, changed, base)
 
 
 def _row(name: str, of_class: str, changed: pd.DataFrame, base: pd.DataFrame) -> str:
     """Return shares of all guards, or differences from them with the errors of pairs."""
-    cells, sums = [], []
-    for part in (changed, base):
-        campaign = part.index.get_level_values("class") == CAMPAIGNS
-        sums.append(part.groupby([campaign, "cluster"], sort=False).sum())
+    cells = []
+    sums = [part.groupby("cluster", sort=False).sum() for part in (changed, base)]
     for numerator, denominator in SHARES.values():
         shares, terms = [], []
         for part in sums:
@@ -231,25 +165,8 @@ def _row(name: str, of_class: str, changed: pd.DataFrame, base: pd.DataFrame) ->
     return f"| {name} | {of_class} | {len(networks)} | {' | '.join(cells)} |"
 
 
-def main() -> None:
-    """Write the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("networks", nargs="?", type=int, default=40, help="at least 12")
-    parser.add_argument("--only", nargs="+", choices=[guard.name for guard in GUARDS])
-    parser.add_argument("--classes", nargs="+", help="of these only, without campaigns")
-    parser.add_argument("--mark", default="ablation", help="of the table in the page")
-    given = parser.parse_args()
-    inputs: list[Any] = []
-    if not given.classes:
-        with tempfile.TemporaryDirectory() as folder:
-            inputs = list(_campaign_inputs(Path(folder)))
-    guards = [guard for guard in GUARDS if not given.only or guard.name in given.only]
-    counts = measure(lambda k: score(k, inputs), range(given.networks), guards)
-    counts = counts.droplevel("quantity")
-    if given.classes:
-        counts = counts[counts.index.isin(given.classes, level="class")]
-    write_table(PAGE, given.mark, table(counts))
-
-
 if __name__ == "__main__":
-    main()
+    counts = measure(score, range(requested_number(__doc__, NETWORKS)), GUARDS)
+    write_table(
+        PAGES / "network.md", "ablation", table(counts.droplevel(["quantity", "satisfied"]))
+    )

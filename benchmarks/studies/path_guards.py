@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.stability import random_homogeneous
-from benchmarks.studies.ablation import (
-    PAGES,
-    Guard,
-    measure,
-    replaced,
-    requested_number,
-    table,
-    without,
-    write_table,
-)
+from benchmarks.scenes import homogeneous_paths
+from benchmarks.studies.ablation import Guard, replaced, requested_number, without, write_guards
 from lidarops.flags import Quality
 from lidarops.retrieve.homogeneous import _fit_quality, path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -60,10 +52,8 @@ TABLES: Final = {"guards": ((8, 800), GUARDS), "guards of 4 to 7 bins": ((4, 7),
 """Mark of the table in the page -> numbers of bins and guards."""
 
 if __name__ == "__main__":
-    clusters = range(requested_number(__doc__, CLUSTERS))
+    clusters = requested_number(__doc__, CLUSTERS)
     for mark, (bins, guards) in TABLES.items():
-        with replaced((random_homogeneous, "_BINS", bins)):
-            counts = measure(
-                lambda k: random_homogeneous.score_homogeneous(k, PROFILES), clusters, guards
-            )
-        write_table(PAGES / "homogeneous.md", mark, table(counts))
+        with replaced((homogeneous_paths, "RANDOM_BINS", bins)):
+            score = partial(homogeneous_paths.score_homogeneous, profiles=PROFILES)
+            write_guards("homogeneous.md", score, clusters, guards, mark)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -11,10 +13,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import yaml
 
+from benchmarks.harness.figure import Scores
 from benchmarks.harness.results import Effort, Results, Study
-from benchmarks.harness.timing import in_fresh_process, peak_memory
-from benchmarks.harness.verdicts import Scores
-from benchmarks.throughput.campaigns import CAMPAIGN_FILE, campaign_settings
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.errors import CampaignError
 from lidarops.raw import licel
@@ -26,9 +26,9 @@ SIZES: Final = (26, 101, 400)
 """MB of raw counts of a scene."""
 _TINY: Final = 1
 """MB of the scene that loads the code of a process before the measurement."""
-_SHOTS: Final = 400
-_INTERVAL: Final = timedelta(seconds=20)
 _DAY: Final = datetime(2025, 3, 20, tzinfo=UTC)
+_INTERVAL: Final = timedelta(seconds=20)
+_SHOTS: Final = 400
 _BIN_WIDTH: Final = 3.75
 _VARIANTS: Final = 4
 """Number of different profiles; files repeat them."""
@@ -78,10 +78,7 @@ def _network() -> dict[str, Any]:
             for name, (digits, _, _, azimuth) in _NETWORK.items()
         },
         "networks": {
-            "valley": {
-                "instruments": list(_NETWORK),
-                "visibility": {"channel": "photon_532o"},
-            }
+            "valley": {"instruments": list(_NETWORK), "visibility": {"channel": "photon_532o"}}
         },
     }
 
@@ -141,8 +138,7 @@ def measure_memory(effort: Effort) -> Study:
         "compiled code. Slope: growth above the base from the smallest scene, MB for 1 MB of raw "
         "counts."
     )
-    results = Results("Peak memory", scores, note, method="raw MB")
-    return Study("Memory of a process, by size of the scene", effort.date, [results])
+    return Study([Results("Peak memory", scores, note, method="raw MB")])
 
 
 def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
@@ -153,9 +149,16 @@ def measure_peaks(sizes: Sequence[int], cases: Sequence[str]) -> Iterator[Peak]:
             write_files(root / str(size), size)
         for name in cases:
             # The first process compiles what is not cached, which takes memory of its own.
-            in_fresh_process(_peak, root, name, _TINY)
+            _peak_of_process(root, name, _TINY)
             for size in sizes:
-                yield in_fresh_process(_peak, root, name, size)
+                yield _peak_of_process(root, name, size)
+
+
+def _peak_of_process(root: Path, case: str, size: int) -> Peak:
+    """Return the peak of a new process, whose memory holds nothing else."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_peak, root, case, size).result()
 
 
 def _peak(root: Path, case: str, size: int) -> Peak:
@@ -170,33 +173,41 @@ def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
     record = archive.reprocess(campaign_of(folder, case, out))
     if record is None or any(scene.error for scene in record.scenes):
         raise CampaignError("a scene of the benchmark gave no product", field=case)
-    return peak_memory() / 1e6
+    # The maximum of `resource` includes the memory of the parent process.
+    status = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    kibibytes = next(line for line in status if line.startswith("VmHWM")).split()[1]
+    return 1024.0 * float(kibibytes) / 1e6
 
 
 def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
+    settings = {
+        "name": "memory",
+        "title": "Campaign of a benchmark",
+        "archive": "raw",
+        "output": "out",
+        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
+        **CASES[case],
+    }
     out.mkdir()
-    file = out / CAMPAIGN_FILE
-    settings = campaign_settings("memory", **CASES[case])
+    file = out / "campaign.yaml"
     file.write_text(yaml.safe_dump(settings), encoding="utf-8")
     return load_campaign(file, archive=str(folder), output=str(out))
 
 
-def write_files(folder: Path, size: float) -> int:
-    """Write raw files with `size` MB of counts, and dark files; return the number without these."""
+def write_files(folder: Path, size: float) -> None:
+    """Write raw files with `size` MB of counts, and dark files."""
     folder.mkdir(parents=True)
     layout: dict[str, Any] = {
-        "wavelength": 532e-9,
-        "bins": BINS,
-        "bin_width": _BIN_WIDTH,
-        "shots": _SHOTS,
-    }
+        "wavelength": 532e-9, "bins": BINS, "bin_width": _BIN_WIDTH, "shots": _SHOTS,
+    }  # fmt: skip
     kinds = (DatasetKind.ANALOG, DatasetKind.PHOTON)
     datasets = [licel.new_dataset(licel.Recorder(kind), **layout) for kind in kinds]
-    counts = _counts()
+    distance = _BIN_WIDTH * (np.arange(BINS) + 0.5)
+    expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
+    counts = np.random.default_rng(7).poisson(expected, (_VARIANTS, BINS))
     number = round(size * 1e6 / (4 * BINS * len(kinds)))
-    dark = max(1, round(_DARK_SHARE * number))
-    for index in range(-dark, number):
+    for index in range(-max(1, round(_DARK_SHARE * number)), number):
         start = _DAY + index * _INTERVAL
         name = f"h{index:06d}" if index >= 0 else f"d{-index:06d}"
         header = licel.new_header(
@@ -210,11 +221,3 @@ def write_files(folder: Path, size: float) -> int:
         signal = counts[index % _VARIANTS] if index >= 0 else np.zeros_like(counts[0])
         values = {dataset.name: signal for dataset in header.datasets}
         (folder / name).write_bytes(licel.encode(header, values))
-    return number
-
-
-def _counts() -> np.ndarray[Any, Any]:
-    """Return noisy counts of a decaying signal, (profile, bin)."""
-    distance = _BIN_WIDTH * (np.arange(BINS) + 0.5)
-    expected = 40.0 + 2e4 * (1e3 / (distance + 300.0)) ** 2 * np.exp(-2e-4 * distance)
-    return np.random.default_rng(7).poisson(expected, (_VARIANTS, BINS))

@@ -11,10 +11,8 @@ import tables
 import verdicts
 from benchmark_results import Row
 
-from benchmarks.harness.figure import Figure, Unit, format_time, with_error
-from benchmarks.harness.verdicts import Judgement, Target
-from benchmarks.stability.random_scenes import TARGETS
-from benchmarks.stability.reasons import Unmet
+from benchmarks.harness.figure import Figure, Judgement, Target, Unit, format_time, with_error
+from benchmarks.harness.rates import TARGETS, Unmet
 
 RATIO: Final = "ratio"
 """Beginning of a place that names two figures, of which the first is divided by the second."""

@@ -9,13 +9,10 @@ import benchmark_results
 import tables
 from benchmark_results import Row
 
-from benchmarks.harness.figure import share_text
+from benchmarks.harness import rates
+from benchmarks.harness.figure import CPU_TIME, Judgement, Verdict, share_text
+from benchmarks.harness.rates import SATISFIED, SHARE, TARGET, TARGETS, Unmet
 from benchmarks.harness.results import cell
-from benchmarks.harness.timing import CPU_TIME
-from benchmarks.harness.verdicts import Judgement, Verdict
-from benchmarks.stability import reasons
-from benchmarks.stability.random_scenes import SATISFIED, SHARE, TARGET, TARGETS
-from benchmarks.stability.reasons import Unmet
 
 _WORDS: Final = {TARGET: "false", "needless target": "needless"}
 
@@ -97,11 +94,11 @@ def _rows() -> Iterator[Row]:
         yield from rows
 
 
-def stated_reasons() -> list[reasons.Reason]:
+def stated_reasons() -> list[rates.Reason]:
     """Return the reasons for targets that are not met, the most special ones first."""
-    return reasons.read_reasons(benchmark_results.RESULTS / reasons.FILE.name)
+    return rates.read_reasons()
 
 
 def why(one: Unmet) -> str:
     """Return the reason of a target that is not met; empty if none is stated."""
-    return reasons.why(one, stated_reasons())
+    return rates.why(one, stated_reasons())

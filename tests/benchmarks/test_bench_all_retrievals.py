@@ -38,9 +38,9 @@ def study():
             patch.setattr(module, name, partial(getattr(module, name), **size))
         scenes = (multiangle_cases.clear(3000.0, bins=25), multiangle_cases.cloud())
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
-        effort = Effort(quick=True, repeats=1, date="2024-01-01", progress=steps.append)
+        effort = Effort(quick=True, progress=steps.append)
         result = all_retrievals.measure_all(effort)
-    assert len(steps) > 35
+    assert len(steps) == 20
     return result
 
 
@@ -99,13 +99,10 @@ def test_where_a_peer_is_ahead_the_table_says_so():
     assert beside(ours) == {}
 
 
-def test_page_and_figures_are_written_once_each(study, tmp_path):
-    page = study.write(tmp_path)
-    text = page.read_text(encoding="utf-8")
+def test_tables_and_figures_are_written_once_each(study, tmp_path):
+    study.write(tmp_path)
     charts = [chart.name for chart in study.charts]
     tables = [results.title for results in study.results]
     assert len(set(charts)) == len(charts)
     assert len(set(tables)) == len(tables)
-    assert all(f"{name}.svg" in text and (tmp_path / f"{name}.svg").is_file() for name in charts)
-    assert "http://" not in text
-    assert "https://" not in text
+    assert all((tmp_path / f"{name}.svg").is_file() for name in charts)

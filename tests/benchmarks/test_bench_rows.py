@@ -6,10 +6,9 @@ import json
 
 import pytest
 
-from benchmarks.harness.figure import Figure, cpu_time, share, with_error
-from benchmarks.harness.plots import Chart, draw, pareto
+from benchmarks.harness.figure import CPU_TIME, Figure, cpu_time, share, with_error
+from benchmarks.harness.plots import Chart, draw
 from benchmarks.harness.results import Results, Study, frame, table
-from benchmarks.harness.timing import CPU_TIME
 from lidarops.errors import CatalogError
 
 pytestmark = pytest.mark.slow
@@ -83,7 +82,7 @@ def test_times_have_a_suitable_unit(nanoseconds, text):
 
 @pytest.mark.parametrize("quantity", ["RMSE", CPU_TIME])
 def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time(quantity):
-    chart = Chart("work", "Errors & times", "", frame(results()), quantity, {"peer"})
+    chart = Chart("work", "Errors & times", frame(results()), quantity, {"peer"})
     drawn = draw(chart)
     assert drawn == draw(chart)
     text = drawn.decode()
@@ -91,27 +90,18 @@ def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time(quantity):
     assert "Errors &amp; times" in text
 
 
-def test_the_pareto_front_holds_the_unbeaten_points():
-    points = [(3.0, 1.0), (1.0, 4.0), (2.0, 4.0), (2.0, 2.0), (4.0, 1.0), (1.0, 5.0)]
-    assert pareto(points) == ((1.0, 4.0), (2.0, 2.0), (3.0, 1.0))
-    assert pareto([]) == ()
-
-
-def test_a_study_has_one_json_and_one_page(tmp_path):
+def test_a_study_writes_its_json_and_charts(tmp_path):
     tables = [Results("Shown", results()), Results("Folded", results(), "A note.", folded=True)]
-    charts = [Chart("work", "Errors", "", frame(results()), "RMSE")]
-    study = Study("Title", "2024-01-01", tables, charts)
+    charts = [Chart("work", "Errors", frame(results()), "RMSE")]
+    study = Study(tables, charts, date="2024-01-01")
     assert study.figures("Shown")["cloud", "peer", "RMSE"].value == 4e3
-    page = study.write(tmp_path / "sub")
-    text = page.read_text()
-    assert text.index("work.svg") < text.index(">Shown<")
-    assert text.index(">Shown<") < text.index("<details><summary>Folded<") < text.index("A note.")
-    assert "http" not in text
-    assert (page.parent / "work.svg").is_file()
-    content = json.loads((page.parent / "result.json").read_text())
-    assert (content["title"], content["date"]) == ("Title", "2024-01-01")
+    written = study.write(tmp_path / "sub")
+    assert (written.parent / "work.svg").is_file()
+    content = json.loads(written.read_text())
+    assert content["date"] == "2024-01-01"
+    assert content["notes"] == {"Shown": "", "Folded": "A note."}
     row = content["tables"]["Folded"][1]
     assert (row["case"], row["method"], row["quantity"]) == ("clear", "ours", "RMSE")
     assert (row["value"], row["error"], row["unit"]) == (2.0, 0.1, "")
     with pytest.raises(CatalogError, match="cannot be written"):
-        study.write(page / "sub")
+        study.write(written / "sub")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.harness.figure import Figure, Unit
-from benchmarks.harness.verdicts import Judgement, Target, Verdict
+from benchmarks.harness.figure import Figure, Judgement, Target, Unit, Verdict
 
 pytestmark = pytest.mark.slow
 

@@ -13,11 +13,9 @@ import verdicts
 from support.cases import each
 
 from benchmarks.__main__ import BENCHMARKS, app
-from benchmarks.harness.figure import Figure, Unit
-from benchmarks.harness.verdicts import Judgement, Target, Verdict
+from benchmarks.harness.figure import Figure, Judgement, Target, Unit, Verdict
+from benchmarks.harness.rates import TARGETS, Unmet
 from benchmarks.stability import study
-from benchmarks.stability.random_scenes import TARGETS
-from benchmarks.stability.reasons import Unmet
 
 
 @pytest.fixture

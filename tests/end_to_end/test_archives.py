@@ -14,7 +14,6 @@ from support import factories
 from support.archives import raw_archives
 from typer.testing import CliRunner
 
-from benchmarks.__main__ import app as benchmarks
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.store import Store
 from lidarops.cli import app
@@ -235,15 +234,6 @@ def test_the_examples_of_the_help_name_files_that_the_demo_makes(
                     named += 1
                     assert list(root.glob(word.removeprefix(prefix))), word
     assert named >= 3
-
-
-@pytest.mark.slow
-def test_the_benchmark_reports_every_way_of_reading(demo_archive: Path) -> None:
-    files = sorted(str(path) for path in (demo_archive / "hill").glob("v24921*"))[:4]
-    result = CliRunner().invoke(benchmarks, ["throughput", *files, "--repeats", "1"])
-    assert result.exit_code == 0, result.output
-    assert "header" in result.stdout
-    assert "times floor" in result.stdout
 
 
 def test_a_profile_without_shots_is_flagged_and_others_are_not(tmp_path: Path) -> None:

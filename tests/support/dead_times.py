@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.stability.random_dead_times import (
+from benchmarks.scenes.recorded_signals import (
     DISTANCE,
     LAG,
     LIGHT,

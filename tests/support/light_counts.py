@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from benchmarks.stability.random_light import RANGE, SHAPE, draw_counts
+from benchmarks.scenes.recorded_signals import RANGE, SHAPE, draw_counts
 
 __all__ = ["RANGE", "SHAPE", "draw_counts"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.stability.random_raman import LASER, RAMAN, along, make_sky, mean_over
+from benchmarks.scenes.raman_skies import LASER, RAMAN, along, make_sky, mean_over
 
 __all__ = ["LASER", "RAMAN", "along", "make_sky", "mean_over", "sliding_line"]
 

@@ -12,8 +12,7 @@ from support.scan_arguments import retrieve_optical_depth
 
 from benchmarks.accuracy import multiangle, multiangle_cases, multiangle_peers
 from benchmarks.accuracy.multiangle import StudySize
-from benchmarks.harness import statistics
-from benchmarks.harness.figure import Figure
+from benchmarks.harness.figure import Figure, clustered_share, mean_by_block, root_by_block
 from benchmarks.harness.results import Effort
 from lidarops.retrieve.multiangle import mld
 
@@ -30,9 +29,7 @@ def study():
     scenes = (SHORT, multiangle_cases.cloud())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(multiangle_cases, "scan_scenes", lambda: scenes)
-        result = multiangle.measure_multiangle(
-            Effort(date="2024-01-01", progress=steps.append), size=SMALL
-        )
+        result = multiangle.measure_multiangle(Effort(progress=steps.append), size=SMALL)
     assert steps == [1] * len(scenes)
     return result
 
@@ -197,20 +194,20 @@ def test_methods_are_compared_where_all_have_a_value():
 
 def test_errors_come_from_independent_blocks():
     values, kept = np.array([1.0, 2.0, math.nan, 6.0]), np.array([True, True, False, True])
-    figure = statistics.mean_by_block(np.nan_to_num(values), kept, 1)
+    figure = mean_by_block(np.nan_to_num(values), kept, 1)
     assert figure.value == pytest.approx(3.0)
-    square = statistics.root_by_block(np.array([1.0, 3.0]), np.ones(2, bool), 1)
+    square = root_by_block(np.array([1.0, 3.0]), np.ones(2, bool), 1)
     assert (square.value, square.error) == pytest.approx((math.sqrt(5.0), 4.0 / math.sqrt(20.0)))
-    assert statistics.root_by_block(np.zeros(2), np.ones(2, bool), 1) == Figure(0.0, 0.0)
-    assert statistics.root_by_block(np.zeros(2), np.zeros(2, bool), 1) is None
-    part = statistics.clustered_share(np.array([10.0, 0.0, 30.0]), np.array([100.0, 100.0, 200.0]))
+    assert root_by_block(np.zeros(2), np.ones(2, bool), 1) == Figure(0.0, 0.0)
+    assert root_by_block(np.zeros(2), np.zeros(2, bool), 1) is None
+    part = clustered_share(np.array([10.0, 0.0, 30.0]), np.array([100.0, 100.0, 200.0]))
     assert part.value == pytest.approx(0.1)
     assert part.error == pytest.approx(math.sqrt(0 + 100 + 100) / 400)
-    none = statistics.clustered_share(np.zeros(2), np.full(2, 50.0))
+    none = clustered_share(np.zeros(2), np.full(2, 50.0))
     assert none.value == 0.0
     # Of a share at the limit, no event is seen in 5 percent of the cases.
     assert (1.0 - 2.0 * none.error) ** 100 == pytest.approx(0.05, rel=0.1)
-    empty = statistics.clustered_share(np.zeros(2), np.zeros(2))
+    empty = clustered_share(np.zeros(2), np.zeros(2))
     assert (empty.value, empty.error) == (0.0, 0.0)
 
 

@@ -3,47 +3,71 @@
 from __future__ import annotations
 
 import math
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
 from benchmarks.accuracy import network as network_benchmark
-from benchmarks.accuracy import network_cases, network_peers
-from benchmarks.harness.results import Effort
-from benchmarks.harness.statistics import mean_by_block, share_by_block
+from benchmarks.accuracy import network_peers
+from benchmarks.harness.figure import mean_by_block, share_by_block
+from benchmarks.scenes import lidar_networks
 
 pytestmark = pytest.mark.slow
 
-PROFILES = 3 * network_cases.BLOCK
+PROFILES = 3 * lidar_networks.BLOCK
 
 
 @pytest.fixture(scope="module")
-def accuracy():
-    return network_benchmark.measure_network(
-        Effort(date="2024-01-01", repeats=1), profiles=PROFILES, peer_profiles=10
-    )
+def cases():
+    """Return results, with truth and near crossings, by network, air, noise and method."""
+    found = {}
+    for lidars in lidar_networks.LIDAR_LINES:
+        for number, (air, noise) in network_benchmark.CASES:
+            clean = lidar_networks.signals(lidars.network(), air)
+            solved = network_benchmark.solve_case(clean, noise, PROFILES, number)
+            near = clean.network.near_crossing
+            for method, result in solved.items():
+                found[lidars.name, air.name, noise, method] = Case(
+                    result, clean.truth(PROFILES)[:, near], near
+                )
+    return found
 
 
-@pytest.fixture(scope="module")
-def case(accuracy):
-    def score(lidars, air, noise):
-        """Return the scores of all methods in one case, by method and quantity."""
-        title, name = lidars.name.capitalize(), f"{air}, noise {100 * noise:g} %"
-        scores = {}
-        for (label, method, quantity), row in accuracy.figures(f"{title}: all methods").items():
-            if label == name:
-                scores.setdefault(method, {})[quantity] = row
-        return scores
+class Case(NamedTuple):
+    """Results of a solver in one case."""
 
-    return score
+    result: dict[str, np.ndarray]
+    truth: np.ndarray
+    """(profile, near crossing) m-1."""
+    near: np.ndarray
+
+    def near_values(self, name):
+        """Return an array of the near crossings."""
+        return self.result[name][:, self.near]
+
+    @property
+    def rmse(self):
+        """RMS relative error of visibility, clipped at 3, by crossing."""
+        error = np.clip(self.truth / self.near_values("extinction") - 1.0, -3.0, 3.0)
+        return np.sqrt(np.nanmean(error**2, axis=0))
+
+    @property
+    def within_three(self):
+        """Share of the unflagged values within 3 stated errors."""
+        stated = self.near_values("extinction_standard_error")
+        deviation = (self.near_values("extinction") - self.truth) / stated
+        trusted = np.isfinite(deviation) & ~self.near_values("flagged")
+        return np.mean(np.abs(deviation[trusted]) <= 3.0)
 
 
 # Simulation ------------------------------------------------------------------------------------
 
 
 def test_the_triangle_is_the_one_of_the_paper():
-    network = network_cases.TRIANGLE.network()
+    network = lidar_networks.TRIANGLE.network()
     assert (network.beams, network.crossings) == (3, 3)
     # Beams 1 and 3 cross above lidar 3; the other crossings follow from the lines.
     expected = {
@@ -54,15 +78,15 @@ def test_the_triangle_is_the_one_of_the_paper():
     crossings = {(round(x, 6) + 0.0, round(up, 6)) for x, _, up in network.crossing}
     assert crossings == {(x, round(up, 6)) for x, up in expected}
     assert network.near_crossing.tolist() == [True, True, False]
-    six_beams = network_cases.THREE_BY_TWO.network()
+    six_beams = lidar_networks.THREE_BY_TWO.network()
     assert (six_beams.beams, six_beams.crossings, six_beams.passages.beam.size) == (6, 8, 16)
 
 
-@pytest.mark.parametrize("air", network_cases.AIRS, ids=lambda air: air.name)
+@pytest.mark.parametrize("air", lidar_networks.AIRS, ids=lambda air: air.name)
 def test_signals_obey_the_lidar_equation(air):
     """Compare with adaptive quadrature of the optical depth along a beam."""
-    network = network_cases.TRIANGLE.network()
-    signals = network_cases.signals(network, air)
+    network = lidar_networks.TRIANGLE.network()
+    signals = lidar_networks.signals(network, air)
     for number, extinction in list(enumerate(air.fields()))[:: max(len(air.fields()) - 1, 1)]:
         for beam in range(network.beams):
             origin, direction = network.origin[beam], network.direction[beam]
@@ -81,16 +105,16 @@ def test_signals_obey_the_lidar_equation(air):
 
 def test_fields_of_extinction_are_as_described():
     signals_of = {
-        air.name: network_cases.signals(network_cases.TRIANGLE.network(), air)
-        for air in network_cases.AIRS
+        air.name: lidar_networks.signals(lidar_networks.TRIANGLE.network(), air)
+        for air in lidar_networks.AIRS
     }
     assert np.all(signals_of["homogeneous"].extinction == 2e-3)
-    assert np.all(signals_of[network_cases.THIN.name].extinction == 2e-4)
+    assert np.all(signals_of[lidar_networks.THIN.name].extinction == 2e-4)
     gradient = signals_of["gradient"].extinction[0]
     height = signals_of["gradient"].network.crossing[:, 2]
     np.testing.assert_allclose(np.diff(np.log(gradient)), -np.diff(height) / 1010.0)
     drift = signals_of["drifting plume"].extinction
-    assert len(drift) == network_cases.BLOCK
+    assert len(drift) == lidar_networks.BLOCK
     assert drift[:, 0].max() > 1.3 * drift[:, 0].min()
     signals = signals_of["drifting plume"]
     np.testing.assert_array_equal(signals.truth(120)[50:100], drift)
@@ -98,7 +122,7 @@ def test_fields_of_extinction_are_as_described():
 
 
 def test_noise_is_as_stated_and_reproducible():
-    signals = network_cases.signals(network_cases.TRIANGLE.network(), network_cases.AIRS[1])
+    signals = lidar_networks.signals(lidar_networks.TRIANGLE.network(), lidar_networks.AIRS[1])
     power, variance = signals.draw(0.05, 2000, 3)
     assert np.array_equal(power, signals.draw(0.05, 2000, 3)[0])
     assert not np.array_equal(power[:5], signals.draw(0.05, 5, 4)[0])
@@ -116,15 +140,15 @@ def test_noise_is_as_stated_and_reproducible():
 # Peers ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", network_cases.LIDAR_LINES, ids=lambda place: place.name)
+@pytest.mark.parametrize("place", lidar_networks.LIDAR_LINES, ids=lambda place: place.name)
 def test_a_plain_fit_finds_the_same_network(place):
-    signals = network_cases.signals(place.network(), network_cases.AIRS[1])
+    signals = lidar_networks.signals(place.network(), lidar_networks.AIRS[1])
     clean = network_peers.network_by_scipy(signals.power, 1e-10 * signals.power**2, signals)[0]
     # Error of trapezoids of 5 m.
     np.testing.assert_allclose(clean, signals.extinction[0], rtol=0.01)
     power, variance = signals.draw(0.01, 6, 1)
     ours, near = (
-        network_cases.NETWORK_WITHOUT_PRIOR(power, variance, signals),
+        lidar_networks.SOLVERS[lidar_networks.NO_PRIOR](power, variance, signals),
         signals.network.near_crossing,
     )
     difference = (network_peers.network_by_scipy(power, variance, signals) - ours.extinction)[
@@ -134,11 +158,11 @@ def test_a_plain_fit_finds_the_same_network(place):
 
 
 def test_a_plain_fit_of_means_has_one_value_for_the_profiles_of_a_block():
-    signals = network_cases.signals(network_cases.TRIANGLE.network(), network_cases.AIRS[0])
-    profiles = network_cases.BLOCK + 7
+    signals = lidar_networks.signals(lidar_networks.TRIANGLE.network(), lidar_networks.AIRS[0])
+    profiles = lidar_networks.BLOCK + 7
     power, variance = signals.draw(0.05, profiles, 2)
     fitted = network_peers.network_by_scipy_of_means(power, variance, signals)
-    for block in (slice(network_cases.BLOCK), slice(network_cases.BLOCK, None)):
+    for block in (slice(lidar_networks.BLOCK), slice(lidar_networks.BLOCK, None)):
         count = len(power[block])
         mean, of_mean = power[block].mean(axis=0), variance[block].sum(axis=0) / count**2
         expected = network_peers.network_by_scipy(mean[np.newaxis], of_mean[np.newaxis], signals)
@@ -153,7 +177,7 @@ def test_a_plain_fit_of_means_has_one_value_for_the_profiles_of_a_block():
 
 def test_errors_of_means_come_from_the_scatter_of_blocks():
     random = np.random.default_rng(1)
-    blocks, block = 400, network_cases.BLOCK
+    blocks, block = 400, lidar_networks.BLOCK
     shared = np.repeat(random.standard_normal(blocks), block)
     values = 2.0 + shared + 0.1 * random.standard_normal(shared.size)
     mean = mean_by_block(values, np.ones(values.size, dtype=bool), block)
@@ -169,63 +193,19 @@ def test_errors_of_means_come_from_the_scatter_of_blocks():
     assert 0.005 < share.error < 0.01
 
 
-def test_scores_of_known_errors():
-    relative = np.array([[0.2, np.nan], [-0.1, 0.4], [3.5, 0.0]])
-    truth = np.full(relative.shape, 2e-3)
-    result = {
-        "extinction": truth * (1.0 + relative),
-        "extinction_standard_error": truth * relative / [[1.5, 1.0], [-0.5, 2.5], [9.0, 1.0]],
-        "flagged": np.array([[False, True], [False, False], [True, False]]),
-        "reduced_chi_square": np.array([1.0, np.nan, 2.0]),
-    }
-    result["extinction_standard_error"][2, 1] = 1e-3
-    near = np.ones(2, dtype=bool)
-    score = network_benchmark.score_crossings(result, truth, near)
-    assert score["solved"].value == pytest.approx(5 / 6)
-    assert score["flagged"].value == pytest.approx(2 / 6)
-    assert score["mean error"].value == pytest.approx(3.5 / 5)
-    rmse = math.sqrt((0.04 + 0.01 + 0.16 + 9.0) / 5)
-    assert score["RMSE of extinction"].value == pytest.approx(rmse)
-    assert score["RMSE unflagged"].value == pytest.approx(math.sqrt((0.04 + 0.01 + 0.16) / 4))
-    within = [score[f"within {sigmas}"].value for sigmas in ("1", "1.96", "3")]
-    assert within == [0.5, 0.75, 1.0]
-    first, second = (1.0 / (1.0 + relative[:, k]) - 1.0 for k in range(2))
-    assert score["mean error at the first crossing"].value == pytest.approx(first.mean())
-    crossings = (math.sqrt(np.mean(first**2)), math.sqrt(np.nanmean(second**2)))
-    assert score["median crossing"].value == pytest.approx(np.median(crossings))
-    assert score["χ²/dof"] == 1.5
-    all_flagged = result | {"flagged": np.ones((3, 2), dtype=bool)}
-    score = network_benchmark.score_crossings(all_flagged, truth, near)
-    assert score["within 1"] is score["RMSE unflagged"] is None
-
-
 # Results --------------------------------------------------------------------------------------
 
 
-def test_every_case_is_scored_with_every_solver(case):
-    names = [solver.name for solver in network_cases.NETWORK_SOLVERS]
-    for lidars in network_cases.LIDAR_LINES:
-        for air in network_cases.AIRS:
-            for noise in network_cases.NOISES:
-                scores = case(lidars, air.name, noise)
-                assert list(scores) == names
-                for score in scores.values():
-                    assert 0.0 <= score["solved"].value <= 1.0
-                    assert score["reads"].value > 1.0
-
-
-def test_the_network_reaches_the_required_accuracy(case):
+def test_the_network_reaches_the_required_accuracy(cases):
     """The first crossing of the triangle and the median one of 3 x 2 beams: within 8 percent."""
-    network = network_cases.NETWORK.name
+    network, exact = lidar_networks.NETWORK, lidar_networks.NO_PRIOR
     for air, noise in (("homogeneous", 0.1), ("plume", 0.05), ("gradient", 0.05)):
-        scores = case(network_cases.TRIANGLE, air, noise)
-        assert scores[network]["RMSE at the first crossing"].value <= 0.08
-        exact = scores[network_cases.NETWORK_WITHOUT_PRIOR.name]
-        assert exact["RMSE at the first crossing"].value > 0.12
+        assert cases["triangle", air, noise, network].rmse[0] <= 0.08
+        assert cases["triangle", air, noise, exact].rmse[0] > 0.12
     for air in ("homogeneous", "gradient", "plume"):
-        score = case(network_cases.THREE_BY_TWO, air, 0.05)[network]
-        assert score["median crossing"].value <= 0.08
-        assert 0.7 < score["χ²/dof"].value < 1.3
+        case = cases["3 x 2 beams", air, 0.05, network]
+        assert np.median(case.rmse) <= 0.08
+        assert 0.7 < np.nanmean(case.result["reduced_chi_square"]) < 1.3
 
 
 @pytest.mark.parametrize(
@@ -240,29 +220,28 @@ def test_the_network_reaches_the_required_accuracy(case):
         ),
     ],
 )
-def test_unflagged_values_of_the_network_are_as_stated(case, moving):
-    for lidars in network_cases.LIDAR_LINES:
-        for air in (air for air in network_cases.AIRS[:4] if air.moving is moving):
-            for noise in network_cases.NOISES:
-                score = case(lidars, air.name, noise)[network_cases.NETWORK.name]
-                assert score["within 3"].value >= 0.98
-                assert score["flagged"].value < 0.1
+def test_unflagged_values_of_the_network_are_as_stated(cases, moving):
+    for lidars in lidar_networks.LIDAR_LINES:
+        for air in (air for air in lidar_networks.AIRS[:4] if air.moving is moving):
+            for noise in lidar_networks.NOISES:
+                case = cases[lidars.name, air.name, noise, lidar_networks.NETWORK]
+                assert case.within_three >= 0.98
+                assert np.mean(case.near_values("flagged")) < 0.1
 
 
-def test_the_network_agrees_with_a_plain_fit(accuracy):
-    rows = accuracy.figures("Networks and scipy, the same profiles and crossings")
-    pairs = list(dict.fromkeys((place, air) for place, air, _ in rows))
-    assert len(pairs) == 8
-    for pair in pairs:
-        assert rows[*pair, "profiles"].value == 10
-        assert rows[*pair, "difference / stated"].value < 1.0
-        ours, plain, peer = (
-            rows[*pair, f"{method}, RMSE"].value
-            for method in ("network", "network, no prior", "scipy least_squares")
-        )
-        assert peer == pytest.approx(plain, rel=0.5)
-        assert rows[*pair, "network / scipy"].value == pytest.approx(ours / peer)
-        # 10 profiles are one block.
-        mean = rows[*pair, "scipy least_squares, mean of 50 profiles, RMSE"].value
-        ratio = rows[*pair, "network / scipy of means of 50"].value
-        assert ratio == pytest.approx(ours / mean)
+@pytest.mark.parametrize("number", range(8))
+def test_the_network_agrees_with_a_plain_fit(number):
+    lidars, air = [*product(lidar_networks.LIDAR_LINES, lidar_networks.AIRS[:4])][number]
+    clean = lidar_networks.signals(lidars.network(), air)
+    row = network_benchmark.compare_with_scipy(clean, 10, number)
+    assert row["profiles"] == 10
+    assert row["difference / stated"] < 1.0
+    ours, plain, peer = (
+        row[f"{method}, RMSE"].value
+        for method in ("network", "network, no prior", "scipy least_squares")
+    )
+    assert peer == pytest.approx(plain, rel=0.5)
+    assert row["network / scipy"].value == pytest.approx(ours / peer)
+    # 10 profiles are one block.
+    mean = row["scipy least_squares, mean of 50 profiles, RMSE"].value
+    assert row["network / scipy of means of 50"].value == pytest.approx(ours / mean)

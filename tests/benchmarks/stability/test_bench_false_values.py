@@ -10,16 +10,16 @@ import pytest
 import verdicts
 from scipy import stats
 
-from benchmarks.harness.statistics import design_effect
-from benchmarks.stability import (
-    random_elastic,
-    random_homogeneous,
-    random_networks,
-    random_raman,
-    random_scans,
-    random_signals,
+from benchmarks.harness.figure import design_effect
+from benchmarks.harness.rates import COVERED, FALSE, SATISFIED
+from benchmarks.scenes import (
+    elastic_skies,
+    homogeneous_paths,
+    lidar_networks,
+    raman_skies,
+    recorded_signals,
 )
-from benchmarks.stability.random_scenes import COVERED, FALSE, SATISFIED
+from benchmarks.stability import random_scans
 from lidarops.flags import Quality, rejecting
 
 pytestmark = pytest.mark.slow
@@ -28,7 +28,7 @@ FOUND = 0.95
 """Probability that twice the target is found."""
 CONFINED = 0.3
 """Share of the values that are false in a network that has false ones: as large as in the random
-networks of `test_bench_random_networks.py`. Of other retrievals, values beyond 1.96 errors show how
+networks of `test_bench_lidar_networks.py`. Of other retrievals, values beyond 1.96 errors show how
 those of one geometry depend on each other."""
 
 
@@ -92,18 +92,19 @@ def test_few_networks_are_too_few_whatever_their_number_of_values():
 
 
 def counts_of(scored):
-    """Return false values, those beyond 1.96 errors and all by class and quantity.
+    """Return false values, those beyond 1.96 errors and all by class and quantity, (3, cluster).
 
     They are those of the target: of all values that no flag rejects, by random errors.
     """
     counts = {}
-    for values in scored:
+    for cluster, values in scored:
         rejected = (values.bits & rejecting((*Quality, *values.own))) != 0
         kept = np.isfinite(values.error) & ~rejected
         sizes = np.abs(values.error)[kept] / np.broadcast_to(values.random, kept.shape)[kept]
         part = (np.sum(~(sizes <= FALSE)), np.sum(~(sizes <= COVERED)), sizes.size)
-        counts.setdefault((values.failure.name, values.quantity), []).append(part)
-    return {key: np.array(rows, dtype=float).T for key, rows in counts.items()}
+        of_class = counts.setdefault((values.failure.name, values.quantity), {})
+        of_class[cluster] = of_class.get(cluster, 0.0) + np.array(part, dtype=float)
+    return {key: np.stack([*rows.values()], axis=1) for key, rows in counts.items()}
 
 
 def with_few_together(counts, confined):
@@ -119,13 +120,13 @@ def with_few_together(counts, confined):
 
 
 def where_the_model_holds(score, clusters, profiles):
-    """Yield the values of the first classes, which are those where the model holds."""
+    """Yield cluster and values of the first classes, which are those where the model holds."""
     for cluster in range(clusters):
         chunks = takewhile(lambda chunk: chunk.failure.satisfied, score(cluster, profiles))
-        yield from chunks
+        yield from ((cluster, chunk) for chunk in chunks)
 
 
-HOMOGENEOUS = (random_homogeneous.score_homogeneous, 50, 200)
+HOMOGENEOUS = (homogeneous_paths.score_homogeneous, 50, 200)
 """Score, clusters and profiles of the check of the default suite. Clusters take the time."""
 
 
@@ -147,7 +148,7 @@ def test_twice_the_target_in_one_class_of_homogeneous_paths_is_found():
 
 def networks(cluster, profiles):
     """Yield networks without missing bins, with which one of seven is accepted: too few to tell."""
-    chunks = random_networks.score_networks(cluster, profiles)
+    chunks = lidar_networks.score_networks(cluster, profiles)
     yield from takewhile(lambda chunk: chunk.failure.name != "gaps", chunks)
 
 
@@ -158,10 +159,10 @@ KNOWN = verdicts.above_target()
 @pytest.mark.parametrize(
     ("score", "clusters", "profiles", "confined"),
     [
-        pytest.param(random_homogeneous.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
-        pytest.param(random_homogeneous.score_short_sections, 600, 300, 0.0, id="short sections"),
-        pytest.param(random_signals.score_signals, 200, 50, 0.0, id="signal chain"),
-        pytest.param(random_elastic.score_elastic, 400, 20, 0.0, id="elastic"),
+        pytest.param(homogeneous_paths.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
+        pytest.param(homogeneous_paths.score_short_sections, 600, 300, 0.0, id="short sections"),
+        pytest.param(recorded_signals.score_signals, 200, 50, 0.0, id="signal chain"),
+        pytest.param(elastic_skies.score_elastic, 400, 20, 0.0, id="elastic"),
         pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
         pytest.param(
             partial(random_scans.score_short_scans, length=1), 400, 4, 0.0, id="scans, blocks of 1"
@@ -169,7 +170,7 @@ KNOWN = verdicts.above_target()
         pytest.param(
             partial(random_scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
         ),
-        pytest.param(random_raman.score_raman, 1000, 4, 0.0, id="Raman"),
+        pytest.param(raman_skies.score_raman, 1000, 4, 0.0, id="Raman"),
         pytest.param(networks, 1500, 50, CONFINED, id="network"),
     ],
 )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.stability import random_networks
-from benchmarks.stability.random_networks import score_networks
+from benchmarks.scenes import lidar_networks
+from benchmarks.scenes.lidar_networks import score_networks
 from lidarops.retrieve.network import _block_solution, _changing_field
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -72,8 +72,8 @@ def test_the_errors_of_stratified_air_are_right(cluster, length, errors, monkeyp
     """Without a prior for it, values of layered air deviate by more than their errors."""
 
     def beyond():
-        (values,) = random_networks.score_short_blocks(
-            cluster, 6, draw_air=random_networks.layered, name="layered", length=length
+        (values,) = lidar_networks.score_short_blocks(
+            cluster, 6, draw_air=lidar_networks.layered, name="layered", length=length
         )
         kept = np.isfinite(values.error) & (values.bits == 0)
         assert kept.mean() > 0.5

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from scipy import special
 
-from benchmarks.accuracy import elastic_cases
+from benchmarks.scenes import elastic_skies
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.clouds import layers
@@ -38,9 +38,9 @@ _SCALE: Final = 2e-5
 
 
 @cache
-def sky() -> elastic_cases.SimulatedSky:
+def sky() -> elastic_skies.SimulatedSky:
     """Return the simulated sky (cached)."""
-    return elastic_cases.simulated_sky()
+    return elastic_skies.simulated_sky()
 
 
 def elastic_arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def elastic_arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True)
     bins = (air.range > 400.0) & (air.range < 12e3)
     if noise:
         counts = air.counts(level, draws, 31)
-        power, variance = counts - level, elastic_cases.count_variance(counts)
+        power, variance = counts - level, elastic_skies.count_variance(counts)
     else:
         power = np.broadcast_to(air.signal, (draws, air.range.size))
         variance = 1e-12 * power**2
@@ -58,7 +58,7 @@ def elastic_arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True)
         "range": air.range[bins],
         "molecular_backscatter": air.molecular_backscatter[bins],
         "molecular_extinction": air.molecular_extinction[bins],
-        "lidar_ratio": elastic_cases.LIDAR_RATIO,
+        "lidar_ratio": elastic_skies.LIDAR_RATIO,
         "reference": (7000.0, 8000.0),
         "variance": variance[:, bins],
     }
@@ -121,7 +121,7 @@ def _thick(depth: float) -> dict[str, Any]:
     r = arguments["range"]
     cloud = np.exp(-0.5 * ((r - 3000.0) / 100.0) ** 2) / (100.0 * np.sqrt(2.0 * np.pi))
     optical_depth = depth * special.ndtr((r - 3000.0) / 100.0)
-    added = depth * cloud / elastic_cases.LIDAR_RATIO
+    added = depth * cloud / elastic_skies.LIDAR_RATIO
     factor = (truth() + arguments["molecular_backscatter"] + added) / (
         truth() + arguments["molecular_backscatter"]
     )
@@ -136,7 +136,7 @@ def _thick(depth: float) -> dict[str, Any]:
 def _behind(depth: float, low: float, high: float) -> Array:
     r = elastic_arguments(noise=False)["range"]
     cloud = np.exp(-0.5 * ((r - 3000.0) / 100.0) ** 2) / (100.0 * np.sqrt(2.0 * np.pi))
-    particles = truth() + depth * cloud / elastic_cases.LIDAR_RATIO
+    particles = truth() + depth * cloud / elastic_skies.LIDAR_RATIO
     return np.asarray(particles[(r >= low) & (r <= high)])
 
 
@@ -246,7 +246,7 @@ def _refusals() -> tuple[StiffCase, ...]:
 # The reference window -------------------------------------------------------------------------
 
 
-def _choose_window(power: Array, variance: Array, air: elastic_cases.SimulatedSky) -> Answer:
+def _choose_window(power: Array, variance: Array, air: elastic_skies.SimulatedSky) -> Answer:
     clouds = layers.find_layers(power, air.range, variance, molecular_attenuated=air.shape)
     window = reference_window.choose_reference(
         power, air.range, variance, molecular_attenuated=air.shape,
@@ -262,7 +262,7 @@ def _window(level: float, *, haze: float = 0.0) -> Mapping[str, Any]:
     power = np.where(air.inverted, counts - level, np.nan)
     # Haze with a scale height of 3 km at all heights.
     power = power * (1.0 + haze * np.exp(-air.range / 3000.0))
-    return {"power": power, "variance": elastic_cases.count_variance(counts), "air": air}
+    return {"power": power, "variance": elastic_skies.count_variance(counts), "air": air}
 
 
 def _windows() -> tuple[StiffCase, ...]:

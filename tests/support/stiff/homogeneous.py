@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.accuracy.homogeneous_cases import Scenario
+from benchmarks.scenes.homogeneous_paths import Scenario
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
@@ -68,7 +68,7 @@ class Path:
 
     @property
     def scenario(self) -> Scenario:
-        """The path as a scenario of `benchmarks.accuracy.homogeneous_cases`."""
+        """The path as a scenario of `benchmarks.scenes.homogeneous_paths`."""
         return Scenario(self.start, self.length, self.extinction, self.signal, self.background)
 
     def noisy(self, profiles: int = 200, seed: int = 1) -> Array:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.accuracy.network_cases import (
+from benchmarks.scenes.lidar_networks import (
     AIRS,
     FULL_OVERLAP,
     THREE_BY_TWO,

@@ -6,17 +6,28 @@ it differs from the truth by more than 4 stated standard errors.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from benchmarks.harness.figure import Array, Figure, Mask
-from benchmarks.harness.statistics import clustered_share, design_effect
-from benchmarks.harness.verdicts import Judgement, Score, Scores, Target
+from benchmarks.harness.figure import (
+    Array,
+    Figure,
+    Judgement,
+    Mask,
+    Score,
+    Scores,
+    Target,
+    clustered_share,
+    design_effect,
+)
 from lidarops.flags import FlagBit, Quality, rejecting
 
 FALSE: Final = 4.0
@@ -38,7 +49,6 @@ percent if the sign is known as well). A test that does not know the shape misse
 HELD: Final = "all where the model holds"
 BROKEN: Final = "all violations"
 """Classes of all scenes of a retrieval."""
-POOLED: Final = frozenset({HELD, BROKEN})
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +58,6 @@ class Failure:
     name: str
     satisfied: bool = False
     """Whether the model holds, so that random errors alone must cover the truth."""
-    unseen: str = ""
-    """Reason why the data cannot reveal the violation; empty where they can."""
 
 
 _Class = TypeVar("_Class", bound=tuple[Any, ...])
@@ -92,58 +100,52 @@ class ScoredValues:
     """Misfit of the violation, in standard deviations of the noise; None where unknown."""
 
 
-def joined(blocks: Sequence[ScoredValues]) -> ScoredValues:
-    """Return the values of several blocks of profiles of one class as one chunk."""
-
-    def stacked(name: str) -> Any:
-        parts = [np.broadcast_to(getattr(block, name), block.error.shape) for block in blocks]
-        return np.concatenate(parts)
-
-    names = [
-        name
-        for name in ("error", "random", "systematic", "bits", "uncertain", "solvable", "misfit")
-        if getattr(blocks[0], name) is not None
-    ]
-    return replace(blocks[0], **{name: stacked(name) for name in names})
+KEYS: Final = ["quantity", "class", "satisfied", "cluster"]
+"""Columns that name the scenes of which a row counts the values."""
 
 
-class Tally:
-    """Counts by quantity, class and cluster; scenes of one cluster share their geometry."""
+def collect(
+    generator: Callable[[int], Iterable[ScoredValues]],
+    clusters: int,
+    progress: Callable[[int], object] = lambda _: None,
+) -> pd.DataFrame:
+    """Return the counts of that many clusters; the same numbers give the same scenes.
 
-    def __init__(self) -> None:
-        self._rows: list[dict[str, Any]] = []
-        self._failures = {HELD: Failure(HELD, satisfied=True), BROKEN: Failure(BROKEN)}
-
-    def add(self, values: ScoredValues) -> None:
-        """Count the values of a chunk; its first axis is that of scenes."""
-        self._failures[values.failure.name] = values.failure
-        pooled = HELD if values.failure.satisfied else BROKEN
-        own = {"quantity": values.quantity, "measured": values.misfit is not None, **counts(values)}
-        self._rows += [own | {"class": name} for name in (values.failure.name, pooled)]
-
-    def rates(self, needless: float | None, *, pooled: bool = True) -> Scores:
-        """Return the shares of kept, false and flagged values by quantity and class.
-
-        Parameters
-        ----------
-        needless : float, optional
-            Largest share of needless flags where the model holds, a target of our own.
-        pooled : bool
-            Whether to add all classes that satisfy the model together, and all that do not.
-        """
-        target = None if needless is None else Target(needless, own=True)
-        groups = dict(list(pd.DataFrame(self._rows).groupby(["quantity", "class"], sort=False)))
-        # Of each quantity, what is pooled comes last.
-        return {
-            (quantity, name): _score(groups[quantity, name], self._failures[name], target)
-            for quantity, name in sorted(groups, key=lambda key: (key[0], key[1] in POOLED))
-            if pooled or name not in POOLED
-        }
+    Scenes of one cluster share their geometry.
+    """
+    rows: list[dict[str, Any]] = []
+    for cluster in range(clusters):
+        rows += [counts(values) | {"cluster": cluster} for values in generator(cluster)]
+        progress(1)
+    return pd.DataFrame(rows).groupby(KEYS, sort=False).sum().reset_index()
 
 
-def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> Score:
-    """Return the shares of one class, given its counts by cluster."""
-    holds = failure.satisfied
+def rates(counted: pd.DataFrame, needless: float | None, *, pooled: bool = True) -> Scores:
+    """Return the shares of kept, false and flagged values by quantity and class.
+
+    Parameters
+    ----------
+    counted : DataFrame
+        Of `collect`.
+    needless : float, optional
+        Largest share of needless flags where the model holds, a target of our own.
+    pooled : bool
+        Whether to add all classes that satisfy the model together, and all that do not.
+    """
+    target = None if needless is None else Target(needless, own=True)
+    scores: Scores = {}
+    for quantity, chunks in counted.groupby("quantity"):
+        for (name, holds), own in chunks.groupby(["class", "satisfied"], sort=False):
+            scores[quantity, name] = _score(own, target, holds=holds, alone=True)
+        for holds, every in chunks.groupby("satisfied", sort=False) if pooled else ():
+            scores[quantity, HELD if holds else BROKEN] = _score(
+                every, target, holds=holds, alone=False
+            )
+    return scores
+
+
+def _score(chunks: pd.DataFrame, needless: Target | None, *, holds: bool, alone: bool) -> Score:
+    """Return the shares of one class, or of all together, given the counts by cluster."""
     # Where false values are few, those beyond 1.96 errors show how values depend on each other.
     inside, of = ("covered", "kept") if holds else ("plain covered", "plain")
     effect = design_effect((chunks[of] - chunks[inside]).to_numpy(), chunks[of].to_numpy())
@@ -158,15 +160,15 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
     flagged = part("solvable rejected", "solvable", known=holds)
     measured = bool(chunks["measured"].any())
     # A class has intervals of its own; those of all classes together may hide it.
-    alone = holds and failure.name not in POOLED
+    intervals = holds and alone
     return {
         "clusters": len(chunks),
         "values": int(chunks["values"].sum()),
         "not rejected": part("kept", "values"),
         COVERED_SHARE: covered,
-        COVERED_TARGET: _judged(covered, COVERED_BY_95 if alone else None),
+        COVERED_TARGET: _judged(covered, COVERED_BY_95 if intervals else None),
         ONE_SHARE: covered_by_one,
-        ONE_TARGET: _judged(covered_by_one, COVERED_BY_68 if alone else None),
+        ONE_TARGET: _judged(covered_by_one, COVERED_BY_68 if intervals else None),
         "stated / median error": _stated_over_median(chunks["sizes"].sum()),
         FALSE_RANDOM: false_random,
         FALSE_PLAIN: false_plain,
@@ -179,7 +181,6 @@ def _score(chunks: pd.DataFrame, failure: Failure, needless: Target | None) -> S
         "without any flag": part("false bare", "bare"),
         NEEDLESS: flagged,
         NEEDLESS_TARGET: _judged(flagged, needless),
-        "detectable in the data": f"no: {failure.unseen}" if failure.unseen else "yes",
     }
 
 
@@ -241,20 +242,6 @@ def shares(parts: Iterable[Part], target: Callable[[str, str], Target | None]) -
     return scores
 
 
-def collect(
-    generator: Callable[[int], Iterable[ScoredValues]],
-    clusters: int,
-    progress: Callable[[int], object] = lambda _: None,
-) -> Tally:
-    """Count the values of that many clusters; the same numbers give the same scenes."""
-    tally = Tally()
-    for cluster in range(clusters):
-        for values in generator(cluster):
-            tally.add(values)
-        progress(1)
-    return tally
-
-
 def counts(values: ScoredValues) -> dict[str, Any]:
     """Return how many values are kept, false or flagged, and the sizes of their errors."""
     shape = values.error.shape
@@ -273,6 +260,8 @@ def counts(values: ScoredValues) -> dict[str, Any]:
     kept = valued & ~rejected
     plain, bare = kept & ~uncertain, kept & (bits == 0)
     masks = {
+        "scored": np.ones(shape, dtype=np.bool_),
+        "lost": ~plain,
         "values": valued,
         "covered": kept & (size <= COVERED * random),
         "covered by one": kept & (size <= ONE * random),
@@ -291,5 +280,53 @@ def counts(values: ScoredValues) -> dict[str, Any]:
     }
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         sizes = np.clip(size[kept] / random[kept], _EDGES[0], _EDGES[-1])
-    numbers: dict[str, Any] = {name: float(np.count_nonzero(mask)) for name, mask in masks.items()}
-    return numbers | {"sizes": np.histogram(sizes[~np.isnan(sizes)], _EDGES)[0]}
+    return {
+        "quantity": values.quantity,
+        "class": values.failure.name,
+        "satisfied": values.failure.satisfied,
+        "measured": float(values.misfit is not None),
+        **{name: float(np.count_nonzero(mask)) for name, mask in masks.items()},
+        "sizes": np.histogram(sizes[~np.isnan(sizes)], _EDGES)[0],
+    }
+
+
+# Reasons for targets that are not met ---------------------------------------------------------
+
+REASONS: Final = Path(__file__).parents[2] / "docs/results/reasons.json"
+Reason = dict[str, str]
+"""``why``, and patterns of the part, quantity, class, target and verdict that it is for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unmet:
+    """A target that is missed, or for which the scenes do not decide."""
+
+    part: str
+    quantity: str
+    name: str
+    """Class."""
+    target: str
+    judgement: Judgement
+
+    def __str__(self) -> str:
+        place = f"{self.name} ({self.quantity})" if self.quantity else self.name
+        return f"{self.part}: {place}, {self.target} {self.judgement}"
+
+
+def read_reasons(file: Path = REASONS) -> list[Reason]:
+    """Return the reasons of a file, the most special ones first; none without the file."""
+    return list(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else []
+
+
+def why(one: Unmet, reasons: Sequence[Reason]) -> str:
+    """Return the reason of a target that is not met; empty if none is stated."""
+    texts = {"part": one.part, "quantity": one.quantity, "class": one.name, "target": one.target,
+             "verdict": one.judgement.verdict}  # fmt: skip
+    return next(
+        (
+            reason["why"]
+            for reason in reasons
+            if all(fnmatchcase(text, reason.get(key, "*")) for key, text in texts.items())
+        ),
+        "",
+    )

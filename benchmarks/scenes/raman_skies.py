@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from benchmarks.harness.figure import Array
-from benchmarks.stability.random_scenes import Failure, ScoredValues
+from benchmarks.harness.figure import Array, Random, log_uniform
+from benchmarks.harness.rates import Failure, ScoredValues
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.common.arrays import Flags
 from lidarops.retrieve.raman.flags import RamanQuality, concerning
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
-from lidarops.retrieve.raman.signals import (
-    AirColumn,
-    Cells,
-    ChannelSignal,
-    make_cells,
-)
-
-Random = np.random.Generator
+from lidarops.retrieve.raman.signals import AirColumn, Cells, ChannelSignal, make_cells
 
 LASER: Final = 354.7e-9
 RAMAN: Final = 386.7e-9
@@ -162,12 +154,12 @@ def make_sky(
 
 def _hazy(rng: Random, exponent: float = _EXPONENT) -> Sky:
     """Return haze that falls with height and ends smoothly; the settings are those of products."""
-    amount, scale = _between(rng, 2e-5, 3e-4), rng.uniform(800.0, 3000.0)
+    amount, scale = log_uniform(rng, 2e-5, 3e-4), rng.uniform(800.0, 3000.0)
     top = 1.0 + np.exp((_RANGE - rng.uniform(*_TOPS)) / 300.0)
     sky = make_sky(
-        amount * np.exp(-_RANGE / scale) / top, _STEP, _between(rng, *_COUNTS),
+        amount * np.exp(-_RANGE / scale) / top, _STEP, log_uniform(rng, *_COUNTS),
         lidar_ratio=float(rng.uniform(*_LIDAR_RATIOS)), exponent=exponent, cell=_CELL,
-        full_overlap=_between(rng, *_FULL_OVERLAPS),
+        full_overlap=log_uniform(rng, *_FULL_OVERLAPS),
     )  # fmt: skip
     settings = RamanSettings(
         reference=RamanReference(relative_error=0.0),
@@ -177,10 +169,6 @@ def _hazy(rng: Random, exponent: float = _EXPONENT) -> Sky:
         overlap_relative_error=0.0,
     )
     return replace(sky, settings=settings)
-
-
-def _between(rng: Random, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def _of_other_colour(rng: Random) -> Sky:
@@ -203,19 +191,16 @@ def _with_particles_aloft(rng: Random) -> Sky:
 def _with_overlap(rng: Random) -> Sky:
     sky = _hazy(rng)
     full = float(_RANGE[np.isfinite(sky.air.overlap)][0])
-    fall = np.exp(-np.maximum(_RANGE - full, 0.0) / _between(rng, _SHORTEST, full))
+    fall = np.exp(-np.maximum(_RANGE - full, 0.0) / log_uniform(rng, _SHORTEST, full))
     seen = 1.0 - 0.05 * fall
     return replace(sky, raman=seen * sky.raman, elastic=seen * sky.elastic)
 
 
-_COLOUR: Final = "two wavelengths do not show the colour of extinction: the stated error covers it"
-_ALIKE: Final = "particles that are mixed as air is look like air in the reference window"
-_NEAR: Final = "what overlap lacks looks like extinction: the stated error covers it"
 FAILURES: Final[tuple[tuple[Failure, Callable[[Random], Sky]], ...]] = (
     (Failure("none", satisfied=True), _hazy),
-    (Failure("Angstrom exponent off as stated", unseen=_COLOUR), _of_other_colour),
-    (Failure("particles in the reference window", unseen=_ALIKE), _with_particles_aloft),
-    (Failure("overlap 5 percent off", unseen=_NEAR), _with_overlap),
+    (Failure("Angstrom exponent off as stated"), _of_other_colour),
+    (Failure("particles in the reference window"), _with_particles_aloft),
+    (Failure("overlap 5 percent off"), _with_overlap),
 )
 
 

@@ -1,37 +1,245 @@
-"""Random homogeneous paths, and random violations of homogeneity."""
+"""Homogeneous paths with known truth, chosen and random: signals, bounds of accuracy, and solvers.
+
+Random paths satisfy or violate homogeneity.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 from scipy import stats
 
-from benchmarks.accuracy.homogeneous_cases import least_errors, relative_signal
-from benchmarks.accuracy.multiangle_cases import correlated
-from benchmarks.harness.figure import Array
-from benchmarks.stability.random_scenes import COVERED, Failure, ScoredValues
+from benchmarks.harness.figure import Array, Mask, Random, correlated, log_uniform
+from benchmarks.harness.rates import COVERED, Failure, ScoredValues
+from lidarops.flags import Quality, rejecting
+from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
+from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod, HomogeneousResult
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
+from lidarops.simulate.signal import optical_depth
 
-Random = np.random.Generator
+BINS: Final = 225
+BACKGROUND: Final = 370.0
+"""In standard deviations of the noise, like all powers here."""
+QUANTITIES: Final = ("extinction", "background")
+"""The compared unknowns; the third, the amplitude, is the signal extrapolated to range zero."""
+TAIL_MEAN: Final = "tail_mean"
+"""Solver: the mean of the last tenth of the bins as the background, as is usual."""
+WRONG_PRIOR: Final = 0.8
+"""Prior extinction, where one is needed, as a share of the truth."""
 
-_EXTINCTIONS: Final = (1e-7, 6e-2)
+_STARTS: Final = (2500.0, 10500.0)
+_LENGTHS: Final = (1700.0, 8000.0)
+_EXTINCTIONS: Final = (1e-5, 1e-4, 1e-3, 5e-3)
+_AMPLITUDES: Final = (15.0, 1e2, 1e3, 1e4, 1e5)
+_SOLVABLE: Final = 0.1
+_QUICK: Final = 8
+_SEED: Final = 20240915
+
+
+def relative_signal(distance: Array, extinction: Array, backscatter: Array) -> Array:
+    r"""Return the signal of backscatter beyond full overlap, over that of the first bin, 1.
+
+    Parameters
+    ----------
+    distance : ndarray, m, shape (bins,)
+        Range of the bin centres, positive and ascending.
+    extinction, backscatter : ndarray, shape (..., bins)
+        m-1, and in any unit.
+
+    Notes
+    -----
+    :math:`(\beta_i / \beta_0) (R_0 / R_i)^2 \exp(-2 (\tau_i - \tau_0))` is defined also where
+    nothing of the signal itself is left in the first bin.
+    """
+    depth = optical_depth(distance, extinction)
+    shape = backscatter / backscatter[..., :1] * (distance[0] / distance) ** 2
+    signal: Array = shape * np.exp(-2.0 * (depth - depth[..., :1]))
+    return signal
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One homogeneous path with white noise of unit variance."""
+
+    start: float
+    """m."""
+    length: float
+    """m."""
+    extinction: float
+    """m-1."""
+    signal: float
+    """Above the background, at the start."""
+    background: float = BACKGROUND
+    bins: int = BINS
+
+    @property
+    def range(self) -> Array:
+        """Ranges in m, uniform from the start to the start plus the length."""
+        return np.linspace(self.start, self.start + self.length, self.bins)
+
+    @property
+    def mean(self) -> Array:
+        """Noise-free power."""
+        air = np.ones(self.bins)
+        signal = relative_signal(self.range, self.extinction * air, air)
+        return np.asarray(self.background + self.signal * signal)
+
+    @property
+    def label(self) -> str:
+        """Description, in km and km-1."""
+        return (
+            f"{self.start / 1e3:g} + {self.length / 1e3:g} km, "
+            f"{1e3 * self.extinction:g} km-1, signal {self.signal:g}"
+        )
+
+    def powers(self, count: int, seed: int = 0, dtype: npt.DTypeLike = np.float64) -> Any:
+        """Return `count` noisy profiles; the same seed gives the same noise."""
+        noise = np.random.default_rng([_SEED, seed]).standard_normal((count, self.bins))
+        return (self.mean + noise).astype(dtype)
+
+    def least_errors(self) -> dict[str, float]:
+        """Return the Cramér-Rao bound of the standard error of each of `QUANTITIES`."""
+        bounds = least_errors(self.range, self.extinction, self.signal)
+        return {name: float(bound[0]) for name, bound in bounds.items()}
+
+    def difficulty(self) -> float:
+        """Return the least standard error of extinction over extinction + 1 / mean range."""
+        scale = self.extinction + 1.0 / float(self.range.mean())
+        return self.least_errors()["extinction"] / scale
+
+
+def least_errors(
+    distance: Array, extinction: npt.ArrayLike, signal: npt.ArrayLike
+) -> dict[str, Array]:
+    r"""Return the Cramér-Rao bounds of the standard errors of paths, each (profile,).
+
+    The inverse Fisher matrix of background, signal in the first bin and extinction with Gaussian
+    noise of unit variance (kay1993),
+
+    .. math:: F = J^T J, \quad J = [1, \; \phi, \; -2 (R - R_0) S \phi],
+        \quad \phi = (R_0 / R)^2 e^{-2 \sigma (R - R_0)}
+
+    The bound of an unknown is the reciprocal norm of what its column adds to the others: the last
+    diagonal element of the triangular factor.
+
+    Parameters
+    ----------
+    distance : (bin,) float
+        m.
+    extinction, signal : (profile, 1) float
+        m-1, and the signal in the first bin over the noise.
+    """
+    depth = distance - distance[0]
+    shape = (distance[0] / distance) ** 2 * np.exp(-2.0 * np.atleast_2d(extinction) * depth)
+    slope = -2.0 * depth * signal * shape
+    last = {"extinction": (np.ones_like(shape), shape, slope),
+            "background": (shape, slope, np.ones_like(shape))}  # fmt: skip
+    bounds = {}
+    for name, columns in last.items():
+        factor = np.asarray(np.linalg.qr(np.stack(columns, -1), mode="r"))
+        bounds[name] = 1.0 / np.maximum(np.abs(factor[:, -1, -1]), np.finfo(float).tiny)
+    return bounds
+
+
+def scenarios(*, quick: bool = False) -> list[Scenario]:
+    """Return the paths of the benchmark: those with a difficulty of at most 0.1, or 8 of them."""
+    grid = product(_STARTS, _LENGTHS, _EXTINCTIONS, _AMPLITUDES)
+    solvable = [s for values in grid if (s := Scenario(*values)).difficulty() <= _SOLVABLE]
+    if not quick:
+        return solvable
+    selected = np.linspace(0, len(solvable) - 1, _QUICK).round().astype(int)
+    return [solvable[k] for k in selected]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates:
+    """Estimates of a solver, one value per profile, by `QUANTITIES`."""
+
+    values: Mapping[str, Array]
+    standard_errors: Mapping[str, Array]
+    flagged: Mask
+    """Any quality bit."""
+    rejected: Mask
+    """A rejecting quality bit."""
+
+
+PathSolver = Callable[[Any, Scenario], Estimates]
+"""Solver: returns estimates from powers (profile, range) and their scenario."""
+
+
+def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str, Any]:
+    """Return the arguments that a method needs besides the power.
+
+    Known values are exact; the prior of "linearized" is 20 percent low.
+    """
+    match method:
+        case HomogeneousMethod.LINEARIZED:
+            return {"extinction": WRONG_PRIOR * scenario.extinction}
+        case HomogeneousMethod.KNOWN_EXTINCTION:
+            return {"extinction": scenario.extinction}
+        case HomogeneousMethod.KNOWN_BACKGROUND:
+            return {"background": scenario.background}
+        case _:
+            return {}
+
+
+def methods() -> dict[str, PathSolver]:
+    """Return a solver for every method of `fit_homogeneous_path` and for `TAIL_MEAN`, by name."""
+    solvers: dict[str, PathSolver] = {
+        method.value: partial(_solve, method=method) for method in HomogeneousMethod
+    }
+    return solvers | {TAIL_MEAN: _fit_above_tail}
+
+
+def _solve(power: Any, scenario: Scenario, method: HomogeneousMethod) -> Estimates:
+    options = method_arguments(method, scenario)
+    fit = path_fit.fit_homogeneous_path(
+        power, scenario.range, variance=1.0, method=method.value, **options
+    )
+    return _estimates(fit)
+
+
+def _fit_above_tail(power: Any, scenario: Scenario) -> Estimates:
+    tail = cubic_and_tail.tail_mean(power, scenario.range, variance=1.0)
+    fit = path_fit.fit_homogeneous_path(
+        power, scenario.range, variance=1.0, method="known_background", background=tail.background,
+        background_standard_error=tail.background_standard_error,
+    )  # fmt: skip
+    return _estimates(fit)
+
+
+def _estimates(fit: HomogeneousResult) -> Estimates:
+    return Estimates(
+        values={name: getattr(fit, name) for name in QUANTITIES},
+        standard_errors={name: getattr(fit, f"{name}_standard_error") for name in QUANTITIES},
+        flagged=fit.quality != 0,
+        rejected=(fit.quality & rejecting((*Quality, *HomogeneousQuality))) != 0,
+    )
+
+
+# Random paths ---------------------------------------------------------------------------------
+
+_RANDOM_EXTINCTIONS: Final = (1e-7, 6e-2)
 """m-1."""
 _SIGNALS: Final = (1e-2, 1e6)
 """Over the noise, in the first bin."""
 _BACKGROUNDS: Final = (1.0, 1e8)
 _NO_BACKGROUND: Final = 0.1
-_STARTS: Final = (200.0, 12e3)
+_RANDOM_STARTS: Final = (200.0, 12e3)
 """m."""
-_LENGTHS: Final = (100.0, 12e3)
+_RANDOM_LENGTHS: Final = (100.0, 12e3)
 _STEPS: Final = (3.75, 7.5, 15.0, 37.5)
-_BINS: Final = (8, 800)
-_SOLVABLE: Final = 0.075
+RANDOM_BINS: Final = (8, 800)
+_DETERMINED: Final = 0.075
 """Largest `least_relative_error` of a solvable path: 4 such errors of a thin path reach the lower
 bound of the search, -0.3 / last range."""
 _DEEPEST: Final = 600.0
@@ -69,23 +277,18 @@ Violation = Callable[[Paths, Random], Array]
 """Returns (profile, bin) signals above the background of paths with a violation."""
 
 
-def between(rng: Random, low: float, high: float, count: int) -> Array:
-    """Return (count, 1) numbers, uniform in the logarithm."""
-    return np.exp(rng.uniform(np.log(low), np.log(high), (count, 1)))
-
-
 def random_paths(cluster: int, profiles: int) -> tuple[Paths, Random]:
     """Return random paths of one geometry."""
     rng = np.random.default_rng((71, cluster))
-    start = float(between(rng, *_STARTS, 1)[0, 0])
-    length, step = float(between(rng, *_LENGTHS, 1)[0, 0]), float(rng.choice(_STEPS))
-    bins = int(np.clip(round(length / step) + 1, *_BINS))
-    background = between(rng, *_BACKGROUNDS, profiles)
+    start = log_uniform(rng, *_RANDOM_STARTS)
+    length, step = log_uniform(rng, *_RANDOM_LENGTHS), float(rng.choice(_STEPS))
+    bins = int(np.clip(round(length / step) + 1, *RANDOM_BINS))
+    background = log_uniform(rng, *_BACKGROUNDS, (profiles, 1))
     background[rng.random(profiles) < _NO_BACKGROUND] = 0.0
     paths = Paths(
         np.asarray(start + step * np.arange(bins, dtype=np.float64)),
-        between(rng, *_EXTINCTIONS, profiles),
-        between(rng, *_SIGNALS, profiles),
+        log_uniform(rng, *_RANDOM_EXTINCTIONS, (profiles, 1)),
+        log_uniform(rng, *_SIGNALS, (profiles, 1)),
         background,
     )
     return paths, rng
@@ -95,59 +298,52 @@ def _none(paths: Paths, _: Random) -> Array:
     return paths.clean
 
 
-def _sign(rng: Random, count: int) -> Array:
-    return np.asarray(rng.choice([-1.0, 1.0], (count, 1)))
-
-
 def _slope(paths: Paths, rng: Random) -> Array:
-    count = len(paths.signal)
-    scale = between(rng, 1e3, 1e5, count) * _sign(rng, count)
-    return paths.clean * np.exp(-paths.depth / scale)
+    of_path = paths.signal.shape
+    scale = log_uniform(rng, 1e3, 1e5, of_path) * rng.choice([-1.0, 1.0], of_path)
+    return np.asarray(paths.clean * np.exp(-paths.depth / scale))
 
 
 def _curved(paths: Paths, rng: Random) -> Array:
-    count = len(paths.signal)
-    amount = between(rng, 1e-3, 1.0, count) * _sign(rng, count)
+    of_path = paths.signal.shape
+    amount = log_uniform(rng, 1e-3, 1.0, of_path) * rng.choice([-1.0, 1.0], of_path)
     position = paths.depth / paths.depth[:, -1:] - 0.5
-    return paths.clean * np.exp(amount * position**2)
+    return np.asarray(paths.clean * np.exp(amount * position**2))
 
 
 def _excess(paths: Paths, rng: Random) -> Array:
     """Return the excess of a cloud in the path, (profile, bin), over the path's own scattering."""
-    count = len(paths.signal)
-    middle = rng.random((count, 1)) * paths.depth[:, -1:]
-    width = between(rng, 0.01, 0.5, count) * paths.depth[:, -1:]
+    of_path, length = paths.signal.shape, paths.depth[:, -1:]
+    middle = rng.random(of_path) * length
+    width = log_uniform(rng, 0.01, 0.5, of_path) * length
     shape = np.exp(-0.5 * ((paths.depth - middle) / width) ** 2)
-    return np.asarray(between(rng, 1e-2, 10.0, count) * shape)
+    return np.asarray(log_uniform(rng, 1e-2, 10.0, of_path) * shape)
 
 
 def _overlap(paths: Paths, rng: Random) -> Array:
-    count = len(paths.signal)
-    lost = rng.uniform(0.0, 0.3, (count, 1))
-    scale = between(rng, 0.02, 1.0, count) * paths.depth[:, -1:]
+    lost = rng.uniform(0.0, 0.3, paths.signal.shape)
+    scale = log_uniform(rng, 0.02, 1.0, paths.signal.shape) * paths.depth[:, -1:]
     return paths.clean * (1.0 - lost * np.exp(-paths.depth / scale))
 
 
 def _turbulent(paths: Paths, rng: Random) -> Array:
-    amount = between(rng, 1e-3, 0.2, len(paths.signal))
+    amount = log_uniform(rng, 1e-3, 0.2, paths.signal.shape)
     return paths.clean * np.exp(amount * correlated(rng, paths.clean.shape, rng.uniform(0.0, 0.95)))
 
 
 def _afterpulse(paths: Paths, rng: Random) -> Array:
-    count = len(paths.signal)
-    share = between(rng, 1e-4, 0.1, count)
-    scale = between(rng, 0.05, 1.0, count) * paths.depth[:, -1:]
+    share = log_uniform(rng, 1e-4, 0.1, paths.signal.shape)
+    scale = log_uniform(rng, 0.05, 1.0, paths.signal.shape) * paths.depth[:, -1:]
     return paths.clean + share * paths.signal * np.exp(-paths.depth / scale)
 
 
 def _saturated(paths: Paths, rng: Random) -> Array:
-    top = rng.uniform(0.3, 0.99, (len(paths.signal), 1)) * paths.signal
-    return np.minimum(paths.clean, top)
+    return np.minimum(paths.clean, rng.uniform(0.3, 0.99, paths.signal.shape) * paths.signal)
 
 
 def _bent(paths: Paths, rng: Random) -> Array:
     """Return signals of a detector that loses a share proportional to the signal."""
-    lost = between(rng, 1e-3, 0.3, len(paths.signal))
+    lost = log_uniform(rng, 1e-3, 0.3, paths.signal.shape)
     return paths.clean * (1.0 - lost * paths.clean / paths.signal)
 
 
@@ -161,17 +357,10 @@ def _with_gaps(power: Array, rng: Random) -> Array:
 
 def _with_outliers(power: Array, rng: Random) -> Array:
     hit = rng.random(power.shape) < rng.uniform(0.0, 0.02, (len(power), 1))
-    size = between(rng, 3.0, 1e3, power.size).reshape(power.shape)
+    size = log_uniform(rng, 3.0, 1e3, power.shape)
     return np.asarray(power + hit * size * rng.choice([-1.0, 1.0], power.shape))
 
 
-_SAME_SHAPE: Final = (
-    "an exponential of range has the shape of extinction itself: only the stated model error"
-    " can cover it"
-)
-_SHORT_SCALE: Final = (
-    "a change over the whole section has nearly the shape of extinction and background"
-)
 _WITH_GAPS: Final = Failure("gaps", satisfied=True)
 _NOISE_NOT_STATED: Final = Failure("none, noise not stated", satisfied=True)
 _OUTLIERS: Final = Failure("outliers")
@@ -181,12 +370,12 @@ FAILURES: Final[tuple[tuple[Failure, Violation], ...]] = (
     (_NOISE_NOT_STATED, _none),
     (_WITH_GAPS, _none),
     (_OUTLIERS, _none),
-    (Failure("slope of the backscatter along the section", unseen=_SAME_SHAPE), _slope),
+    (Failure("slope of the backscatter along the section"), _slope),
     (Failure("bent backscatter"), _curved),
     (_PLUME, _none),
-    (Failure("overlap error", unseen=_SHORT_SCALE), _overlap),
+    (Failure("overlap error"), _overlap),
     (Failure("eddies"), _turbulent),
-    (Failure("afterpulse", unseen=_SHORT_SCALE), _afterpulse),
+    (Failure("afterpulse"), _afterpulse),
     (Failure("saturated"), _saturated),
     (Failure("detector not linear"), _bent),
 )
@@ -241,7 +430,7 @@ def score_homogeneous(cluster: int, profiles: int) -> Iterator[ScoredValues]:
         wider = _widening(paths.range.size) if noise is None else 1.0
         # Missing bins lose information.
         expected = failure.satisfied and failure is not _WITH_GAPS
-        solvable = within & (wider * least <= _SOLVABLE) if expected else None
+        solvable = within & (wider * least <= _DETERMINED) if expected else None
         known = violate is _none and failure is not _PLUME
         misfit = None if known else visible_misfit(paths.range, signal)
         fit = path_fit.fit_homogeneous_path(power, paths.range, variance=noise)
@@ -282,10 +471,6 @@ _SHORT_STEP: Final = 37.5
 """m."""
 _FALLS: Final = (1.0, 6.0)
 """Decades by which a signal falls from bin to bin."""
-_UNKNOWN: Final = (
-    "noise whose bins are correlated looks like less noise: without the length of the correlation,"
-    " the stated errors are too small"
-)
 
 
 def _fitted(paths: Paths, deviations: Array, **options: Any) -> Any:
@@ -308,10 +493,8 @@ def score_correlated_noise(cluster: int, profiles: int) -> Iterator[ScoredValues
             ("stated", {"noise": path_fit.Noise(correlation_length=length)}),
             ("estimated, as in products", {"noise": path_fit.Noise(correlation_length=estimated)}),
         ):
-            failure = Failure(
-                f"AR(1) {correlation:g}, correlation {words}", satisfied=bool(options),
-                unseen="" if options else _UNKNOWN,
-            )  # fmt: skip
+            name = f"AR(1) {correlation:g}, correlation {words}"
+            failure = Failure(name, satisfied=bool(options))
             yield _scored(
                 failure, "extinction", paths.extinction[:, 0], _fitted(paths, noise, **options)
             )

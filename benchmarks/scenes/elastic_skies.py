@@ -1,36 +1,40 @@
-"""Vertical profiles with known truth, and methods that retrieve background and particles.
+"""Skies above a vertical lidar with known truth, and how background and particles are retrieved.
 
 The simulated set follows the EARLINET elastic intercomparison (boeckmann2004): 532 nm, no
 aerosol above 6 km, 1005 bins of 15 m, means of 1000 shots with Poisson noise over a constant
-background. The files of the intercomparison are read if given.
+background. The files of the intercomparison are read if given. Random skies satisfy or violate the
+model of the inversion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from benchmarks.harness.figure import Array, Mask
+from benchmarks.harness.figure import Array, Mask, Random, log_uniform
+from benchmarks.harness.rates import Failure, ScoredValues
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
-from lidarops.errors import CampaignError, RawFormatError
+from lidarops.errors import CampaignError
 from lidarops.flags import Quality, rejecting
+from lidarops.netcdf.variables import ErrorKind
+from lidarops.products.elastic.variables import sources
 from lidarops.raw import licel
 from lidarops.retrieve.air import MolecularProfile
 from lidarops.retrieve.background import cubic_and_tail, known_shape
-from lidarops.retrieve.background.cubic_and_tail import BackgroundResult
-from lidarops.retrieve.background.known_shape import KnownShapeResult
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
+from lidarops.retrieve.elastic.flags import ElasticQuality
+from lidarops.retrieve.elastic.labeled import constant_ratio
 from lidarops.retrieve.homogeneous import path_fit
-from lidarops.retrieve.homogeneous.path_fit import HomogeneousResult
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
+from lidarops.settings import ReferenceSettings
 from lidarops.simulate.signal import backscatter_signal, bin_centres
 
 WAVELENGTH: Final = 532e-9
@@ -167,8 +171,7 @@ def simulated_sky() -> SimulatedSky:
 # Background -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class BackgroundEstimates:
+class Backgrounds(NamedTuple):
     """Backgrounds in counts, one per profile."""
 
     background: Array
@@ -177,7 +180,7 @@ class BackgroundEstimates:
     """Whether a quality bit rejects the value."""
 
 
-BackgroundMethod = Callable[[Array, SimulatedSky], BackgroundEstimates]
+BackgroundMethod = Callable[[Array, SimulatedSky], Backgrounds]
 """Returns backgrounds, given counts (profile, range) and their simulated sky."""
 
 KNOWN_SHAPE: Final = "known_shape"
@@ -195,33 +198,27 @@ def background_methods() -> dict[str, BackgroundMethod]:
     return {
         KNOWN_SHAPE: _known_shape,
         KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
-        TAIL_MEAN: lambda counts, sky: _estimates(cubic_and_tail.tail_mean(counts, sky.range)),
+        TAIL_MEAN: lambda counts, sky: _backgrounds(cubic_and_tail.tail_mean(counts, sky.range)),
         HOMOGENEOUS: partial(_above_aerosol, path_fit.fit_homogeneous_path),
         "cubic": partial(_above_aerosol, cubic_and_tail.cubic),
     }
 
 
-def _known_shape(
-    counts: Array, sky: SimulatedSky, start: float | None = None
-) -> BackgroundEstimates:
-    return _estimates(
+def _known_shape(counts: Array, sky: SimulatedSky, start: float | None = None) -> Backgrounds:
+    return _backgrounds(
         known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS, start=start)
     )
 
 
-def _above_aerosol(
-    fit: Callable[..., HomogeneousResult | BackgroundResult], counts: Array, sky: SimulatedSky
-) -> BackgroundEstimates:
+def _above_aerosol(fit: Callable[..., Any], counts: Array, sky: SimulatedSky) -> Backgrounds:
     far = sky.range >= CLEAN_FROM
     variance = 1.0 / count_weight(counts[:, far])
-    return _estimates(fit(counts[:, far], sky.range[far], variance=variance))
+    return _backgrounds(fit(counts[:, far], sky.range[far], variance=variance))
 
 
-def _estimates(
-    result: KnownShapeResult | HomogeneousResult | BackgroundResult,
-) -> BackgroundEstimates:
+def _backgrounds(result: Any) -> Backgrounds:
     rejected = (result.quality & rejecting(Quality)) != 0
-    return BackgroundEstimates(result.background, result.background_standard_error, rejected)
+    return Backgrounds(result.background, result.background_standard_error, rejected)
 
 
 def least_error(sky: SimulatedSky, level: float) -> float:
@@ -295,7 +292,7 @@ def invert(
         "molecules": sky.air,
         "wavelength": WAVELENGTH,
         "station_altitude": 0.0,
-        "lidar_ratio": labeled.constant_ratio(LIDAR_RATIO, 0.0),
+        "lidar_ratio": constant_ratio(LIDAR_RATIO, 0.0),
         "molecular_relative_error": 0.0,
         "reference": REFERENCE,
         "overlap_is_stated": True,
@@ -317,8 +314,7 @@ CHAINS: Final[dict[str, dict[str, Any]]] = {
 # Published files ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Published:
+class Published(NamedTuple):
     """One file of the intercomparison."""
 
     level: float
@@ -352,31 +348,24 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
     ------
     CampaignError
         If the folder holds no such files.
-    RawFormatError
-        If a file cannot be read, or holds another number of bins.
     """
-    files = sorted(Path(folder).glob("background_1e*.licel"))
-    if not files:
+    levels = {
+        float(file.stem.removeprefix("background_")): file
+        for file in folder.glob("background_1e*.licel")
+    }
+    if not levels:
         raise CampaignError(
             "holds no files background_1e*.licel", file=folder, field="data",
             remedy="give the folder of the intercomparison, or leave it out",
         )  # fmt: skip
-    published = []
     table = folder / "molecular_profile_hPa.csv"
-    try:
-        levels = [float(file.stem.removeprefix("background_")) for file in files]
-        pressure, temperature, height = np.loadtxt(table, delimiter=",", unpack=True, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise CampaignError(
-            f"cannot be read: {error}", file=table, field="data",
-            remedy="name files background_1eN.licel, and give pressure, temperature and height",
-        ) from error  # fmt: skip
+    pressure, temperature, height = np.loadtxt(table, delimiter=",", unpack=True)
     air = MolecularProfile.from_profile(height, pressure, temperature, pressure_unit="hPa")
-    clean = _raw_counts(folder / "noise_free.licel")
-    sky = _sky(air, clean, np.full(RANGE.size, np.nan))
+    sky = _sky(air, _raw_counts(folder / "noise_free.licel"), np.full(RANGE.size, np.nan))
     inverted = invert(sky.signal[np.newaxis], sky, **CHAINS[GIVEN])
     sky = replace(sky, backscatter=inverted["aerosol_backscatter"].to_numpy()[0])
-    for level, file in sorted(zip(levels, files, strict=True)):
+    published = []
+    for level, file in sorted(levels.items()):
         counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
         truth = known_shape.fit_known_shape(
             counts, sky.range, sky.signal, variance=(sky.signal + level) / SHOTS,
@@ -388,10 +377,176 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
 
 
 def _raw_counts(file: Path) -> Array:
-    counts = licel.read_counts(file, [_CHANNEL])[1][_CHANNEL].astype(np.float64)
-    if counts.size != RANGE.size or not counts.max() > 0:
-        raise RawFormatError(
-            f"holds {counts.size} bins with a maximum of {counts.max():g}", file=file,
-            field=_CHANNEL, remedy=f"give a file of the intercomparison, of {RANGE.size} bins",
-        )  # fmt: skip
-    return counts
+    return licel.read_counts(file, [_CHANNEL])[1][_CHANNEL].astype(np.float64)
+
+
+# Random skies ---------------------------------------------------------------------------------
+
+_RATIO_ERROR: Final = 0.2
+"""Stated relative standard error of the lidar ratio."""
+_AIR_ERROR: Final = 0.02
+"""Stated relative standard error of the air density."""
+_OF_PRODUCTS: Final = Reference(**dict(ReferenceSettings()))
+"""That of products."""
+_ASSUMED: Final[dict[str, Any]] = {
+    "lidar_ratio": constant_ratio(LIDAR_RATIO, _RATIO_ERROR * LIDAR_RATIO),
+    "molecular_relative_error": _AIR_ERROR,
+    "reference": _OF_PRODUCTS,
+}
+_CLOUD_RATIO: Final = 20.0
+"""sr, lidar ratio of clouds."""
+
+
+@dataclass(frozen=True, slots=True)
+class RandomSky:
+    """True sky and instrument; the retrieval knows none of it. Arrays are (range,)."""
+
+    particles: Array
+    """m-1 sr-1."""
+    lidar_ratio: float = LIDAR_RATIO
+    """sr."""
+    density: float = 1.0
+    """Density of the air over the assumed one."""
+    background: float = 0.0
+    """Counts of a baseline that falls slowly with range."""
+    cloud: float = 0.0
+    """Optical depth of a cloud at 9 km."""
+    overlap: float = 0.0
+    """m, scale of an overlap that the retrieval does not know."""
+    gaps: float = 0.0
+    """Share of missing bins."""
+    outlying: float = 0.0
+    """Share of isolated outlying bins."""
+
+
+def _random_sky(rng: Random) -> RandomSky:
+    """Return a sky with haze in a mixed layer and a layer aloft, none above 6 km."""
+    top, amount = rng.uniform(500.0, 3000.0), log_uniform(rng, 1e-7, 1e-5)
+    mixed = amount / (1.0 + np.exp((RANGE - top) / rng.uniform(50.0, 200.0)))
+    middle, half = rng.uniform(3500.0, 5000.0), rng.uniform(200.0, 900.0)
+    aloft = rng.uniform(0.0, 1.0) * amount * np.exp(-0.5 * ((RANGE - middle) / (0.3 * half)) ** 2)
+    return RandomSky(np.where(RANGE < CLEAN_FROM, mixed + aloft, 0.0))
+
+
+_Change = Callable[[RandomSky, Random], RandomSky]
+
+
+def _hazy(least: float) -> _Change:
+    """Return the change that adds haze of `least` to 100 times as much, m-1 sr-1 at the ground."""
+
+    def change(sky: RandomSky, rng: Random) -> RandomSky:
+        haze = log_uniform(rng, least, 100.0 * least)
+        return replace(sky, particles=sky.particles + haze * np.exp(-RANGE / 5000.0))
+
+    return change
+
+
+def _clean(sky: RandomSky, _: Random) -> RandomSky:
+    """Return the sky without particles at the heights of possible reference windows."""
+    lowest = _OF_PRODUCTS.lowest
+    # Smoothly, as in air: 1e-7 of them are left there.
+    left = 1.0 / (1.0 + np.exp((RANGE - lowest + 1000.0) / 60.0))
+    return replace(sky, particles=np.where(lowest > RANGE, left * sky.particles, 0.0))
+
+
+def _off(rng: Random, error: float) -> float:
+    """Return a factor that deviates by this standard error, at most by 3 of them."""
+    return 1.0 + error * float(np.clip(rng.normal(), -3.0, 3.0))
+
+
+FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
+    (Failure("none", satisfied=True), _clean),
+    (
+        Failure("gaps", satisfied=True),
+        lambda sky, rng: replace(_clean(sky, rng), gaps=rng.uniform(0.0, 0.2)),
+    ),
+    (
+        Failure("lidar ratio off as stated"),
+        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * _off(rng, _RATIO_ERROR)),
+    ),
+    (
+        Failure("lidar ratio off by a factor of 2"),
+        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0]))),
+    ),
+    (
+        Failure("density of the air off as stated"),
+        lambda sky, rng: replace(sky, density=_off(rng, _AIR_ERROR)),
+    ),
+    (Failure("haze at all heights"), _hazy(1e-9)),
+    (Failure("slow baseline"), lambda sky, rng: replace(sky, background=rng.uniform(0.0, 3.0))),
+    (
+        Failure("cloud in the far range"),
+        lambda sky, rng: replace(sky, cloud=log_uniform(rng, 0.01, 3.0)),
+    ),
+    (Failure("overlap error"), lambda sky, rng: replace(sky, overlap=rng.uniform(50.0, 300.0))),
+    (Failure("more haze than stated"), _hazy(1e-8)),
+    (Failure("outliers"), lambda sky, rng: replace(sky, outlying=rng.uniform(0.0, 0.02))),
+    (Failure("particles in the reference window"), lambda sky, _: sky),
+)
+
+
+def _random_signal(sky: RandomSky) -> Array:
+    """Return the noise-free signal, 1 in the brightest bin that the inversion uses."""
+    air = MolecularProfile.us_standard()
+
+    def haze(z: Array) -> Array:
+        return np.interp(z, RANGE, sky.particles)
+
+    def cirrus(z: Array) -> Array:
+        return sky.cloud * np.exp(-0.5 * ((z - 9000.0) / 150.0) ** 2) / (150.0 * 2.5066282746)
+
+    def extinction(z: Array) -> Array:
+        molecules = sky.density * air.extinction(z, WAVELENGTH)
+        return molecules + sky.lidar_ratio * haze(z) + cirrus(z)
+
+    def backscatter(z: Array) -> Array:
+        molecules = sky.density * air.backscatter(z, WAVELENGTH)
+        return np.asarray(haze(z) + cirrus(z) / _CLOUD_RATIO + molecules)
+
+    signal = clean_signal(extinction, backscatter)
+    if sky.overlap:
+        signal = signal * (1.0 - np.exp(-((RANGE / sky.overlap) ** 2)))
+    return np.asarray(signal / signal[RANGE > OVERLAP].max())
+
+
+def score_elastic(cluster: int, profiles: int) -> Iterator[ScoredValues]:
+    """Yield the scored values of profiles of one random sky, class by class."""
+    base = simulated_sky()
+    for number, (failure, change) in enumerate(FAILURES):
+        rng = np.random.default_rng((74, cluster, number))
+        sky = change(_random_sky(rng), rng)
+        brightest, level = log_uniform(rng, 1e4, 1e8), log_uniform(rng, 1.0, 1e5)
+        signal = brightest * np.minimum(_random_signal(sky), 1.0)
+        mean = SHOTS * (signal + level + sky.background * np.exp(-RANGE / 8000.0))
+        counts = rng.poisson(np.broadcast_to(mean, (profiles, mean.size))) / SHOTS
+        if sky.gaps:
+            counts = np.where(rng.random(counts.shape) < sky.gaps, np.nan, counts)
+        noise = count_variance(counts)
+        if sky.outlying:
+            counts = counts + np.sqrt(noise) * _deviations(rng, counts.shape, sky.outlying)
+        yield _scored(failure, sky, invert(counts, base, noise=noise, **_ASSUMED))
+
+
+def _deviations(rng: Random, shape: tuple[int, ...], share: float) -> Array:
+    """Return the deviations of bins in standard deviations of the noise: 0, or 3 to 1000."""
+    size = log_uniform(rng, 3.0, 1e3, shape) * rng.choice([-1.0, 1.0], shape)
+    return np.where(rng.random(shape) < share, size, 0.0)
+
+
+def _scored(failure: Failure, sky: RandomSky, product: xr.Dataset) -> ScoredValues:
+    inside = simulated_sky().compared
+
+    def values(name: str) -> Any:
+        return product[name].to_numpy()[:, inside]
+
+    def error(kind: ErrorKind) -> Array:
+        parts = [values(f"aerosol_backscatter_error_{cause}") for cause in sources(kind)]
+        return np.asarray(np.sqrt(sum(part**2 for part in parts)))
+
+    bits = values("quality_flag")
+    # As products average them: what is independent between profiles is random.
+    return ScoredValues(
+        failure, "backscatter", values("aerosol_backscatter") - sky.particles[inside],
+        error(ErrorKind.RANDOM), error(ErrorKind.SYSTEMATIC), bits, ElasticQuality,
+        uncertain=(bits & int(ElasticQuality.CLOUD)) != 0,
+    )  # fmt: skip
