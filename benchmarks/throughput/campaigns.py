@@ -27,7 +27,7 @@ from lidarops.errors import CampaignError
 from lidarops.netcdf.write import write_plain
 from lidarops.records import RunRecord
 from lidarops.run import archive
-from lidarops.simulate.campaign import plan_simulation, write_simulation
+from lidarops.simulate import campaign as simulation
 
 CAMPAIGN_FILE: Final = "campaign.yaml"
 """Name of the campaign file in the folder of each simulated campaign."""
@@ -149,7 +149,7 @@ def simulate_campaign(size: CampaignSize, folder: Path) -> Campaign:
     path = folder / CAMPAIGN_FILE
     path.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
     campaign = load_campaign(path)
-    written = write_simulation(plan_simulation(campaign))
+    written = simulation.simulate_campaign(campaign)
     write_plain(written.truth, campaign.truth_path)
     return campaign
 
