@@ -213,25 +213,6 @@ class Processes(AbstractContextManager["Processes[Kept]"], Generic[Kept]):
             else:
                 yield from zip(batch, results[0], strict=True)
 
-    def later(
-        self,
-        task: Callable[[Kept, Item], Result],
-        item: Item,
-        *,
-        lost: Lost[Item, Result] = None,
-    ) -> Callable[[], Result]:
-        """Start a task; return a function that waits for its result and returns or raises it.
-
-        Without processes, that function calls the task. `lost` is that of `map_items`.
-        """
-        future = self._submit(task, item)
-
-        def result() -> Result:
-            done = self._wait(future)
-            return self._by_itself(task, item, lost) if done is None else done[0]
-
-        return result
-
     def _submit(self, task: Callable[[Kept, Item], Result], item: Item) -> Future[Result] | None:
         """Start a task; None if it is to be called by itself, when its result is needed."""
         if self._alone or self._careful:
