@@ -11,7 +11,8 @@ from typing import Annotated, Final
 import typer
 
 # First of all, it sets the number of threads.
-from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_rows
+from lidarops.cli import options
+from lidarops.cli.app import command, no_url, progress_bar, show_rows
 
 # isort: split
 from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle, network
@@ -72,7 +73,7 @@ def main(
     out: Annotated[
         str | None, typer.Option("--out", help="Folder for the page and its JSON.", callback=no_url)
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Measure accuracy, throughput or stability.
 
