@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidarops.cli import options
 from lidarops.cli.app import (
     NO_SCENE,
     Table,
@@ -32,6 +31,7 @@ from lidarops.cli.app import (
     show_tables,
 )
 from lidarops.errors import UNAVAILABLE, LidarOpsError
+from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from lidarops.cli import options
 from lidarops.cli.app import (
     NO_SCENE,
     command,
@@ -31,6 +30,7 @@ from lidarops.cli.app import (
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
+from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign

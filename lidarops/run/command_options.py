@@ -1,4 +1,4 @@
-"""The arguments and options that commands share."""
+"""The arguments and options that commands and flows share."""
 
 from __future__ import annotations
 
