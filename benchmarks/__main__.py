@@ -10,8 +10,10 @@ from typing import Annotated, Final
 
 import typer
 
+from lidarops.cli.app import command, no_url, progress_bar, show_rows
+
 # First of all, it sets the number of threads.
-from lidarops.cli.app import JsonOption, command, no_url, progress_bar, show_rows
+from lidarops.run import command_options as options
 
 # isort: split
 from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle, network
@@ -54,7 +56,7 @@ def main(
         str | None,
         typer.Option("--out", help="Folder for all numbers as JSON, and charts.", callback=no_url),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Measure accuracy, throughput or stability.
 

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
 
 import typer
 from prefect import flow, get_run_logger
@@ -25,6 +24,7 @@ from lidarops.campaign.model import load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
+from lidarops.run import command_options as options
 from lidarops.run.archive import update_catalog
 
 
@@ -69,12 +69,10 @@ def catalog(
 
 def main(
     campaign: str,
-    archive: str | None = None,
-    out: str | None = None,
-    url: Annotated[
-        str | None, typer.Option("--catalog", help="SQLAlchemy URL of catalog and ledger.")
-    ] = None,
-    wait: Annotated[float, typer.Option(min=0, help="Seconds to wait for another run.")] = 0.0,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    url: options.Catalog = None,
+    wait: options.Wait = 0.0,
 ) -> None:
     """Update the catalog of a campaign as a Prefect flow."""
     # Check before the flow, which would start a server first and show tracebacks.

@@ -56,6 +56,7 @@ from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import run_tables
 from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
+from lidarops.run import command_options as options
 from lidarops.run.archive import (
     Options,
     Result,
@@ -152,7 +153,7 @@ def process_task(
 ) -> Result:
     """Bring catalog and products up to date."""
     progress = _Progress(campaign.name)
-    options = Options(
+    chosen = Options(
         force=full,
         wait=wait,
         journal=True,
@@ -160,10 +161,10 @@ def process_task(
         expect=progress.expect,
     )
     if isinstance(cluster, clusters.Local):
-        options = replace(options, workers=cluster.workers, memory=cluster.memory)
+        chosen = replace(chosen, workers=cluster.workers, memory=cluster.memory)
     else:
-        options = replace(options, cluster=partial(clusters.connect_client, cluster))
-    result = bring_up_to_date(campaign, selection=selection, options=options)
+        chosen = replace(chosen, cluster=partial(clusters.connect_client, cluster))
+    result = bring_up_to_date(campaign, selection=selection, options=chosen)
     progress.end()
     if result.status is not RunStatus.FINISHED:
         raise _unfinished(result)
@@ -355,39 +356,23 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
 
 def main(
     campaign: str,
-    archive: str | None = None,
-    out: str | None = None,
-    catalog: Annotated[
-        str | None, typer.Option(help="SQLAlchemy URL of catalog and ledger.")
-    ] = None,
-    instruments: Annotated[
-        list[str] | None, typer.Option("--instrument", help="Only this one; may be repeated.")
-    ] = None,
-    stations: Annotated[
-        list[str] | None, typer.Option("--station", help="Only this one; may be repeated.")
-    ] = None,
-    products: Annotated[
-        list[str] | None, typer.Option("--product", help="Only this kind; may be repeated.")
-    ] = None,
-    since: Annotated[
-        datetime | None, typer.Option(help="Only scenes that end after this UTC time.")
-    ] = None,
-    until: Annotated[
-        datetime | None, typer.Option(help="Only scenes that start before this UTC time.")
-    ] = None,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
+    instruments: options.Instruments = None,
+    stations: options.Stations = None,
+    products: options.Products = None,
+    since: options.Since = None,
+    until: options.Until = None,
     workers: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Number of workers.")
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a running dask scheduler to use.")
-    ] = None,
-    cluster: Annotated[
-        str | None, typer.Option(help="slurm, kubernetes, or a YAML file that describes a cluster.")
-    ] = None,
+    scheduler: options.Scheduler = None,
+    cluster: options.Cluster = None,
     memory_limit: Annotated[
         str | None, typer.Option(help="Memory limit of a local worker, such as 2GiB.")
     ] = None,
-    wait: Annotated[float, typer.Option(min=0, help="Seconds to wait for another run.")] = 0.0,
+    wait: options.Wait = 0.0,
     publish: Annotated[
         str | None, typer.Option(help="URL of a store to which the products are copied.")
     ] = None,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -512,33 +511,34 @@ def _csv(content: bytes, file: str) -> dict[str, tuple[str, Array]]:
         raise AncillaryError("is not text", file=file) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     try:
-        rows = list(csv.reader(io.StringIO("\n".join(lines)), skipinitialspace=True))
+        rows = list(csv.reader(lines, skipinitialspace=True))
     except csv.Error as error:
         raise AncillaryError(f"is not a CSV table: {error}", file=file) from error
     if len(rows) < 2:
         raise AncillaryError("holds no rows", file=file)
     head, *body = rows
-    names = [title.partition("[")[0].strip().lower() for title in head]
+    titles = [title.partition("[") for title in head]
+    names = [name.strip().lower() for name, *_ in titles]
     for name in names:
         if names.count(name) > 1:
             raise AncillaryError(f"has more than one column {name!r}", file=file)
-    columns: dict[str, list[float]] = {title: [] for title in head}
     for number, row in enumerate(body, start=2):
         if len(row) != len(head):
             raise AncillaryError(
                 f"row {number} has {len(row)} values for {len(head)} columns", file=file
             )
-        for title, cell in zip(head, row, strict=True):
-            try:
-                columns[title].append(float(cell))
-            except ValueError:
-                # Columns that are not used may hold anything.
-                columns[title].append(np.nan)
     return {
-        name.strip().lower(): (unit.rstrip("] ").strip(), np.array(columns[title]))
-        for title in head
-        for name, _, unit in [title.partition("[")]
+        name: (unit.rstrip("] ").strip(), np.array([_number(row[place]) for row in body]))
+        for place, (name, (_, _, unit)) in enumerate(zip(names, titles, strict=True))
     }
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        # Columns that are not used may hold anything.
+        return math.nan
 
 
 def _refuse_large(variables: Mapping[str, xr.Variable], file: str) -> None:

@@ -415,18 +415,23 @@ class Acquisition(SettingsModel):
 
     @model_validator(mode="after")
     def _fits_headers(self) -> Self:
-        if self.interval % 1 or (self.duration % 1 and not self.states_no_duration):
+        if self.interval % 1 or self.repetition_rate % 1:
             raise ValueError(
-                "interval and shots / repetition_rate must be whole seconds: the headers of raw"
-                f" files hold no fractions, and a file lasts {self.duration:g} s"
+                "interval (s) and repetition_rate (Hz) must be whole numbers, as in the headers"
             )
-        if self.repetition_rate % 1:
-            raise ValueError("repetition_rate must be a whole number of Hz, as in the headers")
-        if self.duration > self.interval:
-            raise ValueError(
-                f"a file lasts {self.duration:g} s, longer than the interval of"
-                f" {self.interval:g} s: use fewer shots or a longer interval"
-            )
+        recordings: list[Acquisition] = [self, *(self.at(change.at) for change in self.changes)]
+        for recorded in recordings:
+            lasts = f"a file of {recorded.shots} shots lasts {recorded.duration:g} s"
+            if recorded.duration % 1 and not self.states_no_duration:
+                raise ValueError(
+                    "shots / repetition_rate must be whole seconds: the headers of raw files hold"
+                    f" no fractions, and {lasts}"
+                )
+            if recorded.duration > self.interval:
+                raise ValueError(
+                    f"{lasts}, longer than the interval of {self.interval:g} s: use fewer shots or"
+                    " a longer interval"
+                )
         return self
 
     @model_validator(mode="after")
@@ -439,18 +444,6 @@ class Acquisition(SettingsModel):
                 raise ValueError(f"the times of {name} must ascend")
         if len(self.clock) > 99:
             raise ValueError("clock has more than 99 jumps, more than file names can number")
-        return self
-
-    @model_validator(mode="after")
-    def _changes_are_possible(self) -> Self:
-        for change in self.changes:
-            changed = self.at(change.at)
-            whole = changed.duration % 1 == 0 or self.states_no_duration
-            if not whole or changed.duration > self.interval:
-                raise ValueError(
-                    f"with the change at {change.at:%Y-%m-%d %H:%M} a file lasts"
-                    f" {changed.duration:g} s: it must be a whole number, at most the interval"
-                )
         return self
 
     def at(self, moment: datetime) -> Acquisition:

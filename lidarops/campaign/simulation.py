@@ -208,36 +208,25 @@ class SimulationSettings(SettingsModel):
     )
 
     @model_validator(mode="after")
-    def _damage_exists(self) -> Self:
+    def _has_files_and_air(self) -> Self:
         for key, instrument in self.instruments.items():
-            files = self.files(key)
+            files, place = self.files(key), ("instruments", key)
             if not files:
-                raise located_error(
+                problem = (
                     f"no file fits into {self.duration:g} s:"
-                    " make the campaign longer or the files shorter",
-                    "instruments",
-                    key,
+                    " make the campaign longer or the files shorter"
                 )
+                raise located_error(problem, *place)
             for damage in instrument.damage:
                 if damage.index >= files:
-                    raise located_error(
+                    problem = (
                         f"damage at index {damage.index}, but the files have indices 0 to"
-                        f" {files - 1}",
-                        "instruments",
-                        key,
-                        "damage",
+                        f" {files - 1}"
                     )
-        return self
-
-    @model_validator(mode="after")
-    def _air_exists(self) -> Self:
-        for key in self.instruments:
+                    raise located_error(problem, *place, "damage")
             if self.own_air(key) is None and self.atmosphere is None:
-                raise located_error(
-                    "has no atmosphere: give it one, or give simulation.atmosphere for all",
-                    "instruments",
-                    key,
-                )
+                problem = "has no atmosphere: give it one, or give simulation.atmosphere for all"
+                raise located_error(problem, *place)
         return self
 
     def air_of(self, key: str) -> AtmosphereSettings:

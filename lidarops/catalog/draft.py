@@ -115,7 +115,7 @@ def draft_campaign(
     CatalogError
         If the folder holds no raw file that can be used.
     """
-    known, lone = _instruments(contents)
+    known, lone = drafted_instruments(contents)
     if not known:
         reasons = [reason for _, reason in contents.refused[:1]]
         packed = "".join(f"unpack {path}, or " for path in _packed(contents)[:1])
@@ -142,7 +142,8 @@ def draft_campaign(
     ]
     for key, headers in known.items():
         # Instruments of one archive with equal channels have equal detectors.
-        estimates = any(_channel_names(own) == _channel_names(headers) for own in scanning)
+        names = {channel.name for channel in headers.layout}
+        estimates = any({channel.name for channel in own.layout} == names for own in scanning)
         seen = replace(headers, look=looks.get(key))
         lines += [*_instrument(key, seen, sites[key], estimates=estimates), ""]
     lines += _networks({key: (headers, sites[key]) for key, headers in known.items()})
@@ -150,15 +151,13 @@ def draft_campaign(
     return "\n".join([*lines, *_left_out(contents, archive, lone), ""])
 
 
-def drafted_instruments(contents: FolderContents) -> dict[str, InstrumentHeaders]:
-    """Return the instruments of a draft by their keys; none where no raw file can be used."""
-    return _instruments(contents)[0]
-
-
-def _instruments(
+def drafted_instruments(
     contents: FolderContents,
 ) -> tuple[dict[str, InstrumentHeaders], list[FileGroup]]:
-    """Return the instruments of a draft by their keys, and groups of beams that are left out."""
+    """Return the instruments of a draft by their keys, and groups of beams that are left out.
+
+    None where no raw file can be used.
+    """
     tests = [group for group in contents.groups if group.purpose not in _USED]
     if not any(group.purpose is Purpose.MEASUREMENT for group in contents.groups):
         tests = []
@@ -178,18 +177,15 @@ def _instruments(
 
 def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
     """Return the station of each instrument: one for each site and position of headers."""
-    first = [instrument.main for instrument in instruments]
-    places = list(dict.fromkeys((group.site, group.coordinates) for group in first))
-    keys = dict(zip(places, _keys(site or "station" for site, _ in places), strict=True))
+    first: dict[tuple[str, Position], FileGroup] = {}
+    for group in (instrument.main for instrument in instruments):
+        first.setdefault((group.site, group.coordinates), group)
+    keys = _keys(site or "station" for site, _ in first)
     stations = {
-        (group.site, group.coordinates): _Site(
-            keys[group.site, group.coordinates],
-            group.site,
-            *_position(group),
-        )
-        for group in reversed(first)
+        place: _Site(key, group.site, *_position(group))
+        for key, (place, group) in zip(keys, first.items(), strict=True)
     }
-    return [stations[group.site, group.coordinates] for group in first]
+    return [stations[one.main.site, one.main.coordinates] for one in instruments]
 
 
 def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
@@ -221,10 +217,6 @@ def _is_free(group: FileGroup) -> bool:
     return max(map(abs, group.zenith_angles)) <= 90.0 - THRESHOLDS.lowest_free
 
 
-def _channel_names(headers: InstrumentHeaders) -> set[str]:
-    return {channel.name for channel in headers.layout}
-
-
 def _instrument(
     key: str, headers: InstrumentHeaders, site: _Site, *, estimates: bool
 ) -> Iterator[str]:
@@ -254,7 +246,10 @@ def _instrument(
     if doubtful:
         yield f"    name_times: ignored  # ? {doubtful[0].time_doubt}"
     yield from _facts(headers, estimates=estimates)
-    yield from _products(headers)
+    yield "    products:"
+    for kind in kinds_of(Scope.CHANNEL):
+        if kind.draft:
+            yield from (f"      {line}" for line in kind.draft(headers))
 
 
 def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
@@ -368,13 +363,6 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
     if refused:
         yield f"# ? {refused} files state no sure pointing and are refused without zenith_angle"
         yield from (f"#   {doubt}" for doubt in doubts[:1])
-
-
-def _products(headers: InstrumentHeaders) -> Iterator[str]:
-    yield "    products:"
-    for kind in kinds_of(Scope.CHANNEL):
-        if kind.draft:
-            yield from (f"      {line}" for line in kind.draft(headers))
 
 
 def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[str]:

@@ -23,8 +23,6 @@ from lidarops.figures.wording import visible
 from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from lidarops.campaign.model import Campaign
     from lidarops.records import Findings
     from lidarops.run.options import Selection
@@ -36,75 +34,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-CampaignFile = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN")]
-ArchiveOption = Annotated[
-    str | None,
-    typer.Option("--archive", help="Folder or URL of the raw files; overrides the campaign file."),
-]
-OutOption = Annotated[
-    # Not a Path: it would turn a URL into a folder name.
-    str | None,
-    typer.Option(
-        "--out", help="Folder of catalog, products and reports; overrides the campaign file."
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
-InstrumentOption = Annotated[
-    list[str] | None, typer.Option("--instrument", help="Only this instrument; may be repeated.")
-]
-SinceOption = Annotated[
-    datetime | None, typer.Option("--since", help="Only scenes that end after this UTC time.")
-]
-UntilOption = Annotated[
-    datetime | None, typer.Option("--until", help="Only scenes that start before this UTC time.")
-]
-
-CatalogOption = Annotated[
-    str | None,
-    typer.Option(
-        "--catalog",
-        help="SQLAlchemy URL of catalog and ledger; overrides LIDAROPS_CATALOG and the file.",
-        metavar="URL",
-    ),
-]
-StationOption = Annotated[
-    list[str] | None, typer.Option("--station", help="Only this station; may be repeated.")
-]
-ProductOption = Annotated[
-    list[str] | None, typer.Option("--product", help="Only this kind of product; may be repeated.")
-]
-WaitOption = Annotated[
-    float,
-    typer.Option("--wait", min=0, help="Seconds to wait for another run on the same catalog."),
-]
-
-WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, max=256, help="Number of processes.")
-]
-AllStepsOption = Annotated[
-    bool,
-    typer.Option(
-        "--all-steps", help="Run every step, even those without effect, and read files in full."
-    ),
-]
-
-LogLevelOption = Annotated[
-    str, typer.Option("--log-level", help="debug, info, warning or error.", metavar="LEVEL")
-]
-LogJsonOption = Annotated[
-    bool, typer.Option("--log-json", help="Write one JSON object per log line.")
-]
-LogFileOption = Annotated[
-    Path | None,
-    typer.Option("--log-file", help="Append the log to this file instead of standard error."),
-]
-
 NO_SCENE: Final = "nothing to do: the selection contains no scene of the archive"
 
+Table = tuple[str, Iterable[str], Iterable[Iterable[Any]]]
+"""Title, names of columns, and rows."""
 _P = ParamSpec("_P")
-
-_LEAST_COLUMN_WIDTH = 12
-"""Least width of a table column, in characters."""
 
 _TABLE_LINES = 3
 """Characters between the columns of a table."""
@@ -243,10 +177,10 @@ def progress_bar(name: str, total: int | None, unit: str = "") -> Iterator[Bar]:
         progress.TextColumn("{task.description}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
-        *([Speed("")] if unit else []),
         progress.TimeElapsedColumn(),
     ]
     if unit:
+        columns[3:3] = [Speed("")]
         columns += [progress.TextColumn("remaining"), progress.TimeRemainingColumn()]
     console = Console(stderr=True)
     with progress.Progress(*columns, console=console, transient=True) as bar:
@@ -256,17 +190,6 @@ def progress_bar(name: str, total: int | None, unit: str = "") -> Iterator[Bar]:
             bar.update(task, total=(bar.tasks[0].total or 0) + number)
 
         yield Bar(grow, lambda done: bar.advance(task, done))
-
-
-def show(table: Table) -> None:
-    """Print a table, unless it has no rows."""
-    from rich.console import Console
-
-    if table.row_count:
-        # In narrower columns words would fold to single letters. A file has no width.
-        least_width = _LEAST_COLUMN_WIDTH * len(table.columns)
-        width = max(Console().width, least_width) if Console().is_terminal else _FILE_WIDTH
-        Console(width=width).print(table)
 
 
 def show_rows(
@@ -294,16 +217,23 @@ def show_rows(
                 say_wrapped(f"{name}: {cell}" if name else cell, "  ")
             say("")
         return
-    from rich.table import Table
+    from rich.console import Console
+    from rich.table import Table as RichTable
     from rich.text import Text
 
-    table = Table()
+    table = RichTable()
     for name, width in zip(names, widths, strict=True):
         table.add_column(name, width=width, overflow="fold")
     for row in cells:
         # Text, because rich would read brackets in a path or reason as markup.
         table.add_row(*(Text(cell) for cell in row))
-    show(table)
+    Console(width=terminal_width()).print(table)
+
+
+def show_tables(tables: Iterable[Table], most: int | None = None) -> None:
+    """Print tables as `show_rows` does each."""
+    for title, columns, rows in tables:
+        show_rows(title, columns, rows, most)
 
 
 def terminal_width() -> int:
@@ -454,8 +384,8 @@ def findings_document(findings: Findings) -> dict[str, Any]:
     }
 
 
-def show_findings(findings: Findings, most: int | None = None) -> None:
-    """Print the findings as tables, each of at most so many rows."""
+def finding_tables(findings: Findings) -> Iterator[Table]:
+    """Yield the findings as tables."""
     from lidarops.reports.findings import finding_rows, lacking
 
     columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
@@ -463,15 +393,15 @@ def show_findings(findings: Findings, most: int | None = None) -> None:
         (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
         for unmet in findings.unmet
     )
-    show_rows("Requested, but not in the files", columns, unmet, most)
+    yield "Requested, but not in the files", columns, unmet
     columns = ("instrument", "what", "finding")
+    rows = finding_rows(findings)
     for title, fails in (
         ("The archive is not what the campaign states", True),
         ("Notes on files and products", False),
     ):
-        rows = [row for row in finding_rows(findings) if row.fails is fails]
-        cells = ((row.instrument, row.subject, row.problem) for row in rows)
-        show_rows(title, columns, cells, most)
+        found = [(row.instrument, row.subject, row.problem) for row in rows if row.fails is fails]
+        yield title, columns, found
 
 
 def never_made(findings: Findings) -> str:

@@ -13,24 +13,10 @@ import typer
 
 from lidarops.cli.app import (
     NO_SCENE,
-    AllStepsOption,
-    ArchiveOption,
-    CampaignFile,
-    CatalogOption,
-    InstrumentOption,
-    JsonOption,
-    LogFileOption,
-    LogJsonOption,
-    LogLevelOption,
-    OutOption,
-    ProductOption,
-    SinceOption,
-    StationOption,
-    UntilOption,
-    WaitOption,
-    WorkersOption,
+    Table,
     command,
     exit_with_status,
+    finding_tables,
     findings_document,
     from_here,
     loaded_campaign,
@@ -41,13 +27,14 @@ from lidarops.cli.app import (
     selection_of,
     set_up_log,
     show_error,
-    show_findings,
     show_rows,
+    show_tables,
 )
 from lidarops.errors import UNAVAILABLE, LidarOpsError
+from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from distributed import Client
@@ -90,12 +77,12 @@ def _size(text: str | None) -> str | None:
 
 @command()
 def catalog(
-    campaign: CampaignFile,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
-    workers: WorkersOption = 1,
-    wait: WaitOption = 0.0,
+    campaign: options.Campaign,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
+    workers: options.Workers = 1,
+    wait: options.Wait = 0.0,
     rebuild: Annotated[
         bool,
         typer.Option(
@@ -103,7 +90,7 @@ def catalog(
             help="Also enter products that the ledger lacks, from their own provenance.",
         ),
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Create or update the catalog of the archive; list refused files, notes on files, and why.
 
@@ -138,12 +125,12 @@ def catalog(
             document["rebuilt"] = asdict(rebuilt)
         typer.echo(json.dumps(document, indent=2))
     else:
-        _show_refused(refused)
-        show_findings(findings)
+        show_tables([_refused_table(refused), *finding_tables(findings)])
+        declared = sum(granule.is_declared_invalid for granule in refused)
         say(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
-            f" {summary.refused} refused{_declared(refused)}"
+            f" {summary.refused} refused" + (f", {declared} declared invalid" if declared else "")
         )
         if rebuilt is not None:
             show_rows("Not entered in the ledger", ("file", "reason"), rebuilt.problems.items())
@@ -158,15 +145,15 @@ def catalog(
 
 @command()
 def reprocess(
-    campaign: CampaignFile,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
-    instrument: InstrumentOption = None,
-    station: StationOption = None,
-    product: ProductOption = None,
-    since: SinceOption = None,
-    until: UntilOption = None,
+    campaign: options.Campaign,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
+    instrument: options.Instruments = None,
+    station: options.Stations = None,
+    product: options.Products = None,
+    since: options.Since = None,
+    until: options.Until = None,
     force: Annotated[
         bool, typer.Option("--force", help="Process everything selected, even what is fresh.")
     ] = False,
@@ -176,9 +163,7 @@ def reprocess(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Number of worker processes; default 1.")
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a running dask scheduler to use.")
-    ] = None,
+    scheduler: options.Scheduler = None,
     tls: Annotated[
         tuple[Path, Path, Path] | None,
         typer.Option(
@@ -186,12 +171,7 @@ def reprocess(
             help="Certificate of the authority, own certificate and own key, for --scheduler.",
         ),
     ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            "--cluster", help="slurm, kubernetes, or a YAML file that describes a cluster."
-        ),
-    ] = None,
+    cluster: options.Cluster = None,
     memory_limit: Annotated[
         str | None,
         typer.Option(
@@ -200,7 +180,7 @@ def reprocess(
             callback=_size,
         ),
     ] = None,
-    wait: WaitOption = 0.0,
+    wait: options.Wait = 0.0,
     remove_orphans: Annotated[
         bool,
         typer.Option(
@@ -219,11 +199,17 @@ def reprocess(
     everything: Annotated[
         bool, typer.Option("--all", help="List every product, file and finding.")
     ] = False,
-    all_steps: AllStepsOption = False,
-    log_level: LogLevelOption = "warning",
-    log_json: LogJsonOption = False,
-    log_file: LogFileOption = None,
-    as_json: JsonOption = False,
+    all_steps: options.AllSteps = False,
+    log_level: Annotated[
+        str, typer.Option(help="debug, info, warning or error.", metavar="LEVEL")
+    ] = "warning",
+    log_json: Annotated[
+        bool, typer.Option("--log-json", help="Write one JSON object per log line.")
+    ] = False,
+    log_file: Annotated[
+        Path | None, typer.Option(help="Append the log to this file instead of standard error.")
+    ] = None,
+    as_json: options.Json = False,
 ) -> None:
     """Update the catalog, make all stale products, and write a report.
 
@@ -241,7 +227,7 @@ def reprocess(
     selection = selection_of(instrument, station, product, since, until)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with progress_bar("reprocess", None, "granules") as bar:
-        options = pipeline.Options(
+        chosen = pipeline.Options(
             force=force,
             thaw=thaw,
             workers=workers or 1,
@@ -253,7 +239,7 @@ def reprocess(
             progress=lambda outcome: bar.advance(outcome.granules),
             expect=bar.grow,
         )
-        result = pipeline.bring_up_to_date(settings, selection=selection, options=options)
+        result = pipeline.bring_up_to_date(settings, selection=selection, options=chosen)
     no_scene = result.record is None and selects_no_scene(settings, selection)
     if not as_json:
         _print_result(
@@ -263,9 +249,9 @@ def reprocess(
     earlier: list[Path] = []
     try:
         if result.record is not None:
-            page = _page(settings, result.record, options.workers)
+            page = _page(settings, result.record, chosen.workers)
         own = "" if result.record is None else result.record.id
-        earlier = pipeline.report_earlier_runs(settings, without=own, workers=options.workers)
+        earlier = pipeline.report_earlier_runs(settings, without=own, workers=chosen.workers)
         report_note = missing_report(settings) if result.record is None else ""
         if remove_orphans:
             removed = pipeline.remove_orphans(settings, result, wait=wait)
@@ -283,7 +269,8 @@ def reprocess(
             if report_note:
                 typer.echo(report_note)
     if removed is not None and not as_json:
-        _show_orphans(result, removed, None if everything else _FEW_ROWS)
+        most = None if everything else _FEW_ROWS
+        show_tables([_orphan_table(result, f"{removed} removed")], most)
     if result.signal:
         raise typer.Exit(128 + result.signal)
     if result.status is RunStatus.STOPPED:
@@ -327,21 +314,17 @@ def _cluster(
     return partial(clusters.connect_client, chosen)
 
 
-def _declared(refused: list[Granule]) -> str:
-    """Return how many files the campaign declares invalid, for the end of a line."""
-    number = sum(granule.is_declared_invalid for granule in refused)
-    return f", {number} declared invalid" if number else ""
-
-
-def _show_refused(refused: list[Granule], most: int | None = None) -> None:
+def _refused_table(refused: Iterable[Granule]) -> Table:
     rows = ((granule.path, granule.instrument, granule.reason) for granule in refused)
-    show_rows("Refused", ("file", "instrument", "reason"), rows, most)
+    return "Refused", ("file", "instrument", "reason"), rows
 
 
 def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
     from lidarops.run.archive import refused_files
 
     record, scenes = result.record, result.scenes
+    products = [product for scene in scenes for product in scene.products]
+    changes = {product.path: product.change for product in products if product.change is not None}
     refused = refused_files(campaign, result)
     return {
         "run": None if record is None else record.id,
@@ -355,21 +338,10 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         },
         "unusable_scenes": list(result.unusable_scenes),
         "refused_files": {granule.path: granule.reason for granule in refused},
-        "products": [product.path for scene in scenes for product in scene.products],
-        "quality": {
-            product.path: product.verdicts._asdict()
-            for scene in scenes
-            for product in scene.products
-        },
-        "versions": {
-            product.path: product.stamp.version for scene in scenes for product in scene.products
-        },
-        "changes": {
-            product.path: product.change.as_dict()
-            for scene in scenes
-            for product in scene.products
-            if product.change is not None
-        },
+        "products": [product.path for product in products],
+        "quality": {product.path: product.verdicts._asdict() for product in products},
+        "versions": {product.path: product.stamp.version for product in products},
+        "changes": {path: change.as_dict() for path, change in changes.items()},
         "frozen_products": dict(result.frozen),
         "files_set_aside": dict(result.set_aside),
         "empty_scenes": dict(result.empty_scenes),
@@ -381,12 +353,8 @@ def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[
         ],
         "rejections": _rejections(scenes),
         "scene_notes": {scene.scene: list(scene.notes) for scene in scenes if scene.notes},
-        "orphans": {
-            orphan.path: orphan.reason for orphan in result.orphans if not orphan.requested
-        },
-        "kept_products": {
-            orphan.path: orphan.reason for orphan in result.orphans if orphan.requested
-        },
+        "orphans": {each.path: each.reason for each in result.orphans if not each.requested},
+        "kept_products": {each.path: each.reason for each in result.orphans if each.requested},
     }
 
 
@@ -411,34 +379,9 @@ def _print_places(result: Result, page: Path | None) -> None:
 def _print_result(
     campaign: Campaign, result: Result, *, no_scene: bool, removing: bool, everything: bool
 ) -> None:
-    from lidarops.reports.findings import disagreement_rows, scene_note_rows
-    from lidarops.run.archive import refused_files
-
     scenes, most = result.scenes, None if everything else _FEW_ROWS
     _show_products(scenes, everything=everything)
-    _show_changes(result, most)
-    refused = refused_files(campaign, result)
-    _show_refused(refused, most)
-    listed = {granule.path for granule in refused}
-    set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
-    unused = (*set_aside, *result.empty_scenes.items())
-    show_rows("Not used", ("file or scene", "reason"), unused, most)
-    show_findings(result.findings, most)
-    for title, where, found in (
-        ("Channels that disagree", "channels", disagreement_rows(scenes)),
-        ("Not found in the data", "in", scene_note_rows(scenes)),
-    ):
-        rows = ((row.instrument, row.subject, row.problem) for row in found)
-        show_rows(title, ("instrument", where, "finding"), rows, most)
-    if not removing:
-        _show_orphans(result, None, most)
-    kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
-    title = "Requested products that could not be made again (kept)"
-    show_rows(title, ("file", "reason"), kept, most)
-    _show_scenes_with_problems(result, most)
-    title = "Rejected values, and the settings that they follow from"
-    columns = "product", "flag", "values", "settings"
-    show_rows(title, columns, _rejections(scenes), most)
+    show_tables(_tables(campaign, result, removing=removing), most)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
@@ -454,6 +397,56 @@ def _print_result(
         if not result.findings.failed:
             state = "every requested product is fresh or cannot be made"
         say(f"nothing to do: {state}{never_made(result.findings)}")
+
+
+def _tables(campaign: Campaign, result: Result, *, removing: bool) -> Iterator[Table]:
+    """Yield what a run found, but its products: what changed, was not used, or has no value."""
+    from lidarops.figures.wording import change_in_words
+    from lidarops.reports.findings import disagreement_rows, scene_note_rows
+    from lidarops.run.archive import refused_files
+    from lidarops.run.options import NO_USABLE_VALUE
+
+    scenes = result.scenes
+    reason, problem = ("file", "reason"), ("scene", "problem")
+    changes = (
+        (product.path, change.grade.value, change_in_words(change), "; ".join(change.causes))
+        for scene in scenes
+        for product in scene.products
+        for change in [product.change]
+        if change is not None
+    )
+    yield "Products made again", ("file", "change", "difference", "cause"), changes
+    title = "Frozen products that would be replaced (--thaw replaces them)"
+    yield title, reason, result.frozen.items()
+    refused = refused_files(campaign, result)
+    yield _refused_table(refused)
+    listed = {granule.path for granule in refused}
+    set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
+    yield "Not used", ("file or scene", "reason"), (*set_aside, *result.empty_scenes.items())
+    yield from finding_tables(result.findings)
+    for title, where, found in (
+        ("Channels that disagree", "channels", disagreement_rows(scenes)),
+        ("Not found in the data", "in", scene_note_rows(scenes)),
+    ):
+        rows = ((row.instrument, row.subject, row.problem) for row in found)
+        yield title, ("instrument", where, "finding"), rows
+    if not removing:
+        yield _orphan_table(result, "kept; --remove-orphans removes them")
+    kept = ((orphan.path, orphan.reason) for orphan in result.orphans if orphan.requested)
+    yield "Requested products that could not be made again (kept)", reason, kept
+    processed = {scene.scene for scene in scenes}
+    unusable = dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE).items()
+    now = [row for row in unusable if row[0] in processed]
+    yield "Without a usable value", problem, now
+    earlier = [row for row in (*result.failures.items(), *unusable) if row[0] not in processed]
+    yield "From earlier runs, unchanged since", problem, earlier
+    title = "Rejected values, and the settings that they follow from"
+    yield title, ("product", "flag", "values", "settings"), _rejections(scenes)
+
+
+def _orphan_table(result: Result, fate: str) -> Table:
+    rows = ((orphan.path, orphan.reason) for orphan in result.orphans if not orphan.requested)
+    return f"Products that the campaign no longer requests ({fate})", ("file", "reason"), rows
 
 
 def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str]]:
@@ -509,43 +502,3 @@ def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
         yield scene.scene, product.kind, product.channel, *numbers, flags
     if scene.error:
         yield scene.scene, "none", "", "", "", "", "", scene.error
-
-
-def _show_changes(result: Result, most: int | None) -> None:
-    """Print how products differ from those that they replace, and frozen ones that would."""
-    from lidarops.figures.wording import change_in_words
-
-    rows = (
-        (product.path, change.grade.value, change_in_words(change), "; ".join(change.causes))
-        for scene in result.scenes
-        for product in scene.products
-        for change in [product.change]
-        if change is not None
-    )
-    show_rows("Products made again", ("file", "change", "difference", "cause"), rows, most)
-    title = "Frozen products that would be replaced (--thaw replaces them)"
-    show_rows(title, ("file", "reason"), result.frozen.items(), most)
-
-
-def _show_orphans(result: Result, removed: int | None, most: int | None) -> None:
-    fate = "kept; --remove-orphans removes them" if removed is None else f"{removed} removed"
-    rows = ((orphan.path, orphan.reason) for orphan in result.orphans if not orphan.requested)
-    title = f"Products that the campaign no longer requests ({fate})"
-    show_rows(title, ("file", "reason"), rows, most)
-
-
-def _show_scenes_with_problems(result: Result, most: int | None) -> None:
-    from lidarops.run.options import NO_USABLE_VALUE
-
-    processed = {scene.scene for scene in result.scenes}
-    unusable = dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE)
-    columns = ("scene", "problem")
-    now = ((scene, problem) for scene, problem in unusable.items() if scene in processed)
-    show_rows("Without a usable value", columns, now, most)
-    earlier = (*result.failures.items(), *unusable.items())
-    show_rows(
-        "From earlier runs, unchanged since",
-        columns,
-        ((scene, problem) for scene, problem in earlier if scene not in processed),
-        most,
-    )

@@ -11,20 +11,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidarops.cli.app import (
-    ArchiveOption,
-    CampaignFile,
-    CatalogOption,
-    JsonOption,
-    OutOption,
-    WorkersOption,
     command,
     exit_with_status,
     progress_bar,
     say,
-    show,
     show_rows,
+    show_tables,
 )
 from lidarops.errors import LidarOpsError
+from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from lidarops.catalog.store import Run
@@ -35,7 +30,7 @@ def report(
     run: Annotated[
         Path, typer.Argument(help="Report folder of a run, or its run.json.", metavar="RUN")
     ],
-    workers: WorkersOption = 1,
+    workers: options.Workers = 1,
 ) -> None:
     """Build the HTML report of a run and its figures again.
 
@@ -56,7 +51,7 @@ def inspect(
     provenance: Annotated[
         bool, typer.Option("--provenance", help="Print the PROV-JSON of a product.")
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Show the content of a raw file or a product, or the groups of raw files of a folder.
 
@@ -70,8 +65,7 @@ def inspect(
     if as_json:
         typer.echo(json.dumps(inspection.describe(file), indent=2, ensure_ascii=False))
         return
-    for table in inspection.tables(file):
-        show(table)
+    show_tables(inspection.tables(file))
 
 
 @command()
@@ -128,7 +122,7 @@ def reproduce(
             metavar="URL",
         ),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Make a product again from its provenance. Exit code 0 if every byte is the same.
 
@@ -145,7 +139,7 @@ def reproduce(
 def compare(
     old: Annotated[Path, typer.Argument(help="A product.", metavar="OLD")],
     new: Annotated[Path, typer.Argument(help="Another version of it.", metavar="NEW")],
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Show how a product differs from another version of it, and why. Exit code 0 if it does not.
 
@@ -170,13 +164,13 @@ def compare(
 
 @command()
 def runs(
-    campaign: CampaignFile,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
+    campaign: options.Campaign,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
     limit: Annotated[
         int, typer.Option(min=1, help="Number of runs to show, the newest first.")
     ] = 20,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Show the runs of a campaign, the newest first: status, numbers and time per stage.
 
@@ -205,14 +199,14 @@ def _row(run: Run) -> tuple[object, ...]:
 
 @command()
 def verify(
-    campaign: CampaignFile,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
+    campaign: options.Campaign,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
     products_only: Annotated[
         bool, typer.Option("--products-only", help="Do not read the raw files.")
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Read all products and their inputs again; list files that differ from the ledger.
 
@@ -247,16 +241,16 @@ def verify(
 
 @command()
 def publish(
-    campaign: CampaignFile,
+    campaign: options.Campaign,
     url: Annotated[
         str, typer.Argument(help="Destination, such as s3://bucket/prefix or file:///...")
     ],
-    out: OutOption = None,
-    catalog: CatalogOption = None,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
     site: Annotated[
         bool, typer.Option("--site", help="Also copy the pages, to the folder site.")
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Copy products to an object store: send what it lacks or has outdated; remove nothing.
 

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidarops.cli.app import (
-    JsonOption,
-    WorkersOption,
     command,
     exit_with_status,
     progress_bar,
@@ -21,6 +19,7 @@ from lidarops.cli.app import (
     utc,
 )
 from lidarops.figures.wording import visible
+from lidarops.run import command_options as options
 from lidarops.site.paths import CALENDAR_HEIGHT
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def aggregate(
             " snapshot names runs if a campaign file is given.",
         ),
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write an index of products, by which they open as one dataset, and means, stores or STAC.
 
@@ -85,7 +84,7 @@ def aggregate(
     from lidarops.aggregate.means_variables import Period, Weights
 
     root, runs = _root(out, with_runs=store)
-    options = AggregateOptions(
+    chosen = AggregateOptions(
         parse_selection(kind, channel, station, instrument, utc(since), utc(until)),
         None if means is None else parse_choice(Period, means, "means"),
         parse_choice(Weights, weights, "weights"),
@@ -95,7 +94,7 @@ def aggregate(
         products_at,
     )
     with progress_bar("aggregate", None) as bar:
-        made = make_aggregates(root, options, progress=bar.advance)
+        made = make_aggregates(root, chosen, progress=bar.advance)
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:
@@ -143,7 +142,7 @@ def site(
     out: Annotated[
         Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
     ],
-    workers: WorkersOption = 1,
+    workers: options.Workers = 1,
     products_at: Annotated[
         str,
         typer.Option(
@@ -173,7 +172,7 @@ def site(
             " the calendar.",
         ),
     ] = CALENDAR_HEIGHT,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Make a static site of all products: calendar, figures, flags, provenance, downloads.
 

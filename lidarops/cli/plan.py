@@ -16,31 +16,21 @@ import typer
 
 from lidarops.cli.app import (
     NO_SCENE,
-    AllStepsOption,
-    ArchiveOption,
-    CampaignFile,
-    CatalogOption,
-    InstrumentOption,
-    JsonOption,
-    OutOption,
-    ProductOption,
-    SinceOption,
-    StationOption,
-    UntilOption,
-    WaitOption,
     command,
     exit_with_status,
+    finding_tables,
     findings_document,
     loaded_campaign,
     say,
     say_wrapped,
     selection_of,
-    show_findings,
     show_rows,
+    show_tables,
     wrapped,
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
+from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
@@ -59,15 +49,15 @@ _FEW: Final = 5
 
 @command("plan")
 def show_plan(
-    campaign: CampaignFile,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    catalog: CatalogOption = None,
-    instrument: InstrumentOption = None,
-    station: StationOption = None,
-    product: ProductOption = None,
-    since: SinceOption = None,
-    until: UntilOption = None,
+    campaign: options.Campaign,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    catalog: options.Catalog = None,
+    instrument: options.Instruments = None,
+    station: options.Stations = None,
+    product: options.Products = None,
+    since: options.Since = None,
+    until: options.Until = None,
     stale: Annotated[
         bool, typer.Option("--stale", help="Show only the products to be made, and why.")
     ] = False,
@@ -75,9 +65,9 @@ def show_plan(
         bool,
         typer.Option("--all", help="Show settings and reasons of every step, and all left out."),
     ] = False,
-    wait: WaitOption = 0.0,
-    all_steps: AllStepsOption = False,
-    as_json: JsonOption = False,
+    wait: options.Wait = 0.0,
+    all_steps: options.AllSteps = False,
+    as_json: options.Json = False,
 ) -> None:
     """Show scenes, their steps, what is left out and what is stale, and why. Keeps nothing.
 
@@ -163,7 +153,7 @@ def _plan(
         most = None if everything else _FEW
         columns = "product", "flag", "values", "settings"
         show_rows("Without a usable value in the first file", columns, empty, most)
-        show_findings(findings, most)
+        show_tables(finding_tables(findings), most)
         _show_rest(lacking, *earlier, most)
         # With --stale, fresh scenes are not judged.
         whole = "" if stale else f" of {count}"
@@ -215,9 +205,13 @@ def _show_judged(judged: Judgement, *, stale: bool) -> None:
     title += f", about {memory / 1e6:.0f} MB of memory"
     if not stale:
         _show_plan(title, judged.requested)
-    _show_stale(title, judged)
+    rows = _stale_rows(judged)
+    if judged.failure:
+        unchanged = "not tried again, because nothing has changed: " if judged.held else ""
+        rows.append(("none", "", f"{unchanged}{judged.failure.error}"))
+    show_rows(f"{title}: to be made", ("product", "channels", "reason"), rows)
     for what, products in _kept(judged):
-        rows = ((product.kind, product.channel, product.reason) for product in products)
+        rows = [(product.kind, product.channel, product.reason) for product in products]
         show_rows(f"{scene.id}: {what}", ("product", "channel", "reason"), rows)
 
 
@@ -274,14 +268,6 @@ def _effect(step: PlannedStep, plan: Plan) -> str:
     return f"no effect: {idle}" if idle else ", ".join(settings_in_words(step))
 
 
-def _show_stale(title: str, judged: Judgement) -> None:
-    rows = _stale_rows(judged)
-    if judged.failure:
-        unchanged = "not tried again, because nothing has changed: " if judged.held else ""
-        rows.append(("none", "", f"{unchanged}{judged.failure.error}"))
-    show_rows(f"{title}: to be made", ("product", "channels", "reason"), rows)
-
-
 def _stale_rows(judged: Judgement) -> list[tuple[str, str, str]]:
     """Return kind, channels and reason of what is to be made."""
     return list(_grouped((made.kind, made.reason, made.channel) for made in judged.stale))
@@ -300,10 +286,7 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     from lidarops.scene.choices import idle_window
 
     stale, frozen, kept = (
-        [
-            {"kind": product.kind, "channel": product.channel, "reason": product.reason}
-            for product in products
-        ]
+        [{"kind": each.kind, "channel": each.channel, "reason": each.reason} for each in products]
         for products in (judged.stale, judged.frozen, judged.kept)
     )
     plan = judged.requested
@@ -382,16 +365,14 @@ def _step_lines(plan: Plan) -> Iterator[str]:
     told = {left.channel for left in missed}
     unread = [left for left in requested if left.name == READ_STEP and left.channel not in told]
     warned = [step for step in plan.steps if step.warning]
-    for words, lines in (
-        (
-            "requested, but left out: {0} {1}: {2}",
-            [(left.name, left.reason, left.channel) for left in missed],
-        ),
-        ("without product: {1}: {2}", [(left.name, left.reason, left.channel) for left in unread]),
-        ("warning: {0} {1}: {2}", [(step.name, step.warning, step.channel) for step in warned]),
+    for words, entries in (
+        ("requested, but left out: {0} {1}: {2}", missed),
+        ("without product: {1}: {2}", unread),
     ):
-        for row in _grouped(lines):
+        for row in _grouped((left.name, left.reason, left.channel) for left in entries):
             yield f"  {words.format(*row)}"
+    for name, channels, warning in _grouped((w.name, w.warning, w.channel) for w in warned):
+        yield f"  warning: {name} {channels}: {warning}"
     shown = {*kinds(), READ_STEP}
     others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:

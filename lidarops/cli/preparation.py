@@ -14,10 +14,6 @@ from typing import Annotated, Final
 import typer
 
 from lidarops.cli.app import (
-    ArchiveOption,
-    CampaignFile,
-    OutOption,
-    WorkersOption,
     command,
     from_here,
     no_url,
@@ -25,6 +21,7 @@ from lidarops.cli.app import (
     say,
 )
 from lidarops.errors import SceneError
+from lidarops.run import command_options as options
 
 _SCHEMA: Final = "campaign.schema.json"
 _OUTPUT: Final = "out"
@@ -111,10 +108,10 @@ def _free_output(campaign: Path) -> str:
 
 @command()
 def simulate(
-    campaign: CampaignFile,
-    archive: ArchiveOption = None,
-    out: OutOption = None,
-    workers: WorkersOption = 1,
+    campaign: options.Campaign,
+    archive: options.Archive = None,
+    out: options.Out = None,
+    workers: options.Workers = 1,
 ) -> None:
     """Write the raw Licel files of a simulated campaign, and the truth behind them.
 
@@ -125,13 +122,14 @@ def simulate(
     from lidarops.campaign.model import load_campaign
     from lidarops.netcdf.write import write_plain
     from lidarops.run.clusters import local_client
-    from lidarops.simulate.campaign import plan_simulation, write_simulation
+    from lidarops.simulate.campaign import simulate_campaign
 
     settings = load_campaign(campaign, archive=archive, output=out)
-    planned = plan_simulation(settings)
     cluster = nullcontext() if workers == 1 else local_client(workers)
-    with progress_bar("simulate", len(planned.paths)) as bar, cluster as client:
-        simulated = write_simulation(planned, client=client, progress=bar.advance)
+    with progress_bar("simulate", None) as bar, cluster as client:
+        simulated = simulate_campaign(
+            settings, client=client, progress=bar.advance, expect=bar.grow
+        )
     write_plain(simulated.truth, settings.truth_path)
     say(f"{len(simulated.paths)} raw files and truth.nc in {from_here(settings.archive)}")
 
@@ -174,14 +172,14 @@ def _compile_retrievals() -> Path:
     from lidarops.campaign.model import load_campaign
     from lidarops.netcdf.write import write_plain
     from lidarops.run.archive import bring_up_to_date
-    from lidarops.simulate.campaign import plan_simulation, write_simulation
+    from lidarops.simulate.campaign import simulate_campaign
 
     with (
         tempfile.TemporaryDirectory(prefix="lidarops-compile-") as folder,
         resources.as_file(resources.files("lidarops.run") / "compile.yaml") as path,
     ):
         campaign = load_campaign(path, archive=f"{folder}/raw", output=f"{folder}/out")
-        simulated = write_simulation(plan_simulation(campaign))
+        simulated = simulate_campaign(campaign)
         write_plain(simulated.truth, campaign.truth_path)
         result = bring_up_to_date(campaign)
     if result.has_failures:

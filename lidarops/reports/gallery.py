@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -180,14 +180,13 @@ def _read(
 
     def each(task: _Task, items: Sequence[_Item]) -> Iterator[tuple[_Item, Any]]:
         """Yield what a task returns of each product; note those that it fails on."""
-        guarded = partial(_guarded, task, group.root)
-        results: Iterator[tuple[_Item, Any]]
-        if view.first:
-            # None ahead, because mostly the first one is enough.
-            single = (processes.later(guarded, item, lost=_crashed) for item in items)
-            results = zip(items, (result() for result in single), strict=True)
-        else:
-            results = processes.map_items(guarded, items, at_a_time=_AT_A_TIME, lost=_crashed)
+        called = partial(processes.map_items, partial(_guarded, task, group.root), lost=_crashed)
+        # None ahead where mostly the first one is enough.
+        results = (
+            chain.from_iterable(called([item], at_a_time=1, fewest=1) for item in items)
+            if view.first
+            else called(items, at_a_time=_AT_A_TIME)
+        )
         for item, (content, reason) in results:
             if not reason:
                 yield item, content

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -15,12 +16,9 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from rich.table import Table
-from rich.text import Text
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import RawFormatError
-from lidarops.figures.wording import visible
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
@@ -34,12 +32,16 @@ from lidarops.netcdf.stored_flags import (
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
 
+Table = tuple[str, Sequence[str], Sequence[Sequence[Any]]]
+"""Title, names of columns, and rows."""
 _LONG: Final = {"comment", "history", "references"}
 """Attributes too long for a table; the JSON output has them."""
 _CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits", "device")
 """Channel properties in the table; the JSON output has all."""
 _GROUP: Final = ("files", "count", "role", "start", "stop", "site", "zenith_angle", "channels")
 """Properties of a group of raw files in the table."""
+_VARIABLE: Final = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
+_FLAG: Final = ("flags", "name", "severity", "values", "share", "description")
 _UNITS: Final = {
     **dict.fromkeys(("altitude", "bin_width", "wavelength"), "m"),
     **dict.fromkeys(("zenith_as_written", "zenith_angle", "azimuth"), "degree"),
@@ -81,37 +83,31 @@ def describe(file: Path) -> dict[str, Any]:
     return _product(file) if is_netcdf(file) else _raw(file)
 
 
-def tables(file: Path) -> list[Table]:
-    """Return the description of a file as tables; see `describe`."""
+def tables(file: Path) -> Iterator[Table]:
+    """Yield the description of a file as tables: title, names of columns, rows; see `describe`."""
     description = describe(file)
-    about = _table(file.name, "field", "value")
-    for key, value in description.items():
-        if key != _HEADER and (isinstance(value, str | int | float) or value is None):
-            _add_row(about, key.replace("_", " "), _with_unit(key, value))
-    if description["type"] == "folder":
-        refused = _table_of_rows("Damaged files", description["refused"], ("file", "reason"))
-        others = [{"file": path} for path in description["other"][:_OTHERS]]
-        other = _table_of_rows("Files of no raw format", others, ("file",))
-        return [
-            about,
-            _table_of_rows("Groups of like files", description["groups"], _GROUP),
-            refused,
-            other,
-        ]
+    about = [
+        (key.replace("_", " "), _with_unit(key, value))
+        for key, value in description.items()
+        if key != _HEADER and (isinstance(value, str | int | float) or value is None)
+    ]
     if description["type"] == "raw":
-        for note in description["notes"] or ["none"]:
-            _add_row(about, "notes", note)
-        header = _table("Header as written", "line")
-        for line in description.get(_HEADER, "").splitlines():
-            _add_row(header, line)
-        return [about, _table_of_rows("Channels", description["channels"], _CHANNEL), header]
-    for key, value in description["attributes"].items():
-        if key not in _LONG:
-            _add_row(about, key, value)
-    columns = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
-    shown = [about, _table_of_rows("Variables", description["variables"], columns)]
-    flags = ("flags", "name", "severity", "values", "share", "description")
-    return [*shown, _table_of_rows("Quality", description["quality"], flags)]
+        about += [("notes", note) for note in description["notes"] or ["none"]]
+    elif description["type"] == "netcdf":
+        about += [item for item in description["attributes"].items() if item[0] not in _LONG]
+    yield file.name, ("field", "value"), about
+    if description["type"] == "folder":
+        others = [{"file": path} for path in description["other"][:_OTHERS]]
+        yield _table("Groups of like files", description["groups"], _GROUP)
+        yield _table("Damaged files", description["refused"], ("file", "reason"))
+        yield _table("Files of no raw format", others, ("file",))
+    elif description["type"] == "raw":
+        yield _table("Channels", description["channels"], _CHANNEL)
+        lines = description.get(_HEADER, "").splitlines()
+        yield "Header as written", ("line",), [(line,) for line in lines]
+    else:
+        yield _table("Variables", description["variables"], _VARIABLE)
+        yield _table("Quality", description["quality"], _FLAG)
 
 
 def _with_unit(key: str, value: object) -> str:
@@ -274,11 +270,9 @@ def _plain_scalar(value: Any) -> Any:
     return str(value)
 
 
-def _table_of_rows(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
-    table = _table(title, *(_title(column) for column in columns))
-    for item in items:
-        _add_row(table, *(_cell(item.get(column)) for column in columns))
-    return table
+def _table(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
+    rows = [[_cell(item.get(column)) for column in columns] for item in items]
+    return title, [_title(column) for column in columns], rows
 
 
 def _title(column: str) -> str:
@@ -290,15 +284,3 @@ def _cell(value: Any) -> str:
     if value is None:
         return ""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    return table
-
-
-def _add_row(table: Table, *cells: Any) -> None:
-    # As Text, because rich would interpret brackets in a header as markup.
-    table.add_row(*(Text(visible(str(cell))) for cell in cells))

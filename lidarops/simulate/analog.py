@@ -81,25 +81,31 @@ def digitise(
     Where only some shots are clipped, the sum is too low although it is below full scale, as in
     a real instrument.
     """
-    shots, rate = released.shots, released.rate
+    shots, rate, number = released.shots, released.rate, released.number
     if shots == 0:
         return np.zeros(rate.shape, dtype=np.int64)
-    total: Counts
-    if released.number is not None:
-        sample = _sample(recorder, released.bin_time)
-        noise = random.standard_normal(rate.size)
-        total = _sum_samples(rate, released.number, noise, sample, float(shots))
-        return total
-    sample = _sample(recorder, released.bin_time, _NEGLIGIBLE_FAST)
-    if shots * sample.top > _LARGEST:
+    sample = _sample(
+        recorder, released.bin_time, _NEGLIGIBLE_FAST if number is None else _NEGLIGIBLE
+    )
+    if number is None and shots * sample.top > _LARGEST:
         raise SimulationInputError(
             f"of {shots} with {recorder.adc_bits} bits do not fit into 32 bits",
             field="shots",
             remedy="take fewer shots, or draw photoelectrons",
         )
-    fast_noise = random.standard_normal(rate.size, dtype=np.float32)
-    total = _draw_sums(rate, fast_noise, sample, float(shots))
-    return total
+    _, rounded, covariance, centre, kept = _moments_of(rate, sample)
+    if number is None:
+        deviation = np.sqrt(rounded * shots) * random.standard_normal(rate.size, dtype=np.float32)
+    else:
+        events, unit, electronic = rate * sample.window, sample.unit, sample.noise
+        slope = covariance / ((1.0 + sample.spread) * unit**2 * events + electronic**2)
+        own = np.maximum(rounded - slope * covariance, 0.0) + (slope * electronic) ** 2
+        charge = slope**2 * unit**2 * sample.spread * number
+        deviation = slope * unit * (number - events * shots)
+        deviation += np.sqrt(charge + shots * own) * random.standard_normal(rate.size)
+    total = np.clip(shots * centre + kept * deviation, 0.0, shots * sample.top)
+    summed: Counts = (total + 0.5).astype(np.int32 if number is None else np.int64)
+    return summed
 
 
 def sample_moments(
@@ -114,8 +120,8 @@ def sample_moments(
     bin_time : float, s
     """
     _checks.positive("bin_time", bin_time, "s")
-    both = _moments_of(limited_rate(rate), _sample(recorder, bin_time))
-    return both[0], both[1]
+    mean, variance, *_ = _moments_of(limited_rate(rate), _sample(recorder, bin_time))
+    return mean, variance
 
 
 class _Sample(NamedTuple):
@@ -243,38 +249,12 @@ def _clipped(mean: float, rounded: float, events: float, sample: Any) -> tuple[f
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sum_samples(rate: Any, number: Any, noise: Any, sample: Any, shots: float) -> Any:
-    window, _, unit, spread, dark_noise, _, _, top = sample
-    total = np.empty_like(number)
-    for i in range(number.size):
-        events = rate[i] * window
-        mean, rounded, covariance = _rounded(events, sample)
-        variance = (1.0 + spread) * unit * unit * events + dark_noise * dark_noise
-        slope = covariance / variance
-        own = max(rounded - slope * covariance, 0.0) + (slope * dark_noise) ** 2
-        charge = slope * slope * unit * unit * spread * number[i]
-        light = slope * unit * (number[i] - events * shots)
-        centre, kept = _clipped(mean, rounded, events, sample)
-        value = shots * centre + kept * (light + sqrt(charge + shots * own) * noise[i])
-        total[i] = int(min(max(value, 0.0), shots * top) + 0.5)
-    return total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _draw_sums(rate: Any, noise: Any, sample: Any, shots: float) -> Any:
-    total = np.empty(rate.size, np.int32)
+def _moments_of(rate: Any, sample: Any) -> Any:
+    """Return the results of `_rounded` and `_clipped` for each bin, shape (5, bins)."""
+    moments = np.empty((5, rate.size))
     for i in range(rate.size):
         events = rate[i] * sample.window
-        mean, rounded, _ = _rounded(events, sample)
+        mean, rounded, covariance = _rounded(events, sample)
         centre, kept = _clipped(mean, rounded, events, sample)
-        value = shots * centre + kept * sqrt(rounded * shots) * noise[i]
-        total[i] = int(min(max(value, 0.0), shots * sample.top) + 0.5)
-    return total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moments_of(rate: Any, sample: Any) -> Any:
-    both = np.empty((2, rate.size))
-    for i in range(rate.size):
-        both[0, i], both[1, i], _ = _rounded(rate[i] * sample.window, sample)
-    return both
+        moments[:, i] = mean, rounded, covariance, centre, kept
+    return moments

@@ -17,7 +17,6 @@ from lidarops.campaign.simulated_air import (
     AtmosphereSettings,
     Gradient,
     Plume,
-    Sounding,
     Turbulence,
 )
 from lidarops.campaign.simulated_instrument import RamanLines
@@ -120,7 +119,11 @@ class Air:
         self._settings = settings
         self._altitude = altitude
         self._start = start
-        self._sounding = None if settings.sounding is None else _profile(settings.sounding)
+        self._sounding: MolecularProfile | None = None
+        if (given := settings.sounding) is not None:
+            self._sounding = MolecularProfile(
+                np.array(given.altitude), np.array(given.pressure), np.array(given.temperature)
+            )
         self._eddies = None if settings.turbulence is None else _Eddies(settings.turbulence, seed)
 
     def state(self, moment: datetime) -> tuple[object, ...]:
@@ -285,12 +288,6 @@ def _plume_extinction(plume: Plume, points: _Points, seconds: float) -> Array:
     rise = (points.height - plume.height) / plume.vertical_depth
     values: Array = plume.extinction * np.exp(-0.5 * (east**2 + north**2 + rise**2))
     return values
-
-
-def _profile(sounding: Sounding) -> MolecularProfile:
-    return MolecularProfile(
-        np.array(sounding.altitude), np.array(sounding.pressure), np.array(sounding.temperature)
-    )
 
 
 def solar_elevation(moment: datetime, latitude: float, longitude: float) -> float:

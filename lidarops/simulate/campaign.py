@@ -17,7 +17,7 @@ import xarray as xr
 from lidarops.campaign.model import Campaign, Station
 from lidarops.campaign.simulated_instrument import DamageKind
 from lidarops.campaign.simulation import SimulationSettings
-from lidarops.errors import CampaignError, UnavailableError
+from lidarops.errors import CampaignError
 from lidarops.records import DetectionMode, Role
 from lidarops.simulate.files import Simulator
 from lidarops.simulate.planned_files import (
@@ -36,6 +36,8 @@ _Work = Sequence[tuple[PlannedFile, int | None]]
 """Files of one instrument that are written together, and their rows in the truth, None for dark
 files."""
 _Batch = tuple[SimulatedInstrument, _Work]
+_Plan = Sequence[tuple[SimulatedInstrument, Sequence[PlannedFile]]]
+"""Every instrument with its files: dark ones first, then signal files in time."""
 _Truths = list[tuple[int | None, FileTruth]]
 """Of the files of a batch."""
 
@@ -62,22 +64,12 @@ class SimulatedCampaign:
     """True values of every signal file; see `simulate_campaign`."""
 
 
-@dataclass(frozen=True, slots=True)
-class SimulationPlan:
-    """Every file that a simulation will write."""
-
-    campaign: Campaign
-    files: tuple[tuple[SimulatedInstrument, tuple[PlannedFile, ...]], ...]
-    """Of each instrument: dark files first, then signal files in time."""
-
-    @property
-    def paths(self) -> tuple[str, ...]:
-        """Paths in the archive, in the same order."""
-        return tuple(planned.path for _, files in self.files for planned in files)
-
-
 def simulate_campaign(
-    campaign: Campaign, *, client: Client | None = None, progress: Progress | None = None
+    campaign: Campaign,
+    *,
+    client: Client | None = None,
+    progress: Progress | None = None,
+    expect: Progress | None = None,
 ) -> SimulatedCampaign:
     """Write the raw files of a simulated campaign into its archive.
 
@@ -90,6 +82,8 @@ def simulate_campaign(
         Its workers write the files into the same folder; by default this process does.
     progress : callable, optional
         Called with the number of files written since the last call.
+    expect : callable, optional
+        Called with the number of files, before the first one is written.
 
     Returns
     -------
@@ -126,42 +120,15 @@ def simulate_campaign(
     instrument and its number, not on order, batches or workers. Memory holds the names of the
     files and their truth.
     """
-    return write_simulation(plan_simulation(campaign), client=client, progress=progress)
-
-
-def plan_simulation(campaign: Campaign) -> SimulationPlan:
-    """Return the files that `simulate_campaign` would write, after all checks.
-
-    Raises
-    ------
-    CampaignError
-        As `simulate_campaign`, except for the content of the archive.
-    """
-    if "://" in campaign.archive:
-        raise CampaignError(
-            "a simulation is written to a local folder",
-            file=campaign.archive,
-            field="archive",
-            remedy="give a path",
-        )
-    files = tuple((site, tuple(site.planned_files())) for site in _sites(campaign))
-    for site, planned_files in files:
-        _check_air(site)
-        _check_facts(site, planned_files)
-        _check_names(site, planned_files)
-    return SimulationPlan(campaign, files)
-
-
-def write_simulation(
-    plan: SimulationPlan, *, client: Client | None = None, progress: Progress | None = None
-) -> SimulatedCampaign:
-    """Write the files of a plan; see `simulate_campaign`."""
-    archive, paths = Path(plan.campaign.archive), plan.paths
-    _refuse_foreign_files(archive, [site for site, _ in plan.files], frozenset(paths))
+    plan = _plan(campaign)
+    archive, paths = Path(campaign.archive), [file.path for _, files in plan for file in files]
+    _refuse_foreign_files(archive, [site for site, _ in plan], frozenset(paths))
     for folder in {path.rpartition("/")[0] for path in paths}:
-        _make_folder(archive / folder)
-    rows = sum(planned.role is Role.SIGNAL for _, files in plan.files for planned in files)
-    table = TruthTable(rows, {site.key: Simulator(site).grid for site, _ in plan.files})
+        (archive / folder).mkdir(parents=True, exist_ok=True)
+    if expect:
+        expect(len(paths))
+    rows = sum(planned.role is Role.SIGNAL for _, files in plan for planned in files)
+    table = TruthTable(rows, {site.key: Simulator(site).grid for site, _ in plan})
     work = _batches(plan)
     results = (
         (_write_batch(batch, archive) for batch in work)
@@ -174,24 +141,29 @@ def write_simulation(
                 table.add(row, file_truth)
         if progress:
             progress(len(truths))
-    return SimulatedCampaign(archive, paths, table.dataset(plan.campaign.name))
+    return SimulatedCampaign(archive, tuple(paths), table.dataset(campaign.name))
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnavailableError(
-            f"cannot be made: {error.strerror}",
-            file=folder,
+def _plan(campaign: Campaign) -> _Plan:
+    """Return the files to write, after all checks but those of the archive."""
+    if "://" in campaign.archive:
+        raise CampaignError(
+            "a simulation is written to a local folder",
+            file=campaign.archive,
             field="archive",
-            remedy="give a folder that can be written",
-        ) from error
+            remedy="give a path",
+        )
+    plan = [(site, tuple(site.planned_files())) for site in _sites(campaign)]
+    for site, planned_files in plan:
+        _check_air(site)
+        _check_facts(site, planned_files)
+        _check_names(site, planned_files)
+    return plan
 
 
-def _batches(plan: SimulationPlan) -> Iterator[_Batch]:
+def _batches(plan: _Plan) -> Iterator[_Batch]:
     rows = count()
-    for site, files in plan.files:
+    for site, files in plan:
         work = [(file, next(rows) if file.role is Role.SIGNAL else None) for file in files]
         for first in range(0, len(work), _BATCH):
             yield site, work[first : first + _BATCH]

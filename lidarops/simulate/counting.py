@@ -227,10 +227,9 @@ def count_photons(
                 remedy="take fewer shots, or draw photoelectrons",
             )
         noise = random.standard_normal(rate.size, dtype=np.float32)
-        counted = _draw_counts(
-            rate, noise, exposure, dead_time * 1e6, 2.0 * in_previous, paralyzable
-        )
-        return counted
+        mean, variance = _moments(rate, dead_time * 1e6, 2.0 * in_previous, paralyzable=paralyzable)
+        drawn = mean * exposure + np.sqrt(variance * exposure) * noise
+        return np.maximum(drawn + 0.5, 0.0).astype(np.int32)
     if released.shots == 0 or dead_time == 0.0:
         return released.number.copy()
     per_event = dead_time / (released.exposure * 1e-6)
@@ -265,8 +264,22 @@ def counter_moments(
     _checks.not_negative("dead_time", dead_time, "s")
     rate = limited_rate(rate)
     in_previous = 2.0 * _share_in_previous(dead_time, bin_time)
-    both = _moments_of(rate, bin_time * 1e6, dead_time * 1e6, in_previous, paralyzable)
-    return both[0], both[1]
+    mean, variance = _moments(rate, dead_time * 1e6, in_previous, paralyzable=paralyzable)
+    return mean * bin_time * 1e6, variance * bin_time * 1e6
+
+
+def _moments(
+    rate: Array, dead_time: float, in_previous: float, *, paralyzable: bool
+) -> tuple[Array, Array]:
+    """Return mean and variance of the counts per microsecond, with the dead time in these."""
+    x = rate * dead_time
+    if paralyzable:
+        mean = rate * np.exp(-x)
+        # Within a window of length t, only pairs of events less than t apart count.
+        return mean, mean * (1.0 - 2.0 * x * np.exp(-x) * (1.0 - 0.5 * in_previous))
+    y = 1.0 + x
+    edge = in_previous * x * (y * y + 2.0 * y + 3.0) / (6.0 * y**4)
+    return rate / y, rate * (1.0 / y**3 + edge)
 
 
 def _share_in_previous(dead_time: float, bin_time: float) -> float:
@@ -320,41 +333,3 @@ def _count_events(
         if whole > 0:
             counted[i] -= random.binomial(whole, min(chance, 1.0))
     return counted
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moments(
-    rate: float, dead_time: float, in_previous: float, paralyzable: Any
-) -> tuple[float, float]:
-    """Return mean and variance of the counts per time."""
-    x = rate * dead_time
-    if paralyzable:
-        mean = rate * exp(-x)
-        # Within a window of length t, only pairs of events less than t apart count.
-        return mean, mean * (1.0 - 2.0 * x * exp(-x) * (1.0 - 0.5 * in_previous))
-    y = 1.0 + x
-    edge = in_previous * x * (y * y + 2.0 * y + 3.0) / (6.0 * y**4)
-    return rate / y, rate * (1.0 / y**3 + edge)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moments_of(
-    rate: Any, exposure: float, dead_time: float, in_previous: float, paralyzable: Any
-) -> Any:
-    both = np.empty((2, rate.size))
-    for i in range(rate.size):
-        mean, variance = _moments(rate[i], dead_time, in_previous, paralyzable)
-        both[0, i], both[1, i] = mean * exposure, variance * exposure
-    return both
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _draw_counts(
-    rate: Any, noise: Any, exposure: float, dead_time: float, in_previous: float, paralyzable: Any
-) -> Any:  # fmt: skip
-    counts = np.empty(rate.size, np.int32)
-    for i in range(rate.size):
-        mean, variance = _moments(rate[i], dead_time, in_previous, paralyzable)
-        value = mean * exposure + sqrt(variance * exposure) * noise[i]
-        counts[i] = int(value + 0.5) if value > 0.0 else 0
-    return counts

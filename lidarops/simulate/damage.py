@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta
 from typing import Final
 
@@ -97,17 +97,12 @@ def _in_counts(edit: Callable[[Dataset, NDArray[np.int32], np.random.Generator],
 
     def change(content: bytes, random: np.random.Generator) -> bytes:
         changed = bytearray(content)
-        for dataset, counts in _channels(changed):
+        for dataset in parse_header(content).datasets:
+            counts = np.frombuffer(changed, "<i4", dataset.bins, dataset.offset or 0)
             edit(dataset, counts, random)
         return bytes(changed)
 
     return change
-
-
-def _channels(content: bytearray) -> Iterator[tuple[Dataset, NDArray[np.int32]]]:
-    header = parse_header(bytes(content))
-    for dataset in header.datasets:
-        yield dataset, np.frombuffer(content, "<i4", dataset.bins, dataset.offset or 0)
 
 
 def _glitch(dataset: Dataset, counts: NDArray[np.int32], random: np.random.Generator) -> None:

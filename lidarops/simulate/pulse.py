@@ -18,8 +18,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numba
 import numpy as np
@@ -40,30 +39,22 @@ _MOST_CELLS: Final = 100_000
 _CELLS_OF_PULSE: Final = 32
 _CELLS_OF_BIN: Final = 5
 _DECAYS: Final = 16.0
-
-
-class Origin(Enum):
-    """Point of the pulse at time zero of the recorder, and so at range 0."""
-
-    LEADING_EDGE = "leading edge"
-    PEAK = "peak"
+_REACH: Final = 3.0
+"""Standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pulse(ABC):
-    """Power of a laser pulse of unit energy over time; time zero is range 0."""
+    """Power of a laser pulse of unit energy over time; its peak leaves at time zero, range 0."""
 
     width: float
     """s: duration of a rectangle, full width at half maximum of a Gaussian, or the time in which
     the power of an exponential falls to 1/e."""
+    ends: ClassVar[tuple[float, float]]
+    """Where the pulse is cut, in units of time."""
 
     def __post_init__(self) -> None:
         _checks.between("width", self.width, 1e-15, 1e-3, "s")
-
-    @property
-    def peak(self) -> float:
-        """Time of the highest power, s."""
-        return 0.0
 
     @property
     def unit(self) -> float:
@@ -71,36 +62,31 @@ class Pulse(ABC):
         return self.width
 
     @property
-    @abstractmethod
-    def ends(self) -> tuple[float, float]:
-        """Where the pulse is cut, in units from the peak."""
-
-    @property
     def start(self) -> float:
         """Time before which no energy leaves, s."""
-        return self.peak + self.ends[0] * self.unit
+        return self.ends[0] * self.unit
 
     @property
     def stop(self) -> float:
         """Time after which no energy leaves, s."""
-        return self.peak + self.ends[1] * self.unit
+        return self.ends[1] * self.unit
 
     def passed(self, time: Array) -> Array:
         """Return the share of the energy that has left by a time (s), from 0 to 1."""
-        return self._share(np.clip((time - self.peak) / self.unit, *self.ends))
+        return self._share(np.clip(time / self.unit, *self.ends))
 
     def passed_integral(self, time: Array) -> Array:
         """Return the integral of `passed` up to a time, s."""
-        u = np.clip((time - self.peak) / self.unit, *self.ends)
-        return self.unit * self._integral(u) + np.clip(time - self.stop, 0.0, None)
+        integral = self._integral(np.clip(time / self.unit, *self.ends))
+        return self.unit * integral + np.clip(time - self.stop, 0.0, None)
 
     @abstractmethod
     def _share(self, u: Array) -> Array:
-        """Return `passed` at times in units from the peak."""
+        """Return `passed` at times in units."""
 
     @abstractmethod
     def _integral(self, u: Array) -> Array:
-        """Return the integral of `_share` up to times in units from the peak."""
+        """Return the integral of `_share` up to times in units."""
 
 
 class RectangularPulse(Pulse):
@@ -115,43 +101,25 @@ class RectangularPulse(Pulse):
         return 0.5 * u**2
 
 
-@dataclass(frozen=True, slots=True)
 class GaussianPulse(Pulse):
-    """Gaussian power, cut at `reach` standard deviations on both sides of its peak."""
+    """Gaussian power, cut at 3 standard deviations on both sides of its peak, at time zero."""
 
-    origin: Origin = Origin.LEADING_EDGE
-    """Where time zero lies: at the leading cut or at the peak."""
-    reach: float = 3.0
-    """Standard deviations."""
-
-    def __post_init__(self) -> None:
-        _checks.between("width", self.width, 1e-15, 1e-3, "s")
-        _checks.between("reach", self.reach, 1.0, 8.0)
-
-    @property
-    def peak(self) -> float:
-        """Time of the highest power, s."""
-        return 0.0 if self.origin is Origin.PEAK else self.reach * self.unit
+    ends = (-_REACH, _REACH)
 
     @property
     def unit(self) -> float:
         """Standard deviation of the uncut Gaussian, s."""
         return self.width / _FWHM
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Where the pulse is cut, in units from the peak."""
-        return -self.reach, self.reach
-
     def _share(self, u: Array) -> Array:
-        cut = ndtr(-self.reach)
+        cut = ndtr(-_REACH)
         share: Array = (ndtr(u) - cut) / (1.0 - 2.0 * cut)
         return share
 
     def _integral(self, u: Array) -> Array:
-        reach, cut = self.reach, ndtr(-self.reach)
-        low = -reach * cut + _density(np.array(reach))
-        inside = u * ndtr(u) + _density(u) - low - cut * (u + reach)
+        cut = ndtr(-_REACH)
+        low = -_REACH * cut + _density(np.array(_REACH))
+        inside = u * ndtr(u) + _density(u) - low - cut * (u + _REACH)
         integral: Array = inside / (1.0 - 2.0 * cut)
         return integral
 
@@ -170,19 +138,9 @@ class ExponentialPulse(Pulse):
         return integral
 
 
-@dataclass(frozen=True, slots=True)
-class Response:
-    """Signal of a point scatterer at range 0: pulse and bin convolved, in cells."""
-
-    edges: Array
-    """m behind the range of the time, ascending, shape (cells + 1,)."""
-    density: Array
-    """m-1, energy in each cell over its length; the sum of density times length is 1."""
-
-
 def response(
     pulse: Pulse | None, *, bin_width: float | None = None, resolution: float | None = None
-) -> Response:
+) -> tuple[Array, Array]:
     """Return the energy of a pulse over range, convolved with a bin.
 
     Parameters
@@ -194,6 +152,13 @@ def response(
         power.
     resolution : float, m, optional
         Longest cell; by default a fifth of the bin, or 1/32 of the pulse without a bin.
+
+    Returns
+    -------
+    edges : ndarray, m, shape (cells + 1,)
+        Of cells behind the range of the time, ascending.
+    density : ndarray, m-1, shape (cells,)
+        Energy in each cell over its length; the sum of density times length is 1.
 
     Raises
     ------
@@ -215,7 +180,7 @@ def response(
     cells = max(math.ceil(span / resolution * (1.0 - 1e-12)), 1)
     _checks.between("resolution", cells, 1, _MOST_CELLS, "cells")
     edges = np.linspace(start - half, stop + half, cells + 1)
-    return Response(edges, np.diff(_passed(pulse, edges, half)) / (span / cells))
+    return edges, np.diff(_passed(pulse, edges, half)) / (span / cells)
 
 
 def _passed(pulse: Pulse | None, edges: Array, half: float) -> Array:
@@ -283,11 +248,11 @@ def pulsed_signal(
     """
     _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
     _checks.not_negative("full_overlap_range", full_overlap_range, "m")
-    cells = response(pulse, bin_width=bin_width, resolution=resolution)
-    _refuse_near(distance, cells, full_overlap_range)
+    edges, density = response(pulse, bin_width=bin_width, resolution=resolution)
+    _refuse_near(distance, edges, full_overlap_range)
     grid = distance if path is None else path
     points = _points(grid, extinction, backscatter, returning_extinction)
-    signal: Array = _sum_cells(distance, cells.edges, cells.density, *points, full_overlap_range)
+    signal: Array = _sum_cells(distance, edges, density, *points, full_overlap_range)
     return system_constant * signal
 
 
@@ -339,24 +304,24 @@ def pulse_echo(
 
 _SHAPES: Final[Mapping[str, Callable[[float], tuple[Pulse, float]]]] = {
     "rectangle": lambda width: (RectangularPulse(width), 0.5 * width),
-    "gaussian": lambda width: (GaussianPulse(width, Origin.PEAK), 0.0),
+    "gaussian": lambda width: (GaussianPulse(width), 0.0),
     "exponential": lambda width: (ExponentialPulse(width), width),
 }
 """Shape in a campaign file -> width in s -> the pulse, and the time of its centroid, s."""
 
 
-def _refuse_near(distance: Array, cells: Response, full_overlap_range: float) -> None:
+def _refuse_near(distance: Array, edges: Array, full_overlap_range: float) -> None:
     _checks.ascending("distance", distance)
-    if cells.edges[-1] >= distance[-1]:
+    if edges[-1] >= distance[-1]:
         raise SimulationInputError(
-            f"is as long as the range: {cells.edges[-1]:g} m of {distance[-1]:g} m",
+            f"is as long as the range: {edges[-1]:g} m of {distance[-1]:g} m",
             field="pulse",
             remedy="give a shorter pulse (in s) or a longer range",
         )
-    reached = (distance > cells.edges[0]) & (distance <= cells.edges[-1])
+    reached = (distance > edges[0]) & (distance <= edges[-1])
     if reached.any() and full_overlap_range == 0.0:
         raise SimulationInputError(
-            f"must be positive, or the signal within the pulse ({cells.edges[-1]:g} m) is infinite",
+            f"must be positive, or the signal within the pulse ({edges[-1]:g} m) is infinite",
             field="full_overlap_range",
             remedy="give the range of full overlap, or ranges behind the pulse",
         )

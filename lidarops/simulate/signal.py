@@ -121,7 +121,10 @@ def backscatter_signal(
     `vasylkivskyi2009`, equations 15 and 22 (23 where both wavelengths are equal), taken at the
     bin centre.
     """
-    _check_ranges(distance)
+    if distance.ndim != 1 or distance.size > 1:
+        _checks.ascending("distance", distance)
+    if not np.all(np.abs(distance[-1:]) <= _FARTHEST):
+        raise SimulationInputError(f"ends at {distance[-1]:g} m", field="distance")
     _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
     _checks.profile("extinction", extinction, distance.shape, "m-1")
     _checks.profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
@@ -133,10 +136,3 @@ def backscatter_signal(
     gathered = sine_overlap(distance, full_overlap_range) * backscatter / safe**2
     transmitted = np.exp(-optical_depth(distance, two_way))
     return np.where(positive, system_constant * gathered * transmitted, 0.0)
-
-
-def _check_ranges(distance: Array) -> None:
-    if distance.ndim != 1 or distance.size > 1:
-        _checks.ascending("distance", distance)
-    if not np.all(np.abs(distance[-1:]) <= _FARTHEST):
-        raise SimulationInputError(f"ends at {distance[-1]:g} m", field="distance")

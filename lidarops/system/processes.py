@@ -21,7 +21,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
 from itertools import chain, islice
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext
@@ -203,7 +202,7 @@ class Processes(AbstractContextManager["Processes[Kept]"], Generic[Kept]):
         ahead: deque[tuple[list[Item], Future[list[Result]] | None]] = deque()
         while True:
             for batch in islice(batches, _BATCHES_AHEAD * self._number - len(ahead)):
-                ahead.append((batch, self._submit(partial(_run_batch, task), batch)))
+                ahead.append((batch, self._submit(task, batch)))
             if not ahead:
                 return
             batch, future = ahead.popleft()
@@ -211,33 +210,16 @@ class Processes(AbstractContextManager["Processes[Kept]"], Generic[Kept]):
             if results is None:
                 yield from ((item, self._by_itself(task, item, lost)) for item in batch)
             else:
-                yield from zip(batch, results[0], strict=True)
+                yield from zip(batch, results, strict=True)
 
-    def later(
-        self,
-        task: Callable[[Kept, Item], Result],
-        item: Item,
-        *,
-        lost: Lost[Item, Result] = None,
-    ) -> Callable[[], Result]:
-        """Start a task; return a function that waits for its result and returns or raises it.
-
-        Without processes, that function calls the task. `lost` is that of `map_items`.
-        """
-        future = self._submit(task, item)
-
-        def result() -> Result:
-            done = self._wait(future)
-            return self._by_itself(task, item, lost) if done is None else done[0]
-
-        return result
-
-    def _submit(self, task: Callable[[Kept, Item], Result], item: Item) -> Future[Result] | None:
-        """Start a task; None if it is to be called by itself, when its result is needed."""
+    def _submit(
+        self, task: Callable[[Kept, Item], Result], items: list[Item]
+    ) -> Future[list[Result]] | None:
+        """Start a task for some items; None if it is to be called for each when it is needed."""
         if self._alone or self._careful:
             return None
         try:
-            return self._started_pool(self._number).submit(_run_task, task, item)
+            return self._started_pool(self._number).submit(_run, task, items)
         # A process was lost, none can be started, or the server that forks them has ended.
         except (BrokenProcessPool, OSError, EOFError) as error:
             self._lost(error)
@@ -253,12 +235,12 @@ class Processes(AbstractContextManager["Processes[Kept]"], Generic[Kept]):
             )
         return self._pool
 
-    def _wait(self, future: Future[Result] | None) -> tuple[Result] | None:
-        """Return the result of a started task; None if its process was lost."""
+    def _wait(self, future: Future[list[Result]] | None) -> list[Result] | None:
+        """Return the results of a started task; None if its process was lost."""
         # Never cancel here: the thread that marks the tasks of a lost process would stop at a
         # cancelled future, and the remaining processes would wait for ever.
         try:
-            return None if future is None else (future.result(),)
+            return None if future is None else future.result()
         # A process was killed (e.g. for its memory), or could not be started.
         except (BrokenProcessPool, CancelledError) as error:
             # Of several tasks of one lost pool, only the first one to be waited for says so.
@@ -279,7 +261,7 @@ class Processes(AbstractContextManager["Processes[Kept]"], Generic[Kept]):
             if not self._starts_one():
                 return task(self._kept, item)
             try:
-                return self._started_pool(1).submit(_run_task, task, item).result()
+                return self._started_pool(1).submit(_run, task, [item]).result()[0]
             except BrokenProcessPool as error:
                 self._lost(error)
         if lost is None:
@@ -382,12 +364,8 @@ def objects_frozen() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _run_task(task: Callable[[Any, Item], Result], item: Item) -> Result:
-    return task(_KEPT[0], item)
-
-
-def _run_batch(task: Callable[[Kept, Item], Result], kept: Kept, items: list[Item]) -> list[Result]:
-    return [task(kept, item) for item in items]
+def _run(task: Callable[[Any, Item], Result], items: list[Item]) -> list[Result]:
+    return [task(_KEPT[0], item) for item in items]
 
 
 def _die_with(parent: int) -> None:

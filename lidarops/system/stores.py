@@ -155,7 +155,7 @@ class RemoteStore:
         self._scheme = url.partition("://")[0]
         try:
             # Some drivers connect here.
-            with self._errors_as(UnavailableError, "cannot be reached"):
+            with self._unavailable("cannot be reached"):
                 self._fs, prefix = fsspec.core.url_to_fs(url)
         except (ValueError, ImportError) as error:
             raise CatalogError(
@@ -187,7 +187,7 @@ class RemoteStore:
         CatalogError
             If the store cannot be reached or listed.
         """
-        with self._errors_as(UnavailableError, "cannot be listed"):
+        with self._unavailable("cannot be listed"):
             # Another process may have written since the last listing.
             self._fs.invalidate_cache()
             listing = dict(self._sized(self._find(), is_used))
@@ -304,21 +304,21 @@ class RemoteStore:
         """
         for path in paths:
             _confine(path)
-        pairs = [(self._name(path), str(folder / path)) for path in paths]
+        names, targets = list(map(self._name, paths)), [str(folder / path) for path in paths]
         refused: dict[str, str] = {}
-        with self._errors_as(UnavailableError, "cannot be read"):
+        with self._unavailable("cannot be read"):
             for path in paths:
                 (folder / path).parent.mkdir(parents=True, exist_ok=True)
             try:
-                self._fs.get(*_columns(pairs), batch_size=_BATCH)
+                self._fs.get(names, targets, batch_size=_BATCH)
             except _failures() as error:
                 if not self._is_of_one_object(error):
                     raise
                 # Rare, so existing files may be fetched twice.
-                for path, pair in zip(paths, pairs, strict=True):
+                for path, name, target in zip(paths, names, targets, strict=True):
                     try:
                         with self._one_object(path):
-                            self._fs.get_file(*pair)
+                            self._fs.get_file(name, target)
                     except FileNotFoundError:
                         continue
                     except OSError as answer:
@@ -369,7 +369,7 @@ class RemoteStore:
         ]
         for first in range(0, len(due), _BATCH):
             batch = {path: products[path] for path in due[first : first + _BATCH]}
-            with self._errors_as(UnavailableError, "cannot be written"):
+            with self._unavailable("cannot be written"):
                 self._upload(root, batch)
             _append_journal(journal, batch)
         others = [
@@ -423,10 +423,10 @@ class RemoteStore:
 
     @contextmanager
     def _one_object(self, path: str) -> Iterator[None]:
-        """Raise an OSError where an answer concerns one object, else as `_errors_as`."""
+        """Raise an OSError where an answer concerns one object, else as `_unavailable`."""
         _confine(path)
         try:
-            with self._errors_as(UnavailableError, f"{path} cannot be read"):
+            with self._unavailable(f"{path} cannot be read"):
                 yield
         except CatalogError as error:
             cause = error.__cause__
@@ -464,13 +464,14 @@ class RemoteStore:
         return True
 
     @contextmanager
-    def _errors_as(self, kind: type[LidarOpsError], problem: str) -> Iterator[None]:
+    def _unavailable(self, problem: str) -> Iterator[None]:
+        """Raise what a driver raises as an error that states the problem."""
         try:
             yield
         except LidarOpsError:
             raise
         except _failures() as error:
-            raise kind(
+            raise UnavailableError(
                 f"{problem}: {without_keys(repr(error))}",
                 file=self.url,
                 remedy="check address, network and keys",
@@ -519,10 +520,6 @@ def _reading(product: Path) -> Iterator[None]:
 def _size(product: Path) -> int:
     with _reading(product):
         return product.stat().st_size
-
-
-def _columns(pairs: Sequence[tuple[str, str]]) -> tuple[list[str], list[str]]:
-    return [first for first, _ in pairs], [second for _, second in pairs]
 
 
 def _read_journal(journal: Path) -> dict[str, str]:

@@ -12,7 +12,6 @@ from pydantic import ValidationError
 from lidarops.campaign.simulated_air import AtmosphereSettings
 from lidarops.campaign.simulated_instrument import AnalogRecorder
 from lidarops.campaign.simulation import SimulationSettings
-from lidarops.errors import CatalogError
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate import analog
 from lidarops.simulate._checks import SimulationInputError
@@ -139,5 +138,5 @@ def test_values_that_do_not_fit_a_raw_file_are_refused(old, new, message):
 
 def test_an_archive_that_cannot_be_created_is_named(tmp_path, small):
     (tmp_path / "raw").write_text("a file")
-    with pytest.raises(CatalogError, match="cannot be made"):
+    with pytest.raises(NotADirectoryError, match="raw/deeper"):
         simulate_campaign(small(archive="raw/deeper"))

@@ -13,7 +13,7 @@ from lidarops.cli import app
 from lidarops.errors import CampaignError
 from lidarops.run import clusters
 from lidarops.simulate import campaign as module
-from lidarops.simulate.campaign import plan_simulation, simulate_campaign
+from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.files import Simulator
 
 
@@ -77,11 +77,12 @@ def test_any_order_gives_the_same_files(small):
             assert simulator.simulate(planned)[0] == content
 
 
-def test_the_plan_names_all_files(small):
-    campaign = small(_scenery)
-    assert plan_simulation(campaign).paths == simulate_campaign(campaign).paths
+def test_the_number_of_files_is_told_before_the_first(small):
+    told = []
+    paths = simulate_campaign(small(_scenery), progress=told.append, expect=told.append).paths
+    assert told[0] == sum(told[1:]) == len(paths)
     with pytest.raises(CampaignError, match="no simulation"):
-        plan_simulation(small(lambda tree: tree.pop("simulation")))
+        simulate_campaign(small(lambda tree: tree.pop("simulation")))
 
 
 def test_the_command_line_writes_the_same_with_workers(small, client, tmp_path, monkeypatch):

@@ -120,14 +120,12 @@ class TestEach:
         monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)
         with Processes(2, 2) as pool:
             assert list(pool.map_items(product, range(9), at_a_time=3)) == doubled(range(9))
-            assert pool.later(product, 7)() == 14
+            assert list(pool.map_items(product, [7], at_a_time=1, fewest=1)) == [(7, 14)]
 
     def test_loses_nothing_with_a_process(self, tmp_path, caplog) -> None:
         with caplog.at_level(logging.WARNING), Processes(2, tmp_path / "lost") as pool:
-            last = pool.later(deadly_once, 7)
             done = list(pool.map_items(deadly_once, range(40), at_a_time=2, lost=lost))
             assert done == doubled(range(40))
-            assert last() == 14
             (other,) = {one for _, one in pool.map_items(process, range(4), at_a_time=1)}
             assert other != os.getpid()
         assert caplog.text.count("a process was lost") == 1
@@ -135,7 +133,8 @@ class TestEach:
     def test_reports_an_item_that_ends_each_process_and_never_works_on_it_here(self) -> None:
         with Processes(2, 2) as pool:
             done = dict(pool.map_items(deadly, range(40), at_a_time=3, lost=lost))
-            assert pool.later(deadly, 5, lost=lost)() == -5
+            alone = pool.map_items(deadly, [5], at_a_time=1, fewest=1, lost=lost)
+            assert list(alone) == [(5, -5)]
             with pytest.raises(BrokenProcessPool, match="5 ends each process"):
                 list(pool.map_items(deadly, range(9), at_a_time=1))
         assert done == dict(doubled(range(40))) | {5: -5}
@@ -251,11 +250,13 @@ if __name__ == "__main__":
     # The variable may be one that dates products or gives keys of a store.
     os.environ["LIDAROPS_SEEN"] = "later"
     with Processes(2, 2) as pool:
-        assert pool.later(variable, "LIDAROPS_SEEN")() == "later"
+        (found,) = pool.map_items(variable, ["LIDAROPS_SEEN"], at_a_time=1, fewest=1)
+        assert found[1] == "later"
     del os.environ["LIDAROPS_SEEN"]
     assert start_method() == "forkserver"
     with Processes(2, 2) as pool:
-        print(pool.later(seen, 1)()[1], flush=True)
+        ((_, found),) = pool.map_items(seen, [1], at_a_time=1, fewest=1)
+        print(found[1], flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -283,7 +284,7 @@ if __name__ == "__main__":
     thread.join()
     assert processes.start_method() == "forkserver"
     with processes.Processes(2, 2) as pool:
-        assert pool.later(kept_variables, 0)() == []
+        assert list(pool.map_items(kept_variables, [0], at_a_time=1, fewest=1)) == [(0, [])]
 """
 
 WORKERS = """
@@ -385,14 +386,6 @@ def _ends(pid: int) -> bool:
             return True
         time.sleep(0.05)
     return False
-
-
-class TestLater:
-    @pytest.mark.parametrize("number", [1, 2])
-    def test_gives_what_it_came_to(self, number: int) -> None:
-        with Processes(number, 3) as pool:
-            begun = [pool.later(product, item) for item in range(9)]
-            assert [results() for results in begun] == [3 * item for item in range(9)]
 
 
 def test_existing_objects_are_not_collected_within_and_are_afterwards():
