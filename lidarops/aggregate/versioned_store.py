@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate import need
-from lidarops.aggregate._join import Part, Source, pattern_of, shared_attributes, sorted_by_time
+from lidarops.aggregate._join import Source, pattern_of, shared_attributes, sorted_by_time
 from lidarops.aggregate.facts import (
     Facts,
     ProductSelection,
@@ -260,8 +260,7 @@ def _write_group(
     attributes, pattern = {}, None
     for at in read:
         with _opened(root, products[at]) as product:
-            part = Part.of(product, products[at], root)
-            attributes[at], times[at] = part.attributes, part.times
+            attributes[at], times[at] = product.attrs, product["time"].values
             if at == 0:
                 pattern = pattern_of(product, products[at])
     refuse_duplicates((products[at].path, part) for at, part in times.items())

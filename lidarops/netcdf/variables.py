@@ -459,11 +459,12 @@ def attributes(
 
 
 def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
+    texts = (f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in flags)
     return {
         FLAG_LAYOUT: flags.layout,
         "flag_masks": np.array(flags.bits, dtype=stored),
-        "flag_meanings": flags.words,
-        "comment": f"0: no test failed. {flags.explanation}. reject: do not use the value; care:"
+        "flag_meanings": " ".join(bit.word for bit in flags),
+        "comment": f"0: no test failed. {'; '.join(texts)}. reject: do not use the value; care:"
         " the value is valid, but its stated uncertainty may be too small, or as large as the"
         " value.",
     }
