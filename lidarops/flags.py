@@ -196,6 +196,8 @@ class Flags:
     """Raised when a bit gets another place."""
     bits: tuple[FlagBit, ...]
     """Bits of `Quality`, then the kind's own; rising."""
+    layout: str = field(init=False)
+    """Name of the places, such as ``elastic 2``."""
     rejecting: int = field(init=False)
     """Union of the bits that reject a value."""
 
@@ -211,12 +213,8 @@ class Flags:
                 f"flags of {self.kind}: names and places must differ, and places rise: shared bits"
                 f" below {FIRST_OWN}, own bits from {FIRST_OWN} to {PLACES - 1}"
             )
+        object.__setattr__(self, "layout", f"{self.kind} {self.version}")
         object.__setattr__(self, "rejecting", rejecting(self.bits))
-
-    @property
-    def layout(self) -> str:
-        """Name of the places, such as ``elastic 2``."""
-        return f"{self.kind} {self.version}"
 
     def __iter__(self) -> Iterator[FlagBit]:
         """Iterate over the bits, rising."""

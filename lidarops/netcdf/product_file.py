@@ -193,19 +193,16 @@ class ProductWriter:
             judge = self._layout.row(rows.judging(row.name, flags))
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
             judged = row.dims == judge.dims and not spared
-            encoded[row.name] = stored(profiles, row, flags[judge.name] if judged else None)
-            self._refuse_other_sizes(row, encoded[row.name])
+            values = stored(profiles, row, flags[judge.name] if judged else None)
+            for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
+                if dim not in self._sizes:
+                    along = (one.name for one in self._layout.coordinates if one.dims == (dim,))
+                    raise ProductError("is missing", field=next(along, dim))
+                if size != self._sizes[dim]:
+                    words = f"has {size} values along {dim}, not {self._sizes[dim]}"
+                    raise ProductError(words, field=row.name)
+            encoded[row.name] = values
         return encoded
-
-    def _refuse_other_sizes(self, row: Row, values: Values) -> None:
-        for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
-            if dim not in self._sizes:
-                along = (other.name for other in self._layout.coordinates if other.dims == (dim,))
-                raise ProductError("is missing", field=next(along, dim))
-            if size != self._sizes[dim]:
-                raise ProductError(
-                    f"has {size} values along {dim}, not {self._sizes[dim]}", field=row.name
-                )
 
     def skeleton(self, encoded: Mapping[str, Values]) -> Skeleton:
         """Return all of the file except the values of profiles.

@@ -445,29 +445,26 @@ def attributes(
         attrs["quantization_nsb"] = np.int32(row.bits)
     if row.error_kind is not None and not row.uncertain:
         attrs["error_kind"] = row.error_kind.value
+    comment = row.comment
     if row.flags is not None:
-        attrs |= _flag_attributes(row.flags, stored)
+        bits = row.flags.bits
+        texts = (f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in bits)
+        attrs[FLAG_LAYOUT] = row.flags.layout
+        attrs["flag_masks"] = np.array(bits, dtype=stored)
+        attrs["flag_meanings"] = " ".join(bit.word for bit in bits)
+        comment = (
+            f"0: no test failed. {'; '.join(texts)}. reject: do not use the value; care: the value"
+            " is valid, but its stated uncertainty may be too small, or as large as the value."
+            f" {row.comment or ''}"
+        ).strip()
     if row.reasons is not None:
         attrs["flag_masks"] = np.array([*row.reasons], dtype=stored)
         attrs["flag_meanings"] = " ".join(str(reason.name).lower() for reason in row.reasons)
     if row.states:
         attrs["flag_values"] = np.arange(len(row.states), dtype=stored)
         attrs["flag_meanings"] = " ".join(row.states)
-    texts = (attrs.get("comment"), row.comment)
-    attrs["comment"] = " ".join(text for text in texts if text) or None
+    attrs["comment"] = comment or None
     return {key: value for key, value in attrs.items() if value is not None}
-
-
-def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
-    texts = (f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in flags)
-    return {
-        FLAG_LAYOUT: flags.layout,
-        "flag_masks": np.array(flags.bits, dtype=stored),
-        "flag_meanings": " ".join(bit.word for bit in flags),
-        "comment": f"0: no test failed. {'; '.join(texts)}. reject: do not use the value; care:"
-        " the value is valid, but its stated uncertainty may be too small, or as large as the"
-        " value.",
-    }
 
 
 TIME: Final = Row(

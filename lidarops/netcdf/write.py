@@ -243,17 +243,6 @@ class QuietFile(io.FileIO):
             self.error = error
             return 0
 
-    def check(self) -> None:
-        """Raise the first error.
-
-        Raises
-        ------
-        OSError
-            If the file is not as it was written.
-        """
-        if self.error is not None:
-            raise self.error
-
 
 @contextmanager
 def create_file(
@@ -392,7 +381,8 @@ class RowFile:
             for (first, *others), data in chunks:
                 with NETCDF4_PYTHON_LOCK:
                     self._targets[name].write_direct_chunk((begin + first, *others), data)
-                self._stream.check()
+                if self._stream.error is not None:
+                    raise self._stream.error
 
     def complete(self) -> None:
         """Close the file, if all rows came and are in it."""
@@ -401,7 +391,8 @@ class RowFile:
         with _disk_errors(self._path):
             with NETCDF4_PYTHON_LOCK:
                 self._file.close()
-            self._stream.check()
+            if self._stream.error is not None:
+                raise self._stream.error
 
     def close(self) -> None:
         """Close the file; where it is not complete, write nothing more."""
