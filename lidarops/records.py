@@ -39,6 +39,8 @@ class DetectionMode(StrEnum):
     PHOTON = "photon"
 
 
+SIGNAL_UNITS: Final[Mapping[str, str]] = {"analog": "mV", "photon": "MHz"}
+"""Detection mode -> unit of its signal."""
 GLUED: Final = "glued_"
 """Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
 

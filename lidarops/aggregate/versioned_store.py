@@ -225,24 +225,8 @@ def _write_group(
 ) -> None:
     """Write the products that a group lacks; one whose rows are at their place stays.
 
-    Parameters
-    ----------
-    store : icechunk.IcechunkStore
-        Of a writable session.
-    name : str
-        Of the group.
-    root : path
-    products : sequence of Facts
-        All of the group, in order of time.
-    changes : Changes
-        Gets what changes.
-
-    Raises
-    ------
-    ProductError
-        If a time occurs twice. Nothing is written then.
-    UnreadableProductError
-        If a product cannot be read or has changed since. Part of the group may be written then.
+    `products` are all of the group, in order of time. Where a time occurs twice, nothing is
+    written; where a product cannot be read, part of the group may be.
     """
     held = _held(store, name)
     ids = [product.id for product in products]

@@ -64,7 +64,7 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
     ProductError
         If a coordinate is missing, not finite, not rising, or outside its cell bounds.
     """
-    time, moments, bounds = _time(source, layout.row("time"))
+    time, moments, bounds = _time(source, layout.rows["time"])
     station = context.station
     place = _PLACES.get(layout.sampled, _beam_place)
     by_name, vertical = place(source, layout, station.altitude)
@@ -79,7 +79,7 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
     }
     for name, value in fixed.items():
         if name not in by_name and name in layout.rows and np.isfinite(value):
-            row = layout.row(name)
+            row = layout.rows[name]
             row = deployment(row) if f"bin_{name}" in bins else row
             by_name[name] = Coordinate(row, (), np.asarray(value, np.float64))
     by_name |= bins
@@ -135,12 +135,12 @@ _Place = tuple[dict[str, Coordinate], _Vertical]
 def _beam_place(source: xr.Dataset, layout: Layout, station: float) -> _Place:
     """Return the coordinates of a kind whose values lie along the beam."""
     names = _names_along(layout)
-    by_name = {name: _along(source, layout.row(name)) for name in names}
-    zenith = _beam(source, layout.row("zenith_angle"))
-    altitude, vertical = _altitude(layout.row("altitude"), by_name[names[-1]], zenith, station)
+    by_name = {name: _along(source, layout.rows[name]) for name in names}
+    zenith = _beam(source, layout.rows["zenith_angle"])
+    altitude, vertical = _altitude(layout.rows["altitude"], by_name[names[-1]], zenith, station)
     by_name |= {"altitude": altitude, "zenith_angle": zenith}
     if "azimuth" in source:
-        by_name["azimuth"] = _beam(source, layout.row("azimuth"))
+        by_name["azimuth"] = _beam(source, layout.rows["azimuth"])
     return by_name, vertical
 
 
@@ -161,7 +161,7 @@ def _air_positions(
     positions = beam_positions(
         station.latitude, station.longitude, station.altitude, ahead, azimuth, up
     )
-    rows = (layout.row(name) for name in ("bin_latitude", "bin_longitude"))
+    rows = (layout.rows[name] for name in ("bin_latitude", "bin_longitude"))
     return {
         row.name: Coordinate(row, row.dims, values.astype(row.dtype))
         for row, values in zip(rows, positions, strict=True)
@@ -174,8 +174,8 @@ def _scan_place(source: xr.Dataset, layout: Layout, station: float) -> _Place:
     # Layers, planes and the baseline are optional, and so are their coordinates.
     optional = ("beam_azimuth", "layer_altitude", "plane", "plane_azimuth", "baseline_range")
     names += [name for name in optional if name in source]
-    by_name = {name: _along(source, layout.row(name)) for name in names}
-    row = layout.row("altitude")
+    by_name = {name: _along(source, layout.rows[name]) for name in names}
+    row = layout.rows["altitude"]
     values = _along(source, replace(row, bounds=None)).values
     if values[0] <= station:
         raise ProductError(
@@ -191,7 +191,7 @@ def _network_place(source: xr.Dataset, layout: Layout, _station: float) -> _Plac
     angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
     beams = (f"beam_{name}" for name in angles)
     names = ("crossing_id", "latitude", "longitude", "altitude", "beam", *beams)
-    by_name = {name: _along(source, layout.row(name)) for name in names}
+    by_name = {name: _along(source, layout.rows[name]) for name in names}
     altitude = by_name["altitude"].values
     # Crossings are not ordered by altitude, so there is no vertical step.
     return by_name, _Vertical(altitude, None, profiles=False)

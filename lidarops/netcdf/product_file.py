@@ -112,7 +112,7 @@ class ProductWriter:
             for dim, size in variable.sizes.items()
         }
         for name, values in self._fixed.items():
-            self._sizes |= dict(zip(layout.row(name).dims, values.shape, strict=True))
+            self._sizes |= dict(zip(layout.rows[name].dims, values.shape, strict=True))
         self._counts = FlagCounter(layout.flags.rejecting)
         self.file: RowFile | None = None
         """None until the first profiles, which decide on optional variables."""
@@ -190,7 +190,7 @@ class ProductWriter:
                 continue
             # Bits refer to retrieved values; an optional derived or an auxiliary value may be
             # missing without one.
-            judge = self._layout.row(rows.judging(row.name, flags))
+            judge = self._layout.rows[rows.judging(row.name, flags)]
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
             judged = row.dims == judge.dims and not spared
             values = stored(profiles, row, flags[judge.name] if judged else None)
