@@ -304,7 +304,7 @@ class LeftOut:
     """As of a planned step."""
 
 
-_AnyEntry = TypeVar("_AnyEntry", PlannedStep, LeftOut)
+_AnyEntry = TypeVar("_AnyEntry", bound=PlannedStep | LeftOut)
 
 
 def products_of(entries: Iterable[_AnyEntry]) -> tuple[_AnyEntry, ...]:
