@@ -13,7 +13,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
-import netCDF4
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -296,7 +295,7 @@ def read_product_facts(
             yield facts
 
 
-def read_header(product: netCDF4.Dataset, path: str, selection: ProductSelection) -> Header | None:
+def read_header(product: Any, path: str, selection: ProductSelection) -> Header | None:
     """Return what an open product states of itself; None where it is not selected.
 
     Parameters
@@ -340,7 +339,7 @@ def read_header(product: netCDF4.Dataset, path: str, selection: ProductSelection
         raise ProductError(problem, file=path) from error
 
 
-def _facts(product: netCDF4.Dataset, file: Path, header: Header) -> Facts:
+def _facts(product: Any, file: Path, header: Header) -> Facts:
     flags = {
         name: xr.Variable(variable.dimensions, variable[...], vars(variable))
         for name, variable in product.variables.items()
@@ -375,7 +374,7 @@ def coordinate_names(kind: str) -> frozenset[str]:
     return frozenset({*(row.name for row in rows), *bounds})
 
 
-def _grid_digest(product: netCDF4.Dataset, kind: str) -> str:
+def _grid_digest(product: Any, kind: str) -> str:
     """Return a digest of what must be equal in products that are joined along time.
 
     These are names, types, dimensions, units and flags of the variables, the recorders, and the
@@ -481,7 +480,7 @@ def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> No
         )
 
 
-def _middle(product: netCDF4.Dataset, name: str) -> float:
+def _middle(product: Any, name: str) -> float:
     """Return a coordinate of the station, or its mean over a network; NaN if missing."""
     known = name in product.variables
     return float(product[name][...].mean()) if known else float("nan")

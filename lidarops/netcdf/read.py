@@ -16,11 +16,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import h5py
-import netCDF4
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.netcdf.stored_flags import refuse_moved_flags
@@ -111,8 +109,12 @@ def opened_product(
 
 
 @contextmanager
-def opened_stored(path: str | Path) -> Iterator[netCDF4.Dataset]:
-    """Open a whole product by netCDF4, twice as fast as `opened_product`; values are as stored.
+def opened_stored(path: str | Path) -> Iterator[Any]:
+    """Open a whole product as netCDF4 gives it, faster than `opened_product`; values are as stored.
+
+    Yields
+    ------
+    netCDF4.Dataset
 
     Raises
     ------
@@ -121,7 +123,8 @@ def opened_stored(path: str | Path) -> Iterator[netCDF4.Dataset]:
     """
     with reading(path):
         check_sizes(path)
-        with NETCDF4_PYTHON_LOCK, netCDF4.Dataset(path) as product:
+        with _STORE.open(os.fspath(path)) as store:
+            product = store.ds
             product.set_auto_maskandscale(False)
             product.set_auto_chartostring(False)
             yield product
