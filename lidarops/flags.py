@@ -40,8 +40,18 @@ class Meaning(NamedTuple):
     description: str
 
 
+def reject(place: int, description: str) -> tuple[int, Severity, str]:
+    """Return the member of a `FlagBit` that forbids the use of a value."""
+    return place, Severity.REJECT, description
+
+
+def care(place: int, description: str) -> tuple[int, Severity, str]:
+    """Return the member of a `FlagBit` that asks for care."""
+    return place, Severity.CARE, description
+
+
 class FlagBit(IntFlag):
-    """Base of enums of quality bits, whose members are given as place, severity, description.
+    """Base of enums of quality bits, whose members are given by `reject`, `care`, or their values.
 
     Places count from 0. Names in lower case are the CF ``flag_meanings``. Members of different
     enums may be the same number: compare them within one kind of product only. A union of members
@@ -70,105 +80,70 @@ class FlagBit(IntFlag):
 class Quality(FlagBit):
     """Bits that kinds of product share."""
 
-    INPUT_MISSING = 0, Severity.REJECT, "the raw data are missing or not finite"
-    SATURATED = (
+    INPUT_MISSING = reject(0, "the raw data are missing or not finite")
+    SATURATED = reject(
         1,
-        Severity.REJECT,
-        (
-            "the digitiser is at full scale in at least some shots, or the photon counter is"
-            " paralysed, or its dead time is not known well enough for its rate"
-        ),
+        "the digitiser is at full scale in at least some shots, or the photon counter is"
+        " paralysed, or its dead time is not known well enough for its rate",
     )
-    PILE_UP = (
+    PILE_UP = care(
         2,
-        Severity.CARE,
-        (
-            "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the dead"
-            " time is unknown"
-        ),
+        "the dead-time effect on the count rate exceeds 10 percent, or 1 percent where the dead"
+        " time is unknown",
     )
-    INCOMPLETE_OVERLAP = (
+    INCOMPLETE_OVERLAP = reject(
         3,
-        Severity.REJECT,
-        (
-            "the range is shorter than that of full overlap between laser beam and telescope field"
-            " of view"
-        ),
+        "the range is shorter than that of full overlap between laser beam and telescope field"
+        " of view",
     )
-    TOO_FEW_BINS = 4, Severity.REJECT, "the section has fewer than 8 valid range bins"
-    NO_SIGNAL = (
+    TOO_FEW_BINS = reject(4, "the section has fewer than 8 valid range bins")
+    NO_SIGNAL = reject(
         5,
-        Severity.REJECT,
-        (
-            "the profile contains no backscatter, as of a laser that is off: it is constant, or"
-            " shows no light where other profiles of the scene show much, or none of them any"
-        ),
+        "the profile contains no backscatter, as of a laser that is off: it is constant, or"
+        " shows no light where other profiles of the scene show much, or none of them any",
     )
-    LOW_SIGNAL = (
+    LOW_SIGNAL = reject(
         6,
-        Severity.REJECT,
-        (
-            "the backscatter signal is less than 5 times its standard error, or so small that noise"
-            " may have shifted the root of the cubic"
-        ),
+        "the backscatter signal is less than 5 times its standard error, or so small that noise"
+        " may have shifted the root of the cubic",
     )
-    SINGLE_RECORD = (
+    SINGLE_RECORD = care(
         7,
-        Severity.CARE,
-        (
-            "analog detection and photon counting are not glued: one alone gives the signal, as the"
-            " other is missing, saturated or too weak, or no range is linear in both"
-        ),
+        "analog detection and photon counting are not glued: one alone gives the signal, as the"
+        " other is missing, saturated or too weak, or no range is linear in both",
     )
-    NEGATIVE_AMPLITUDE = 8, Severity.REJECT, "the fitted amplitude is not positive"
-    CONTRADICTED = (
+    NEGATIVE_AMPLITUDE = reject(8, "the fitted amplitude is not positive")
+    CONTRADICTED = reject(
         9,
-        Severity.REJECT,
-        (
-            "the value differs by more than stated errors from another channel that measures the"
-            " same, and further channels tell that this one is wrong"
-        ),
+        "the value differs by more than stated errors from another channel that measures the"
+        " same, and further channels tell that this one is wrong",
     )
-    DISAGREES = (
+    DISAGREES = care(
         10,
-        Severity.CARE,
-        (
-            "another channel that measures the same disagrees by more than stated errors, here or"
-            " elsewhere in the profile"
-        ),
+        "another channel that measures the same disagrees by more than stated errors, here or"
+        " elsewhere in the profile",
     )
-    NOT_HOMOGENEOUS = (
-        11,
-        Severity.REJECT,
-        "the residuals vary systematically with range: the path is not homogeneous",
+    NOT_HOMOGENEOUS = reject(
+        11, "the residuals vary systematically with range: the path is not homogeneous"
     )
-    OUTLIER = 12, Severity.CARE, "at least one bin deviates by more than 5 standard errors"
-    NO_REAL_SOLUTION = 13, Severity.REJECT, "the estimating equation has no admissible real root"
-    LOW_SIGNAL_TO_NOISE = (
+    OUTLIER = care(12, "at least one bin deviates by more than 5 standard errors")
+    NO_REAL_SOLUTION = reject(13, "the estimating equation has no admissible real root")
+    LOW_SIGNAL_TO_NOISE = care(
         14,
-        Severity.CARE,
-        (
-            "the value is smaller than its error by noise, dead time and baseline (or another"
-            " multiple, by least_signal_to_noise): keep it in means, which would be biased without"
-            " such values"
-        ),
+        "the value is smaller than its error by noise, dead time and baseline (or another"
+        " multiple, by least_signal_to_noise): keep it in means, which would be biased without"
+        " such values",
     )
-    BACKGROUND_UNCERTAIN = (
+    BACKGROUND_UNCERTAIN = care(
         15,
-        Severity.CARE,
-        (
-            "the background may contain signal: signal before the far range implies some there, or"
-            " the bins of the background do not look like what its method assumes"
-        ),
+        "the background may contain signal: signal before the far range implies some there, or"
+        " the bins of the background do not look like what its method assumes",
     )
-    NO_GLUING = (
+    NO_GLUING = reject(
         16,
-        Severity.REJECT,
-        (
-            "analog detection and photon counting are not glued, and none alone gives the signal:"
-            " their ratio shows that one is not linear or that the lag is wrong, both are too weak,"
-            " or the scale of analog detection is not known"
-        ),
+        "analog detection and photon counting are not glued, and none alone gives the signal:"
+        " their ratio shows that one is not linear or that the lag is wrong, both are too weak,"
+        " or the scale of analog detection is not known",
     )
 
 
@@ -223,10 +198,6 @@ class Flags:
     """Bits of `Quality`, then the kind's own; rising."""
     layout: str = field(init=False)
     """Name of the places, such as ``elastic 2``."""
-    words: str = field(init=False)
-    """Names of the bits, as in ``flag_meanings``."""
-    explanation: str = field(init=False)
-    """Severity and meaning of each bit."""
     rejecting: int = field(init=False)
     """Union of the bits that reject a value."""
 
@@ -242,14 +213,8 @@ class Flags:
                 f"flags of {self.kind}: names and places must differ, and places rise: shared bits"
                 f" below {FIRST_OWN}, own bits from {FIRST_OWN} to {PLACES - 1}"
             )
-        texts = [f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in self]
-        for name, value in {
-            "layout": f"{self.kind} {self.version}",
-            "words": " ".join(bit.word for bit in self.bits),
-            "explanation": "; ".join(texts),
-            "rejecting": rejecting(self.bits),
-        }.items():
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "layout", f"{self.kind} {self.version}")
+        object.__setattr__(self, "rejecting", rejecting(self.bits))
 
     def __iter__(self) -> Iterator[FlagBit]:
         """Iterate over the bits, rising."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from math import inf
 from types import MappingProxyType
@@ -247,31 +247,23 @@ def registered(group: str, of: type[_Part], noun: str) -> dict[str, _Part]:
     """
     parts: dict[str, _Part] = {}
     for point in entry_points(group=group):
+        package = point.module.partition(".")[0]
+        remedy = f"repair or remove the package {point.dist.name if point.dist else package}"
         try:
             part = point.load()
         except Exception as error:
             # The code of a package may raise anything; the cause is chained.
-            if _package(point) == __package__:
+            if package == __package__:
                 raise  # a bug of lidarops, whose traceback tells more
             raise LidarOpsError(
                 f"{noun} {point.name!r} cannot be loaded from {point.value}: {error!r}",
-                remedy=f"repair or remove the package {_distribution(point)}; python -c 'import"
-                f" {point.module}' shows where it fails",
+                remedy=f"{remedy}; python -c 'import {point.module}' shows where it fails",
             ) from error
         if not isinstance(part, of) or part.name != point.name or part.name in parts:
             raise LidarOpsError(
                 f"{noun} {point.name!r} of {point.value} is no {of.__name__} of that name, or the"
                 " name is taken",
-                remedy=f"repair or remove the package {_distribution(point)}",
+                remedy=remedy,
             )
         parts[part.name] = part
     return parts
-
-
-def _distribution(point: EntryPoint) -> str:
-    """Return the distribution that registers an entry point, or else its package."""
-    return point.dist.name if point.dist else _package(point)
-
-
-def _package(point: EntryPoint) -> str:
-    return point.module.partition(".")[0]

@@ -39,6 +39,8 @@ class DetectionMode(StrEnum):
     PHOTON = "photon"
 
 
+SIGNAL_UNITS: Final[Mapping[str, str]] = {"analog": "mV", "photon": "MHz"}
+"""Detection mode -> unit of its signal."""
 GLUED: Final = "glued_"
 """Prefix of channels that are glued from the ``analog_`` and ``photon_`` ones of a detector."""
 
@@ -262,25 +264,8 @@ class Scene:
         return self.granules[0].layout if self.granules else ()
 
 
-class _Entry:
-    """What entries of a plan have in common, whether they run or are left out."""
-
-    __slots__ = ()
-    name: str
-    product: str
-    """Kind of product to which the step belongs; empty where all kinds share it."""
-
-
-_AnyEntry = TypeVar("_AnyEntry", bound=_Entry)
-
-
-def products_of(entries: Iterable[_AnyEntry]) -> tuple[_AnyEntry, ...]:
-    """Return the entries that are products themselves, and no steps on the way to one."""
-    return tuple([entry for entry in entries if entry.name == entry.product])
-
-
 @dataclass(frozen=True, slots=True)
-class PlannedStep(_Entry):
+class PlannedStep:
     """One step of a plan, with its settings and the reason why it runs."""
 
     name: str
@@ -294,6 +279,7 @@ class PlannedStep(_Entry):
     number: float | None = None
     """Number on which the rule decided, where there is one."""
     product: str = ""
+    """Kind of product to which it belongs; empty where all kinds share it."""
     needs: tuple[str, ...] = ()
     """Steps whose outputs it takes, run or left out: ``name``, or ``channel/name`` of another
     channel; for a product, also those of the same kind with which it is compared."""
@@ -302,7 +288,7 @@ class PlannedStep(_Entry):
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut(_Entry):
+class LeftOut:
     """One step that a plan leaves out, and the reason."""
 
     name: str
@@ -315,6 +301,15 @@ class LeftOut(_Entry):
     number: float | None = None
     """Number on which the rule decided, where there is one."""
     product: str = ""
+    """As of a planned step."""
+
+
+_AnyEntry = TypeVar("_AnyEntry", bound=PlannedStep | LeftOut)
+
+
+def products_of(entries: Iterable[_AnyEntry]) -> tuple[_AnyEntry, ...]:
+    """Return the entries that are products themselves, and no steps on the way to one."""
+    return tuple([entry for entry in entries if entry.name == entry.product])
 
 
 _ALWAYS: Final = frozenset({"name", "channel", "settings", "reason"})

@@ -17,7 +17,6 @@ from lidarops.aggregate.facts import UNSHARED, Header, coordinate_names
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.netcdf.read import stored_values
 from lidarops.netcdf.variables import attributes
-from lidarops.system.files import within
 
 _PER_PRODUCT: Final = (
     "date_", "history", "id", "lidarops_input_count", "lidarops_plan", "lidarops_scene",
@@ -57,12 +56,6 @@ class Part(NamedTuple):
     attributes: Mapping[str, Any]
     times: NDArray[np.float64]
     """s since 1970, of each profile."""
-
-    @classmethod
-    def of(cls, product: xr.Dataset, header: Header, root: Path) -> Part:
-        """Return the part of an open product, not decoded, of a root."""
-        source = Source(within(root, header.path), header.id)
-        return cls(header, source, product.attrs, product["time"].values)
 
 
 def pattern_of(product: xr.Dataset, header: Header) -> xr.Dataset:

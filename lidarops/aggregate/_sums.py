@@ -205,7 +205,7 @@ def _clouds(product: xr.Dataset, layout: Layout, usable: NDArray[np.bool_]) -> S
     fraction = np.full(usable.shape, np.nan)
     if CLOUD_FRACTION in product:
         fraction = _numbers(product, CLOUD_FRACTION)
-        cloudy = product[CLOUD_MASK].values == layout.row(CLOUD_MASK).code("cloudy")
+        cloudy = product[CLOUD_MASK].values == layout.rows[CLOUD_MASK].code("cloudy")
         fraction = np.where(cloudy & np.isnan(fraction), 1.0, fraction)
     return Sample(fraction, exact, exact, (), {}, usable)
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import RECORDERS
-from lidarops.netcdf.read import changed, opened_product
-from lidarops.netcdf.stored_flags import FlagCounter, all_bits, flags_names, rejecting_mask
-from lidarops.netcdf.variables import PROVENANCE, layout_of
+from lidarops.netcdf.read import changed, opened_product, opened_stored
+from lidarops.netcdf.stored_flags import FlagCounter, all_bits, rejecting_mask
+from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
 from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
 
@@ -172,7 +172,7 @@ class Header:
         ProductError
             If it cannot be read, or is another product now.
         """
-        with opened_undecoded(root, self.path) as product:
+        with opened_product(within(root, self.path), decode_cf=False) as product:
             if product.attrs.get("id") != self.id:
                 raise changed(self.path)
             yield product
@@ -192,20 +192,11 @@ class Facts(Header):
     """m above the geoid, of the station or mean over the network."""
     sha256: str
     size: int
-    values: int
-    """Number of values of ``quality_flag``."""
-    usable: int
-    """Number of values that no bit rejects."""
-    unflagged: int
-    """Number of values without any bit."""
+    verdicts: Verdicts
+    """Of the values of ``quality_flag``."""
     code_version: str
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Quality bit name -> number of values that carry it, if any."""
-
-    @property
-    def verdicts(self) -> Verdicts:
-        """Numbers of good values, of those to be used with care, and of rejected ones."""
-        return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
 
 
 _Stated = TypeVar("_Stated", bound=Header)
@@ -292,24 +283,25 @@ def read_product_facts(
     """
     for path in paths:
         try:
-            with opened_undecoded(root, path) as product:
+            file = within(root, path)
+            with opened_stored(file) as product:
                 header = read_header(product, path, selection)
                 if header is None:
                     continue
-                facts = _facts(product, within(root, path), header)
+                facts = _facts(product, file, header)
         except ProductError as error:
             yield Refused(path, error.problem)
         else:
             yield facts
 
 
-def read_header(product: xr.Dataset, path: str, selection: ProductSelection) -> Header | None:
+def read_header(product: Any, path: str, selection: ProductSelection) -> Header | None:
     """Return what an open product states of itself; None where it is not selected.
 
     Parameters
     ----------
-    product : xr.Dataset
-        From `opened_undecoded`.
+    product : netCDF4.Dataset
+        From `opened_stored`.
     path : str
     selection : ProductSelection
 
@@ -318,78 +310,61 @@ def read_header(product: xr.Dataset, path: str, selection: ProductSelection) -> 
     ProductError
         If it is not a product of lidarops, or of an unknown kind.
     """
-    kind = _kind_of(product, path)
-    attributes = product.attrs
-    ends = (attributes[f"time_coverage_{end}"] for end in ("start", "end"))
-    start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in ends)
-    names = {name: attributes[f"lidarops_{name}"] for name in NAMES}
-    if not selection.admits(names, start, stop):
-        return None
-    return Header(
-        path=path,
-        id=attributes["id"],
-        mode=attributes["lidarops_detection_mode"],
-        start=start,
-        stop=stop,
-        profiles=product.sizes["time"],
-        grid=_grid_digest(product, kind),
-        recorder=attributes.get(RECORDERS, ""),
-        **names,
-    )
+    attributes = vars(product)
+    kind = attributes.get("lidarops_kind")
+    if kind not in set(kinds()):
+        problem = "is not a product of lidarops" if kind is None else f"has an unknown kind: {kind}"
+        raise ProductError(problem, file=path)
+    if PERIOD in attributes:
+        raise ProductError("holds means of products and is not a product itself", file=path)
+    try:
+        ends = (attributes[f"time_coverage_{end}"] for end in ("start", "end"))
+        start, stop = (datetime.fromisoformat(text).astimezone(UTC) for text in ends)
+        names = {name: attributes[f"lidarops_{name}"] for name in NAMES}
+        if not selection.admits(names, start, stop):
+            return None
+        return Header(
+            path=path,
+            id=attributes["id"],
+            mode=attributes["lidarops_detection_mode"],
+            start=start,
+            stop=stop,
+            profiles=product.dimensions["time"].size,
+            grid=_grid_digest(product, kind),
+            recorder=attributes.get(RECORDERS, ""),
+            **names,
+        )
+    except KeyError as error:
+        problem = f"is not a product of lidarops: it has no {error}"
+        raise ProductError(problem, file=path) from error
 
 
-def _facts(product: xr.Dataset, file: Path, header: Header) -> Facts:
-    bits = all_bits(product)
+def _facts(product: Any, file: Path, header: Header) -> Facts:
+    flags = {
+        name: xr.Variable(variable.dimensions, variable[...], vars(variable))
+        for name, variable in product.variables.items()
+        if name.endswith(QUALITY_FLAG)
+    }
+    bits = all_bits(xr.Dataset(flags, attrs=vars(product)))
     counts = FlagCounter(rejecting_mask(bits))
-    for name in flags_names(product):
-        counts.add(product[name].values)
-    height = "station_altitude" if "station_altitude" in product else "altitude"
+    for variable in flags.values():
+        counts.add(variable.values)
+    height = "station_altitude" if "station_altitude" in product.variables else "altitude"
     return Facts(
         **{stated.name: getattr(header, stated.name) for stated in fields(header)},
-        campaign=product.attrs["lidarops_campaign"],
+        campaign=product.lidarops_campaign,
         wavelength=_middle(product, "wavelength") * 1e-9,
         latitude=_middle(product, "latitude"),
         longitude=_middle(product, "longitude"),
         altitude=_middle(product, height),
         sha256=sha256_of(file),
         size=file.stat().st_size,
-        values=counts.verdicts.values,
-        usable=counts.verdicts.usable,
-        unflagged=counts.verdicts.good,
-        code_version=product.attrs["lidarops_code_version"],
+        verdicts=counts.verdicts,
+        code_version=product.lidarops_code_version,
         flagged={
             bit.word.upper(): counts.carried[bit.mask] for bit in bits if bit.mask in counts.carried
         },
     )
-
-
-@contextmanager
-def opened_undecoded(root: Path, path: str) -> Iterator[xr.Dataset]:
-    """Open a file of a root; one that lacks what every product has is refused."""
-    file = within(root, path)
-    with opened_product(file, decode_cf=False) as product:
-        try:
-            yield product
-        except KeyError as error:
-            problem = f"is not a product of lidarops: it has no {error}"
-            raise ProductError(problem, file=file) from error
-
-
-def _kind_of(product: xr.Dataset, file: str) -> str:
-    """Return the kind of a product.
-
-    Raises
-    ------
-    ProductError
-        If the file is not a product, or of an unknown kind.
-    """
-    kind = product.attrs.get("lidarops_kind")
-    if kind not in set(kinds()):
-        problem = "is not a product of lidarops" if kind is None else f"has an unknown kind: {kind}"
-        raise ProductError(problem, file=file)
-    if PERIOD in product.attrs:
-        raise ProductError("holds means of products and is not a product itself", file=file)
-    return str(kind)
 
 
 def coordinate_names(kind: str) -> frozenset[str]:
@@ -399,34 +374,23 @@ def coordinate_names(kind: str) -> frozenset[str]:
     return frozenset({*(row.name for row in rows), *bounds})
 
 
-def _grid_digest(product: xr.Dataset, kind: str) -> str:
+def _grid_digest(product: Any, kind: str) -> str:
     """Return a digest of what must be equal in products that are joined along time.
 
     These are names, types, dimensions, units and flags of the variables, the recorders, and the
     values of all coordinates that do not change with time, including the position of the station.
-
-    Parameters
-    ----------
-    product : xr.Dataset
-        Not decoded.
-    kind : str
-
-    Returns
-    -------
-    str
-        16 hexadecimal digits.
     """
-    digest = hashlib.sha256(f"{kind}{product.attrs.get(RECORDERS, '')}".encode())
+    digest = hashlib.sha256(f"{kind}{getattr(product, RECORDERS, '')}".encode())
     coordinates = coordinate_names(kind)
-    for name in sorted(str(name) for name in product.variables):
+    for name, variable in sorted(product.variables.items()):
         if name in UNSHARED:
             continue
-        variable = product.variables[name]
-        sizes = [(str(dim), size) for dim, size in variable.sizes.items() if dim != "time"]
-        schema = [plain(variable.attrs.get(key)) for key in _SCHEMA_ATTRIBUTES]
-        digest.update(repr((name, variable.dtype.str, variable.dims, sizes, schema)).encode())
-        if name in coordinates and "time" not in variable.dims:
-            digest.update(np.ascontiguousarray(variable.values).tobytes())
+        dims = variable.dimensions
+        sizes = [(dim, n) for dim, n in zip(dims, variable.shape, strict=True) if dim != "time"]
+        schema = [plain(getattr(variable, key, None)) for key in _SCHEMA_ATTRIBUTES]
+        digest.update(repr((name, variable.dtype.str, dims, sizes, schema)).encode())
+        if name in coordinates and "time" not in dims:
+            digest.update(np.ascontiguousarray(variable[...]).tobytes())
     return digest.hexdigest()[:_GRID_DIGITS]
 
 
@@ -516,6 +480,7 @@ def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> No
         )
 
 
-def _middle(product: xr.Dataset, name: str) -> float:
+def _middle(product: Any, name: str) -> float:
     """Return a coordinate of the station, or its mean over a network; NaN if missing."""
-    return float(product[name].values.mean()) if name in product else float("nan")
+    known = name in product.variables
+    return float(product[name][...].mean()) if known else float("nan")

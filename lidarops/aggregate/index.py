@@ -22,6 +22,7 @@ from lidarops.aggregate import need
 from lidarops.aggregate.facts import EVERYTHING, FOLDER, Facts, ProductSelection, parse_selection
 from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.kinds import flags_of, kinds
+from lidarops.records import Verdicts
 from lidarops.system.code_version import module_version
 from lidarops.system.files import sha256_of, write_atomically
 
@@ -118,6 +119,7 @@ def _cells(facts: Facts) -> dict[str, Any]:
     stated = {item.name: getattr(facts, item.name) for item in fields(facts)}
     return {
         **stated,
+        "values": facts.verdicts.values,
         **facts.verdicts._asdict(),
         "id": UUID(facts.id).bytes,
         "sha256_prefix": bytes.fromhex(facts.sha256)[:_PREFIX_BYTES],
@@ -169,8 +171,7 @@ def _facts(row: dict[str, Any], sha256: str) -> Facts:
     return Facts(
         **stated | {"id": str(UUID(bytes=row["id"]))},
         sha256=sha256,
-        usable=row["good"] + row["care"],
-        unflagged=row["good"],
+        verdicts=Verdicts(row["good"], row["care"], row["reject"]),
         flagged={name.removeprefix(_FLAG).upper(): count for name, count in counts.items()},
     )
 

@@ -257,7 +257,7 @@ def _encoded(frame: Mapping[str, xr.Variable], year: _Year) -> xr.Dataset:
     """Return the dataset of a file of means, for `lidarops.netcdf.write.write_product`."""
     mode = year.first.counting
     table = layout(year.first.kind, year.period, year.weights)
-    time = table.row("time")
+    time = table.rows["time"]
     bounds = year.bounds.astype(np.float64)
     variables = {
         time.name: xr.Variable(time.dims, bounds.mean(axis=1), attributes(time, mode=mode)),

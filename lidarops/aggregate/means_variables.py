@@ -120,7 +120,7 @@ def layout(kind: str, period: Period, weights: Weights) -> Layout:
         ``quality_flag`` and ``shots``.
     """
     source = layout_of(kind)
-    time = replace(source.row("time"), long_name=f"middle of the {period.value}, UTC")
+    time = replace(source.rows["time"], long_name=f"middle of the {period.value}, UTC")
     return replace(
         source,
         title=f"{_ADJECTIVE[period]} means: {source.title}",
@@ -158,7 +158,7 @@ def _rows(source: Layout, weights: Weights) -> Iterator[Row]:
         ancillaries = (*names, *of_values) if row.dims == flags.dims else names
         yield from _mean_rows(row, weights, ancillaries)
         for name in names:
-            error = _interval_error(row, name) if row.lower_end else source.row(name)
+            error = _interval_error(row, name) if row.lower_end else source.rows[name]
             yield _averaged(
                 error,
                 row,
@@ -169,7 +169,7 @@ def _rows(source: Layout, weights: Weights) -> Iterator[Row]:
         yield from _shares(flags)
         yield replace(flags, comment=_FLAG_COMMENT + (_CLOUD_COMMENT if cloudy else ""))
     for name in cloudy:
-        fraction = source.row(name)
+        fraction = source.rows[name]
         yield _averaged(
             fraction,
             fraction,
@@ -177,7 +177,7 @@ def _rows(source: Layout, weights: Weights) -> Iterator[Row]:
             " where the weights of values are their variances, else as values. One of which only"
             " the mean shows a cloud is cloudy. Missing where no such profile was examined.",
         )
-    shots = source.row("shots")
+    shots = source.rows["shots"]
     yield replace(shots, dtype="f8", long_name="number of laser shots of all profiles")
 
 

@@ -11,13 +11,12 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from lidarops.aggregate._join import Part, join, pattern_of
+from lidarops.aggregate._join import Part, Source, join, pattern_of
 from lidarops.aggregate.facts import (
-    Group,
+    Header,
     ProductSelection,
     groups,
     list_products,
-    opened_undecoded,
     parse_selection,
     read_header,
     refuse_duplicates,
@@ -26,7 +25,9 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
+from lidarops.netcdf.read import opened_stored
 from lidarops.netcdf.variables import judging, summary_of
+from lidarops.system.files import within
 
 CARE: Final = 1
 ALL: Final = 2
@@ -103,20 +104,19 @@ def open_products(
             "only stores have versions", field="version", remedy="give the folder of a store"
         )
     root, paths = _candidates(source, selection)
-    parts, patterns = _read(root, paths, selection)
+    parts = _read(root, paths, selection)
     if not parts:
         raise ProductError("no product found", file=store, remedy=_remedy(store))
-    by_group = groups(part.header for part in parts)
+    by_group = groups(parts)
     remedy = "select by kind, channel, station or instrument, or give the files of one grid"
     refuse_several([group.words for group in by_group], store, remedy)
-    ((group, headers),) = by_group.items()
-    by_path = {part.header.path: part for part in parts}
-    ordered = [by_path[header.path] for header in headers]
+    (headers,) = by_group.values()
+    ordered = [parts[header] for header in headers]
     refuse_duplicates((part.header.path, part.times) for part in ordered)
+    with headers[0].opened(root) as product:
+        pattern = pattern_of(product, headers[0])
     # Decoded once, which is much faster than decoding each product.
-    return _usable_values(
-        xr.decode_cf(join(ordered, patterns[group])), usable, on_altitude=on_altitude
-    )
+    return _usable_values(xr.decode_cf(join(ordered, pattern)), usable, on_altitude=on_altitude)
 
 
 def _remedy(folder: Path | None) -> str:
@@ -143,25 +143,20 @@ def _candidates(source: Paths, selection: ProductSelection) -> tuple[Path, list[
     return root, [file.resolve().relative_to(root).as_posix() for file in files]
 
 
-def _read(
-    root: Path, paths: Iterable[str], selection: ProductSelection
-) -> tuple[list[Part], dict[Group, xr.Dataset]]:
-    """Open each file once; return the selected products, and the pattern of each group."""
-    parts: list[Part] = []
-    first: dict[Group, tuple[tuple[datetime, str], xr.Dataset]] = {}
+def _read(root: Path, paths: Iterable[str], selection: ProductSelection) -> dict[Header, Part]:
+    """Return the selected products."""
+    parts = {}
     for path in paths:
         try:
-            with opened_undecoded(root, path) as product:
+            file = within(root, path)
+            with opened_stored(file) as product:
                 header = read_header(product, path, selection)
-                if header is None:
-                    continue
-                parts.append(Part.of(product, header, root))
-                place = (header.start, path)
-                if header.group not in first or place < first[header.group][0]:
-                    first[header.group] = place, pattern_of(product, header)
+                if header is not None:
+                    source = Source(file, header.id)
+                    parts[header] = Part(header, source, vars(product), product["time"][...])
         except ProductError as error:
             raise ProductError(error.problem, file=path, remedy="leave the file out") from error
-    return parts, {group: pattern for group, (_, pattern) in first.items()}
+    return parts
 
 
 def _usable_values(data: xr.Dataset, worst: int, *, on_altitude: bool) -> xr.Dataset:

@@ -129,7 +129,7 @@ def _item(pystac: Any, product: Facts) -> Any:
         "wavelength": wavelength,
         "station_altitude": product.altitude,
         "profiles": product.profiles,
-        "values": product.values,
+        "values": product.verdicts.values,
         **product.verdicts._asdict(),
         "grid": product.grid,
         "code_version": product.code_version,

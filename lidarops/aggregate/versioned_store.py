@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate import need
-from lidarops.aggregate._join import Part, Source, pattern_of, shared_attributes, sorted_by_time
+from lidarops.aggregate._join import Source, pattern_of, shared_attributes, sorted_by_time
 from lidarops.aggregate.facts import (
     Facts,
     ProductSelection,
@@ -225,24 +225,8 @@ def _write_group(
 ) -> None:
     """Write the products that a group lacks; one whose rows are at their place stays.
 
-    Parameters
-    ----------
-    store : icechunk.IcechunkStore
-        Of a writable session.
-    name : str
-        Of the group.
-    root : path
-    products : sequence of Facts
-        All of the group, in order of time.
-    changes : Changes
-        Gets what changes.
-
-    Raises
-    ------
-    ProductError
-        If a time occurs twice. Nothing is written then.
-    UnreadableProductError
-        If a product cannot be read or has changed since. Part of the group may be written then.
+    `products` are all of the group, in order of time. Where a time occurs twice, nothing is
+    written; where a product cannot be read, part of the group may be.
     """
     held = _held(store, name)
     ids = [product.id for product in products]
@@ -259,11 +243,13 @@ def _write_group(
     times = {at: held.times[slice(*rows)] for at, rows in enumerate(pairwise(starts))}
     attributes, pattern = {}, None
     for at in read:
-        with _opened(root, products[at]) as product:
-            part = Part.of(product, products[at], root)
-            attributes[at], times[at] = part.attributes, part.times
-            if at == 0:
-                pattern = pattern_of(product, products[at])
+        try:
+            with products[at].opened(root) as product:
+                attributes[at], times[at] = product.attrs, product["time"].values
+                if at == 0:
+                    pattern = pattern_of(product, products[at])
+        except ProductError as error:
+            raise UnreadableProductError(products[at], error.problem) from error
     refuse_duplicates((products[at].path, part) for at, part in times.items())
     known = [] if gone or 0 in lacking else [held.attributes]
     shared = shared_attributes([*known, *attributes.values()])
@@ -298,29 +284,57 @@ def _held(store: Any, name: str) -> _Held:
     return _Held(group.attrs.asdict(), group["time"][:], places)
 
 
-@contextmanager
-def _opened(root: Path, facts: Facts) -> Iterator[xr.Dataset]:
-    """Open a product; where it cannot be read, raise `UnreadableProductError`."""
+def _write_rows(
+    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
+) -> None:
+    """Write the rows of some products to the arrays of a group."""
+    length = {"time": starts[-1], PRODUCT.name: len(products)}
+    for name, array in group.arrays():
+        dims = array.metadata.dimension_names or ()
+        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
+        if not {"time", PRODUCT.name} & set(dims):
+            continue
+        firsts = starts if "time" in dims else range(len(products) + 1)
+        for pieces in _pieces(lacking, firsts, array.chunks[0]):
+            values = []
+            for at, low, high in pieces:
+                rows = slice(low - firsts[at], high - firsts[at]) if "time" in dims else None
+                values.append(_rows(root, products[at], at, name, rows))
+            array[pieces[0][1] : pieces[-1][2]] = np.concatenate(values)
+
+
+def _rows(root: Path, facts: Facts, number: int, name: str, rows: slice | None) -> NDArray[Any]:
+    """Return some rows of a variable of a product; its only one where `rows` is None."""
+    if name == PRODUCT.name:
+        return np.array([facts.id])
+    if name == PRODUCT_INDEX.name:
+        return np.full(facts.profiles, number, np.int32)[rows]
     try:
-        with facts.opened(root) as product:
-            yield product
+        source = Source(within(root, facts.path), facts.id)
+        return source.read(name)[None] if rows is None else source.read(name, rows)
     except ProductError as error:
         raise UnreadableProductError(facts, error.problem) from error
 
 
-def _write_rows(
-    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
-) -> None:
-    length = {"time": starts[-1], PRODUCT.name: len(products)}
-    rows = {}
-    for name, array in group.arrays():
-        dims = array.metadata.dimension_names or ()
-        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
-        rows[name] = _Rows(array)
+def _pieces(
+    lacking: Sequence[int], firsts: Sequence[int], chunk: int
+) -> Iterator[list[tuple[int, int, int]]]:
+    """Yield what is written at once: number of a product, first row, and the one past the last.
+
+    Neighbours in one chunk are together, because each write keeps a copy of its chunk, and chunks
+    are apart, so that memory holds few rows.
+    """
+    together: list[tuple[int, int, int]] = []
     for at in lacking:
-        _write_product(rows, root, products[at], at, starts[at])
-    for array in rows.values():
-        array.flush()
+        start, stop = firsts[at], firsts[at + 1]
+        edges = (start, *range((start // chunk + 1) * chunk, stop, chunk), stop)
+        for low, high in pairwise(edges):
+            if together and (low % chunk == 0 or low != together[-1][2]):
+                yield together
+                together = []
+            together.append((at, low, high))
+    if together:
+        yield together
 
 
 def _create(store: Any, name: str, pattern: xr.Dataset) -> None:
@@ -345,63 +359,6 @@ def _chunk(variable: xr.Variable) -> tuple[int, ...]:
     row = variable.dtype.itemsize * int(np.prod(variable.shape[1:]))
     rows = min(max(_ROWS, _LEAST_CHUNK // row), max(1, _LARGEST_CHUNK // row))
     return (rows, *variable.shape[1:])
-
-
-@dataclass(slots=True)
-class _Rows:
-    """Rows of an array that wait until their chunk is complete, because each write keeps a copy."""
-
-    array: Any
-    first: int = 0
-    stop: int = 0
-    waiting: list[NDArray[Any]] = field(default_factory=list)
-
-    def add(self, first: int, values: NDArray[Any]) -> None:
-        """Write rows of one chunk, at the latest when the next one begins."""
-        if first != self.stop:
-            self.flush()
-            self.first = first
-        self.waiting.append(values)
-        self.stop = first + len(values)
-        if self.stop % self.array.chunks[0] == 0:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write all rows that wait."""
-        if self.waiting:
-            self.array[self.first : self.stop] = np.concatenate(self.waiting)
-        self.waiting.clear()
-        self.first = self.stop
-
-
-def _write_product(
-    rows: Mapping[str, _Rows], root: Path, facts: Facts, number: int, start: int
-) -> None:
-    source = Source(within(root, facts.path), facts.id)
-    known = {
-        PRODUCT.name: np.array([facts.id]),
-        PRODUCT_INDEX.name: np.full(facts.profiles, number, np.int32),
-    }
-    for name, waiting in rows.items():
-        along = waiting.array.metadata.dimension_names or ()
-        first, count = (start, facts.profiles) if "time" in along else (number, 1)
-        if not {"time", PRODUCT.name} & set(along):
-            continue
-        for low, high in _blocks(first, first + count, waiting.array.chunks[0]):
-            some = slice(low - first, high - first)
-            if name in known:
-                values = known[name][some]
-            else:
-                try:
-                    values = source.read(name, some) if "time" in along else source.read(name)[None]
-                except ProductError as error:
-                    raise UnreadableProductError(facts, error.problem) from error
-            waiting.add(low, values)
-
-
-def _blocks(start: int, stop: int, chunk: int) -> Iterator[tuple[int, int]]:
-    """Yield the rows from `start` to `stop` in blocks within chunks, so that memory holds few."""
-    return pairwise((start, *range((start // chunk + 1) * chunk, stop, chunk), stop))
 
 
 def open_store(path: Path, selection: ProductSelection, version: str | None) -> xr.Dataset:

@@ -93,7 +93,8 @@ def compare_products(old: Path, new: Path) -> Change:
     ProductError
         If a file cannot be read, is no product, or is another product.
     """
-    causes = tuple(_causes(_making(old), _making(new)))
+    then, now = _making(old), _making(new)
+    causes = [cause for what in then for cause in _changes(what, then[what], now[what])]
     try:
         with _opened(old) as before, _opened(new) as after:
             _refuse_another(before, after, new)
@@ -119,7 +120,7 @@ def compare_products(old: Path, new: Path) -> Change:
         most.largest,
         most.variable if most.largest else first_lost,
         sum(d.count for d in differences) / max(sum(sizes.values()), 1),
-        causes,
+        _first_causes(causes, _MOST_CAUSES),
         measure=most.measure,
         lost=lost,
         flags=sum(d.flags for d in differences),
@@ -325,22 +326,13 @@ def planned_changes(file: Path, settings: Mapping[str, Any], plan: Plan) -> tupl
     making = _making(file)
     changes = [*_changes("setting", making["setting"], dict(_flat("", settings)))]
     changes = changes or [*_changes("step", making["step"], _steps(plan.as_dict()))]
-    return tuple(_first_causes(changes, _MOST_REASONS))
+    return _first_causes(changes, _MOST_REASONS)
 
 
-def _causes(
-    old: Mapping[str, Mapping[str, str]], new: Mapping[str, Mapping[str, str]]
-) -> Iterator[str]:
-    """Yield what differs in the making of two products."""
-    causes = [cause for what in old for cause in _changes(what, old[what], new[what])]
-    yield from _first_causes(causes, _MOST_CAUSES)
-
-
-def _first_causes(causes: Sequence[str], most: int) -> Iterator[str]:
-    """Yield the first causes, and the number of the others."""
-    yield from causes[:most]
-    if len(causes) > most:
-        yield f"and {len(causes) - most} more"
+def _first_causes(causes: Sequence[str], most: int) -> tuple[str, ...]:
+    """Return the first causes, and the number of the others."""
+    more = (f"and {len(causes) - most} more",) if len(causes) > most else ()
+    return (*causes[:most], *more)
 
 
 def _changes(what: str, old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:

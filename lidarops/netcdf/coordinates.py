@@ -64,11 +64,10 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
     ProductError
         If a coordinate is missing, not finite, not rising, or outside its cell bounds.
     """
-    moments, bounds = (_moments(source, name) for name in ("time", "time_bnds"))
-    time = _time(layout.row("time"), moments, bounds)
+    time, moments, bounds = _time(source, layout.rows["time"])
     station = context.station
     place = _PLACES.get(layout.sampled, _beam_place)
-    by_name, vertical = place(source, layout, station.altitude, time.values.size)
+    by_name, vertical = place(source, layout, station.altitude)
     by_name["time"] = time
     bins = {} if vertical.profiles else _air_positions(by_name, layout, context)
     fixed = {
@@ -80,7 +79,7 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
     }
     for name, value in fixed.items():
         if name not in by_name and name in layout.rows and np.isfinite(value):
-            row = layout.row(name)
+            row = layout.rows[name]
             row = deployment(row) if f"bin_{name}" in bins else row
             by_name[name] = Coordinate(row, (), np.asarray(value, np.float64))
     by_name |= bins
@@ -98,10 +97,8 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
         bins[f"bin_{name}"].values if bins else by_name[name].values
         for name in ("latitude", "longitude")
     ]
-    extents = {
-        **_horizontal_extent(horizontal, _SPREADS.get(layout.sampled, "along the beam")),
-        **_other_extents(vertical, moments, bounds),
-    }
+    spread = _SPREADS.get(layout.sampled, "along the beam")
+    extents = _extents(horizontal, spread, vertical, moments, bounds)
     return Located(variables, moving, extents, vertical.profiles)
 
 
@@ -135,15 +132,15 @@ class _Vertical(NamedTuple):
 _Place = tuple[dict[str, Coordinate], _Vertical]
 
 
-def _beam_place(source: xr.Dataset, layout: Layout, station: float, profiles: int) -> _Place:
+def _beam_place(source: xr.Dataset, layout: Layout, station: float) -> _Place:
     """Return the coordinates of a kind whose values lie along the beam."""
     names = _names_along(layout)
-    by_name = {name: _along(source, layout.row(name)) for name in names}
-    zenith = _beam(source, layout.row("zenith_angle"), profiles)
-    altitude, vertical = _altitude(layout.row("altitude"), by_name[names[-1]], zenith, station)
+    by_name = {name: _along(source, layout.rows[name]) for name in names}
+    zenith = _beam(source, layout.rows["zenith_angle"])
+    altitude, vertical = _altitude(layout.rows["altitude"], by_name[names[-1]], zenith, station)
     by_name |= {"altitude": altitude, "zenith_angle": zenith}
     if "azimuth" in source:
-        by_name["azimuth"] = _beam(source, layout.row("azimuth"), profiles)
+        by_name["azimuth"] = _beam(source, layout.rows["azimuth"])
     return by_name, vertical
 
 
@@ -164,21 +161,21 @@ def _air_positions(
     positions = beam_positions(
         station.latitude, station.longitude, station.altitude, ahead, azimuth, up
     )
-    rows = (layout.row(name) for name in ("bin_latitude", "bin_longitude"))
+    rows = (layout.rows[name] for name in ("bin_latitude", "bin_longitude"))
     return {
         row.name: Coordinate(row, row.dims, values.astype(row.dtype))
         for row, values in zip(rows, positions, strict=True)
     }
 
 
-def _scan_place(source: xr.Dataset, layout: Layout, station: float, _profiles: int) -> _Place:
+def _scan_place(source: xr.Dataset, layout: Layout, station: float) -> _Place:
     """Return the coordinates of a kind whose values lie at altitudes of a scan."""
     names = ["beam", "beam_zenith_angle"]
     # Layers, planes and the baseline are optional, and so are their coordinates.
     optional = ("beam_azimuth", "layer_altitude", "plane", "plane_azimuth", "baseline_range")
     names += [name for name in optional if name in source]
-    by_name = {name: _along(source, layout.row(name)) for name in names}
-    row = layout.row("altitude")
+    by_name = {name: _along(source, layout.rows[name]) for name in names}
+    row = layout.rows["altitude"]
     values = _along(source, replace(row, bounds=None)).values
     if values[0] <= station:
         raise ProductError(
@@ -189,12 +186,12 @@ def _scan_place(source: xr.Dataset, layout: Layout, station: float, _profiles: i
     return by_name, _Vertical(values, _common_step(values, np.ones(1)), profiles=False)
 
 
-def _network_place(source: xr.Dataset, layout: Layout, _station: float, _profiles: int) -> _Place:
+def _network_place(source: xr.Dataset, layout: Layout, _station: float) -> _Place:
     """Return the coordinates of a kind whose values lie at crossings of beams."""
     angles = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
     beams = (f"beam_{name}" for name in angles)
     names = ("crossing_id", "latitude", "longitude", "altitude", "beam", *beams)
-    by_name = {name: _along(source, layout.row(name)) for name in names}
+    by_name = {name: _along(source, layout.rows[name]) for name in names}
     altitude = by_name["altitude"].values
     # Crossings are not ordered by altitude, so there is no vertical step.
     return by_name, _Vertical(altitude, None, profiles=False)
@@ -210,7 +207,15 @@ def _names_along(layout: Layout) -> list[str]:
     return [row.name for row in along if not row.follows_beam]
 
 
-def _time(row: Row, moments: Values, bounds: Values) -> Coordinate:
+def _time(source: xr.Dataset, row: Row) -> tuple[Coordinate, Values, Values]:
+    """Return the coordinate, and the times and their bounds (datetime64[ns])."""
+    times = []
+    for name, dims in ((row.name, row.dims), (f"{row.bounds}", (*row.dims, BOUNDS_DIM))):
+        values = taken(source, name, dims)
+        if values.dtype.kind != "M":
+            raise ProductError(f"has data of type {values.dtype}, not datetime64", field=name)
+        times.append(values.astype("datetime64[ns]"))
+    moments, bounds = times
     if np.isnat(moments).any() or np.isnat(bounds).any():
         raise ProductError("holds missing times", field=row.name)
     if (np.diff(moments) <= np.timedelta64(0)).any():
@@ -219,15 +224,8 @@ def _time(row: Row, moments: Values, bounds: Values) -> Coordinate:
             field=row.name,
             remedy="sort the profiles by time, and keep one of those at the same time",
         )
-    seconds = ((times - _EPOCH) / np.timedelta64(1, "s") for times in (moments, bounds))
-    return _with_bounds(row, *seconds)
-
-
-def _moments(source: xr.Dataset, name: str) -> Values:
-    times = taken(source, name, ("time",) if name == "time" else ("time", BOUNDS_DIM))
-    if times.dtype.kind != "M":
-        raise ProductError(f"has data of type {times.dtype}, not datetime64", field=name)
-    return times.astype("datetime64[ns]")
+    seconds = ((values - _EPOCH) / np.timedelta64(1, "s") for values in times)
+    return _with_bounds(row, *seconds), moments, bounds
 
 
 def _along(source: xr.Dataset, row: Row) -> Coordinate:
@@ -275,12 +273,10 @@ def _with_bounds(row: Row, values: Values, bounds: Values) -> Coordinate:
     return Coordinate(row, row.dims, values, bounds)
 
 
-def _beam(source: xr.Dataset, row: Row, profiles: int) -> Coordinate:
+def _beam(source: xr.Dataset, row: Row) -> Coordinate:
     """Return an angle of the beam: one number for a fixed beam, else over time."""
     dims = ("time",) if row.name in source and source[row.name].dims else ()
     values = _finite(row.name, taken(source, row.name, dims))
-    if dims and values.shape != (profiles,):
-        raise ProductError(f"has {values.size} values for {profiles} profiles", field=row.name)
     if (values == values.flat[0]).all():
         return Coordinate(row, (), values.flat[0][...])
     return Coordinate(row, ("time",), values)
@@ -340,8 +336,10 @@ def _common_step(altitude: Values, rise: Values) -> float | None:
 _SPREADS: Final = {"crossing": "irregular: crossings of beams"}
 
 
-def _horizontal_extent(positions: Sequence[Values], spread: str) -> dict[str, Any]:
-    """Return the area of the sounded air, also as WKT: a point, or the bounding rectangle."""
+def _extents(
+    positions: Sequence[Values], spread: str, vertical: _Vertical, moments: Values, bounds: Values
+) -> dict[str, Any]:
+    """Return the attributes on extents, of the area also as WKT: a point, or a rectangle."""
     (south, north), (west, east) = ((float(p.min()), float(p.max())) for p in positions)
     area = f"POINT ({south!r} {west!r})"
     if (south, west) != (north, east):
@@ -349,6 +347,11 @@ def _horizontal_extent(positions: Sequence[Values], spread: str) -> dict[str, An
         area = f"POLYGON (({', '.join(f'{lat!r} {lon!r}' for lat, lon in corners)}))"
     else:
         spread = "not applicable: single position"
+    # ACDD wants the resolution in every file.
+    resolution = f"{vertical.step:.6g} m" if vertical.step else "none: the beam is level"
+    ends = bounds[:, 0].min(), bounds[:, 1].max()
+    start, stop = (end.astype("datetime64[us]").item().replace(tzinfo=UTC) for end in ends)
+    intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
     return {
         # Latitude first: the order of axes that EPSG:4326 defines.
         "geospatial_bounds": area,
@@ -362,17 +365,6 @@ def _horizontal_extent(positions: Sequence[Values], spread: str) -> dict[str, An
         "geospatial_lon_max": east,
         "geospatial_lon_units": "degrees_east",
         "geospatial_lon_resolution": spread,
-    }
-
-
-def _other_extents(vertical: _Vertical, moments: Values, bounds: Values) -> dict[str, Any]:
-    """Return the extents in height and time."""
-    # ACDD wants the resolution in every file.
-    resolution = f"{vertical.step:.6g} m" if vertical.step else "none: the beam is level"
-    ends = bounds[:, 0].min(), bounds[:, 1].max()
-    start, stop = (end.astype("datetime64[us]").item().replace(tzinfo=UTC) for end in ends)
-    intervals = np.diff(moments) if moments.size > 1 else bounds[:, 1] - bounds[:, 0]
-    return {
         "geospatial_vertical_min": float(vertical.altitude.min()),
         "geospatial_vertical_max": float(vertical.altitude.max()),
         "geospatial_vertical_units": "m",

@@ -112,7 +112,7 @@ class ProductWriter:
             for dim, size in variable.sizes.items()
         }
         for name, values in self._fixed.items():
-            self._sizes |= dict(zip(layout.row(name).dims, values.shape, strict=True))
+            self._sizes |= dict(zip(layout.rows[name].dims, values.shape, strict=True))
         self._counts = FlagCounter(layout.flags.rejecting)
         self.file: RowFile | None = None
         """None until the first profiles, which decide on optional variables."""
@@ -190,22 +190,19 @@ class ProductWriter:
                 continue
             # Bits refer to retrieved values; an optional derived or an auxiliary value may be
             # missing without one.
-            judge = self._layout.row(rows.judging(row.name, flags))
+            judge = self._layout.rows[rows.judging(row.name, flags)]
             spared = row.optional or row.coverage is rows.Coverage.AUXILIARY
             judged = row.dims == judge.dims and not spared
-            encoded[row.name] = stored(profiles, row, flags[judge.name] if judged else None)
-            self._refuse_other_sizes(row, encoded[row.name])
+            values = stored(profiles, row, flags[judge.name] if judged else None)
+            for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
+                if dim not in self._sizes:
+                    along = (one.name for one in self._layout.coordinates if one.dims == (dim,))
+                    raise ProductError("is missing", field=next(along, dim))
+                if size != self._sizes[dim]:
+                    words = f"has {size} values along {dim}, not {self._sizes[dim]}"
+                    raise ProductError(words, field=row.name)
+            encoded[row.name] = values
         return encoded
-
-    def _refuse_other_sizes(self, row: Row, values: Values) -> None:
-        for dim, size in zip(row.dims[1:], values.shape[1:], strict=True):
-            if dim not in self._sizes:
-                along = (other.name for other in self._layout.coordinates if other.dims == (dim,))
-                raise ProductError("is missing", field=next(along, dim))
-            if size != self._sizes[dim]:
-                raise ProductError(
-                    f"has {size} values along {dim}, not {self._sizes[dim]}", field=row.name
-                )
 
     def skeleton(self, encoded: Mapping[str, Values]) -> Skeleton:
         """Return all of the file except the values of profiles.

@@ -108,24 +108,36 @@ def opened_product(
             yield product
 
 
-def read_provenance(path: str | Path) -> dict[str, Any]:
-    """Read the PROV-JSON document of a product.
+@contextmanager
+def opened_stored(path: str | Path) -> Iterator[Any]:
+    """Open a whole product as netCDF4 gives it, faster than `opened_product`; values are as stored.
 
-    Parameters
-    ----------
-    path : path or str
-        A product file.
+    Yields
+    ------
+    netCDF4.Dataset
+
+    Raises
+    ------
+    ProductError
+        If it cannot be read, or states more than it can hold.
+    """
+    with reading(path):
+        check_sizes(path)
+        with _STORE.open(os.fspath(path)) as store:
+            product = store.ds
+            product.set_auto_maskandscale(False)
+            product.set_auto_chartostring(False)
+            yield product
+
+
+def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read the PROV-JSON document of a product and its global attributes.
 
     Raises
     ------
     ProductError
         If the file cannot be read or holds no provenance.
     """
-    return read_origin(path)[0]
-
-
-def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read the PROV-JSON document of a product and its global attributes; see `read_provenance`."""
     if not is_netcdf(path):
         remedy = "give the path of a product of lidarops"
         raise ProductError("is no NetCDF file", file=path, remedy=remedy, wrong_use=True)
@@ -139,6 +151,11 @@ def read_origin(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     except (ValueError, RecursionError) as error:
         raise ProductError(f"is not JSON: {error}", file=path, field="provenance") from error
     return document, attributes
+
+
+def read_provenance(path: str | Path) -> dict[str, Any]:
+    """Read the PROV-JSON document of a product; see `read_origin`."""
+    return read_origin(path)[0]
 
 
 def is_netcdf(path: str | Path) -> bool:
@@ -304,7 +321,8 @@ def _stated_bytes(opened: h5py.File, name: str, file: Path) -> int:
     if layout is None or layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
         problem = "takes its values from elsewhere, which could be any file of this machine"
         raise ProductError(problem, file=file, field=name, remedy=_DISTRUST)
-    if stored.get_type().get_class() == h5py.h5t.VLEN:
+    held = stored.get_type()
+    if held.get_class() == h5py.h5t.VLEN:
         problem = "has values of variable length, and does not state how large they are"
         raise ProductError(problem, file=file, field=name, remedy=_DISTRUST)
     chunk = math.prod(layout.get_chunk()) if layout.get_layout() == h5py.h5d.CHUNKED else 0
@@ -312,4 +330,4 @@ def _stated_bytes(opened: h5py.File, name: str, file: Path) -> int:
     scale = h5py.h5ds.get_scale_name(stored) if h5py.h5ds.is_scale(stored) else b""
     bare = scale.startswith(_NO_VARIABLE)
     values = 0 if bare else stored.get_space().get_simple_extent_npoints()
-    return int(stored.get_type().get_size() * max(values, chunk))
+    return int(held.get_size() * max(values, chunk))

@@ -23,7 +23,7 @@ from lidarops import __version__
 from lidarops.errors import ProductError
 from lidarops.flags import Flags, Severity
 from lidarops.kinds import kinds
-from lidarops.records import DetectionMode
+from lidarops.records import SIGNAL_UNITS, DetectionMode
 
 CONVENTIONS: Final = "CF-1.11, ACDD-1.3"
 STANDARD_NAME_TABLE: Final = "CF Standard Name Table v93"
@@ -33,7 +33,6 @@ TIME_UNITS: Final = "seconds since 1970-01-01 00:00:00"
 """All files share one epoch, so that tools that do not decode time can join them."""
 BOUNDS_DIM: Final = "nv"
 
-_SIGNAL_UNITS: Final = {DetectionMode.ANALOG: "mV", DetectionMode.PHOTON: "MHz"}
 _ERROR_BITS: Final = 8
 """Significant bits of the standard error of a rounded quantity: 0.2 percent at worst."""
 NO_STANDARD_NAME: Final = f"The {STANDARD_NAME_TABLE} has no name for this quantity."
@@ -300,22 +299,6 @@ class Layout:
         """Variables and coordinates by name."""
         return {row.name: row for row in (*self.coordinates, *self.variables)}
 
-    def row(self, name: str) -> Row:
-        """Return the row of a variable or coordinate.
-
-        Raises
-        ------
-        ProductError
-            If the layout has no such variable.
-        """
-        if name not in self.rows:
-            raise ProductError(
-                "is not a variable of this kind of product",
-                field=name,
-                remedy=f"its variables are {', '.join(self.rows)}",
-            )
-        return self.rows[name]
-
 
 @cache
 def layout_of(kind: str) -> Layout:
@@ -425,7 +408,7 @@ def attributes(
     attrs: dict[str, Any] = {
         "standard_name": row.standard_name,
         "long_name": row.long_name,
-        "units": row.units and row.units.format(signal=_SIGNAL_UNITS[mode]),
+        "units": row.units and row.units.format(signal=SIGNAL_UNITS[mode]),
         "axis": row.axis,
         "positive": row.positive,
         "bounds": row.bounds,
@@ -445,28 +428,26 @@ def attributes(
         attrs["quantization_nsb"] = np.int32(row.bits)
     if row.error_kind is not None and not row.uncertain:
         attrs["error_kind"] = row.error_kind.value
+    comment = row.comment
     if row.flags is not None:
-        attrs |= _flag_attributes(row.flags, stored)
+        bits = row.flags.bits
+        texts = (f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in bits)
+        attrs[FLAG_LAYOUT] = row.flags.layout
+        attrs["flag_masks"] = np.array(bits, dtype=stored)
+        attrs["flag_meanings"] = " ".join(bit.word for bit in bits)
+        comment = (
+            f"0: no test failed. {'; '.join(texts)}. reject: do not use the value; care: the value"
+            " is valid, but its stated uncertainty may be too small, or as large as the value."
+            f" {row.comment or ''}"
+        ).strip()
     if row.reasons is not None:
         attrs["flag_masks"] = np.array([*row.reasons], dtype=stored)
         attrs["flag_meanings"] = " ".join(str(reason.name).lower() for reason in row.reasons)
     if row.states:
         attrs["flag_values"] = np.arange(len(row.states), dtype=stored)
         attrs["flag_meanings"] = " ".join(row.states)
-    texts = (attrs.get("comment"), row.comment)
-    attrs["comment"] = " ".join(text for text in texts if text) or None
+    attrs["comment"] = comment or None
     return {key: value for key, value in attrs.items() if value is not None}
-
-
-def _flag_attributes(flags: Flags, stored: np.dtype[Any]) -> dict[str, Any]:
-    return {
-        FLAG_LAYOUT: flags.layout,
-        "flag_masks": np.array(flags.bits, dtype=stored),
-        "flag_meanings": flags.words,
-        "comment": f"0: no test failed. {flags.explanation}. reject: do not use the value; care:"
-        " the value is valid, but its stated uncertainty may be too small, or as large as the"
-        " value.",
-    }
 
 
 TIME: Final = Row(

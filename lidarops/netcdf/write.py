@@ -56,8 +56,6 @@ _Format = Literal["NETCDF4", "NETCDF4_CLASSIC"]
 _LEVEL: Final = 1
 """Compression level of libdeflate, 1 to 12; level 2 takes a sixth longer for 5 % smaller files."""
 
-Offset = tuple[int, ...]
-
 
 @dataclass(frozen=True, slots=True)
 class Written:
@@ -86,7 +84,6 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     ProductError
         If the dataset is not in memory, or the file cannot be written.
     """
-    _refuse_lazy(dataset, path)
     unlimited = next((str(name) for name in dataset.encoding.get("unlimited_dims", ())), None)
     return _write(dataset, unlimited, Path(path), "NETCDF4_CLASSIC")
 
@@ -106,7 +103,6 @@ def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
     ProductError
         If the dataset is not in memory, cannot be encoded, or the file cannot be written.
     """
-    _refuse_lazy(dataset, path)
     variables, attributes = xr.conventions.encode_dataset_coordinates(dataset)
     try:
         encoded, attributes = xr.conventions.cf_encoder(variables, attributes)
@@ -152,19 +148,16 @@ def chunk_sizes(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
     return tuple(chunk)
 
 
-def _refuse_lazy(dataset: xr.Dataset, path: str | Path) -> None:
-    for name, variable in dataset.variables.items():
+def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Format) -> Written:
+    variables = {str(name): variable for name, variable in dataset.variables.items()}
+    for name, variable in variables.items():
         if variable.chunks is not None:
             raise ProductError(
                 "is a dask array, whose bytes in a file depend on the order of its tasks",
                 file=path,
-                field=str(name),
+                field=name,
                 remedy="load the dataset before it is written",
             )
-
-
-def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Format) -> Written:
-    variables = {str(name): variable for name, variable in dataset.variables.items()}
     skeleton = Skeleton(variables, dataset.attrs, unlimited)
     with create_file(skeleton, path, model) as file:
         rows = {name: variable.values for name, variable in skeleton.with_rows.items()}
@@ -250,17 +243,6 @@ class QuietFile(io.FileIO):
             self.error = error
             return 0
 
-    def check(self) -> None:
-        """Raise the first error.
-
-        Raises
-        ------
-        OSError
-            If the file is not as it was written.
-        """
-        if self.error is not None:
-            raise self.error
-
 
 @contextmanager
 def create_file(
@@ -308,7 +290,8 @@ def create_file(
             finally:
                 file.close()
         with _disk_errors(path):
-            written = _settle(temporary)
+            _sync(temporary)
+            written = Written(sha256_of(temporary), temporary.stat().st_size)
         if not replaces(temporary):
             return
         with _disk_errors(path):
@@ -332,11 +315,9 @@ class RowFile:
         self._stream = stream
         self._rows = 0
         self._chunks = skeleton.chunks
-        self._columns = {
-            name: RowBlocks(variable.shape[0], self._chunks[name][0])
-            for name, variable in skeleton.with_rows.items()
-        }
-        self._total = skeleton.sizes[str(skeleton.unlimited)] if self._columns else 0
+        self._held: dict[str, list[_Array]] = {name: [] for name in skeleton.with_rows}
+        """The last rows of each variable, whose chunk is incomplete."""
+        self._total = skeleton.sizes[str(skeleton.unlimited)] if self._held else 0
         self._targets = {}
         with _disk_errors(path), NETCDF4_PYTHON_LOCK:
             self._file = h5py.File(stream, "r+")
@@ -355,7 +336,7 @@ class RowFile:
         ----------
         rows : mapping of str to ndarray, shape (n, ...)
             Values of every variable that has rows, with its type and shape; n is at least 1, and
-            at most the number of rows that are missing.
+            at most the number of rows that are missing. Those of incomplete chunks are copied.
 
         Raises
         ------
@@ -364,14 +345,30 @@ class RowFile:
         """
         blocks = [
             (first + len(values), name, first, values)
-            for name, column in self._columns.items()
-            for first, values in column.take(rows[name])
+            for name in self._held
+            for first, values in self._complete_chunks(name, rows[name])
         ]
         # Among blocks with the same last row, the order of variables stays.
         blocks.sort(key=itemgetter(0))
         for _, name, first, values in blocks:
             self.write(name, first, values)
         self._rows += len(next(iter(rows.values())))
+
+    def _complete_chunks(self, name: str, rows: _Array) -> Iterator[tuple[int, _Array]]:
+        """Yield first row and rows of the chunks that the next rows complete; hold the rest."""
+        step, held = self._chunks[name][0], self._held[name]
+        first = self._rows - self._rows % step
+        while len(rows):
+            size = min(step, self._total - first)
+            missing = size - sum(map(len, held))
+            if len(rows) < missing:
+                held.append(rows.copy())
+                return
+            pieces = [*held, rows[:missing]]
+            rows = rows[missing:]
+            yield first, pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+            held.clear()
+            first += size
 
     def write(self, name: str, begin: int, values: _Array) -> None:
         """Write whole chunks of a variable, from a row on."""
@@ -384,7 +381,8 @@ class RowFile:
             for (first, *others), data in chunks:
                 with NETCDF4_PYTHON_LOCK:
                     self._targets[name].write_direct_chunk((begin + first, *others), data)
-                self._stream.check()
+                if self._stream.error is not None:
+                    raise self._stream.error
 
     def complete(self) -> None:
         """Close the file, if all rows came and are in it."""
@@ -393,7 +391,8 @@ class RowFile:
         with _disk_errors(self._path):
             with NETCDF4_PYTHON_LOCK:
                 self._file.close()
-            self._stream.check()
+            if self._stream.error is not None:
+                raise self._stream.error
 
     def close(self) -> None:
         """Close the file; where it is not complete, write nothing more."""
@@ -434,11 +433,6 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _settle(path: Path) -> Written:
-    _sync(path)
-    return Written(sha256_of(path), path.stat().st_size)
 
 
 class _DefinedAtOnce(netCDF4.Dataset):
@@ -487,52 +481,9 @@ def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
                 target[...] = skeleton.variables[name].values
 
 
-class RowBlocks:
-    """The rows of one variable, cut into the blocks that its chunks hold.
-
-    Parameters
-    ----------
-    total : int
-        Number of rows that will come.
-    step : int
-        Rows of a block; the last block may have fewer.
-    """
-
-    def __init__(self, total: int, step: int) -> None:
-        self._total = total
-        self._step = step
-        self._first = 0
-        self._held: list[NDArray[Any]] = []
-
-    def take(self, rows: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
-        """Take the next rows, and yield the blocks that are complete with them.
-
-        Parameters
-        ----------
-        rows : ndarray, shape (n, ...)
-            No more than are still to come. A copy is kept of rows whose block is incomplete.
-
-        Yields
-        ------
-        (int, ndarray)
-            Number of the first row, and the rows.
-        """
-        while len(rows):
-            size = min(self._step, self._total - self._first)
-            missing = size - sum(map(len, self._held))
-            if len(rows) < missing:
-                self._held.append(rows.copy())
-                return
-            pieces = [*self._held, rows[:missing]]
-            rows = rows[missing:]
-            yield self._first, pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-            self._held = []
-            self._first += size
-
-
 def deflate_chunks(
     values: NDArray[Any], chunk: tuple[int, ...], fill_value: Any
-) -> Iterator[tuple[Offset, bytes]]:
+) -> Iterator[tuple[tuple[int, ...], bytes]]:
     """Cut an array into chunks, and shuffle and deflate each.
 
     Equal values give equal bytes, with one version of libdeflate on one architecture of
@@ -561,11 +512,7 @@ def deflate_chunks(
             whole = np.full(chunk, fill_value, dtype=values.dtype)
             whole[tuple(slice(size) for size in part.shape)] = part
             part = whole
-        yield offset, _deflate(part)
-
-
-def _deflate(part: NDArray[Any]) -> bytes:
-    return bytes(zlib_compress(b"".join(map(bytes, _planes(part))), _LEVEL))
+        yield offset, bytes(zlib_compress(b"".join(map(bytes, _planes(part))), _LEVEL))
 
 
 def _planes(part: NDArray[Any]) -> Iterator[NDArray[np.uint8]]:

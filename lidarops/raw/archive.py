@@ -50,7 +50,7 @@ from lidarops.raw.header import (
     named_layout,
     recorder_names,
 )
-from lidarops.records import Granule, Header
+from lidarops.records import SIGNAL_UNITS, Granule, Header
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | Granule]
 Position = Literal["longitude_first", "latitude_first", "ignore"]
@@ -495,9 +495,10 @@ def _properties(
     channel = files.selected[index]
     polarisation = POLARISATIONS.get(channel.polarisation, channel.polarisation)
     mode = str(channel.mode)
+    units = SIGNAL_UNITS[mode]
     label = int(channel.wavelength_label.partition(".")[0])
     attributes: dict[str, Any] = {
-        "units": channel.units if scaled else "count",
+        "units": units if scaled else "count",
         "long_name": f"{mode} signal at {label} nm, {polarisation} polarisation",
         "detection_mode": mode,
         "wavelength_label": channel.wavelength_label,
@@ -519,7 +520,7 @@ def _properties(
             attributes[name] = values[0].item()
             continue
         about = {
-            "units": prop.units or channel.units,
+            "units": prop.units or units,
             "long_name": f"{prop.description} of {channel.name}",
         }
         varying[f"{channel.name}_{name}"] = "time", values.astype(prop.dtype), about

@@ -107,10 +107,6 @@ class RawFile(AbstractContextManager["RawFile"]):
         return UnreadableFileError(f"cannot be read: {error.strerror}", file=self.path)
 
 
-def _not_stated(_: object) -> None:
-    return None
-
-
 @dataclass(frozen=True, slots=True)
 class RawFormat:
     """One raw format. Its functions raise `RawFormatError` for what is damaged."""
@@ -130,9 +126,9 @@ class RawFormat:
     read_counts: Callable[[RawFile, int, Stretches | None, NDArray[np.int32]], None]
     """Fill a row with the counts at one of the `places` of a channel: open file, place, stretches
     of bins (None for all), row."""
-    read_start: Callable[[bytes], datetime | None] = _not_stated
+    read_start: Callable[[bytes], datetime | None] = lambda _: None
     """First bytes of a file that is refused -> when it starts; None where they do not tell."""
-    named_time: Callable[[str], datetime | None] = _not_stated
+    named_time: Callable[[str], datetime | None] = lambda _: None
     """Name of a file -> about when it was recorded, by its clock; None where it does not tell."""
 
     def read_channel(

@@ -92,11 +92,6 @@ class RawChannel:
         return hash((self.name, self.places, self.shots))
 
     @property
-    def units(self) -> str:
-        """Unit of the physical values."""
-        return "mV" if self.mode is DetectionMode.ANALOG else "MHz"
-
-    @property
     def full_scale(self) -> int | None:
         """Counts of a saturated digitiser, ``shots (2^adc_bits - 1)``; None without one."""
         analog = self.mode is DetectionMode.ANALOG

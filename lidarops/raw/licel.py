@@ -50,7 +50,6 @@ __all__ = [
     "Recorder",
     "ScanGrid",
     "encode",
-    "format_header",
     "new_dataset",
     "new_header",
     "parse_header",
@@ -337,23 +336,6 @@ def new_header(
     return header
 
 
-def format_header(header: Header) -> bytes:
-    """Return the header as bytes, as read or as built by `new_header`.
-
-    Raises
-    ------
-    RawFormatError
-        If a field was changed after the header was made and contradicts the text.
-    """
-    if parse_header(header.source, file=header.path, size=header.size) != header:
-        raise RawFormatError(
-            "the fields contradict the text of the header",
-            file=header.path,
-            remedy="build a changed header with new_header",
-        )
-    return header.source
-
-
 def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
     """Return the bytes of a file.
 
@@ -366,13 +348,20 @@ def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
     Raises
     ------
     RawFormatError
-        If counts are missing, surplus, of a wrong shape or type, or exceed 32 bits.
+        If counts are missing, surplus, of a wrong shape or type, or exceed 32 bits, or if a field
+        of the header was changed after it was made and contradicts its text.
     """
+    if parse_header(header.source, file=header.path, size=header.size) != header:
+        raise RawFormatError(
+            "the fields contradict the text of the header",
+            file=header.path,
+            remedy="build a changed header with new_header",
+        )
     stored = [dataset for dataset in header.datasets if dataset.places]
     surplus = set(counts) - {dataset.name for dataset in stored}
     if surplus:
         raise RawFormatError(f"not stored by the header: {', '.join(sorted(surplus))}")
-    parts = [format_header(header)]
+    parts = [header.source]
     for dataset in stored:
         parts += [_counts(dataset, counts).tobytes(), b"\r\n"]
     # The size of a header read from a file without its last CRLF excludes the CRLF.

@@ -34,10 +34,6 @@ _SECTOR: Final = 128
 """Bins in 512 bytes, the smallest block that a disk loses."""
 
 
-def _recognises(head: bytes) -> bool:
-    return _FIRST_LINES.match(head) is not None
-
-
 def _parse_header(head: bytes, file: str, size: int) -> RawHeader:
     header = licel_header.parse_header(head, file=file, size=size)
     if len(head) == size:
@@ -129,7 +125,7 @@ FORMAT: Final = RawFormat(
     name=licel_header.FORMAT,
     title="Licel",
     conversion=licel_header.CONVENTION,
-    recognises=_recognises,
+    recognises=lambda head: _FIRST_LINES.match(head) is not None,
     parse_header=_parse_header,
     read_counts=read_dataset,
     read_start=licel_header.stated_start,

@@ -35,9 +35,9 @@ def test_facts_are_those_of_the_file(tmp_path: Path):
         assert facts.id == product.attrs["id"]
         assert facts.start == datetime(2026, 3, 3, 10, tzinfo=UTC)
         assert facts.stop == datetime(2026, 3, 3, 10, 50, tzinfo=UTC)
-    assert facts.values == flags.size == 15
-    assert facts.usable == np.count_nonzero((flags & flags_of(facts.kind).rejecting) == 0)
-    assert facts.unflagged == np.count_nonzero(flags == 0)
+    assert facts.verdicts.values == flags.size == 15
+    assert facts.verdicts.usable == np.count_nonzero((flags & flags_of(facts.kind).rejecting) == 0)
+    assert facts.verdicts.good == np.count_nonzero(flags == 0)
     assert facts.flagged == {"NO_SIGNAL": 1, "LOW_SIGNAL": 1}
     assert facts.wavelength == pytest.approx(532e-9)
     assert (facts.latitude, facts.longitude, facts.altitude) == (46.44, 30.76, 53.5)

@@ -22,6 +22,7 @@ from lidarops.aggregate.index import (
     write_index,
 )
 from lidarops.errors import ProductError, RetrievalInputError
+from lidarops.records import Verdicts
 
 pytest.importorskip("pyarrow")
 
@@ -65,9 +66,9 @@ def fabricated(count: int) -> list[Facts]:
                 sha256=rng.bytes(32).hex(),
                 size=int(rng.normal(4e5, 5e3)),
                 profiles=144,
-                values=values,
-                usable=usable,
-                unflagged=int(usable * rng.uniform(0.5, 1.0)),
+                verdicts=Verdicts.of(
+                    values, unflagged=int(usable * rng.uniform(0.5, 1.0)), usable=usable
+                ),
                 grid="0123456789abcdef",
                 code_version="0123456789abcdef",
                 flagged={

@@ -35,7 +35,7 @@ def test_means_stay_within_their_errors(name: str):
         )
         short = name.removeprefix("vertical_").removeprefix("total_")
         errors = getattr(smooth, f"{short}_standard_error")
-        budget = budget_of(layout_of("multiangle").row(name))
+        budget = budget_of(layout_of("multiangle").rows[name])
         random, shared = (errors, ()) if budget is None else (np.zeros_like(errors), (errors,))
         usable = np.isfinite(smooth.optical_depth)
         day = Sample(getattr(smooth, short), errors, random, shared, {}, usable)

@@ -359,7 +359,7 @@ def test_a_failure_leaves_the_former_file(
         assert len(list(tmp_path.iterdir())) == 2
         raise failure
 
-    monkeypatch.setattr(writer, "_settle", fail)
+    monkeypatch.setattr(writer, "_sync", fail)
     with pytest.raises(ProductError, match="disk has space") as caught:
         write_product(product, path)
     assert caught.value.file == str(path)
@@ -373,7 +373,7 @@ def test_an_interrupt_leaves_nothing(
     def interrupt(_: Path) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(writer, "_settle", interrupt)
+    monkeypatch.setattr(writer, "_sync", interrupt)
     with pytest.raises(KeyboardInterrupt):
         write_product(product, tmp_path / "product.nc")
     assert list(tmp_path.iterdir()) == []
@@ -384,7 +384,7 @@ import os, signal, sys
 from support.products.made_products import context, homogeneous
 from lidarops.netcdf import write as writer
 from support.products.encoded_products import build_product
-writer._settle = lambda path: os.kill(os.getpid(), signal.SIGKILL)
+writer._sync = lambda path: os.kill(os.getpid(), signal.SIGKILL)
 writer.write_product(build_product(homogeneous(), context()), sys.argv[1])
 """
 

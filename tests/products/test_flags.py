@@ -222,7 +222,7 @@ def test_published_places_do_not_change(kind: str):
     assert {word: SHARED[word] for word in places if word in SHARED} | OWN[kind] == places
     assert {int(bit) for bit in flags} == {1 << place for place in places.values()}
     assert sorted({*places.values()}) == list(places.values())
-    assert layout_of(kind).row("quality_flag").dtype == "i4"
+    assert layout_of(kind).rows["quality_flag"].dtype == "i4"
     assert sum(flags) <= np.iinfo(np.int32).max
 
 

@@ -11,7 +11,6 @@ import pytest
 from compliance_checker.cfunits import Unit
 from support.cases import each
 
-from lidarops.errors import ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import (
     PROVENANCE,
@@ -269,7 +268,7 @@ def test_no_standard_name_means_total_extinction_in_air(standard_names: dict[str
     ],
 )
 def test_units_of_the_signal_follow_the_mode(mode: DetectionMode, name: str, unit: str):
-    assert attributes(layout_of("signal").row(name), mode=mode)["units"] == unit
+    assert attributes(layout_of("signal").rows[name], mode=mode)["units"] == unit
 
 
 @pytest.mark.parametrize("layout", map(layout_of, kinds()), ids=list(kinds()))
@@ -279,7 +278,7 @@ def test_ancillaries_and_standard_errors_are_consistent(layout):
     for row in layout.variables:
         assert set(row.ancillaries) <= set(names)
         if row.uncertain:
-            error = layout.row(f"{row.name}_standard_error")
+            error = layout.rows[f"{row.name}_standard_error"]
             assert row.ancillaries[0] == error.name
             assert (error.units, error.dims, error.dtype) == (row.units, row.dims, row.dtype)
             assert error.valid_min == 0
@@ -318,8 +317,3 @@ def test_retrieved_quantities_keep_all_their_bits_and_signals_13():
     bits = {row.name: row.bits for row in layout_of("signal").variables}
     assert bits["signal"] == 13
     assert all(row.bits is None for row in layout_of("homogeneous").variables)
-
-
-def test_unknown_row_is_refused_with_the_choices():
-    with pytest.raises(ProductError, match=r"bogus.*extinction_standard_error"):
-        layout_of("homogeneous").row("bogus")

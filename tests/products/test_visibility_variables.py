@@ -76,7 +76,7 @@ def test_a_value_may_not_be_missing_without_a_reason(data: xr.Dataset):
 
 
 def test_bits_are_those_that_a_network_can_raise(data: xr.Dataset):
-    flags = layout_of(KIND).row("quality_flag").flags
+    flags = layout_of(KIND).rows["quality_flag"].flags
     assert flags is not None
     strange = data.copy(deep=True)
     strange["quality_flag"][0, 0] = int(Quality.NO_GLUING)

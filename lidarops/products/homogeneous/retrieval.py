@@ -324,7 +324,7 @@ class _Sections(ProductStream):
             definition = VisibilityDefinition(self._signal.wavelength, **dict(requested))
             sections = _with_visibility(sections, definition)
         method = self._settings.method
-        product = sections.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
+        product = sections.assign(retrieval_method=LAYOUT.rows["retrieval_method"].code(method))
         paper = _PAPERS.get(method)
         return in_one_batch(product.assign_attrs(references=paper) if paper else product)
 

@@ -412,7 +412,7 @@ class _Scans(ProductStream):
         )
         self.notes += blocked_in_words(optical_depth)
         optical_depth = optical_depth.assign(
-            retrieval_method=LAYOUT.row("retrieval_method").code(optical_depth.attrs["method"]),
+            retrieval_method=LAYOUT.rows["retrieval_method"].code(optical_depth.attrs["method"]),
             background_method=BACKGROUND_METHOD.code(self._background.method),
         )
         # Beside those of all methods.

@@ -350,7 +350,7 @@ class _NetworkStream(NetworkStream):
         method = "beams_with_prior" if settings.prior == "block" else "beams_without_prior"
         if settings.multiplier is not None:
             method = "triangles"
-        return retrieved.assign(retrieval_method=LAYOUT.row("retrieval_method").code(method))
+        return retrieved.assign(retrieval_method=LAYOUT.rows["retrieval_method"].code(method))
 
 
 class _Beam:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lidarops.flags import FIRST_OWN, FlagBit, Severity
+from lidarops.flags import FIRST_OWN, FlagBit, care, reject
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 
 _MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
@@ -13,48 +13,32 @@ _MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
 class ElasticQuality(FlagBit):
     """Own bits. A place is never given to another bit."""
 
-    CLOUD = (
+    CLOUD = care(
         FIRST_OWN,
-        Severity.CARE,
-        (
-            f"within {_MARGIN} of a cloud, or behind one as seen from the start of the inversion,"
-            " where the lidar ratio of aerosol does not hold"
-        ),
+        f"within {_MARGIN} of a cloud, or behind one as seen from the start of the inversion,"
+        " where the lidar ratio of aerosol does not hold",
     )
-    NO_REFERENCE = (
+    NO_REFERENCE = reject(
         FIRST_OWN + 1,
-        Severity.REJECT,
         "no range window passes the tests for aerosol-free air, so the profile is not calibrated",
     )
-    UNSTABLE_INVERSION = (
+    UNSTABLE_INVERSION = reject(
         FIRST_OWN + 2,
-        Severity.REJECT,
-        (
-            "numerically unstable (near-zero denominator), or beyond the range that the boundary"
-            " value constrains"
-        ),
+        "numerically unstable (near-zero denominator), or beyond the range that the boundary"
+        " value constrains",
     )
-    NEGATIVE_BACKSCATTER = (
+    NEGATIVE_BACKSCATTER = reject(
         FIRST_OWN + 3,
-        Severity.REJECT,
-        (
-            "backscatter is below zero by several standard errors, here or between here and the"
-            " start of the inversion: the signal is not as assumed (overlap, baseline, gluing)"
-        ),
+        "backscatter is below zero by several standard errors, here or between here and the"
+        " start of the inversion: the signal is not as assumed (overlap, baseline, gluing)",
     )
-    UNKNOWN_OVERLAP = (
+    UNKNOWN_OVERLAP = care(
         FIRST_OWN + 4,
-        Severity.CARE,
-        (
-            "the signal shows incomplete overlap nearer than here, where it was stated to be full"
-            " or not stated: it may be incomplete here too"
-        ),
+        "the signal shows incomplete overlap nearer than here, where it was stated to be full"
+        " or not stated: it may be incomplete here too",
     )
-    PARTLY_CLOUDY = (
+    PARTLY_CLOUDY = care(
         FIRST_OWN + 5,
-        Severity.CARE,
-        (
-            f"some of the averaged profiles, not all, show a cloud within {_MARGIN}, or between"
-            " here and the start of the inversion: the mean is that of cloudy and clear air"
-        ),
+        f"some of the averaged profiles, not all, show a cloud within {_MARGIN}, or between"
+        " here and the start of the inversion: the mean is that of cloudy and clear air",
     )

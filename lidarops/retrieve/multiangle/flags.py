@@ -5,49 +5,36 @@ from __future__ import annotations
 from typing import Final
 
 from lidarops import flags
-from lidarops.flags import FIRST_OWN, FlagBit, Quality, Severity, rejecting
+from lidarops.flags import FIRST_OWN, FlagBit, Quality, care, reject, rejecting
 
 
 class MultiAngleQuality(FlagBit):
     """Own bits. A place is never given to another bit."""
 
-    NEGATIVE_OPTICAL_DEPTH = (
+    NEGATIVE_OPTICAL_DEPTH = care(
         FIRST_OWN + 2,
-        Severity.CARE,
-        (
-            "the optical depth is below zero, or falls with altitude, by more than 2 standard"
-            " errors: keep it in means, which would be biased without such values"
-        ),
+        "the optical depth is below zero, or falls with altitude, by more than 2 standard"
+        " errors: keep it in means, which would be biased without such values",
     )
-    NO_LEVERAGE = (
-        FIRST_OWN + 3,
-        Severity.REJECT,
-        "the zenith angles are too few or too similar to determine an optical depth",
+    NO_LEVERAGE = reject(
+        FIRST_OWN + 3, "the zenith angles are too few or too similar to determine an optical depth"
     )
-    POOR_STRATIFICATION = (
+    POOR_STRATIFICATION = reject(
         FIRST_OWN + 4,
-        Severity.REJECT,
-        (
-            "the signals of the slant paths differ by more than level layers allow: by the air, or"
-            " by distorted signals of near ranges, of an analog channel or of a dead time that is"
-            " wrong or stated too exactly"
-        ),
+        "the signals of the slant paths differ by more than level layers allow: by the air, or"
+        " by distorted signals of near ranges, of an analog channel or of a dead time that is"
+        " wrong or stated too exactly",
     )
     PRIOR_DOMINATED = FIRST_OWN + 5, *flags.PRIOR_DOMINATED
-    EXTRAPOLATED = (
+    EXTRAPOLATED = reject(
         FIRST_OWN + 6,
-        Severity.REJECT,
         "beyond the reach of the signals, where only the prior would determine the value",
     )
-    INTERPOLATED = (
-        FIRST_OWN + 7,
-        Severity.CARE,
-        "in a gap of the data, interpolated from the altitudes above and below",
+    INTERPOLATED = care(
+        FIRST_OWN + 7, "in a gap of the data, interpolated from the altitudes above and below"
     )
-    NO_RESIDUAL = (
-        FIRST_OWN + 10,
-        Severity.CARE,
-        "there are as many unknowns as angles, so no residual tests the result",
+    NO_RESIDUAL = care(
+        FIRST_OWN + 10, "there are as many unknowns as angles, so no residual tests the result"
     )
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.flags import FIRST_OWN, FlagBit, Quality, Severity
+from lidarops.flags import FIRST_OWN, FlagBit, Quality, care, reject
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common.arrays import Flags
 
@@ -18,71 +18,47 @@ _MARGIN: Final = f"{THRESHOLDS.cloud_margin:g} m"
 class RamanQuality(FlagBit):
     """Own bits. A place is never given to another bit."""
 
-    NO_REFERENCE = (
+    NO_REFERENCE = care(
         FIRST_OWN,
-        Severity.CARE,
-        (
-            "no range window passes the tests for aerosol-free air, so that backscatter and lidar"
-            " ratio are missing; extinction needs none"
-        ),
+        "no range window passes the tests for aerosol-free air, so that backscatter and lidar"
+        " ratio are missing; extinction needs none",
     )
-    WEAK_SIGNAL = (
+    WEAK_SIGNAL = reject(
         FIRST_OWN + 1,
-        Severity.REJECT,
-        (
-            "the smoothed Raman signal is less than 5 times its standard error, or jumps so that no"
-            " smooth one follows it"
-        ),
+        "the smoothed Raman signal is less than 5 times its standard error, or jumps so that no"
+        " smooth one follows it",
     )
-    NO_LIDAR_RATIO = (
+    NO_LIDAR_RATIO = care(
         FIRST_OWN + 2,
-        Severity.CARE,
-        (
-            "the lidar ratio is missing: backscatter exceeds zero by too few standard errors, or"
-            " extinction is not above zero"
-        ),
+        "the lidar ratio is missing: backscatter exceeds zero by too few standard errors, or"
+        " extinction is not above zero",
     )
-    NEGATIVE_EXTINCTION = (
+    NEGATIVE_EXTINCTION = reject(
         FIRST_OWN + 3,
-        Severity.REJECT,
-        (
-            "beyond, the Raman signal falls less than in air without particles, by more than its"
-            " error: the overlap may not be full where stated, a background is wrong, or the air is"
-            " not that of molecular_source"
-        ),
+        "beyond, the Raman signal falls less than in air without particles, by more than its"
+        " error: the overlap may not be full where stated, a background is wrong, or the air is"
+        " not that of molecular_source",
     )
-    PARTLY_CLOUDY = (
+    PARTLY_CLOUDY = care(
         FIRST_OWN + 4,
-        Severity.CARE,
-        (
-            f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or in the mean"
-            " over vertical_resolution: the value is that of cloudy and clear air"
-        ),
+        f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or in the mean"
+        " over vertical_resolution: the value is that of cloudy and clear air",
     )
-    CLOUD = (
+    CLOUD = care(
         FIRST_OWN + 5,
-        Severity.CARE,
-        (
-            f"the mean of the profiles shows a cloud within {_MARGIN} or in the mean over"
-            " vertical_resolution:"
-            " multiple scattering makes extinction too small, by more than its error states"
-        ),
+        f"the mean of the profiles shows a cloud within {_MARGIN} or in the mean over"
+        " vertical_resolution:"
+        " multiple scattering makes extinction too small, by more than its error states",
     )
-    DOUBTFUL_WATER_VAPOUR = (
+    DOUBTFUL_WATER_VAPOUR = care(
         FIRST_OWN + 6,
-        Severity.CARE,
-        (
-            "water vapour is missing or may be wrong: its channel has no data, is saturated, counts"
-            " too fast or has an uncertain background; other values are not concerned"
-        ),
+        "water vapour is missing or may be wrong: its channel has no data, is saturated, counts"
+        " too fast or has an uncertain background; other values are not concerned",
     )
-    COMMON_OVERLAP = (
+    COMMON_OVERLAP = care(
         FIRST_OWN + 7,
-        Severity.CARE,
-        (
-            "the overlap is not full: the value holds where both channels have the same overlap,"
-            " which its error does not cover"
-        ),
+        "the overlap is not full: the value holds where both channels have the same overlap,"
+        " which its error does not cover",
     )
 
 
