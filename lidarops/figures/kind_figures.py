@@ -16,8 +16,7 @@ import xarray as xr
 
 from lidarops.figures.image_panels import ImageQuantity, image_figure
 from lidarops.figures.panels import Figure
-from lidarops.figures.raster import Raster, raster_variables, read_raster
-from lidarops.figures.series_data import Comparison
+from lidarops.figures.raster import COLUMNS, Raster, raster_variables, read_raster
 from lidarops.figures.series_panels import Quantity
 from lidarops.kinds import kinds
 from lidarops.records import SceneOutcome
@@ -29,13 +28,9 @@ Content = TypeVar("Content")
 class ProductSource:
     """What is known about a product beside its data; nothing on a page of the product alone."""
 
-    instrument: str = ""
-    channel: str = ""
     scene: SceneOutcome | None = None
-    truth: xr.Dataset | None = None
-    """Truth of a simulated campaign."""
-    profiles: int = 0
-    """Profiles per column of an image; 0 for as many as fit the product."""
+    columns: int = COLUMNS
+    """Most columns of an image, but for those that gaps in time add."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +47,10 @@ class View(Generic[Content]):
     possible to pickle it."""
     draw: Callable[[Sequence[Content]], Iterable[Figure]]
     """Returns the figures of the contents of at least one product."""
-    compare: Callable[[Sequence[Content]], Iterable[Comparison | None]] | None = None
-    """Compares contents with the truth."""
     first: bool = False
     """Whether a report draws only the first product that has content."""
     shows: str = ""
-    """Variable of an image against time, for which `read` needs `ProductSource.profiles`."""
+    """Variable of an image against time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +86,8 @@ def _read_raster(
     part = product[names]
     if along in part:
         part = part.isel({along: slice(0, int(np.searchsorted(part[along].values, farthest)))})
-    return read_raster(part, quantity=variable, profiles=source.profiles, along=along)
+    profiles = max(-(-part.sizes["time"] // source.columns), 1)
+    return read_raster(part, quantity=variable, profiles=profiles, along=along)
 
 
 def figures_of(kind: str) -> KindFigures | None:

@@ -1,4 +1,4 @@
-"""The figures of the ``visibility`` product: series at crossings with the truth, a map of beams."""
+"""The figures of the ``visibility`` product: series at crossings, a map of beams."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -22,17 +23,8 @@ from lidarops.figures.panels import (
     Words,
     number,
 )
-from lidarops.figures.series_data import (
-    Comparison,
-    SeriesEstimate,
-    TimeSeries,
-    compare,
-    float_values,
-    join,
-    require,
-)
+from lidarops.figures.series_data import TimeSeries, float_values, join, require
 from lidarops.figures.series_panels import Quantity, series_figures
-from lidarops.figures.time_axis import Times
 from lidarops.figures.wording import counted
 from lidarops.kinds import flags_of
 from lidarops.products.visibility.network import NAME
@@ -48,19 +40,18 @@ _EXTINCTION: Final = (
 )
 _VISIBILITY: Final = ("visibility_in_air", "visibility_in_air_lower", "visibility_in_air_upper")
 _ANGLES: Final = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
-_SHARED: Final = ("time", "crossing_id", "beam_range", "quality_flag")
-CROSSING_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY, "time_bnds", "beam_zenith_angle")
+_SHARED: Final = ("time", "crossing_id", "quality_flag")
+CROSSING_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY)
 """Variables that `read_crossings` needs."""
 MAP_VARIABLES: Final = (
     *_SHARED,
+    "beam_range",
     "visibility_in_air",
     *(f"beam_{name}" for name in _ANGLES),
     *_ANGLES[:3],
 )
 """Variables that `read_map` needs."""
 _PAIR: Final = ("time", "crossing")
-_SAME_BEAM: Final = 0.2
-"""degree; files of the truth within this zenith angle of a beam belong to it."""
 _FLAT: Final = 0.2
 """Smallest horizontal extent of a map that shows the ground, relative to the larger extent."""
 _HEIGHT: Final = 464.0
@@ -99,25 +90,13 @@ def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
     return ()
 
 
-def read_crossings(
-    product: xr.Dataset, truth: xr.Dataset | None = None, *, instruments: Sequence[str] = ()
-) -> list[TimeSeries]:
-    """Return the series at each crossing of a product.
+def read_crossings(product: xr.Dataset) -> list[TimeSeries]:
+    """Return the series at each crossing of a product; errors include the systematic error.
 
     Parameters
     ----------
     product : Dataset
         Kind ``visibility``.
-    truth : Dataset, optional
-        Truth of a simulated campaign.
-    instruments : sequence of str, optional
-        Instrument of each beam, to select its truth; empty for no truth.
-
-    Returns
-    -------
-    list of TimeSeries
-        Standard errors include the systematic error. The truth is the mean over the beams at the
-        crossing.
 
     Raises
     ------
@@ -126,36 +105,26 @@ def read_crossings(
     """
     require(
         product,
-        {"time": ("time",), "crossing_id": ("crossing",), "beam_range": ("beam", "crossing")}
+        {"time": ("time",), "crossing_id": ("crossing",)}
         | dict.fromkeys((*_EXTINCTION, *_VISIBILITY, "quality_flag"), _PAIR),
     )
     value, random, systematic = (float_values(product, name) for name in _EXTINCTION)
-    visibility, lower, upper = (float_values(product, name) for name in _VISIBILITY)
-    flags = product["quality_flag"].values.astype(np.int64)
-    true_extinction = _truth(product, truth, instruments)
+    visibility, lower, upper = (float_values(product, name) / 1e3 for name in _VISIBILITY)
+    values = {
+        "flag": product["quality_flag"].values.astype(np.int64),
+        "total_extinction": value,
+        "total_extinction_standard_error": np.hypot(random, systematic),
+        "visibility": visibility,
+        "visibility_standard_error": np.abs(upper - lower) / 2.0,
+    }
     time = product["time"].values.astype("datetime64[ns]")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        true_visibility = np.where(
-            true_extinction > 0, _contrast_constant(value, visibility) / true_extinction, np.nan
-        )
+    rejecting = flags_of("visibility").rejecting
     return [
         TimeSeries(
-            time=time,
-            flag=flags[:, v],
-            rejecting=flags_of("visibility").rejecting,
-            estimates={
-                "total_extinction": SeriesEstimate(
-                    value[:, v], np.hypot(random, systematic)[:, v], true_extinction[:, v], "m-1"
-                ),
-                "visibility": SeriesEstimate(
-                    visibility[:, v] / 1e3,
-                    np.abs(upper - lower)[:, v] / 2e3,
-                    true_visibility[:, v] / 1e3,
-                    "km",
-                ),
-            },
-            label=f"crossing {number}",
-            key=(number,),
+            pd.DataFrame({name: both[:, v] for name, both in values.items()}, time),
+            rejecting,
+            f"crossing {number}",
+            (number,),
         )
         for v, number in enumerate(product["crossing_id"].values.tolist())
     ]
@@ -221,82 +190,21 @@ def _plane(points: Floats) -> tuple[list[int], tuple[str, str]]:
     return [0, 1], labels
 
 
-def _contrast_constant(extinction: Floats, visibility: Floats) -> float:
-    """Return visibility times extinction, -ln(contrast); NaN if it is not constant."""
-    known = np.isfinite(extinction) & np.isfinite(visibility)
-    if not known.any():
-        return float("nan")
-    products = extinction[known] * visibility[known]
-    # It varies where the conversion to another wavelength depends on visibility.
-    return float(np.median(products)) if np.ptp(products) < 0.01 * products.mean() else np.nan
-
-
-def _truth(product: xr.Dataset, truth: xr.Dataset | None, instruments: Sequence[str]) -> Floats:
-    shape = product["total_extinction"].shape
-    if truth is None or len(instruments) != product.sizes["beam"]:
-        return np.full(shape, np.nan)
-    bounds = product["time_bnds"].values.astype("datetime64[ns]")
-    zenith, ranges = float_values(product, "beam_zenith_angle"), float_values(product, "beam_range")
-    total, count = np.zeros(shape), np.zeros(shape)
-    for beam, name in enumerate(instruments):
-        for crossing in np.flatnonzero(np.isfinite(ranges[beam])):
-            times, true_values = _along(truth, name, zenith[beam], ranges[beam, crossing])
-            for row, (start, stop) in enumerate(bounds):
-                inside = true_values[(times >= start) & (times <= stop)]
-                if inside.size:
-                    total[row, crossing] += inside.mean()
-                    count[row, crossing] += 1
-    with np.errstate(invalid="ignore"):
-        return np.asarray(total / np.where(count > 0, count, np.nan))
-
-
-def _along(
-    truth: xr.Dataset, instrument: str, zenith: float, distance: float
-) -> tuple[Times, Floats]:
-    """Return times and true extinction at a distance along a beam."""
-    suffix = instrument.replace("-", "_")
-    names = np.asarray(truth["instrument"].values, dtype=np.str_)
-    if f"profile_granule_{suffix}" not in truth:
-        rows = np.flatnonzero(names == instrument)
-        true_values = float_values(truth, "total_extinction")[rows]
-    else:
-        rows = truth[f"profile_granule_{suffix}"].values.astype(np.intp)
-        middle = float_values(truth, f"range_{suffix}")
-        field = np.asarray(
-            truth[f"profile_total_extinction_{suffix}"].values[:, 0], dtype=np.float64
-        )
-        true_values = np.array([np.interp(distance, middle, row) for row in field])
-    times = truth["time"].values.astype("datetime64[ns]")[rows]
-    if "zenith_angle" in truth:
-        same_beam = np.abs(float_values(truth, "zenith_angle")[rows] - zenith) < _SAME_BEAM
-        times, true_values = times[same_beam], true_values[same_beam]
-    finite = np.isfinite(true_values)
-    return times[finite], true_values[finite]
-
-
 # Figures -----------------------------------------------------------------------------------------
 
 
-def _read_crossings(product: xr.Dataset, source: ProductSource) -> list[TimeSeries] | None:
-    instruments = instruments_of(source.scene) if source.scene else ()
-    return read_crossings(product, source.truth, instruments=instruments) or None
+def _read_crossings(product: xr.Dataset, _: ProductSource) -> list[TimeSeries] | None:
+    return read_crossings(product) or None
 
 
 def _read_map(product: xr.Dataset, source: ProductSource) -> NetworkMap:
     return read_map(product, instruments_of(source.scene) if source.scene else ())
 
 
-def _crossings(contents: Sequence[list[TimeSeries]]) -> list[TimeSeries]:
-    return join(crossing for crossings in contents for crossing in crossings)
-
-
 def _draw_crossings(contents: Sequence[list[TimeSeries]]) -> Iterator[Figure]:
+    crossings = join(crossing for crossings in contents for crossing in crossings)
     title = "Visibility and extinction at the crossings"
-    return series_figures(_crossings(contents), _QUANTITIES, title)
-
-
-def _compare(contents: Sequence[list[TimeSeries]]) -> Iterator[Comparison | None]:
-    return (compare(crossing, "total_extinction") for crossing in _crossings(contents))
+    return series_figures(crossings, _QUANTITIES, title)
 
 
 def _draw_map(contents: Sequence[NetworkMap]) -> list[Figure]:
@@ -348,7 +256,7 @@ def _points(points: Floats, style: str, mark: Mark | None = None, label: str = "
 
 FIGURES: Final = KindFigures(
     (
-        View("visibility", CROSSING_VARIABLES, _read_crossings, _draw_crossings, _compare),
+        View("visibility", CROSSING_VARIABLES, _read_crossings, _draw_crossings),
         View("network", MAP_VARIABLES, _read_map, _draw_map, first=True),
     ),
     preferred="visibility_in_air",
