@@ -23,6 +23,7 @@ from lidarops.figures import any_kind, browser
 from lidarops.figures.kind_figures import ProductSource, View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
+from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
@@ -107,8 +108,8 @@ def build_site(
 
     Pages need neither server nor network; one script draws their figures. The page of a product
     depends only on the product, except its links, which are written anew in each build. It is kept
-    while the sha256 of the product, the page and lidarops do not change. Equal archives give equal
-    bytes, for any number of workers.
+    while the sha256 of the product, the page and lidarops do not change; where nothing has changed,
+    all pages are. Equal archives give equal bytes, for any number of workers.
 
     Parameters
     ----------
@@ -150,13 +151,17 @@ def build_site(
         _Task(path, products, site, before.get(path), below) for path in product_paths(products)
     ]
     entries, problems, made = _collect(tasks, workers, progress)
+    built = Site(site / pages.INDEX, len(entries), made, tuple(problems))
+    stated = _stated(entries, problems, links, below)
+    if built.index.is_file() and not copies and (site / MANIFEST).read_bytes() == stated:
+        return built
     entries = list(_linked(site, entries, links))
     expected = _write_calendar(site, entries, problems, links, below)
     if copies:
         expected |= _copy(products, site, entries)
-    _write_manifest(site, entries, problems, links, below)
+    _write(site, MANIFEST, _stated(entries, problems, links, below))
     _sweep(site, expected)
-    return Site(site / pages.INDEX, len(entries), made, tuple(problems))
+    return built
 
 
 def _collect(
@@ -413,7 +418,7 @@ def _write_calendar(
                 name = day_page(station, day)
                 write(name, pages.day(station, day, by_day, before, after))
     campaigns = sorted({entry.campaign for entry in entries})
-    _write(site, "site.css", pages.style().encode())
+    _write(site, pages.SHEET, style("lidarops.site", pages.SHEET))
     _write(site, browser.SCRIPT, browser.script())
     _write(site, pages.INDEX, pages.index(entries, problems, campaigns, links, below))
     return expected
@@ -438,19 +443,20 @@ def _version() -> str:
     return f"{__version__} {pages_version()}"
 
 
-def _write_manifest(
-    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
-) -> None:
+def _stated(
+    entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
+) -> bytes:
+    """Return the manifest, which states all that the site follows from."""
     document = {
         "format": _FORMAT,
         "products_at": links.products,
+        "links": links.outside(entries),
         "below": below,
         "version": _version(),
         "products": [asdict(entry) for entry in entries],
         "problems": [asdict(problem) for problem in problems],
     }
-    text = json.dumps(document, indent=0, sort_keys=True)
-    _write(site, MANIFEST, text.encode("ascii") + b"\n")
+    return json.dumps(document, indent=0, sort_keys=True).encode("ascii") + b"\n"
 
 
 def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
@@ -464,7 +470,7 @@ def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
                 remedy="move it away, so that its content is not lost",
             )
         # Written first, so that an interrupted build is recognised as a site.
-        _write_manifest(site, [], [], links, below)
+        _write(site, MANIFEST, _stated([], [], links, below))
         return {}
     try:
         document = json.loads(file.read_bytes())
