@@ -220,14 +220,12 @@ def _reduced(
 ) -> Iterator[tuple[Sums, int]]:
     """Yield sums over blocks of columns, and the union of their bits."""
     edges = [*columns, product.sizes["time"]]
-    first, most = 0, _READ_BYTES // (8 * product[names[0]].shape[1])
-    while first < columns.size:
-        last = first + 1
-        while last < columns.size and edges[last + 1] - edges[first] <= most:
-            last += 1
+    longest = int(np.diff(edges).max())
+    step = max(1, _READ_BYTES // (8 * product[names[0]].shape[1] * longest))
+    for first in range(0, columns.size, step):
+        last = min(first + step, columns.size)
         block = product.isel(time=slice(int(edges[first]), int(edges[last])))
         yield _sums(block, names, masks, columns[first:last] - edges[first], rows)
-        first = last
 
 
 def _sums(

@@ -137,9 +137,10 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
                 continue
             for view in views_of(group.kind):
                 contents = list(_read(processes, group, view, gallery.problems))
-                for drawn in view.draw(contents) if contents else ():
+                if contents:
                     title = _title(group, gallery.problems)
-                    gallery.pictures.append(_picture(view.name, drawn, group, title))
+                    drawn = (_picture(view.name, one, group, title) for one in view.draw(contents))
+                    gallery.pictures += drawn
     return gallery
 
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -36,7 +36,6 @@ from lidarops.site.paths import (
     day_page,
     month_list,
     product_folder,
-    product_page,
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
@@ -78,15 +77,10 @@ class Site:
     """Products without a page, or with an incomplete page."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    path: str
-    products: Path
-    site: Path
-    known: Entry | None
-    below: float
-
-
+_Kept = tuple[Path, Path, float]
+"""Folders of the products and of the site, and the height of the calendar."""
+_Task = tuple[str, Entry | None]
+"""Path of a product, and its entry if it has a page."""
 _Drawn = tuple[Figure, Markup]
 """A figure, and as a page holds it."""
 _Outcome = tuple[Entry | Problem, bool]
@@ -147,10 +141,10 @@ def build_site(
     links = Links(output, COPIES if copies else products_at, stac_at, reports_at)
     products, site = product_folder(output), output / SITE
     before = _manifest(site, links, below)
-    tasks = [
-        _Task(path, products, site, before.get(path), below) for path in product_paths(products)
-    ]
-    entries, problems, made = _collect(tasks, workers, progress)
+    tasks = [(path, before.get(path)) for path in product_paths(products)]
+    with Processes(workers, (products, site, below)) as processes:
+        done = processes.map_items(_page, tasks, at_a_time=1, lost=_crashed)
+        entries, problems, made = _collected(done, progress)
     built = Site(site / pages.INDEX, len(entries), made, tuple(problems))
     stated = _stated(entries, problems, links, below)
     if built.index.is_file() and not copies and (site / MANIFEST).read_bytes() == stated:
@@ -164,45 +158,41 @@ def build_site(
     return built
 
 
-def _collect(
-    tasks: Sequence[_Task], workers: int, progress: Callable[[int], None] | None
+def _collected(
+    done: Iterable[tuple[_Task, _Outcome]], progress: Callable[[int], None] | None
 ) -> tuple[list[Entry], list[Problem], int]:
     entries, problems, made = [], [], 0
-    with Processes(workers, None) as processes:
-        for _, (outcome, new) in processes.map_items(_page, tasks, at_a_time=1, lost=_crashed):
-            if isinstance(outcome, Problem):
-                problems.append(outcome)
-            else:
-                entries.append(outcome)
-                made += new
-                if outcome.problem:
-                    problems.append(Problem(outcome.path, outcome.problem))
-            if progress is not None:
-                progress(1)
+    for _, (outcome, new) in done:
+        if isinstance(outcome, Problem):
+            problems.append(outcome)
+        else:
+            entries.append(outcome)
+            made += new
+            if outcome.problem:
+                problems.append(Problem(outcome.path, outcome.problem))
+        if progress is not None:
+            progress(1)
     return entries, problems, made
 
 
-def _page(_: None, task: _Task) -> _Outcome:
+def _page(kept: _Kept, task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
+    (products, site, below), (path, known) = kept, task
     try:
-        file = within(task.products, task.path)
+        file = within(products, path)
         with reading(file):
             sha256 = sha256_of(file)
-        if task.known is not None and _is_kept(task.known, sha256, task.site):
-            return task.known, False
-        return _make(task, file, sha256), True
+        if known is not None and _is_kept(known, sha256, site):
+            return known, False
+        return _make(path, file, sha256, site, below), True
     except ProductError as error:
-        return Problem(task.path, _reason(task, error)), True
+        # With relative paths, because pages must not depend on the location of the archive.
+        words = str(error).replace(str(products / path), path)
+        return Problem(path, words or type(error).__name__), True
 
 
 def _crashed(task: _Task) -> _Outcome:
-    return Problem(task.path, CRASHED), True
-
-
-def _reason(task: _Task, error: BaseException) -> str:
-    # With relative paths, because pages must not depend on the location of the archive.
-    words = str(error).replace(str(task.products / task.path), task.path)
-    return words or type(error).__name__
+    return Problem(task[0], CRASHED), True
 
 
 def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
@@ -215,12 +205,12 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
     )
 
 
-def _make(task: _Task, file: Path, sha256: str) -> Entry:
+def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry:
     with opened_product(file, decode_cf=False) as stored:
         kind = attribute(stored, "lidarops_kind")
         opened = _decoded(stored, kind)
         quality, no_quality = _guarded(
-            lambda: read_quality(opened, task.below), "its quality over time cannot be drawn"
+            lambda: read_quality(opened, below), "its quality over time cannot be drawn"
         )
         quality = quality or Quality()
         values, no_values = _guarded(
@@ -231,15 +221,12 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         start, stop = product_contents.span(opened)
         no_flags = "" if QUALITY_FLAG in opened else "the product has no quality flags"
         problems = (not_drawn, no_values, no_quality, origin["problem"], no_flags)
-        page = product_page(task.path)
         station = attribute(opened, "lidarops_station")
         instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
-            path=task.path,
+            path=path,
             sha256=sha256,
             size=file.stat().st_size,
-            page=page,
-            thumbnail=page.removesuffix(".html") + ".png",
             digests=(),
             campaign=product_contents.campaign(opened),
             station=station,
@@ -269,7 +256,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             browser.thumbnail(figures[0][0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):
-        _write(task.site, name, content)
+        _write(site, name, content)
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
@@ -480,16 +467,9 @@ def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
             below,
         ):
             return {}
-        return {item["path"]: _entry(item) for item in document["products"]}
+        known = [
+            Entry(**item | {"digests": tuple(item["digests"])}) for item in document["products"]
+        ]
+        return {entry.path: entry for entry in known}
     except (ValueError, KeyError, TypeError):
         return {}
-
-
-def _entry(item: dict[str, Any]) -> Entry:
-    values = {field.name: item[field.name] for field in fields(Entry)}
-    known = Entry(**(values | {"digests": tuple(item["digests"])}))
-    # Page names follow from the product, not from a manifest that may have been edited.
-    page = product_page(known.path)
-    if (known.page, known.thumbnail) != (page, page.removesuffix(".html") + ".png"):
-        raise ValueError(known.path)
-    return known

@@ -33,8 +33,6 @@ INDEX: Final = "index.html"
 SHEET: Final = "site.css"
 _INPUTS: Final = 12
 """Most input files that a page lists."""
-_YEARS: Final = 48
-"""Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
 _LATEST: Final = 6
 _NAVIGATION: Final = (b"<!-- navigation -->", b"<!-- /navigation -->")
@@ -179,18 +177,11 @@ def _order(entry: Entry) -> tuple[Any, ...]:
 
 
 def _cell(entries: Iterable[Entry]) -> dict[str, Any]:
-    """Return what a day or month shows: the share of usable profiles, and its grade.
-
-    The share is in whole percent; only exact 0 and 1 become 0 % and 100 %.
-    """
+    """Return what a day or month shows: the share of usable profiles, and its grade."""
     share = mean_availability(entries)
     if share is None:
         return {"share": "", "of": "", "grade": ShareGrade.UNKNOWN}
-    whole = round(100 * share)
-    words = f"{whole} %"
-    if whole in (0, 100) and share not in (0.0, 1.0):
-        words = "<1 %" if whole == 0 else ">99 %"
-    return {"share": words, "of": " of profiles usable", "grade": ShareGrade.of(share)}
+    return {"share": percent(share), "of": " of profiles usable", "grade": ShareGrade.of(share)}
 
 
 def _by(entries: Iterable[Entry], key: Callable[[Entry], str]) -> dict[str, list[Entry]]:
@@ -261,7 +252,6 @@ def index(
         report=links.report(INDEX),
         licenses=sorted({entry.license for entry in entries if entry.license}),
         stations=by_station,
-        matrix=sum(len(years(group)) for group in by_station.values()) <= _YEARS,
         latest=retrieved[:_LATEST],
         problems=[(problem.path, problem.reason) for problem in problems],
         files=len({*(entry.path for entry in entries), *(item.path for item in problems)}),
