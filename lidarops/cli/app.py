@@ -456,14 +456,10 @@ def findings_document(findings: Findings) -> dict[str, Any]:
 
 def show_findings(findings: Findings, most: int | None = None) -> None:
     """Print the findings as tables, each of at most so many rows."""
-    from lidarops.reports.findings import finding_rows, lacking
+    from lidarops.reports.findings import finding_rows, unmet_rows
 
     columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
-    unmet = (
-        (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
-        for unmet in findings.unmet
-    )
-    show_rows("Requested, but not in the files", columns, unmet, most)
+    show_rows("Requested, but not in the files", columns, unmet_rows(findings), most)
     columns = ("instrument", "what", "finding")
     for title, fails in (
         ("The archive is not what the campaign states", True),

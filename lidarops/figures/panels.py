@@ -36,6 +36,8 @@ COLOURS: Final = {
     "negative": ("#808080", "#808080"),
 }
 """Colours of styles and of the first codes of images, on light and on dark pages."""
+DASHES: Final = {"d1": (7, 3), "d2": (2, 3), "d3": (9, 3, 2, 3), "d4": (12, 4), "d5": (1, 4)}
+"""Lengths of dashes and gaps of styles."""
 BLANK: Final = 0
 """Code of a block of an image without data, transparent."""
 REJECTED: Final = 1

@@ -21,7 +21,6 @@ from lidarops.figures.wording import visible
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
-    StoredBit,
     bits_of,
     blocks,
     flags_names,
@@ -46,6 +45,8 @@ _UNITS: Final = {
     "pressure": "Pa",
 }
 """Units of what raw headers hold."""
+_VARIABLE: Final = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
+_FLAGS: Final = ("flags", "name", "severity", "values", "share", "description")
 _HEADER: Final = "source"
 """Key of the header as written."""
 _READ_VALUES: Final = 4_000_000
@@ -81,34 +82,34 @@ def describe(file: Path) -> dict[str, Any]:
 def tables(file: Path) -> list[Table]:
     """Return the description of a file as tables; see `describe`."""
     description = describe(file)
-    about = _table(file.name, "field", "value")
-    for key, value in description.items():
-        if key != _HEADER and (isinstance(value, str | int | float) or value is None):
-            _add_row(about, key.replace("_", " "), _with_unit(key, value))
-    if description["type"] == "folder":
-        refused = _table_of_rows("Damaged files", description["refused"], ("file", "reason"))
-        others = [{"file": path} for path in description["other"][:_OTHERS]]
-        other = _table_of_rows("Files of no raw format", others, ("file",))
-        return [
-            about,
-            _table_of_rows("Groups of like files", description["groups"], _GROUP),
-            refused,
-            other,
-        ]
-    if description["type"] == "raw":
-        for note in description["notes"] or ["none"]:
-            _add_row(about, "notes", note)
-        header = _table("Header as written", "line")
-        for line in description.get(_HEADER, "").splitlines():
-            _add_row(header, line)
-        return [about, _table_of_rows("Channels", description["channels"], _CHANNEL), header]
-    for key, value in description["attributes"].items():
-        if key not in _LONG:
-            _add_row(about, key, value)
-    columns = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
-    shown = [about, _table_of_rows("Variables", description["variables"], columns)]
-    flags = ("flags", "name", "severity", "values", "share", "description")
-    return [*shown, _table_of_rows("Quality", description["quality"], flags)]
+    about = [
+        {"field": key.replace("_", " "), "value": _with_unit(key, value)}
+        for key, value in description.items()
+        if key != _HEADER and (isinstance(value, str | int | float) or value is None)
+    ]
+    match description["type"]:
+        case "folder":
+            others = [{"file": path} for path in description["other"][:_OTHERS]]
+            more = [
+                _table("Groups of like files", description["groups"], _GROUP),
+                _table("Damaged files", description["refused"], ("file", "reason")),
+                _table("Files of no raw format", others, ("file",)),
+            ]
+        case "raw":
+            about += [{"field": "notes", "value": n} for n in description["notes"] or ["none"]]
+            header = [{"line": line} for line in description.get(_HEADER, "").splitlines()]
+            more = [
+                _table("Channels", description["channels"], _CHANNEL),
+                _table("Header as written", header, ("line",)),
+            ]
+        case _:
+            attributes = description["attributes"].items()
+            about += [{"field": k, "value": str(text)} for k, text in attributes if k not in _LONG]
+            more = [
+                _table("Variables", description["variables"], _VARIABLE),
+                _table("Quality", description["quality"], _FLAGS),
+            ]
+    return [_table(file.name, about, ("field", "value")), *more]
 
 
 def _with_unit(key: str, value: object) -> str:
@@ -211,37 +212,31 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
 
 def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     """Count values by verdict and by quality bit; empty for files without quality flags."""
-    return [
-        {"flags": name, **row}
-        for name in flags_names(dataset)
-        for row in _counted_flags(dataset[name], bits_of(dataset, name))
-    ]
+    return [row for name in flags_names(dataset) for row in _counted_flags(dataset, name)]
 
 
-def _counted_flags(flags: xr.DataArray, bits: tuple[StoredBit, ...]) -> list[dict[str, Any]]:
+def _counted_flags(dataset: xr.Dataset, name: str) -> list[dict[str, Any]]:
+    flags, bits = dataset[name], bits_of(dataset, name)
+    if not flags.size:
+        return []
     counts = FlagCounter(rejecting_mask(bits))
-    for block in blocks(flags, _READ_VALUES) if flags.size else ():
+    for block in blocks(flags, _READ_VALUES):
         counts.add(quality_bits(block))
-    rows = [
-        _counted(name, "verdict", count, flags.size, "")
-        for name, count in zip(_VERDICTS, counts.verdicts, strict=True)
-        if flags.size
-    ]
+    rows = [(word, "verdict", n, "") for word, n in zip(_VERDICTS, counts.verdicts, strict=True)]
     for bit in (bit for bit in bits if bit.mask in counts.carried):
         severity = "unknown" if bit.severity is None else bit.severity.name.lower()
-        count = counts.carried[bit.mask]
-        rows.append(_counted(bit.word, severity, count, flags.size, bit.description))
-    return rows
-
-
-def _counted(name: str, severity: str, count: int, size: int, description: str) -> dict[str, Any]:
-    return {
-        "name": name,
-        "severity": severity,
-        "values": count,
-        "share": round(count / size, 4) if size else None,
-        "description": description,
-    }
+        rows.append((bit.word, severity, counts.carried[bit.mask], bit.description))
+    return [
+        {
+            "flags": name,
+            "name": word,
+            "severity": severity,
+            "values": count,
+            "share": round(count / flags.size, 4),
+            "description": description,
+        }
+        for word, severity, count, description in rows
+    ]
 
 
 def _plain(value: Any) -> Any:
@@ -253,31 +248,18 @@ def _plain_array(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
-def _table_of_rows(title: str, items: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
-    table = _table(title, *(_title(column) for column in columns))
-    for item in items:
-        _add_row(table, *(_cell(item.get(column)) for column in columns))
+def _table(title: str, rows: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        unit = f" ({_UNITS[column]})" if column in _UNITS else ""
+        table.add_column(f"{column.replace('_', ' ')}{unit}", overflow="fold")
+    for row in rows:
+        # As Text, because rich would interpret brackets in a header as markup.
+        table.add_row(*(Text(visible(_cell(row.get(column)))) for column in columns))
     return table
-
-
-def _title(column: str) -> str:
-    unit = f" ({_UNITS[column]})" if column in _UNITS else ""
-    return f"{column.replace('_', ' ')}{unit}"
 
 
 def _cell(value: Any) -> str:
     if value is None:
         return ""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    return table
-
-
-def _add_row(table: Table, *cells: Any) -> None:
-    # As Text, because rich would interpret brackets in a header as markup.
-    table.add_row(*(Text(visible(str(cell))) for cell in cells))

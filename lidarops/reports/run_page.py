@@ -21,6 +21,7 @@ from lidarops.figures.templates import environment, style
 from lidarops.records import RunRecord
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
+from lidarops.reports.findings import unmet_rows
 from lidarops.reports.gallery import Gallery, Picture
 from lidarops.reports.rejections import rejection_rows
 from lidarops.reports.run_record import FILE_NAME, INDEX
@@ -104,7 +105,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         changes=run_tables.changed_products(record),
         overview=_overview(pictures),
         findings=run_tables.findings(record),
-        unmet=run_tables.unmet(record),
+        unmet=unmet_rows(record.findings),
         instruments=run_tables.instruments(record),
         scenes=record.scenes[:ROWS],
         links=links,
@@ -114,7 +115,10 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         flags=run_tables.flags(record),
         rejections=list(rejection_rows(record.scenes)),
         refused=run_tables.refused(record),
-        failed=run_tables.failures(record),
+        failed=[
+            (scene.scene, scene.station, scene.instrument, scene.granules, scene.error)
+            for scene in run_tables.failed_scenes(record)
+        ],
         internal=run_tables.internal_errors(record),
         problems=sorted(problems.items()),
         pictures=pictures,

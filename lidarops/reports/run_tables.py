@@ -34,7 +34,6 @@ from lidarops.records import (
 from lidarops.reports.findings import (
     disagreement_rows,
     finding_rows,
-    lacking,
     scene_note_rows,
     unmade_words,
 )
@@ -107,50 +106,14 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
     ]
 
 
-def failures(record: RunRecord) -> list[Row]:
-    """Return one row per scene that failed."""
-    return [
-        {
-            "scene": scene.scene,
-            "station": scene.station,
-            "instrument": scene.instrument,
-            "granules": scene.granules,
-            "reason": scene.error,
-        }
-        for scene in failed_scenes(record)
-    ]
-
-
-def findings(record: RunRecord) -> list[Row]:
-    """Return what is not as the campaign states, disagreements of channels, and notes on data."""
+def findings(record: RunRecord) -> list[tuple[str, str, str, str]]:
+    """Return instrument, subject and finding, and "yes" where it fails the run."""
     rows = (
         *finding_rows(record.findings),
         *disagreement_rows(record.scenes),
         *scene_note_rows(record.scenes),
     )
-    return [
-        {
-            "instrument": row.instrument,
-            "what": row.subject,
-            "finding": row.problem,
-            "fails the run": "yes" if row.fails else "",
-        }
-        for row in rows
-    ]
-
-
-def unmet(record: RunRecord) -> list[Row]:
-    """Return the requested channels that files lack."""
-    return [
-        {
-            "instrument": row.instrument,
-            "channel": row.channel,
-            "requested by": row.requested_by,
-            "reason": row.reason,
-            "missing in": lacking(row),
-        }
-        for row in record.findings.unmet
-    ]
+    return [(r.instrument, r.subject, r.problem, "yes" if r.fails else "") for r in rows]
 
 
 def hashes(record: RunRecord) -> list[tuple[str, str, str, str]]:
