@@ -8,8 +8,9 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidarops.figures.kind_figures import ProductSource, figures_of
+from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import Curve, Figure, Panel
+from lidarops.figures.raster import COLUMNS
 from lidarops.figures.stills import still
 from lidarops.figures.time_axis import days
 
@@ -23,7 +24,7 @@ def _panel(kind: str) -> Panel:
     if figures is None or not files:
         raise SystemExit(f"{DEMO} holds no {kind} products: run make demo")
     view = figures.views[0]
-    contents = [view.read(xr.load_dataset(file), ProductSource()) for file in files]
+    contents = [view.read(xr.load_dataset(file), COLUMNS) for file in files]
     figure, *_ = view.draw([content for content in contents if content is not None])
     return figure.panels[0]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lidarops.figures.kind_figures import ProductSource, View, figures_of, preferred_variables
+from lidarops.figures.kind_figures import View, figures_of, preferred_variables
 from lidarops.figures.panels import Figure, units
 from lidarops.figures.series_data import TimeSeries, join
 from lidarops.figures.series_panels import SERIES, Quantity, series_figures
@@ -61,7 +61,7 @@ def views_of(kind: str) -> Sequence[View[Any]]:
     return figures.views if figures is not None else (view_of(kind),)
 
 
-def _read(name: str | None, product: xr.Dataset, _: ProductSource) -> Content | None:
+def _read(name: str | None, product: xr.Dataset, _: int) -> Content | None:
     """Return the series with the most values; of a large variable, only of some profiles."""
     name = name or main_name(product)
     if name is None:

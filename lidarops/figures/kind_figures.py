@@ -16,21 +16,11 @@ import xarray as xr
 
 from lidarops.figures.image_panels import ImageQuantity, image_figure
 from lidarops.figures.panels import Figure
-from lidarops.figures.raster import COLUMNS, Raster, raster_variables, read_raster
+from lidarops.figures.raster import Raster, raster_variables, read_raster
 from lidarops.figures.series_panels import Quantity
 from lidarops.kinds import kinds
-from lidarops.records import SceneOutcome
 
 Content = TypeVar("Content")
-
-
-@dataclass(frozen=True, slots=True)
-class ProductSource:
-    """What is known about a product beside its data; nothing on a page of the product alone."""
-
-    scene: SceneOutcome | None = None
-    columns: int = COLUMNS
-    """Most columns of an image, but for those that gaps in time add."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +31,10 @@ class View(Generic[Content]):
     """Start of the names of its files."""
     variables: tuple[str, ...]
     """Variables that `read` needs."""
-    read: Callable[[xr.Dataset, ProductSource], Content | None]
-    """Reduces an open product, which may be lazy; None if there is nothing to show. Raises
-    `ProductError` if the product is of another kind. It is sent to another process, so it must be
-    possible to pickle it."""
+    read: Callable[[xr.Dataset, int], Content | None]
+    """Reduces an open product, which may be lazy, to so many columns of an image at most; None if
+    there is nothing to show. Raises `ProductError` if the product is of another kind. It is sent to
+    another process, so it must be possible to pickle it."""
     draw: Callable[[Sequence[Content]], Iterable[Figure]]
     """Returns the figures of the contents of at least one product."""
     first: bool = False
@@ -80,13 +70,13 @@ def image_view(
 
 
 def _read_raster(
-    variable: str, along: str, farthest: float, product: xr.Dataset, source: ProductSource
+    variable: str, along: str, farthest: float, product: xr.Dataset, columns: int
 ) -> Raster:
     names = [name for name in raster_variables(variable, along) if name in product.variables]
     part = product[names]
     if along in part:
         part = part.isel({along: slice(0, int(np.searchsorted(part[along].values, farthest)))})
-    profiles = max(-(-part.sizes["time"] // source.columns), 1)
+    profiles = max(-(-part.sizes["time"] // columns), 1)
     return read_raster(part, quantity=variable, profiles=profiles, along=along)
 
 

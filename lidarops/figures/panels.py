@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.figures.time_axis import Times, days, usual_step
+from lidarops.figures.wording import counted
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 COLOURS: Final = {
     "c0": ("#0072b2", "#56b4e9"),
@@ -178,6 +180,21 @@ def axis_of_times(time: Times) -> Axis:
     """Return the axis of profiles by their middles, with half the usual step at both ends."""
     half = usual_step(np.sort(time)) / 2
     return time_axis(time - half, time + half)
+
+
+def flag_marks(x: Floats, y: Floats, care: Mask, rejected: Mask, most: int) -> list[Curve]:
+    """Return marks of values to use with care and of rejected ones, about `most` of each."""
+    marks = []
+    for where, style, mark, words in (
+        (care, "ink hollow", Mark.DISC, "use with care"),
+        (rejected, "soft hollow", Mark.CROSS, "do not use"),
+    ):
+        index = np.flatnonzero(where)
+        if index.size:
+            some = index[:: -(-index.size // most)]
+            label = f"{words}: {counted(index.size, 'value')}"
+            marks.append(Curve(x[some], y[some], style, mark, joined=False, label=label))
+    return marks
 
 
 def codes_of(shares: Floats) -> NDArray[np.uint8]:

@@ -16,10 +16,10 @@ from lidarops.figures.panels import (
     Curve,
     Figure,
     Layer,
-    Mark,
     Panel,
     axis_of_times,
     finite,
+    flag_marks,
     percentile_axis,
     span_in_words,
 )
@@ -82,21 +82,9 @@ def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> P
     layers: list[Layer] = []
     for place, one in enumerate(series):
         layers += _values(one, quantity, place)
-    for label, style, mark, rejected in (
-        ("use with care", "ink hollow", Mark.DISC, False),
-        ("flagged, do not use", "soft hollow", Mark.CROSS, True),
-    ):
-        masks = [(one.flag != 0) & (one.rejected == rejected) for one in series]
-        count = sum(int(mask.sum()) for mask in masks)
-        if count:
-            some = slice(None, None, -(-count // _FLAGGED))
-            at = np.concatenate([days(one.time[m]) for one, m in zip(series, masks, strict=True)])
-            value = np.concatenate(
-                [one.values(name)[m] for one, m in zip(series, masks, strict=True)]
-            )
-            words = f"{label}: {count:,}"
-            marks = Curve(at[some], factor * value[some], style, mark, joined=False, label=words)
-            layers.append(marks)
+    parts = [(days(one.time), factor * one.values(name), one.flag, one.rejected) for one in series]
+    at, value, flag, rejected = (np.concatenate(part) for part in zip(*parts, strict=True))
+    layers += flag_marks(at, value, (flag != 0) & ~rejected, rejected, _FLAGGED)
     good = [factor * _usable(one, name) for one in series]
     if not finite(good).size:
         good = [factor * one.values(name) for one in series]

@@ -18,7 +18,7 @@ import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.figures.any_kind import views_of
-from lidarops.figures.kind_figures import ProductSource, View
+from lidarops.figures.kind_figures import View
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words
 from lidarops.figures.raster import COLUMNS
@@ -27,7 +27,7 @@ from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
 from lidarops.netcdf.read import open_product, opened_product
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.records import ProductRecord, RunRecord, SceneOutcome
+from lidarops.records import ProductRecord, RunRecord
 from lidarops.system.processes import CRASHED, Processes
 
 FIGURES: Final = 40
@@ -41,9 +41,7 @@ _UNREADABLE: Final = *_DAMAGE, ProductError
 """What values of a damaged product may raise; other errors are those of the program."""
 
 
-_Item = tuple[str, ProductSource]
-"""A product by its path, and what is known about it."""
-_Read = Callable[[Path, ProductSource], Any]
+_Read = Callable[[Path], Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,7 @@ class Group:
     kind: str
     instrument: str
     channel: str
-    members: tuple[tuple[SceneOutcome, ProductRecord], ...]
+    products: tuple[ProductRecord, ...]
     root: Path
     """Folder that product paths are relative to."""
 
@@ -65,25 +63,24 @@ class Group:
     @property
     def good(self) -> float:
         """Share of values without a quality bit."""
-        values = sum(product.values for _, product in self.members)
-        return sum(product.unflagged for _, product in self.members) / values if values else 0.0
+        values = sum(product.values for product in self.products)
+        return sum(product.unflagged for product in self.products) / values if values else 0.0
 
     @property
     def lacking(self) -> str:
         """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
-        products = [product for _, product in self.members]
-        if self.kind not in kinds() or any(product.usable != 0 for product in products):
+        if self.kind not in kinds() or any(product.usable != 0 for product in self.products):
             return ""
         flags = flags_of(self.kind)
         counts: Counter[str] = Counter()
-        for product in products:
+        for product in self.products:
             counts.update(product.flagged)
         rejecting = (
             (bit.description, count)
             for name, count in counts.items()
             if (bit := flags.named(name)) is not None and bit.severity is Severity.REJECT
         )
-        return named_shares(rejecting, sum(product.values for product in products))
+        return named_shares(rejecting, sum(product.values for product in self.products))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,17 +146,18 @@ def _read(
 ) -> Iterator[Any]:
     """Yield what a view shows of every readable product of a group, or of the first."""
     # All products of a group share the columns of an image.
-    columns = max(COLUMNS // len(group.members), 1)
-    items = [(product.path, ProductSource(scene, columns)) for scene, product in group.members]
-    guarded = partial(_guarded, partial(_content, view.variables, view.read), group.root)
-    results: Iterator[tuple[_Item, Any]]
+    columns = max(COLUMNS // len(group.products), 1)
+    paths = [product.path for product in group.products]
+    read = partial(_content, view.variables, view.read, columns)
+    guarded = partial(_guarded, read, group.root)
+    results: Iterator[tuple[str, Any]]
     if view.first:
         # None ahead, because mostly the first one is enough.
-        single = (processes.later(guarded, item, lost=_crashed) for item in items)
-        results = zip(items, (result() for result in single), strict=True)
+        single = (processes.later(guarded, path, lost=_crashed) for path in paths)
+        results = zip(paths, (result() for result in single), strict=True)
     else:
-        results = processes.map_items(guarded, items, at_a_time=_AT_A_TIME, lost=_crashed)
-    for (path, _), (content, reason) in results:
+        results = processes.map_items(guarded, paths, at_a_time=_AT_A_TIME, lost=_crashed)
+    for path, (content, reason) in results:
         if reason:
             problems.setdefault(path, reason)
         elif content is not None:
@@ -168,27 +166,26 @@ def _read(
                 return
 
 
-def _guarded(read: _Read, root: Path, _: None, item: _Item) -> tuple[Any, str]:
+def _guarded(read: _Read, root: Path, _: None, path: str) -> tuple[Any, str]:
     """Return what a view reads of a product, or why the product cannot be read."""
-    path, source = item
     try:
-        return read(root / path, source), ""
+        return read(root / path), ""
     except _UNREADABLE as error:
         return None, _reason(root / path, error)
 
 
-def _crashed(_: _Item) -> tuple[Any, str]:
+def _crashed(_: str) -> tuple[Any, str]:
     return None, CRASHED
 
 
 def _content(
     names: tuple[str, ...],
-    read: Callable[[xr.Dataset, ProductSource], Any],
+    read: Callable[[xr.Dataset, int], Any],
+    columns: int,
     file: Path,
-    source: ProductSource,
 ) -> Any:
     with open_product(file, names) as product:
-        return read(product, source)
+        return read(product, columns)
 
 
 def _reason(path: Path, error: BaseException) -> str:
@@ -198,7 +195,7 @@ def _reason(path: Path, error: BaseException) -> str:
 
 
 def _picture(view: str, drawn: Figure, group: Group, title: str) -> Picture:
-    scenes = counted(len(group.members), "scene")
+    scenes = counted(len(group.products), "scene")
     words = f"{scenes}. {drawn.words}."
     caption = f"{drawn.caption}: {title}"
     return Picture(view, drawn, group.instrument, caption, group.lacking, words)
@@ -206,7 +203,7 @@ def _picture(view: str, drawn: Figure, group: Group, title: str) -> Picture:
 
 def _title(group: Group, unreadable: Collection[str]) -> str:
     """Return channel and instrument as people call them, by the first product that can be read."""
-    for _, product in group.members:
+    for product in group.products:
         # What crashed another process would crash this one.
         if product.path in unreadable:
             continue
@@ -225,12 +222,11 @@ def _groups(record: RunRecord) -> list[Group]:
     First one quicklook of each instrument, then what is retrieved, by kind and with the first
     channel of every instrument first, then the other signals, and last what has no usable value.
     """
-    members: dict[tuple[str, str, str], list[tuple[SceneOutcome, ProductRecord]]]
-    members = defaultdict(list)
+    products: dict[tuple[str, str, str], list[ProductRecord]] = defaultdict(list)
     for scene in record.scenes:
         for product in scene.products:
-            members[product.kind, scene.instrument, product.channel].append((scene, product))
-    groups = [Group(*key, tuple(rows), Path(record.products)) for key, rows in members.items()]
+            products[product.kind, scene.instrument, product.channel].append(product)
+    groups = [Group(*key, tuple(own), Path(record.products)) for key, own in products.items()]
     groups.sort(key=lambda group: (group.instrument, -group.good, group.channel))
     signals = [group for group in groups if not is_retrieved(group.kind)]
     quicklooks = [next(first) for _, first in groupby(signals, lambda group: group.instrument)]

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.figures.any_kind import view_of, views_of
 from lidarops.figures.image_panels import ImageQuantity
-from lidarops.figures.kind_figures import ProductSource, View, image_view
+from lidarops.figures.kind_figures import View, image_view
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
+from lidarops.figures.raster import COLUMNS
 from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
@@ -97,7 +98,7 @@ def _of_product(path: Path, chosen: Selection) -> Iterator[Figure]:
     for view in views:
         names = {*view.variables, "time", "range", "altitude", "usable"}
         with reading(path), open_product(path, names) as product:
-            content = view.read(_part(product, chosen, path), ProductSource())
+            content = view.read(_part(product, chosen, path), COLUMNS)
         if content is not None:
             yield from view.draw([content])
 

@@ -20,9 +20,10 @@ from markupsafe import Markup
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError, UnavailableError
 from lidarops.figures import any_kind, browser
-from lidarops.figures.kind_figures import ProductSource, View, figures_of
+from lidarops.figures.kind_figures import View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
+from lidarops.figures.raster import COLUMNS
 from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
@@ -327,7 +328,7 @@ def _draw(
 def _figures(
     opened: xr.Dataset, views: Sequence[View[Any]], quality: Figure | None
 ) -> list[_Drawn]:
-    contents = ((view, view.read(opened, ProductSource())) for view in views)
+    contents = ((view, view.read(opened, COLUMNS)) for view in views)
     figures = [
         figure
         for view, content in contents

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,7 @@ from lidarops.figures.series_data import join
 from lidarops.flags import Quality
 from lidarops.products.visibility.figures import instruments_of, read_crossings, read_map
 from lidarops.products.visibility.retrieval import NetworkSettings
-from lidarops.records import LeftOut, Plan, PlannedStep, SceneOutcome
+from lidarops.records import LeftOut, Plan, PlannedStep
 
 NAMES = ("lidar-0", "lidar-1", "lidar-2")
 
@@ -50,7 +50,7 @@ def test_scenes_are_joined_in_time(made):
 
 
 def test_the_map_shows_each_crossing_to_scale(made):
-    network = read_map(made, NAMES)
+    network = read_map(made)
     (figure,) = figures("visibility", "network", [made])
     (panel,) = figure.panels
     (words,) = (layer for layer in panel.layers if isinstance(layer, Words))
@@ -131,9 +131,13 @@ def test_instruments_are_those_of_the_plan(made):
         exponent_standard_error=0,
     ).model_dump(mode="json", exclude_none=True)
     step = PlannedStep("visibility", "photon_532o", settings, "why", product="visibility")
-    plan = Plan("s", (step,), ())
-    start = made["time"].values[0].astype("datetime64[us]").item()
-    outcome = SceneOutcome("s", "valley", "valley", start, 3, plan)
-    assert instruments_of(outcome) == NAMES
+    assert instruments_of(planned(made, Plan("s", (step,), ()))) == NAMES
     none = Plan("s", (), (LeftOut("visibility", "photon_532o", "why"),))
-    assert instruments_of(replace(outcome, plan=none)) == ()
+    numbered = ("beam 0", "beam 1", "beam 2")
+    assert instruments_of(planned(made, none)) == instruments_of(made) == numbered
+
+
+def planned(made: xr.Dataset, plan: Plan) -> xr.Dataset:
+    """Return a product with a plan in its provenance."""
+    document = {"entity": {"lidarops:plan": {"lidarops:json": plan.text}}}
+    return made.assign(provenance=((), json.dumps(document)))

@@ -11,6 +11,7 @@ from support.products.fabricated import SECTIONS, START, homogeneous, signal, ti
 
 from lidarops.errors import ProductError
 from lidarops.figures.panels import Band, Curve
+from lidarops.figures.wording import counted
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -65,12 +66,12 @@ def test_flagged_values_and_those_to_use_with_care_are_marked():
     flag = product["quality_flag"].values
     rejected = (flag & flags_of("homogeneous").rejecting) != 0
     for words, chosen in (
-        ("flagged, do not use", rejected),
+        ("do not use", rejected),
         ("use with care", (flag != 0) & ~rejected),
     ):
         (marks,) = labelled(panel, words)
         assert not marks.joined
-        assert marks.label == f"{words}: {chosen.sum()}"
+        assert marks.label == f"{words}: {counted(int(chosen.sum()), 'value')}"
         expected = 1e3 * product["total_extinction"].values.T[chosen.T]
         np.testing.assert_allclose(marks.y, expected, rtol=1e-6)
 

@@ -108,8 +108,8 @@ class TestFigures:
 CONTENT = gallery._content
 
 
-def deadly(names, read, file, source):
+def deadly(names, read, columns, file):
     """End the process at a product."""
     if file.name == "e1.nc":
         os._exit(9)
-    return CONTENT(names, read, file, source)
+    return CONTENT(names, read, columns, file)

@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.figures.kind_figures import KindFigures, ProductSource, View
+from lidarops.figures.kind_figures import KindFigures, View
 from lidarops.figures.panels import Figure, units
 from lidarops.figures.series_data import TimeSeries, float_values, join, require
 from lidarops.figures.series_panels import Quantity, series_figures
@@ -66,7 +66,7 @@ def _check(product: xr.Dataset) -> None:
         raise ProductError(f"has the units {units!r}, not 'm-1'", field="total_extinction")
 
 
-def _read(product: xr.Dataset, _: ProductSource) -> _Content | None:
+def _read(product: xr.Dataset, _: int) -> _Content | None:
     sections = read_sections(product)
     unit = units(str(product["background"].attrs.get("units", "")))
     return (unit, sections) if product.sizes["time"] and sections else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -11,7 +12,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.kind_figures import KindFigures, ProductSource, View
+from lidarops.figures.kind_figures import KindFigures, View
 from lidarops.figures.panels import (
     SERIES_MARKS,
     Axis,
@@ -28,7 +29,6 @@ from lidarops.figures.series_panels import Quantity, series_figures
 from lidarops.figures.wording import counted
 from lidarops.kinds import flags_of
 from lidarops.products.visibility.network import NAME
-from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
 
 Floats = NDArray[np.float64]
@@ -49,6 +49,7 @@ MAP_VARIABLES: Final = (
     "visibility_in_air",
     *(f"beam_{name}" for name in _ANGLES),
     *_ANGLES[:3],
+    "provenance",
 )
 """Variables that `read_map` needs."""
 _PAIR: Final = ("time", "crossing")
@@ -81,13 +82,15 @@ class NetworkMap:
     """Instrument of each beam."""
 
 
-def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
-    """Return the instrument of each beam of a scene from its plan; empty if it lists none."""
-    steps = scene.plan.steps if scene.plan else ()
-    for step in steps:
-        if step.name == step.product == NAME:
-            return tuple(beam["instrument"] for beam in step.settings["beams"])
-    return ()
+def instruments_of(product: xr.Dataset) -> tuple[str, ...]:
+    """Return the instrument of each beam by the plan of a product; numbers if it states none."""
+    try:
+        entities = json.loads(str(product["provenance"].item()))["entity"]
+        steps = json.loads(entities["lidarops:plan"]["lidarops:json"])["steps"]
+        beams = next(step["settings"]["beams"] for step in steps if step["name"] == NAME)
+        return tuple(str(beam["instrument"]) for beam in beams)
+    except (ValueError, LookupError, TypeError, StopIteration):
+        return tuple(f"beam {beam}" for beam in range(product.sizes["beam"]))
 
 
 def read_crossings(product: xr.Dataset) -> list[TimeSeries]:
@@ -130,15 +133,13 @@ def read_crossings(product: xr.Dataset) -> list[TimeSeries]:
     ]
 
 
-def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap:
+def read_map(product: xr.Dataset, _: int = 0) -> NetworkMap:
     """Return beams and crossings of a product, projected on two axes.
 
     Parameters
     ----------
     product : Dataset
         Kind ``visibility``.
-    instruments : sequence of str, optional
-        Instrument of each beam; beams are numbered without it.
 
     Raises
     ------
@@ -176,7 +177,7 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
         numbers=tuple(int(number) for number in product["crossing_id"].values),
         visibility=np.array(medians),
         axes=names,
-        instruments=tuple(instruments) or tuple(f"beam {beam}" for beam in range(len(beams))),
+        instruments=instruments_of(product),
     )
 
 
@@ -193,12 +194,8 @@ def _plane(points: Floats) -> tuple[list[int], tuple[str, str]]:
 # Figures -----------------------------------------------------------------------------------------
 
 
-def _read_crossings(product: xr.Dataset, _: ProductSource) -> list[TimeSeries] | None:
+def _read_crossings(product: xr.Dataset, _: int) -> list[TimeSeries] | None:
     return read_crossings(product) or None
-
-
-def _read_map(product: xr.Dataset, source: ProductSource) -> NetworkMap:
-    return read_map(product, instruments_of(source.scene) if source.scene else ())
 
 
 def _draw_crossings(contents: Sequence[list[TimeSeries]]) -> Iterator[Figure]:
@@ -257,7 +254,7 @@ def _points(points: Floats, style: str, mark: Mark | None = None, label: str = "
 FIGURES: Final = KindFigures(
     (
         View("visibility", CROSSING_VARIABLES, _read_crossings, _draw_crossings),
-        View("network", MAP_VARIABLES, _read_map, _draw_map, first=True),
+        View("network", MAP_VARIABLES, read_map, _draw_map, first=True),
     ),
     preferred="visibility_in_air",
     values=(Quantity("visibility_in_air", 1e-3, "km"), Quantity("total_extinction", 1e3, "km⁻¹")),
