@@ -199,7 +199,8 @@ def _crashed(task: _Task) -> _Outcome:
 def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
     if known.sha256 != sha256:
         return False
-    files = (within(site, name) for name in known.files)
+    # Read only: what is written is held to the folder of the site.
+    files = (site / name for name in known.files)
     return all(
         file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest
         for file, digest in zip(files, known.digests, strict=True)
