@@ -28,7 +28,7 @@ class View(Generic[Content]):
     """A way to look at products of one instrument and channel."""
 
     name: str
-    """Start of the names of its files."""
+    """Name among the views of its kind."""
     variables: tuple[str, ...]
     """Variables that `read` needs."""
     read: Callable[[xr.Dataset, int], Content | None]

@@ -6,12 +6,15 @@ This is what `lidarops inspect` shows.
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import fields, is_dataclass
+from datetime import datetime
+from enum import Enum
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from pydantic_core import to_jsonable_python
 from rich.table import Table
 from rich.text import Text
 
@@ -241,11 +244,29 @@ def _counted_flags(dataset: xr.Dataset, name: str) -> list[dict[str, Any]]:
 
 def _plain(value: Any) -> Any:
     """Convert to plain JSON types; numbers that are not finite become None."""
-    return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain_array)
+    if is_dataclass(value):
+        return {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    return _plain_scalar(value)
 
 
-def _plain_array(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+def _plain_scalar(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return value.name.lower()
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return str(value)
 
 
 def _table(title: str, rows: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:

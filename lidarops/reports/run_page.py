@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -126,7 +125,6 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
         undrawn=filled.undrawn,
         hashes=run_tables.hashes(record)[:ROWS],
-        plan_hash=_plan_hash(record),
         run_file=FILE_NAME if (folder / FILE_NAME).is_file() else "",
         rows=ROWS,
     )  # fmt: skip
@@ -166,9 +164,3 @@ def _overview(pictures: Sequence[tuple[str, Sequence[Picture]]]) -> list[Picture
     turns = zip_longest(*(figures for _, figures in pictures))
     first = [picture for turn in turns for picture in turn if picture is not None][:_SHOWN]
     return sorted(first, key=lambda picture: picture.instrument)
-
-
-def _plan_hash(record: RunRecord) -> str:
-    """Return the sha256 over the sorted hashes of all plans."""
-    hashes = sorted(scene.plan.hash for scene in record.scenes if scene.plan)
-    return hashlib.sha256("\n".join(hashes).encode()).hexdigest() if hashes else ""
