@@ -738,8 +738,6 @@ class RunRecord:
     scenes: tuple[SceneOutcome, ...]
     refused: tuple[Granule, ...]
     """Granules that the catalog refused."""
-    truth: str = ""
-    """Path of the truth file of a simulated campaign, empty for real data."""
     findings: Findings = field(default_factory=Findings)
     empty_scenes: Mapping[str, str] = field(default_factory=dict)
     """Scene -> why it can give no product; the first of those that the run examined."""

@@ -386,14 +386,10 @@ def findings_document(findings: Findings) -> dict[str, Any]:
 
 def finding_tables(findings: Findings) -> Iterator[Table]:
     """Yield the findings as tables."""
-    from lidarops.reports.findings import finding_rows, lacking
+    from lidarops.reports.findings import finding_rows, unmet_rows
 
     columns: tuple[str, ...] = ("instrument", "channel", "requested by", "reason", "missing in")
-    unmet = (
-        (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, lacking(unmet))
-        for unmet in findings.unmet
-    )
-    yield "Requested, but not in the files", columns, unmet
+    yield "Requested, but not in the files", columns, unmet_rows(findings)
     columns = ("instrument", "what", "finding")
     rows = finding_rows(findings)
     for title, fails in (

@@ -7,11 +7,12 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from lidarops.figures.kind_figures import ProductSource, View, figures_of, preferred_variables
+from lidarops.figures.kind_figures import View, figures_of, preferred_variables
 from lidarops.figures.panels import Figure, units
-from lidarops.figures.series_data import SeriesEstimate, TimeSeries, join
+from lidarops.figures.series_data import TimeSeries, join
 from lidarops.figures.series_panels import SERIES, Quantity, series_figures
 from lidarops.kinds import kinds
 from lidarops.netcdf.stored_flags import judge
@@ -20,8 +21,8 @@ from lidarops.netcdf.variables import layout_of, possible_judges, summary_of
 _BULK: Final = 64_000_000
 """Bytes of a variable above which only some profiles are read."""
 
-Content = tuple[str, tuple[TimeSeries, ...]]
-"""Title and series of a variable, which has the same name in all of them."""
+Content = tuple[str, Quantity, tuple[TimeSeries, ...]]
+"""Title, the variable, and its series."""
 
 
 def main_name(product: xr.Dataset) -> str | None:
@@ -60,7 +61,7 @@ def views_of(kind: str) -> Sequence[View[Any]]:
     return figures.views if figures is not None else (view_of(kind),)
 
 
-def _read(name: str | None, product: xr.Dataset, _: ProductSource) -> Content | None:
+def _read(name: str | None, product: xr.Dataset, _: int) -> Content | None:
     """Return the series with the most values; of a large variable, only of some profiles."""
     name = name or main_name(product)
     if name is None:
@@ -82,15 +83,15 @@ def _read(name: str | None, product: xr.Dataset, _: ProductSource) -> Content | 
     )
     judged = judge(some, name)
     flags = judged.bits.reshape(shape)
-    unit = str(variable.attrs.get("units", ""))
-    unknown = np.full(len(values), np.nan)
+    time = some["time"].values.astype("datetime64[ns]")
     most_values = np.argsort(-np.isfinite(values).sum(axis=0), kind="stable")[:SERIES]
     series = tuple(
         TimeSeries(
-            time=some["time"].values.astype("datetime64[ns]"),
-            flag=flags[:, k],
-            rejecting=judged.rejecting,
-            estimates={name: SeriesEstimate(values[:, k], errors[:, k], unknown, unit)},
+            pd.DataFrame(
+                {"flag": flags[:, k], name: values[:, k], f"{name}_standard_error": errors[:, k]},
+                index=time,
+            ),
+            judged.rejecting,
             label=f"{variable.dims[1]} {k}" if variable.ndim > 1 else "",
             key=(k,),
         )
@@ -98,12 +99,11 @@ def _read(name: str | None, product: xr.Dataset, _: ProductSource) -> Content | 
     )
     title = str(variable.attrs.get("long_name", name))
     few = f", {len(series)} of {values.shape[1]} series" if values.shape[1] > len(series) else ""
-    return f"{title[:1].upper()}{title[1:]}{few}", series
+    quantity = Quantity(name, 1.0, units(str(variable.attrs.get("units", ""))))
+    return f"{title[:1].upper()}{title[1:]}{few}", quantity, series
 
 
 def _draw(contents: Sequence[Content]) -> Iterator[Figure]:
-    title, series = contents[0]
-    (name,) = series[0].estimates
-    joined = join(one for _, more in contents for one in more if name in one.estimates)
-    unit = units(series[0].estimates[name].units)
-    return series_figures(joined[:SERIES], (Quantity(name, 1.0, unit),), title)
+    title, quantity, _ = contents[0]
+    joined = join(one for _, other, more in contents for one in more if other == quantity)
+    return series_figures(joined[:SERIES], (quantity,), title)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from lidarops.figures.panels import (
     BLANK,
     COLOURS,
+    DASHES,
     FIRST,
     PALETTE,
     Axis,
@@ -53,7 +54,7 @@ _PEN: Final = 110
 def script() -> bytes:
     """Return the script that draws, with the colours and codes of panels."""
     text = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
-    constants = {"COLOURS": COLOURS, "PALETTE": PALETTE, "FIRST": FIRST}
+    constants = {"COLOURS": COLOURS, "DASHES": DASHES, "PALETTE": PALETTE, "FIRST": FIRST}
     head = "".join(f"const {name} = {json.dumps(value)};\n" for name, value in constants.items())
     return f'"use strict";\n{head}{text}'.encode()
 

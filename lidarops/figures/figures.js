@@ -3,7 +3,6 @@
 // arrow keys, under a cross. Positions are logarithms along logarithmic axes.
 
 const FONT = '13px system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", sans-serif';
-const DASHES = { d1: [7, 3], d2: [2, 3], d3: [9, 3, 2, 3], d4: [12, 4], d5: [1, 4] };
 const DAY = 86400e3, MINUTE = 60e3, NARROW = 640, LINE = 18, NONE = 65535;
 const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 180, 360, 720, 1440, 2880, 7200, 14400];
 const HINT = "Drag to zoom, double-click to see all; arrow keys read values, + zooms, Escape ends.";

@@ -17,25 +17,10 @@ import xarray as xr
 from lidarops.figures.image_panels import ImageQuantity, image_figure
 from lidarops.figures.panels import Figure
 from lidarops.figures.raster import Raster, raster_variables, read_raster
-from lidarops.figures.series_data import Comparison
 from lidarops.figures.series_panels import Quantity
 from lidarops.kinds import kinds
-from lidarops.records import SceneOutcome
 
 Content = TypeVar("Content")
-
-
-@dataclass(frozen=True, slots=True)
-class ProductSource:
-    """What is known about a product beside its data; nothing on a page of the product alone."""
-
-    instrument: str = ""
-    channel: str = ""
-    scene: SceneOutcome | None = None
-    truth: xr.Dataset | None = None
-    """Truth of a simulated campaign."""
-    profiles: int = 0
-    """Profiles per column of an image; 0 for as many as fit the product."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,21 +28,19 @@ class View(Generic[Content]):
     """A way to look at products of one instrument and channel."""
 
     name: str
-    """Start of the names of its files."""
+    """Name among the views of its kind."""
     variables: tuple[str, ...]
     """Variables that `read` needs."""
-    read: Callable[[xr.Dataset, ProductSource], Content | None]
-    """Reduces an open product, which may be lazy; None if there is nothing to show. Raises
-    `ProductError` if the product is of another kind. It is sent to another process, so it must be
-    possible to pickle it."""
+    read: Callable[[xr.Dataset, int], Content | None]
+    """Reduces an open product, which may be lazy, to so many columns of an image at most; None if
+    there is nothing to show. Raises `ProductError` if the product is of another kind. It is sent to
+    another process, so it must be possible to pickle it."""
     draw: Callable[[Sequence[Content]], Iterable[Figure]]
     """Returns the figures of the contents of at least one product."""
-    compare: Callable[[Sequence[Content]], Iterable[Comparison | None]] | None = None
-    """Compares contents with the truth."""
     first: bool = False
     """Whether a report draws only the first product that has content."""
     shows: str = ""
-    """Variable of an image against time, for which `read` needs `ProductSource.profiles`."""
+    """Variable of an image against time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +70,14 @@ def image_view(
 
 
 def _read_raster(
-    variable: str, along: str, farthest: float, product: xr.Dataset, source: ProductSource
+    variable: str, along: str, farthest: float, product: xr.Dataset, columns: int
 ) -> Raster:
     names = [name for name in raster_variables(variable, along) if name in product.variables]
     part = product[names]
     if along in part:
         part = part.isel({along: slice(0, int(np.searchsorted(part[along].values, farthest)))})
-    return read_raster(part, quantity=variable, profiles=source.profiles, along=along)
+    profiles = max(-(-part.sizes["time"] // columns), 1)
+    return read_raster(part, quantity=variable, profiles=profiles, along=along)
 
 
 def figures_of(kind: str) -> KindFigures | None:

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.figures.time_axis import Times, days, usual_step
+from lidarops.figures.wording import counted
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 COLOURS: Final = {
     "c0": ("#0072b2", "#56b4e9"),
@@ -36,6 +38,8 @@ COLOURS: Final = {
     "negative": ("#808080", "#808080"),
 }
 """Colours of styles and of the first codes of images, on light and on dark pages."""
+DASHES: Final = {"d1": (7, 3), "d2": (2, 3), "d3": (9, 3, 2, 3), "d4": (12, 4), "d5": (1, 4)}
+"""Lengths of dashes and gaps of styles."""
 BLANK: Final = 0
 """Code of a block of an image without data, transparent."""
 REJECTED: Final = 1
@@ -176,6 +180,21 @@ def axis_of_times(time: Times) -> Axis:
     """Return the axis of profiles by their middles, with half the usual step at both ends."""
     half = usual_step(np.sort(time)) / 2
     return time_axis(time - half, time + half)
+
+
+def flag_marks(x: Floats, y: Floats, care: Mask, rejected: Mask, most: int) -> list[Curve]:
+    """Return marks of values to use with care and of rejected ones, about `most` of each."""
+    marks = []
+    for where, style, mark, words in (
+        (care, "ink hollow", Mark.DISC, "use with care"),
+        (rejected, "soft hollow", Mark.CROSS, "do not use"),
+    ):
+        index = np.flatnonzero(where)
+        if index.size:
+            some = index[:: -(-index.size // most)]
+            label = f"{words}: {counted(index.size, 'value')}"
+            marks.append(Curve(x[some], y[some], style, mark, joined=False, label=label))
+    return marks
 
 
 def codes_of(shares: Floats) -> NDArray[np.uint8]:

@@ -11,21 +11,21 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.kind_figures import ProductSource, View
+from lidarops.figures.kind_figures import View
 from lidarops.figures.panels import (
     Axis,
     Band,
     Curve,
     Figure,
     Layer,
-    Mark,
     Panel,
     decade_axis,
+    flag_marks,
     percentile_axis,
     span_in_words,
 )
 from lidarops.figures.series_data import require
-from lidarops.figures.wording import counted, utc
+from lidarops.figures.wording import utc
 from lidarops.netcdf.stored_flags import flags_names, judge
 from lidarops.netcdf.variables import judging, possible_judges
 
@@ -97,7 +97,7 @@ def _read(
     dims: dict[str, tuple[str, ...]],
     more: tuple[str, ...],
     product: xr.Dataset,
-    _: ProductSource,
+    _: int,
 ) -> xr.Dataset | None:
     """Return the profile with the most unflagged values, up to the last usable one.
 
@@ -193,15 +193,7 @@ def _panel(profile: xr.Dataset, quantity: ProfileQuantity, place: Floats, y: Axi
         layers.append(Curve(beside[thin], place[thin], "c1 d2", label=words))
         spans.append(beside)
     marked = np.isfinite(whole)
-    for where, style, mark, words in (
-        (marked & care, "ink hollow", Mark.DISC, "use with care"),
-        (marked & rejected, "soft hollow", Mark.CROSS, "do not use"),
-    ):
-        index = np.flatnonzero(where)
-        if index.size:
-            some = index[:: -(-index.size // _MARKS)]
-            label = f"{words}: {counted(index.size, 'value')}"
-            layers.append(Curve(whole[some], place[some], style, mark, joined=False, label=label))
+    layers += flag_marks(whole, place, marked & care, marked & rejected, _MARKS)
     return Panel(percentile_axis(quantity.label, spans, 0.5, 0.08), y, tuple(layers), _HEIGHT)
 
 

@@ -41,7 +41,7 @@ Names = tuple[str, str, str]
 """Variables of a quantity, of its standard error and of its flags."""
 
 COLUMNS: Final = 240
-"""Most columns of an image, but for those that gaps in time add."""
+"""About the largest number of columns of an image."""
 ROWS: Final = 180
 """Most rows of an image."""
 _READ_ROWS: Final = 4096
@@ -156,7 +156,7 @@ def _along_both(quantity: str) -> tuple[str, ...]:
 
 
 def read_raster(
-    product: xr.Dataset, *, quantity: str, profiles: int = 0, along: str = "range"
+    product: xr.Dataset, *, quantity: str, profiles: int, along: str = "range"
 ) -> Raster:
     """Reduce one quantity of a product to blocks.
 
@@ -166,9 +166,8 @@ def read_raster(
         Of any kind; may be lazy, because it is read in blocks.
     quantity : str
         A variable of the product, dims (time, `along`), with a standard error.
-    profiles : int, optional
-        Profiles per column; 0 for about `COLUMNS` columns. Columns neither extend across gaps in
-        time nor touch there.
+    profiles : int
+        Profiles per column. Columns neither extend across gaps in time nor touch there.
     along : str, optional
         Dimension across time, with its coordinate: ``range``, or ``altitude``.
 
@@ -192,7 +191,7 @@ def read_raster(
         product = product.isel(time=np.argsort(time, kind="stable"))
     ranges = product[along].values.astype(np.float64)
     starts, stops = profile_bounds(product)
-    columns = column_starts(starts, stops, profiles or -(-starts.size // COLUMNS))
+    columns = column_starts(starts, stops, profiles)
     rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
     known = bits_of(product, judge)
     missing = sum(bit.mask for bit in known if bit.word == Quality.INPUT_MISSING.word)
@@ -221,14 +220,12 @@ def _reduced(
 ) -> Iterator[tuple[Sums, int]]:
     """Yield sums over blocks of columns, and the union of their bits."""
     edges = [*columns, product.sizes["time"]]
-    first, most = 0, _READ_BYTES // (8 * product[names[0]].shape[1])
-    while first < columns.size:
-        last = first + 1
-        while last < columns.size and edges[last + 1] - edges[first] <= most:
-            last += 1
+    longest = int(np.diff(edges).max())
+    step = max(1, _READ_BYTES // (8 * product[names[0]].shape[1] * longest))
+    for first in range(0, columns.size, step):
+        last = min(first + step, columns.size)
         block = product.isel(time=slice(int(edges[first]), int(edges[last])))
         yield _sums(block, names, masks, columns[first:last] - edges[first], rows)
-        first = last
 
 
 def _sums(

@@ -1,4 +1,4 @@
-"""Panels of quantities against time: retrieved values with errors, flags and truth."""
+"""Panels of quantities against time: retrieved values with errors, and flags."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lidarops.figures.panels import (
     Curve,
     Figure,
     Layer,
-    Mark,
     Panel,
     axis_of_times,
     finite,
+    flag_marks,
     percentile_axis,
     span_in_words,
 )
@@ -77,63 +77,36 @@ def series_figures(
 
 
 def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> Panel:
-    """Return a quantity of up to `SERIES` series: unflagged values with errors, flags, truth."""
+    """Return a quantity of up to `SERIES` series: unflagged values with errors, and flags."""
     name, factor = quantity.name, quantity.factor
     layers: list[Layer] = []
     for place, one in enumerate(series):
         layers += _values(one, quantity, place)
-    truths = [_truth(one, quantity) for one in series]
-    known = [truth for truth in truths if np.isfinite(truth.y).any()]
-    layers += [
-        Curve(k.x, k.y, k.style, label="" if i else "simulated truth") for i, k in enumerate(known)
-    ]
-    for label, style, mark, rejected in (
-        ("use with care", "ink hollow", Mark.DISC, False),
-        ("flagged, do not use", "soft hollow", Mark.CROSS, True),
-    ):
-        masks = [(one.flag != 0) & (one.rejected == rejected) for one in series]
-        count = sum(int(mask.sum()) for mask in masks)
-        if count:
-            some = slice(None, None, -(-count // _FLAGGED))
-            at = np.concatenate([days(one.time[m]) for one, m in zip(series, masks, strict=True)])
-            value = np.concatenate(
-                [one.estimates[name].value[m] for one, m in zip(series, masks, strict=True)]
-            )
-            words = f"{label}: {count:,}"
-            marks = Curve(at[some], factor * value[some], style, mark, joined=False, label=words)
-            layers.append(marks)
+    parts = [(days(one.time), factor * one.values(name), one.flag, one.rejected) for one in series]
+    at, value, flag, rejected = (np.concatenate(part) for part in zip(*parts, strict=True))
+    layers += flag_marks(at, value, (flag != 0) & ~rejected, rejected, _FLAGGED)
     good = [factor * _usable(one, name) for one in series]
     if not finite(good).size:
-        good = [factor * one.estimates[name].value for one in series]
-    y = percentile_axis(quantity.label, [*good, *(truth.y for truth in known)])
-    return Panel(x, y, tuple(layers))
+        good = [factor * one.values(name) for one in series]
+    return Panel(x, percentile_axis(quantity.label, good), tuple(layers))
 
 
 def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
     """Return values with bars and marks if they are few, else with a band."""
     drawn = thin(one, _POINTS)
-    estimate = drawn.estimates[quantity.name]
     profiles = round(int((one.flag == 0).sum()) / max(drawn.time.size, 1))
     means = f", means of {profiles} profiles" if profiles > 1 else ""
     few = drawn.time.size <= _BARS
-    x, y, wide = _with_gaps(
-        drawn.time, quantity.factor * estimate.value, quantity.factor * estimate.standard_error
-    )
+    names = quantity.name, f"{quantity.name}_standard_error"
+    x, y, wide = _with_gaps(drawn.time, *(quantity.factor * drawn.values(name) for name in names))
     style, mark = f"c{place} d{place}" if place else "c0", SERIES_MARKS[place] if few else None
     label = f"{one.label}{means}".removeprefix(", ")
     band = Band(x, y - wide, y + wide, style, bars=few)
     return [band, Curve(x, y, style, mark, label=label)]
 
 
-def _truth(one: TimeSeries, quantity: Quantity) -> Curve:
-    truth = one.estimates[quantity.name].truth
-    some = slice(None, None, -(-truth.size // _POINTS) or 1)
-    x, y = _with_gaps(one.time[some], quantity.factor * truth[some])
-    return Curve(x, y, "ink d1")
-
-
 def _usable(one: TimeSeries, name: str) -> Floats:
-    return np.asarray(one.estimates[name].value[one.flag == 0])
+    return np.asarray(one.values(name)[one.flag == 0])
 
 
 def _with_gaps(time: Times, *values: Floats) -> tuple[Floats, ...]:

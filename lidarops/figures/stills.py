@@ -14,6 +14,7 @@ from matplotlib.figure import Figure as Canvas
 from lidarops.figures.panels import (
     BLANK,
     COLOURS,
+    DASHES,
     FIRST,
     Axis,
     Band,
@@ -43,7 +44,6 @@ _UNDATED: Final = {
 }
 """Metadata that would make equal figures differ."""
 _COLOURS: Final = colormaps["viridis"]
-_DASHES: Final = {"d1": (7, 3), "d2": (2, 3), "d3": (9, 3, 2, 3), "d4": (12, 4), "d5": (1, 4)}
 _STYLE: Final[dict[str, Any]] = {
     "svg.hashsalt": "lidarops",
     # Dollar signs of names of files are no formulas.
@@ -151,7 +151,7 @@ def _style(words: str) -> dict[str, Any]:
     """Return what a style means to matplotlib."""
     parts = words.split()
     colour = next((COLOURS[part][0] for part in parts if part in COLOURS), COLOURS["ink"][0])
-    dash = next((_DASHES[part] for part in parts if part in _DASHES), None)
+    dash = next((DASHES[part] for part in parts if part in DASHES), None)
     width = 1.8 if "thick" in parts else 0.8 if "thin" in parts else 1.2
     return {"color": colour, "linewidth": width, "linestyle": (0, dash) if dash else "-"}
 

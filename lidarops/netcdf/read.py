@@ -220,18 +220,6 @@ def open_product(path: str | Path, names: Iterable[str]) -> Iterator[xr.Dataset]
             yield product
 
 
-def profiles_in(path: str | Path) -> int:
-    """Return the number of profiles of a product without reading values; 0 without a time.
-
-    Raises
-    ------
-    ProductError
-        If there is no such file, or it cannot be read.
-    """
-    with reading(path), h5py.File(path, "r") as file:
-        return len(file["time"]) if "time" in file else 0
-
-
 def stored_values(path: str | Path, key: str, name: str, rows: slice = slice(None)) -> NDArray[Any]:
     """Return values of a variable of a product as stored, or some rows of them.
 

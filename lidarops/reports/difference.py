@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from enum import Enum, auto
 from pathlib import Path
+from typing import Final
 
 from lidarops.errors import CatalogError
 from lidarops.figures.wording import counted
@@ -23,15 +23,13 @@ class RunDifference:
     newly_refused: tuple[str, ...] = ()
 
 
-class _Fate(Enum):
-    """What a run made of a product."""
-
-    NEW = auto()
-    """Made for the first time, or again where the file of a first version was missing."""
-    SAME = auto()
-    CHANGED = auto()
-    UNCOMPARED = auto()
-    """Made again, while the file that it replaces was missing or altered."""
+_FATES: Final = (
+    "new",
+    "with other content",
+    "made again with the same content",
+    "made again without a file to compare with",
+)
+"""What a run made of products, in the order of the report."""
 
 
 def difference(record: RunRecord, folder: Path) -> RunDifference:
@@ -44,14 +42,7 @@ def difference(record: RunRecord, folder: Path) -> RunDifference:
         Report folder of the run. Those of earlier runs are beside it.
     """
     fates = Counter(_fate(product) for scene in record.scenes for product in scene.products)
-    uncompared = fates[_Fate.UNCOMPARED]
-    counts = (
-        (fates[_Fate.NEW], "new"),
-        (fates[_Fate.CHANGED], "with other content"),
-        (fates[_Fate.SAME], "made again with the same content"),
-        (uncompared, "made again without a file to compare with"),
-    )
-    made = [(count, words) for count, words in counts if count] or [(0, "made")]
+    made = [(fates[words], words) for words in _FATES if fates[words]] or [(0, "made")]
     products = f"{counted(made[0][0], 'product')} {made[0][1]}"
     products += "".join(f", {count:,} {words}" for count, words in made[1:]) + "."
     if record.frozen:
@@ -76,10 +67,12 @@ def difference(record: RunRecord, folder: Path) -> RunDifference:
     return RunDifference(before.id, tuple(words), newly)
 
 
-def _fate(product: ProductRecord) -> _Fate:
+def _fate(product: ProductRecord) -> str:
+    new, changed, same, uncompared = _FATES
     if product.change is None:
-        return _Fate.NEW if product.stamp.version == 1 else _Fate.UNCOMPARED
-    return _Fate.SAME if product.change.grade is Grade.NONE else _Fate.CHANGED
+        # Made for the first time, or again where the file of a first version was missing.
+        return new if product.stamp.version == 1 else uncompared
+    return same if product.change.grade is Grade.NONE else changed
 
 
 def _before(record: RunRecord, folder: Path) -> RunRecord | None:

@@ -53,8 +53,15 @@ def unmade_words(findings: Findings) -> list[str]:
     ]
 
 
-def lacking(unmet: Unmet) -> str:
-    """Return how many files lack a requested channel."""
+def unmet_rows(findings: Findings) -> list[tuple[str, str, str, str, str]]:
+    """Return the requested channels that files lack: why, and in how many files."""
+    return [
+        (unmet.instrument, unmet.channel, unmet.requested_by, unmet.reason, _lacking(unmet))
+        for unmet in findings.unmet
+    ]
+
+
+def _lacking(unmet: Unmet) -> str:
     expected = unmet.files_expected
     if unmet.nowhere:
         return "the only file" if expected == 1 else f"all {expected:,} files"

@@ -1,4 +1,4 @@
-"""The figures of a run's report: reads products, draws them, compares them with the truth.
+"""The figures of a run's report: reads products and draws them.
 
 A missing or unreadable product does not stop the report; it is listed as a problem. Products are
 read in one process or several; figures and their order do not depend on the number.
@@ -7,35 +7,33 @@ read in one process or several; figures and their order do not depend on the num
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, groupby
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import xarray as xr
 
 from lidarops.errors import ProductError
 from lidarops.figures.any_kind import views_of
-from lidarops.figures.kind_figures import ProductSource, View
+from lidarops.figures.kind_figures import View
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words
 from lidarops.figures.raster import COLUMNS
-from lidarops.figures.series_data import Comparison
-from lidarops.figures.wording import counted, named_shares, percent
+from lidarops.figures.wording import counted, named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
-from lidarops.netcdf.read import UNREADABLE, open_product, opened_product, profiles_in
+from lidarops.netcdf.read import open_product, opened_product
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.records import ProductRecord, RunRecord, SceneOutcome
+from lidarops.records import ProductRecord, RunRecord
 from lidarops.system.processes import CRASHED, Processes
 
 FIGURES: Final = 40
 """Most figures of products in a report."""
 FEWEST: Final = 50
 """Fewest products per process for which starting the process pays."""
-_FLAG_ROWS: Final = 40
 _AT_A_TIME: Final = 8
 """Products sent to a process together, so that it waits less."""
 _DAMAGE: Final = ArithmeticError, LookupError, MemoryError, RuntimeError, ValueError
@@ -43,24 +41,7 @@ _UNREADABLE: Final = *_DAMAGE, ProductError
 """What values of a damaged product may raise; other errors are those of the program."""
 
 
-_Item = tuple[str, ProductSource]
-"""A product by its path, and what is known about it, without the truth."""
-_Task = Callable[[Path, ProductSource], Any]
-
-
-class Problem(NamedTuple):
-    """A file that could not be used for the report."""
-
-    path: str
-    reason: str
-
-
-class Compared(NamedTuple):
-    """A comparison with the truth, with its instrument and channel."""
-
-    instrument: str
-    channel: str
-    comparison: Comparison
+_Read = Callable[[Path], Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +51,7 @@ class Group:
     kind: str
     instrument: str
     channel: str
-    members: tuple[tuple[SceneOutcome, ProductRecord], ...]
+    products: tuple[ProductRecord, ...]
     root: Path
     """Folder that product paths are relative to."""
 
@@ -82,25 +63,24 @@ class Group:
     @property
     def good(self) -> float:
         """Share of values without a quality bit."""
-        values = sum(product.values for _, product in self.members)
-        return sum(product.unflagged for _, product in self.members) / values if values else 0.0
+        values = sum(product.values for product in self.products)
+        return sum(product.unflagged for product in self.products) / values if values else 0.0
 
     @property
     def lacking(self) -> str:
         """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
-        products = [product for _, product in self.members]
-        if self.kind not in kinds() or any(product.usable != 0 for product in products):
+        if self.kind not in kinds() or any(product.usable != 0 for product in self.products):
             return ""
         flags = flags_of(self.kind)
         counts: Counter[str] = Counter()
-        for product in products:
+        for product in self.products:
             counts.update(product.flagged)
         rejecting = (
             (bit.description, count)
             for name, count in counts.items()
             if (bit := flags.named(name)) is not None and bit.severity is Severity.REJECT
         )
-        return named_shares(rejecting, sum(product.values for product in products))
+        return named_shares(rejecting, sum(product.values for product in self.products))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,13 +100,11 @@ class Picture:
 
 @dataclass(slots=True)
 class Gallery:
-    """Figures, comparisons and problems from the products of a run."""
+    """Figures and problems from the products of a run."""
 
     pictures: list[Picture] = field(default_factory=list)
-    flags: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Label of channel and kind -> name of a bit, with * where it asks for care -> share."""
-    compared: list[Compared] = field(default_factory=list)
-    problems: list[Problem] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+    """Files that could not be used for the report, with the reason."""
     undrawn: list[str] = field(default_factory=list)
     """Labels of channels that are not drawn because of the limit on figures."""
 
@@ -138,7 +116,7 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
     ----------
     record : RunRecord
     limit : int, optional
-        Most figures of products. Comparisons with the truth are made for all products.
+        Most figures of products.
     workers : int, optional
         Most processes that read. The figures do not depend on it.
 
@@ -147,89 +125,67 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
     Gallery
         One or more figures per instrument and channel, over all scenes.
     """
-    gallery = Gallery(flags=_shares(record))
-    truth = _truth(record, gallery)
+    gallery = Gallery()
     products = sum(len(scene.products) for scene in record.scenes)
-    with Processes(min(workers, products // FEWEST), truth) as processes:
+    with Processes(min(workers, products // FEWEST), None) as processes:
         for group in _groups(record):
-            full = len(gallery.pictures) >= limit
-            if full:
+            if len(gallery.pictures) >= limit:
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
+                continue
             for view in views_of(group.kind):
-                compares = truth is not None and view.compare is not None
-                if full and not compares:
-                    continue
                 contents = list(_read(processes, group, view, gallery.problems))
-                if contents and compares:
-                    gallery.compared += _compared(view, contents, group)
-                for drawn in view.draw(contents) if contents and not full else ():
-                    title = _title(group, {problem.path for problem in gallery.problems})
-                    gallery.pictures.append(_picture(view.name, drawn, group, title))
+                if contents:
+                    title = _title(group, gallery.problems)
+                    drawn = (_picture(view.name, one, group, title) for one in view.draw(contents))
+                    gallery.pictures += drawn
     return gallery
 
 
 def _read(
-    processes: Processes[xr.Dataset | None],
-    group: Group,
-    view: View[Any],
-    problems: list[Problem],
+    processes: Processes[None], group: Group, view: View[Any], problems: dict[str, str]
 ) -> Iterator[Any]:
     """Yield what a view shows of every readable product of a group, or of the first."""
-    source = ProductSource(group.instrument, group.channel)
-    items = [(product.path, replace(source, scene=scene)) for scene, product in group.members]
-
-    def each(task: _Task, items: Sequence[_Item]) -> Iterator[tuple[_Item, Any]]:
-        """Yield what a task returns of each product; note those that it fails on."""
-        called = partial(processes.map_items, partial(_guarded, task, group.root), lost=_crashed)
-        # None ahead where mostly the first one is enough.
-        results = (
-            chain.from_iterable(called([item], at_a_time=1, fewest=1) for item in items)
-            if view.first
-            else called(items, at_a_time=_AT_A_TIME)
-        )
-        for item, (content, reason) in results:
-            if not reason:
-                yield item, content
-            elif all(problem.path != item[0] for problem in problems):
-                problems.append(Problem(item[0], reason))
-
-    if view.shows:
-        # All products get the same resolution, which follows from their total length.
-        known = list(each(_length, items))
-        profiles = -(-sum(length for _, length in known) // COLUMNS)
-        items = [(path, replace(own, profiles=profiles)) for (path, own), _ in known]
-    for _, content in each(partial(_content, view.variables, view.read), items):
-        if content is not None:
+    # All products of a group share the columns of an image.
+    columns = max(COLUMNS // len(group.products), 1)
+    paths = [product.path for product in group.products]
+    read = partial(_content, view.variables, view.read, columns)
+    guarded = partial(_guarded, read, group.root)
+    called = partial(processes.map_items, guarded, lost=_crashed)
+    # None ahead where mostly the first one is enough.
+    results = (
+        chain.from_iterable(called([path], at_a_time=1, fewest=1) for path in paths)
+        if view.first
+        else called(paths, at_a_time=_AT_A_TIME)
+    )
+    for path, (content, reason) in results:
+        if reason:
+            problems.setdefault(path, reason)
+        elif content is not None:
             yield content
             if view.first:
                 return
 
 
-def _guarded(task: _Task, root: Path, truth: xr.Dataset | None, item: _Item) -> tuple[Any, str]:
-    """Return what a task returns of a product, or why the product cannot be read."""
-    path, source = item
+def _guarded(read: _Read, root: Path, _: None, path: str) -> tuple[Any, str]:
+    """Return what a view reads of a product, or why the product cannot be read."""
     try:
-        return task(root / path, replace(source, truth=truth)), ""
+        return read(root / path), ""
     except _UNREADABLE as error:
         return None, _reason(root / path, error)
 
 
-def _crashed(_: _Item) -> tuple[Any, str]:
+def _crashed(_: str) -> tuple[Any, str]:
     return None, CRASHED
-
-
-def _length(file: Path, _: ProductSource) -> int:
-    return profiles_in(file)
 
 
 def _content(
     names: tuple[str, ...],
-    read: Callable[[xr.Dataset, ProductSource], Any],
+    read: Callable[[xr.Dataset, int], Any],
+    columns: int,
     file: Path,
-    source: ProductSource,
 ) -> Any:
     with open_product(file, names) as product:
-        return read(product, source)
+        return read(product, columns)
 
 
 def _reason(path: Path, error: BaseException) -> str:
@@ -238,14 +194,8 @@ def _reason(path: Path, error: BaseException) -> str:
     return words or type(error).__name__
 
 
-def _compared(view: View[Any], contents: Sequence[Any], group: Group) -> Iterator[Compared]:
-    for comparison in view.compare(contents) if view.compare else ():
-        if comparison is not None:
-            yield Compared(group.instrument, group.channel, comparison)
-
-
 def _picture(view: str, drawn: Figure, group: Group, title: str) -> Picture:
-    scenes = counted(len(group.members), "scene")
+    scenes = counted(len(group.products), "scene")
     words = f"{scenes}. {drawn.words}."
     caption = f"{drawn.caption}: {title}"
     return Picture(view, drawn, group.instrument, caption, group.lacking, words)
@@ -253,7 +203,7 @@ def _picture(view: str, drawn: Figure, group: Group, title: str) -> Picture:
 
 def _title(group: Group, unreadable: Collection[str]) -> str:
     """Return channel and instrument as people call them, by the first product that can be read."""
-    for _, product in group.members:
+    for product in group.products:
         # What crashed another process would crash this one.
         if product.path in unreadable:
             continue
@@ -272,12 +222,11 @@ def _groups(record: RunRecord) -> list[Group]:
     First one quicklook of each instrument, then what is retrieved, by kind and with the first
     channel of every instrument first, then the other signals, and last what has no usable value.
     """
-    members: dict[tuple[str, str, str], list[tuple[SceneOutcome, ProductRecord]]]
-    members = defaultdict(list)
+    products: dict[tuple[str, str, str], list[ProductRecord]] = defaultdict(list)
     for scene in record.scenes:
         for product in scene.products:
-            members[product.kind, scene.instrument, product.channel].append((scene, product))
-    groups = [Group(*key, tuple(rows), Path(record.products)) for key, rows in members.items()]
+            products[product.kind, scene.instrument, product.channel].append(product)
+    groups = [Group(*key, tuple(own), Path(record.products)) for key, own in products.items()]
     groups.sort(key=lambda group: (group.instrument, -group.good, group.channel))
     signals = [group for group in groups if not is_retrieved(group.kind)]
     quicklooks = [next(first) for _, first in groupby(signals, lambda group: group.instrument)]
@@ -290,74 +239,3 @@ def _groups(record: RunRecord) -> list[Group]:
         place = bool(group.lacking), stage, rank_of(group.kind), group.kind, turn
         placed.append((place, group))
     return [group for _, group in sorted(placed, key=lambda pair: pair[0])]
-
-
-def _shares(record: RunRecord) -> Mapping[str, Mapping[str, float]]:
-    """Return label -> name of a bit, with * where it asks for care only -> share, by place."""
-    values: Counter[str] = Counter()
-    order: dict[str, int] = {}
-    carried: dict[str, Counter[str]] = defaultdict(Counter)
-    for group in _groups(record):
-        label = f"{group.label}, {group.kind}"
-        for _, product in group.members:
-            values[label] += product.values
-            flags = flags_of(group.kind) if group.kind in kinds() else None
-            for name, count in product.flagged.items():
-                bit = flags.named(name) if flags is not None else None
-                if bit is not None:
-                    shown = bit.word if bit.severity is Severity.REJECT else f"{bit.word} *"
-                    order.setdefault(shown, int(bit))
-                    carried[label][shown] += count
-    rows = {
-        label: {
-            bit: carried[label][bit] / values[label]
-            for bit in sorted(order, key=lambda name: order[name])
-        }
-        for label in values
-        if values[label] > 0
-    }
-    worst = sorted(rows, key=lambda label: -max(rows[label].values(), default=0.0))
-    names = [
-        name
-        for name in sorted(order, key=lambda name: order[name])
-        if any(row.get(name) for row in rows.values())
-    ]
-    return {
-        label: {name: rows[label][name] for name in names} for label in sorted(worst[:_FLAG_ROWS])
-    }
-
-
-def _truth(record: RunRecord, gallery: Gallery) -> xr.Dataset | None:
-    if not record.truth:
-        return None
-    path = Path(record.truth)
-    try:
-        if not path.is_file():
-            raise ProductError("the file is missing")
-        with opened_product(path, decode_timedelta=False) as opened:
-            truth = opened.load()
-        for name in ("path", "instrument", "time", "total_extinction"):
-            if name not in truth.variables or truth[name].dims != ("granule",):
-                raise ProductError("is not a variable along granule", field=name)
-    except UNREADABLE as error:
-        gallery.problems.append(Problem(record.truth, _reason(path, error)))
-        return None
-    return truth
-
-
-def compared_in_words(compared: Sequence[Compared]) -> Mapping[str, str]:
-    """Return for each quantity the shares of its values within 1 and 3 errors of the truth."""
-    totals: dict[str, Counter[str]] = defaultdict(Counter)
-    for _, _, one in compared:
-        total = totals[one.quantity]
-        total["all"] += one.count
-        if one.count:
-            total["1"] += round(one.within_1 * one.count)
-            total["3"] += round(one.within_3 * one.count)
-    return {
-        quantity: f"{percent(total['1'] / total['all'])} within 1 and"
-        f" {percent(total['3'] / total['all'])} within 3 standard errors of the truth, of"
-        f" {total['all']:,} unflagged values"
-        for quantity, total in totals.items()
-        if total["all"]
-    }

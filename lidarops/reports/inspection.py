@@ -22,7 +22,6 @@ from lidarops.errors import RawFormatError
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
-    StoredBit,
     bits_of,
     blocks,
     flags_names,
@@ -210,37 +209,31 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
 
 def _quality(dataset: xr.Dataset) -> list[dict[str, Any]]:
     """Count values by verdict and by quality bit; empty for files without quality flags."""
-    return [
-        {"flags": name, **row}
-        for name in flags_names(dataset)
-        for row in _counted_flags(dataset[name], bits_of(dataset, name))
-    ]
+    return [row for name in flags_names(dataset) for row in _counted_flags(dataset, name)]
 
 
-def _counted_flags(flags: xr.DataArray, bits: tuple[StoredBit, ...]) -> list[dict[str, Any]]:
+def _counted_flags(dataset: xr.Dataset, name: str) -> list[dict[str, Any]]:
+    flags, bits = dataset[name], bits_of(dataset, name)
+    if not flags.size:
+        return []
     counts = FlagCounter(rejecting_mask(bits))
-    for block in blocks(flags, _READ_VALUES) if flags.size else ():
+    for block in blocks(flags, _READ_VALUES):
         counts.add(quality_bits(block))
-    rows = [
-        _counted(name, "verdict", count, flags.size, "")
-        for name, count in zip(_VERDICTS, counts.verdicts, strict=True)
-        if flags.size
-    ]
+    rows = [(word, "verdict", n, "") for word, n in zip(_VERDICTS, counts.verdicts, strict=True)]
     for bit in (bit for bit in bits if bit.mask in counts.carried):
         severity = "unknown" if bit.severity is None else bit.severity.name.lower()
-        count = counts.carried[bit.mask]
-        rows.append(_counted(bit.word, severity, count, flags.size, bit.description))
-    return rows
-
-
-def _counted(name: str, severity: str, count: int, size: int, description: str) -> dict[str, Any]:
-    return {
-        "name": name,
-        "severity": severity,
-        "values": count,
-        "share": round(count / size, 4) if size else None,
-        "description": description,
-    }
+        rows.append((bit.word, severity, counts.carried[bit.mask], bit.description))
+    return [
+        {
+            "flags": name,
+            "name": word,
+            "severity": severity,
+            "values": count,
+            "share": round(count / flags.size, 4),
+            "description": description,
+        }
+        for word, severity, count, description in rows
+    ]
 
 
 def _plain(value: Any) -> Any:

@@ -6,6 +6,7 @@ import math
 import types
 import typing
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -62,7 +63,7 @@ def _typed(expected: object, value: object, place: str) -> object:
         return from_plain(expected, value, place)
     if isinstance(expected, type) and issubclass(expected, StrEnum):
         return _enum(expected, value, place)
-    return _SCALARS[expected](value, place)
+    return _scalar(expected, value, place)
 
 
 def from_plain(kind: type[_T], value: object, place: str) -> _T:
@@ -98,49 +99,24 @@ def _checked(value: object, kind: type[_T], words: str, place: str) -> _T:
     return value
 
 
-def _text(value: object, place: str) -> str:
-    return _checked(value, str, "text", place)
-
-
-def _integer(value: object, place: str) -> int:
-    return _checked(value, int, "a whole number", place)
-
-
-def _boolean(value: object, place: str) -> bool:
-    if not isinstance(value, bool):
-        raise MismatchError(place, f"true or false, not {value!r:.80}")
-    return value
-
-
-def _float(value: object, place: str) -> float:
-    if isinstance(value, str) and value in _NOT_FINITE:
-        return _NOT_FINITE[value]
-    if isinstance(value, float):
-        return value
-    integer = _checked(value, int, "a number", place)
-    try:
-        return float(integer)
-    except OverflowError as error:
-        raise MismatchError(place, f"a number below 1e308, not {integer!r:.80}") from error
-
-
-def _datetime(value: object, place: str) -> datetime:
-    text = _checked(value, str, "an ISO 8601 date and time", place)
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError as error:
-        raise MismatchError(place, f"an ISO 8601 date and time, not {text!r:.80}") from error
-
-
-def _anything(value: object, _: str) -> object:
-    return value
-
-
-_SCALARS: Final[Mapping[object, Callable[[object, str], object]]] = {
-    str: _text,
-    bool: _boolean,
-    int: _integer,
-    float: _float,
-    datetime: _datetime,
-    Any: _anything,
+_SCALARS: Final[Mapping[object, tuple[Any, Callable[[Any], object], str]]] = {
+    str: (str, str, "text"),
+    bool: (bool, bool, "true or false"),
+    int: (int, int, "a whole number"),
+    float: ((int, float), float, "a number below 1e308"),
+    datetime: (str, datetime.fromisoformat, "an ISO 8601 date and time"),
 }
+"""Types of fields: their types in JSON, how they are read, and what was expected, in words."""
+
+
+def _scalar(kind: object, value: object, place: str) -> object:
+    if kind is Any:
+        return value
+    if kind is float and isinstance(value, str):
+        value = _NOT_FINITE.get(value, value)
+    written, read, words = _SCALARS[kind]
+    # In Python, booleans are integers.
+    if isinstance(value, written) and isinstance(value, bool) == (kind is bool):
+        with suppress(OverflowError, ValueError):
+            return read(value)
+    raise MismatchError(place, f"{words}, not {value!r:.80}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.figures.any_kind import view_of, views_of
 from lidarops.figures.image_panels import ImageQuantity
-from lidarops.figures.kind_figures import ProductSource, View, image_view
+from lidarops.figures.kind_figures import View, image_view
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
+from lidarops.figures.raster import COLUMNS
 from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
@@ -28,20 +29,13 @@ _COLOURS: Final = 5
 _STYLES: Final = ("", " d1", " d2", " d3", " d4")
 
 
-Span = tuple[float, float]
-
-
 @dataclass(frozen=True, slots=True)
 class Selection:
     """What is drawn of a product; all of it where nothing is chosen."""
 
     variable: str = ""
-    time: tuple[np.datetime64, np.datetime64] | None = None
-    """UTC."""
-    range: Span | None = None
-    """m."""
-    altitude: Span | None = None
-    """m."""
+    spans: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+    """Ends of `time`, UTC, of `range` and of `altitude`, m."""
 
 
 ALL: Final = Selection()
@@ -57,34 +51,23 @@ def selection(variable: str, time: str, range_: str, altitude: str) -> Selection
     LidarOpsError
         If an option cannot be read.
     """
-    spans = _metres("range", range_), _metres("altitude", altitude)
-    return Selection(variable, _times(time), *spans)
+    options = (
+        ("time", time, "START/STOP", lambda end: np.datetime64(end.removesuffix("Z"), "ns")),
+        ("range", range_, "LOW/HIGH in km", lambda end: 1e3 * float(end)),
+        ("altitude", altitude, "LOW/HIGH in km", lambda end: 1e3 * float(end)),
+    )
+    return Selection(variable, {option[0]: _ends(*option) for option in options if option[1]})
 
 
-def _times(span: str) -> tuple[np.datetime64, np.datetime64] | None:
-    """Return the ends of a span of time; None for all times."""
+def _ends(name: str, span: str, form: str, read: Callable[[str], Any]) -> tuple[Any, Any]:
+    """Return the ends of a span."""
     try:
-        start, stop = (np.datetime64(end.removesuffix("Z"), "ns") for end in span.split("/"))
+        first, last = (read(end) for end in span.split("/"))
     except ValueError:
-        if not span:
-            return None
         raise LidarOpsError(
-            f"is no span of time: {span!r}", field="time", remedy="give START/STOP", wrong_use=True
+            f"is no span: {span!r}", field=name, remedy=f"give {form}", wrong_use=True
         ) from None
-    return start, stop
-
-
-def _metres(name: str, span: str) -> tuple[float, float] | None:
-    """Return the ends of a span in km, m; None for everything."""
-    try:
-        low, high = (1e3 * float(end) for end in span.split("/"))
-    except ValueError:
-        if not span:
-            return None
-        raise LidarOpsError(
-            f"is no span: {span!r}", field=name, remedy="give LOW/HIGH in km", wrong_use=True
-        ) from None
-    return low, high
+    return first, last
 
 
 def draw_file(path: Path, chosen: Selection = ALL) -> tuple[Figure, ...]:
@@ -115,7 +98,7 @@ def _of_product(path: Path, chosen: Selection) -> Iterator[Figure]:
     for view in views:
         names = {*view.variables, "time", "range", "altitude", "usable"}
         with reading(path), open_product(path, names) as product:
-            content = view.read(_part(product, chosen, path), ProductSource())
+            content = view.read(_part(product, chosen, path), COLUMNS)
         if content is not None:
             yield from view.draw([content])
 
@@ -136,14 +119,11 @@ def _view_of(product: xr.Dataset, kind: str, name: str) -> View[Any]:
 
 def _part(product: xr.Dataset, chosen: Selection, path: Path) -> xr.Dataset:
     """Return the part of a product in the chosen spans."""
-    spans = {"time": chosen.time, "range": chosen.range, "altitude": chosen.altitude}
-    for name, span in spans.items():
-        if span is None:
-            continue
+    for name, (first, last) in chosen.spans.items():
         along = product.variables.get(name)
         if along is None or along.ndim != 1:
             raise ProductError(f"has no {name}", file=path, wrong_use=True)
-        inside = (along.values >= span[0]) & (along.values <= span[1])
+        inside = (along.values >= first) & (along.values <= last)
         if not inside.any():
             raise ProductError("lies outside the product", field=name, file=path, wrong_use=True)
         product = product.isel({along.dims[0]: inside})

@@ -8,7 +8,7 @@ from typing import Final
 
 from lidarops.figures.wording import percent
 from lidarops.flags import Severity
-from lidarops.kinds import flags_of
+from lidarops.kinds import flags_of, kinds
 from lidarops.records import LeftOut, Plan, PlannedStep, ProductRecord, SceneOutcome, file_channels
 from lidarops.scene.retrieval import settings_model
 from lidarops.settings import unit_of
@@ -54,8 +54,9 @@ def rejection_rows(scenes: Iterable[SceneOutcome]) -> Iterator[tuple[str, str, s
         for product in scene.products:
             name = f"{product.kind} {product.channel} of {scene.instrument}"
             values[name] += product.values
-            flags = flags_of(product.kind)
-            for bit, count in ((flags.named(flag), n) for flag, n in product.flagged.items()):
+            # A record may be of a kind that is not installed.
+            flagged = product.flagged if product.kind in kinds() else {}
+            for bit, count in ((flags_of(product.kind).named(f), n) for f, n in flagged.items()):
                 if bit and bit.severity is Severity.REJECT:
                     rejected[name, bit.word, decided_by(plan, product, bit.word)] += count
     for (name, flag, words), count in rejected.most_common():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,31 +12,23 @@ from typing import Final
 from urllib.parse import quote
 
 from jinja2 import Environment
-from markupsafe import Markup
 
 from lidarops.errors import UnavailableError
 from lidarops.figures import browser
 from lidarops.figures.panels import Figure
-from lidarops.figures.templates import environment, page_style
-from lidarops.figures.wording import (
-    change_in_words,
-    duration,
-    percent,
-    size,
-    verdicts_in_words,
-)
+from lidarops.figures.templates import environment, style
 from lidarops.records import RunRecord
 from lidarops.reports import gallery, run_tables
 from lidarops.reports.difference import difference
-from lidarops.reports.findings import disagreement_rows, finding_rows, lacking, scene_note_rows
+from lidarops.reports.findings import unmet_rows
 from lidarops.reports.gallery import Gallery, Picture
+from lidarops.reports.rejections import rejection_rows
 from lidarops.reports.run_record import FILE_NAME, INDEX
 from lidarops.system.files import write_atomically
 
 ROWS: Final = 2000
 """Most rows of a table on the page. The run record beside it holds all rows."""
-
-
+_SHEET: Final = "report.css"
 _SHOWN: Final = 9
 """Most figures on the page, of each instrument in turn; the others are folded."""
 
@@ -85,6 +75,7 @@ def build_report(
         filled = gallery.fill(record, limit=figures, workers=workers)
         target = folder / INDEX
         write_atomically(folder / browser.SCRIPT, browser.script())
+        write_atomically(folder / _SHEET, style("lidarops.reports", _SHEET))
         write_atomically(target, _render(record, folder, filled).encode())
     except OSError as error:
         raise UnavailableError(
@@ -101,43 +92,39 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
     links = {path: _href(record, path, folder) for path in paths}
     missing = sorted(path for path, link in links.items() if not link)
     problems = dict.fromkeys(missing, "the file is missing")
-    problems |= {problem.path: problem.reason for problem in filled.problems}
+    problems |= filled.problems
     pictures = _by_instrument([one for one in filled.pictures if not one.lacking])
     return _environment().get_template("run.html").render(
         record=record,
+        version=record.version,
         summary=run_tables.summary(record),
         verdict=run_tables.verdict(record),
         outcome=run_tables.outcome_class(record),
         difference=difference(record, folder),
         changes=run_tables.changed_products(record),
-        page_style=Markup(page_style()),  # noqa: S704 - it is a file of the package
         overview=_overview(pictures),
-        findings=[
-            *finding_rows(record.findings),
-            *disagreement_rows(record.scenes),
-            *scene_note_rows(record.scenes),
-        ],
+        findings=run_tables.findings(record),
+        unmet=unmet_rows(record.findings),
         instruments=run_tables.instruments(record),
-        stages=run_tables.stages(record),
         scenes=record.scenes[:ROWS],
         links=links,
         left_out=run_tables.left_out(record),
         without_product=run_tables.scenes_without_product(record),
         steps=run_tables.carried_out(record),
         flags=run_tables.flags(record),
+        rejections=list(rejection_rows(record.scenes)),
         refused=run_tables.refused(record),
-        failed=run_tables.failed_scenes(record),
+        failed=[
+            (scene.scene, scene.station, scene.instrument, scene.granules, scene.error)
+            for scene in run_tables.failed_scenes(record)
+        ],
         internal=run_tables.internal_errors(record),
         problems=sorted(problems.items()),
-        compared=filled.compared,
-        compared_words=gallery.compared_in_words(filled.compared),
         pictures=pictures,
         lacking=[picture for picture in filled.pictures if picture.lacking],
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
-        flag_shares=filled.flags,
-        flag_names=next(iter(filled.flags.values()), {}),
         undrawn=filled.undrawn,
-        plan_hash=_plan_hash(record),
+        hashes=run_tables.hashes(record)[:ROWS],
         run_file=FILE_NAME if (folder / FILE_NAME).is_file() else "",
         rows=ROWS,
     )  # fmt: skip
@@ -146,17 +133,10 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
 @cache
 def _environment() -> Environment:
     own = environment("lidarops.reports")
-    own.filters |= {"percent": percent, "moment": run_tables.moment, "url": quote}
-    own.filters |= {"lacking": lacking, "source_hash": _source_hash}
-    own.filters |= {"drawn": browser.inline, "words": change_in_words, "size": size}
-    own.filters |= {"duration": duration, "verdicts": verdicts_in_words}
+    own.globals |= {"root": "", "sheet": _SHEET, "trail": []}
+    own.filters |= {"moment": run_tables.moment, "drawn": browser.inline}
     own.filters |= {"outcome": run_tables.outcome_word}
     return own
-
-
-def _source_hash(style: str) -> str:
-    """Return a style sheet as a content security policy names it, which admits no other."""
-    return f"sha256-{base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()}"
 
 
 def _href(record: RunRecord, product: str, folder: Path) -> str:
@@ -184,9 +164,3 @@ def _overview(pictures: Sequence[tuple[str, Sequence[Picture]]]) -> list[Picture
     turns = zip_longest(*(figures for _, figures in pictures))
     first = [picture for turn in turns for picture in turn if picture is not None][:_SHOWN]
     return sorted(first, key=lambda picture: picture.instrument)
-
-
-def _plan_hash(record: RunRecord) -> str:
-    """Return the sha256 over the sorted hashes of all plans."""
-    hashes = sorted(scene.plan.hash for scene in record.scenes if scene.plan)
-    return hashlib.sha256("\n".join(hashes).encode()).hexdigest() if hashes else ""

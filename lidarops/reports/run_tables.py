@@ -10,28 +10,33 @@ from datetime import UTC, datetime
 from typing import Any, Final, TypeVar
 
 from lidarops.figures.wording import (
+    change_in_words,
     counted,
     decided_on,
     duration,
     percent,
+    size,
     verdicts_in_words,
 )
 from lidarops.flags import PLACES, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import (
-    Change,
     Grade,
     Granule,
     LeftOut,
     PlannedStep,
-    ProductRecord,
     Role,
     RunRecord,
     SceneOutcome,
     Verdicts,
 )
-from lidarops.reports.findings import disagreement_rows, finding_rows, scene_note_rows, unmade_words
+from lidarops.reports.findings import (
+    disagreement_rows,
+    finding_rows,
+    scene_note_rows,
+    unmade_words,
+)
 from lidarops.scene.choices import idle_window
 
 _T = TypeVar("_T")
@@ -45,16 +50,26 @@ Row = dict[str, Any]
 """Values of a row of a table, by column."""
 
 
-def changed_products(record: RunRecord) -> list[tuple[str, ProductRecord, Change]]:
-    """Return scene, product, and how it differs from that it replaces; largest changes first."""
-    rows = [
-        (scene.scene, product, product.change)
+def changed_products(record: RunRecord) -> list[Row]:
+    """Return how products differ from those that they replace, the largest changes first."""
+    changed = [
+        (product.change, scene, product)
         for scene in record.scenes
         for product in scene.products
         if product.change is not None
     ]
     order = list(Grade)
-    return sorted(rows, key=lambda row: -order.index(row[2].grade))
+    return [
+        {
+            "scene": scene.scene,
+            "product": f"{product.kind} {product.channel}",
+            "version": product.stamp.version,
+            "change": change.grade.value,
+            "difference": change_in_words(change),
+            "cause": "; ".join(change.causes),
+        }
+        for change, scene, product in sorted(changed, key=lambda row: -order.index(row[0].grade))
+    ]
 
 
 def summary(record: RunRecord) -> list[tuple[str, str]]:
@@ -89,6 +104,26 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
             for kind, verdicts in _verdicts_by_kind(record)
         ),
     ]
+
+
+def findings(record: RunRecord) -> list[tuple[str, str, str, str]]:
+    """Return instrument, subject and finding, and "yes" where it fails the run."""
+    rows = (
+        *finding_rows(record.findings),
+        *disagreement_rows(record.scenes),
+        *scene_note_rows(record.scenes),
+    )
+    return [(r.instrument, r.subject, r.problem, "yes" if r.fails else "") for r in rows]
+
+
+def hashes(record: RunRecord) -> list[tuple[str, str, str, str]]:
+    """Return scene, plan or product, size and sha256."""
+    rows = []
+    for scene in record.scenes:
+        if scene.plan:
+            rows.append((scene.scene, "plan", "", scene.plan.hash))
+        rows += [(scene.scene, p.path, size(p.size), p.sha256) for p in scene.products]
+    return rows
 
 
 def failed_scenes(record: RunRecord) -> list[SceneOutcome]:
@@ -271,9 +306,10 @@ def refused(record: RunRecord) -> list[Row]:
     return [
         {
             "reason": reason or "no reason was recorded",
-            "when": when,
+            "refused": when,
+            "days": listed({f"{granule.start:%Y-%m-%d}" for granule in alike if granule.start})
+            or "not known",
             "files": sorted({granule.path for granule in alike}),
-            "days": listed({f"{granule.start:%Y-%m-%d}" for granule in alike if granule.start}),
         }
         for (reason, when), alike in _most_frequent_first(granules)
     ]
@@ -289,27 +325,6 @@ def scenes_without_product(record: RunRecord) -> list[tuple[str, list[str]]]:
 
 def _most_frequent_first(groups: Mapping[Any, list[_T]]) -> list[tuple[Any, list[_T]]]:
     return sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
-
-
-def stages(record: RunRecord) -> list[Row]:
-    """Return the time of each stage, in the order in which scenes list them."""
-    times: dict[str, list[tuple[float, str]]] = defaultdict(list)
-    for scene in record.scenes:
-        for stage, seconds in scene.seconds.items():
-            times[stage].append((seconds, scene.scene))
-    totals = {stage: sum(seconds for seconds, _ in spent) for stage, spent in times.items()}
-    whole = sum(totals.values())
-    longest = {stage: max(spent, key=lambda row: row[0]) for stage, spent in times.items()}
-    return [
-        {
-            "stage": stage,
-            "total": duration(total),
-            "share": percent(total / whole) if whole > 0 else "0 %",
-            "longest": duration(longest[stage][0]),
-            "longest_scene": longest[stage][1],
-        }
-        for stage, total in totals.items()
-    ]
 
 
 def listed(names: Iterable[str]) -> str:
@@ -358,5 +373,4 @@ def _instrument_row(name: str, scenes: Sequence[SceneOutcome], refused_before: i
         "products": len(products),
         "retrieved values": sum(product.values for product in retrieved),
         "quality": verdicts_in_words(Verdicts.total(product.verdicts for product in retrieved)),
-        "time": duration(sum(sum(scene.seconds.values()) for scene in scenes)),
     }

@@ -245,7 +245,6 @@ class LedgerRun:
 
     def _record(self, run: Run) -> RunRecord:
         """Return the record of the run without its scenes."""
-        truth = self._campaign.truth_path
         return RunRecord(
             id=run.id,
             campaign=self._campaign.name,
@@ -257,7 +256,6 @@ class LedgerRun:
             products=str(self._campaign.products_root),
             scenes=(),
             refused=(),
-            truth=str(truth) if self._campaign.simulation and truth.exists() else "",
         )
 
 

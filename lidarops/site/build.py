@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -20,9 +20,11 @@ from markupsafe import Markup
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError, UnavailableError
 from lidarops.figures import any_kind, browser
-from lidarops.figures.kind_figures import ProductSource, View, figures_of
+from lidarops.figures.kind_figures import View, figures_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words, scalar
+from lidarops.figures.raster import COLUMNS
+from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
 from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
@@ -35,7 +37,6 @@ from lidarops.site.paths import (
     day_page,
     month_list,
     product_folder,
-    product_page,
     year_page,
 )
 from lidarops.site.product_entry import Entry, Problem
@@ -77,15 +78,10 @@ class Site:
     """Products without a page, or with an incomplete page."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    path: str
-    products: Path
-    site: Path
-    known: Entry | None
-    below: float
-
-
+_Kept = tuple[Path, Path, float]
+"""Folders of the products and of the site, and the height of the calendar."""
+_Task = tuple[str, Entry | None]
+"""Path of a product, and its entry if it has a page."""
 _Drawn = tuple[Figure, Markup]
 """A figure, and as a page holds it."""
 _Outcome = tuple[Entry | Problem, bool]
@@ -107,8 +103,8 @@ def build_site(
 
     Pages need neither server nor network; one script draws their figures. The page of a product
     depends only on the product, except its links, which are written anew in each build. It is kept
-    while the sha256 of the product, the page and lidarops do not change. Equal archives give equal
-    bytes, for any number of workers.
+    while the sha256 of the product, the page and lidarops do not change; where nothing has changed,
+    all pages are. Equal archives give equal bytes, for any number of workers.
 
     Parameters
     ----------
@@ -146,76 +142,77 @@ def build_site(
     links = Links(output, COPIES if copies else products_at, stac_at, reports_at)
     products, site = product_folder(output), output / SITE
     before = _manifest(site, links, below)
-    tasks = [
-        _Task(path, products, site, before.get(path), below) for path in product_paths(products)
-    ]
-    entries, problems, made = _collect(tasks, workers, progress)
+    tasks = [(path, before.get(path)) for path in product_paths(products)]
+    with Processes(workers, (products, site, below)) as processes:
+        done = processes.map_items(_page, tasks, at_a_time=1, lost=_crashed)
+        entries, problems, made = _collected(done, progress)
+    built = Site(site / pages.INDEX, len(entries), made, tuple(problems))
+    stated = _stated(entries, problems, links, below)
+    if built.index.is_file() and not copies and (site / MANIFEST).read_bytes() == stated:
+        return built
     entries = list(_linked(site, entries, links))
     expected = _write_calendar(site, entries, problems, links, below)
     if copies:
         expected |= _copy(products, site, entries)
-    _write_manifest(site, entries, problems, links, below)
+    _write(site, MANIFEST, _stated(entries, problems, links, below))
     _sweep(site, expected)
-    return Site(site / pages.INDEX, len(entries), made, tuple(problems))
+    return built
 
 
-def _collect(
-    tasks: Sequence[_Task], workers: int, progress: Callable[[int], None] | None
+def _collected(
+    done: Iterable[tuple[_Task, _Outcome]], progress: Callable[[int], None] | None
 ) -> tuple[list[Entry], list[Problem], int]:
     entries, problems, made = [], [], 0
-    with Processes(workers, None) as processes:
-        for _, (outcome, new) in processes.map_items(_page, tasks, at_a_time=1, lost=_crashed):
-            if isinstance(outcome, Problem):
-                problems.append(outcome)
-            else:
-                entries.append(outcome)
-                made += new
-                if outcome.problem:
-                    problems.append(Problem(outcome.path, outcome.problem))
-            if progress is not None:
-                progress(1)
+    for _, (outcome, new) in done:
+        if isinstance(outcome, Problem):
+            problems.append(outcome)
+        else:
+            entries.append(outcome)
+            made += new
+            if outcome.problem:
+                problems.append(Problem(outcome.path, outcome.problem))
+        if progress is not None:
+            progress(1)
     return entries, problems, made
 
 
-def _page(_: None, task: _Task) -> _Outcome:
+def _page(kept: _Kept, task: _Task) -> _Outcome:
     """Make or keep the page of one product."""
+    (products, site, below), (path, known) = kept, task
     try:
-        file = within(task.products, task.path)
+        file = within(products, path)
         with reading(file):
             sha256 = sha256_of(file)
-        if task.known is not None and _is_kept(task.known, sha256, task.site):
-            return task.known, False
-        return _make(task, file, sha256), True
+        if known is not None and _is_kept(known, sha256, site):
+            return known, False
+        return _make(path, file, sha256, site, below), True
     except ProductError as error:
-        return Problem(task.path, _reason(task, error)), True
+        # With relative paths, because pages must not depend on the location of the archive.
+        words = str(error).replace(str(products / path), path)
+        return Problem(path, words or type(error).__name__), True
 
 
 def _crashed(task: _Task) -> _Outcome:
-    return Problem(task.path, CRASHED), True
-
-
-def _reason(task: _Task, error: BaseException) -> str:
-    # With relative paths, because pages must not depend on the location of the archive.
-    words = str(error).replace(str(task.products / task.path), task.path)
-    return words or type(error).__name__
+    return Problem(task[0], CRASHED), True
 
 
 def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
     if known.sha256 != sha256:
         return False
-    files = (within(site, name) for name in known.files)
+    # Read only: what is written is held to the folder of the site.
+    files = (site / name for name in known.files)
     return all(
         file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest
         for file, digest in zip(files, known.digests, strict=True)
     )
 
 
-def _make(task: _Task, file: Path, sha256: str) -> Entry:
+def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry:
     with opened_product(file, decode_cf=False) as stored:
         kind = attribute(stored, "lidarops_kind")
         opened = _decoded(stored, kind)
         quality, no_quality = _guarded(
-            lambda: read_quality(opened, task.below), "its quality over time cannot be drawn"
+            lambda: read_quality(opened, below), "its quality over time cannot be drawn"
         )
         quality = quality or Quality()
         values, no_values = _guarded(
@@ -226,15 +223,12 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
         start, stop = product_contents.span(opened)
         no_flags = "" if QUALITY_FLAG in opened else "the product has no quality flags"
         problems = (not_drawn, no_values, no_quality, origin["problem"], no_flags)
-        page = product_page(task.path)
         station = attribute(opened, "lidarops_station")
         instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
-            path=task.path,
+            path=path,
             sha256=sha256,
             size=file.stat().st_size,
-            page=page,
-            thumbnail=page.removesuffix(".html") + ".png",
             digests=(),
             campaign=product_contents.campaign(opened),
             station=station,
@@ -264,7 +258,7 @@ def _make(task: _Task, file: Path, sha256: str) -> Entry:
             browser.thumbnail(figures[0][0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):
-        _write(task.site, name, content)
+        _write(site, name, content)
     return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
 
 
@@ -335,7 +329,7 @@ def _draw(
 def _figures(
     opened: xr.Dataset, views: Sequence[View[Any]], quality: Figure | None
 ) -> list[_Drawn]:
-    contents = ((view, view.read(opened, ProductSource())) for view in views)
+    contents = ((view, view.read(opened, COLUMNS)) for view in views)
     figures = [
         figure
         for view, content in contents
@@ -413,7 +407,7 @@ def _write_calendar(
                 name = day_page(station, day)
                 write(name, pages.day(station, day, by_day, before, after))
     campaigns = sorted({entry.campaign for entry in entries})
-    _write(site, "site.css", pages.style().encode())
+    _write(site, pages.SHEET, style("lidarops.site", pages.SHEET))
     _write(site, browser.SCRIPT, browser.script())
     _write(site, pages.INDEX, pages.index(entries, problems, campaigns, links, below))
     return expected
@@ -438,19 +432,20 @@ def _version() -> str:
     return f"{__version__} {pages_version()}"
 
 
-def _write_manifest(
-    site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
-) -> None:
+def _stated(
+    entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
+) -> bytes:
+    """Return the manifest, which states all that the site follows from."""
     document = {
         "format": _FORMAT,
         "products_at": links.products,
+        "links": links.outside(entries),
         "below": below,
         "version": _version(),
         "products": [asdict(entry) for entry in entries],
         "problems": [asdict(problem) for problem in problems],
     }
-    text = json.dumps(document, indent=0, sort_keys=True)
-    _write(site, MANIFEST, text.encode("ascii") + b"\n")
+    return json.dumps(document, indent=0, sort_keys=True).encode("ascii") + b"\n"
 
 
 def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
@@ -464,7 +459,7 @@ def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
                 remedy="move it away, so that its content is not lost",
             )
         # Written first, so that an interrupted build is recognised as a site.
-        _write_manifest(site, [], [], links, below)
+        _write(site, MANIFEST, _stated([], [], links, below))
         return {}
     try:
         document = json.loads(file.read_bytes())
@@ -474,16 +469,9 @@ def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
             below,
         ):
             return {}
-        return {item["path"]: _entry(item) for item in document["products"]}
+        known = [
+            Entry(**item | {"digests": tuple(item["digests"])}) for item in document["products"]
+        ]
+        return {entry.path: entry for entry in known}
     except (ValueError, KeyError, TypeError):
         return {}
-
-
-def _entry(item: dict[str, Any]) -> Entry:
-    values = {field.name: item[field.name] for field in fields(Entry)}
-    known = Entry(**(values | {"digests": tuple(item["digests"])}))
-    # Page names follow from the product, not from a manifest that may have been edited.
-    page = product_page(known.path)
-    if (known.page, known.thumbnail) != (page, page.removesuffix(".html") + ".png"):
-        raise ValueError(known.path)
-    return known

@@ -7,19 +7,17 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import date
 from functools import cache, partial
-from importlib.resources import files
 from typing import Any, Final
 
 import xarray as xr
 from jinja2 import Environment
 from markupsafe import Markup
 
-from lidarops import __version__
 from lidarops.figures import browser
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import UNKNOWN
-from lidarops.figures.templates import environment, page_style
-from lidarops.figures.wording import counted, percent, size, verdicts_in_words
+from lidarops.figures.templates import environment
+from lidarops.figures.wording import counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.links import Links
@@ -32,10 +30,9 @@ from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import Values
 
 INDEX: Final = "index.html"
+SHEET: Final = "site.css"
 _INPUTS: Final = 12
 """Most input files that a page lists."""
-_YEARS: Final = 48
-"""Most years on the first page with a table of months; beyond, stations link to years."""
 _PROBLEMS: Final = 200
 _LATEST: Final = 6
 _NAVIGATION: Final = (b"<!-- navigation -->", b"<!-- /navigation -->")
@@ -47,28 +44,17 @@ ByDay = Mapping[str, Sequence[Entry]]
 
 
 @cache
-def style() -> str:
-    """Return the style sheet of the site."""
-    own = files("lidarops.site").joinpath("templates", "site.css").read_text(encoding="utf-8")
-    return page_style() + own
-
-
-@cache
 def _templates() -> Environment:
     """Return the templates, with the functions that they call."""
     own = environment("lidarops.site")
     own.globals |= {
-        "version": __version__,
         "grades": list(ShareGrade),
         "weekdays": calendar.day_name[:],
         "month_name": calendar.month_name[:],
-        "counted": counted,
-        "percent": percent,
-        "size": size,
+        "sheet": SHEET,
         "about": _about,
         "clock": _clock,
         "shown_span": _span,
-        "in_words": verdicts_in_words,
         "cell": _cell,
         "by_month": months,
         "by_day": days,
@@ -191,18 +177,11 @@ def _order(entry: Entry) -> tuple[Any, ...]:
 
 
 def _cell(entries: Iterable[Entry]) -> dict[str, Any]:
-    """Return what a day or month shows: the share of usable profiles, and its grade.
-
-    The share is in whole percent; only exact 0 and 1 become 0 % and 100 %.
-    """
+    """Return what a day or month shows: the share of usable profiles, and its grade."""
     share = mean_availability(entries)
     if share is None:
         return {"share": "", "of": "", "grade": ShareGrade.UNKNOWN}
-    whole = round(100 * share)
-    words = f"{whole} %"
-    if whole in (0, 100) and share not in (0.0, 1.0):
-        words = "<1 %" if whole == 0 else ">99 %"
-    return {"share": words, "of": " of profiles usable", "grade": ShareGrade.of(share)}
+    return {"share": percent(share), "of": " of profiles usable", "grade": ShareGrade.of(share)}
 
 
 def _by(entries: Iterable[Entry], key: Callable[[Entry], str]) -> dict[str, list[Entry]]:
@@ -273,9 +252,8 @@ def index(
         report=links.report(INDEX),
         licenses=sorted({entry.license for entry in entries if entry.license}),
         stations=by_station,
-        matrix=sum(len(years(group)) for group in by_station.values()) <= _YEARS,
         latest=retrieved[:_LATEST],
-        problems=problems,
+        problems=[(problem.path, problem.reason) for problem in problems],
         files=len({*(entry.path for entry in entries), *(item.path for item in problems)}),
         most=_PROBLEMS,
     )

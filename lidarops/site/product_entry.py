@@ -10,6 +10,7 @@ from typing import Final
 
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import Verdicts
+from lidarops.site.paths import product_page
 
 
 class ShareGrade(StrEnum):
@@ -62,10 +63,6 @@ class Entry:
     """Relative to the folder of the products."""
     sha256: str
     size: int
-    page: str
-    """Relative to the site."""
-    thumbnail: str
-    """Relative to the site."""
     digests: tuple[str, ...]
     """sha256 of the files of the page, in the order of `files`."""
     campaign: str
@@ -103,6 +100,16 @@ class Entry:
     """Description of the thumbnail."""
     problem: str
     """What is wrong with the product; empty if nothing."""
+
+    @property
+    def page(self) -> str:
+        """Relative to the site."""
+        return product_page(self.path)
+
+    @property
+    def thumbnail(self) -> str:
+        """Relative to the site."""
+        return self.page.removesuffix(".html") + ".png"
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -17,30 +17,16 @@ from lidarops.netcdf.stored_flags import judge
 
 READ_BYTES: Final = 1_000_000
 """Most bytes of a variable that are read. Of a longer one, every second profile is, or fewer."""
-_SHARES: Final = (5.0, 50.0, 95.0)
 
-
-class ValueRow(NamedTuple):
-    """The usable values of one quantity, in the displayed unit, in words."""
-
-    title: str
-    """Name and unit."""
-    usable: str
-    """Share of usable values."""
-    low: str
-    """Value that 5 % are below."""
-    middle: str
-    """Median."""
-    high: str
-    """Value that 95 % are below."""
-    error: str
-    """Median of the standard errors."""
+Row = dict[str, str]
+"""The usable values of one quantity, in the displayed unit, in words, by heading: its name and
+unit, the share of usable values, percentiles, and the median of the standard errors."""
 
 
 class Values(NamedTuple):
     """Summary of the values of a product."""
 
-    rows: tuple[ValueRow, ...] = ()
+    rows: tuple[Row, ...] = ()
     every: int = 1
     """Of how many profiles one counts."""
 
@@ -73,7 +59,7 @@ def _quantities(product: xr.Dataset, kind: str) -> tuple[Quantity, ...]:
     return tuple(q for q in known if product[q.name].dims[:1] == ("time",))
 
 
-def _row(product: xr.Dataset, quantity: Quantity, every: int) -> ValueRow:
+def _row(product: xr.Dataset, quantity: Quantity, every: int) -> Row:
     some = product.isel(time=slice(None, None, every))
     whole = some[quantity.name]
 
@@ -90,12 +76,15 @@ def _row(product: xr.Dataset, quantity: Quantity, every: int) -> ValueRow:
         errors = quantity.factor * error.values.astype(np.float64)
     known = usable & np.isfinite(errors)
     title = quantity.label
-    return ValueRow(
-        f"{title[:1].upper()}{title[1:]}",
-        percent(np.count_nonzero(usable) / usable.size),
-        *_words(values[usable], _SHARES),
-        *_words(errors[known], (50.0,)),
-    )
+    low, middle, high = _words(values[usable], (5.0, 50.0, 95.0))
+    return {
+        "quantity": f"{title[:1].upper()}{title[1:]}",
+        "usable": percent(np.count_nonzero(usable) / usable.size),
+        "5 %": low,
+        "median": middle,
+        "95 %": high,
+        "median error": _words(errors[known], (50.0,))[0],
+    }
 
 
 def _words(values: NDArray[np.float64], shares: tuple[float, ...]) -> list[str]:

@@ -13,7 +13,6 @@ from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
 from lidarops.figures import browser
-from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.raster import COLUMNS
 
 LONG: dict[str, dict[str, Any]] = {
@@ -48,8 +47,7 @@ def products() -> dict[str, xr.Dataset]:
 @pytest.mark.parametrize(("kind", "name"), VIEWS)
 def test_a_figure_of_a_long_product_is_small_and_soon_drawn(products, kind, name):
     view, product = views(kind)[name], products[kind]
-    profiles = -(-product.sizes["time"] // COLUMNS)
-    content = view.read(product, ProductSource(profiles=profiles))
+    content = view.read(product, COLUMNS)
     assert content is not None
     sizes, seconds = [], []
     # CPU time, the least of five: another process may take the caches of the processor.

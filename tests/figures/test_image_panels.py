@@ -26,8 +26,7 @@ from lidarops.kinds import flags_of
 
 
 def drawn(*products):
-    profiles = -(-sum(product.sizes["time"] for product in products) // COLUMNS)
-    (figure,) = figures("signal", "signal", products, profiles=profiles)
+    (figure,) = figures("signal", "signal", products, columns=COLUMNS // len(products))
     return figure
 
 

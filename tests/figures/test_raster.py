@@ -17,7 +17,7 @@ from lidarops.figures.raster import read_raster
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 
-read = partial(read_raster, quantity="signal")
+read = partial(read_raster, quantity="signal", profiles=1)
 BITS = list(flags_of("signal"))
 BAD = flags_of("signal").rejecting
 

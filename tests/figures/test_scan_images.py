@@ -7,7 +7,6 @@ import pytest
 import xarray as xr
 from support.products.drawn import figures, images
 
-from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.panels import BLANK, codes_of
 from lidarops.products.multiangle.scan_images import read_scan
 
@@ -111,9 +110,9 @@ def test_a_blocked_beam_is_marked_where_it_ends():
 
 def test_scans_without_azimuth_or_signal_have_no_image():
     product = scan([62.0])
-    assert read_scan(product.drop_vars("beam_azimuth"), ProductSource()) is None
+    assert read_scan(product.drop_vars("beam_azimuth"), 240) is None
     product["residual"][:] = np.nan
-    assert read_scan(product, ProductSource()) is None
+    assert read_scan(product, 240) is None
 
 
 def test_few_far_outliers_do_not_set_the_colours():

@@ -1,4 +1,4 @@
-"""Panels of series hold values, errors, flags, truth and gaps."""
+"""Panels of series hold values, errors, flags and gaps."""
 
 from __future__ import annotations
 
@@ -6,35 +6,25 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
-from support.products import fabricated as fab
 from support.products.drawn import figures, labelled
-from support.products.fabricated import (
-    CHANNEL,
-    SECTIONS,
-    START,
-    homogeneous,
-    signal,
-    times,
-    truth_of,
-)
+from support.products.fabricated import SECTIONS, START, homogeneous, signal, times
 
 from lidarops.errors import ProductError
 from lidarops.figures.panels import Band, Curve
+from lidarops.figures.wording import counted
 from lidarops.flags import Quality
 from lidarops.kinds import flags_of
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 
-INSTRUMENT = {"instrument": "horizontal", "channel": CHANNEL}
 
-
-def drawn(*products, **source):
-    return figures("homogeneous", "homogeneous", products, **source)
+def drawn(*products):
+    return figures("homogeneous", "homogeneous", products)
 
 
 def values(panel):
     """Return the curves of the series."""
     return [layer for layer in panel.layers if isinstance(layer, Curve) and layer.joined
-            and "truth" not in layer.label and "ink" not in layer.style]  # fmt: skip
+            and "ink" not in layer.style]  # fmt: skip
 
 
 def test_lines_hold_the_unflagged_values_in_km():
@@ -76,12 +66,12 @@ def test_flagged_values_and_those_to_use_with_care_are_marked():
     flag = product["quality_flag"].values
     rejected = (flag & flags_of("homogeneous").rejecting) != 0
     for words, chosen in (
-        ("flagged, do not use", rejected),
+        ("do not use", rejected),
         ("use with care", (flag != 0) & ~rejected),
     ):
         (marks,) = labelled(panel, words)
         assert not marks.joined
-        assert marks.label == f"{words}: {chosen.sum()}"
+        assert marks.label == f"{words}: {counted(int(chosen.sum()), 'value')}"
         expected = 1e3 * product["total_extinction"].values.T[chosen.T]
         np.testing.assert_allclose(marks.y, expected, rtol=1e-6)
 
@@ -97,19 +87,6 @@ def test_values_beyond_the_axis_are_counted():
     product = homogeneous(times(START, 1000, 60.0), flagged=0.0, sections=SECTIONS[:1])
     product["total_extinction"].values[5, 0] = 5.0
     assert "1 value of total extinction beyond the axis" in drawn(product)[0].words
-
-
-def test_truth_is_drawn_and_named_once():
-    time = times(START, 60, 300.0)
-    product = homogeneous(time)
-    upper, lower = drawn(product, truth=truth_of(time), **INSTRUMENT)[0].panels
-    for panel, expected in (
-        (upper, 1e3 * fab.true_extinction(time)),
-        (lower, fab.true_background(time)),
-    ):
-        (truth,) = labelled(panel, "simulated truth")
-        np.testing.assert_allclose(truth.y, expected)
-    assert not labelled(drawn(product)[0].panels[0], "simulated truth")
 
 
 def test_no_line_bridges_a_gap():

@@ -92,7 +92,7 @@ def test_the_report_begins_with_outcome_difference_and_figures(
 ) -> None:
     page = run_page.build_report(simulated, tmp_path / "report").page.read_text("utf-8")
     places = [page.index(f'id="{name}"') for name in (
-        "main", "different", "figures", "summary", "failed", "refused", "truth", "processed",
+        "main", "different", "figures", "summary", "failed", "refused", "processed",
         "left-out", "flagged", "provenance",
     )]  # fmt: skip
     assert places == sorted(places)

@@ -73,6 +73,7 @@ def test_raw_files_show_all_their_channels(tmp_path: Path):
     assert description["type"] == "raw"
     assert description["start"].startswith("2026-03-01")
     assert {"analog_532o", "photon_532o"} <= {row["name"] for row in description["channels"]}
+    assert {"analog", "photon"} <= {row["kind"] for row in description["datasets"]}
     widths = {row["name"]: (row["bins"], row["bin_width"]) for row in description["channels"]}
     assert set(widths.values()) == {(4000, 7.5)}, widths
     green = {row["wavelength"] for row in description["channels"] if "532" in row["name"]}

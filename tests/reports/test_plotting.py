@@ -73,9 +73,8 @@ def test_times_ranges_and_altitudes_are_chosen(elastic: Path):
     with xr.open_dataset(elastic) as product:
         times = product["time"].values
         ranges = product["range"].values
-    chosen = Selection(
-        "aerosol_backscatter", (times[1], times[2]), (float(ranges[5]), float(ranges[19]))
-    )
+    spans = {"time": (times[1], times[2]), "range": (float(ranges[5]), float(ranges[19]))}
+    chosen = Selection("aerosol_backscatter", spans)
     (figure,) = draw_file(elastic, chosen)
     image = figure.panels[0].layers[0]
     assert isinstance(image, Image)

@@ -140,7 +140,6 @@ records = st.builds(
     products=text,
     scenes=some(outcomes),
     refused=some(granules),
-    truth=text,
     findings=findings,
     empty_scenes=st.dictionaries(text, text, max_size=2),
     more_empty_scenes=whole,
@@ -259,7 +258,7 @@ def test_damaged_field_is_named(tmp_path, keys, value, field):
     assert caught.value.file == str(path)
 
 
-@pytest.mark.parametrize("name", ["id", "scenes", "truth", "finished"])
+@pytest.mark.parametrize("name", ["id", "scenes", "finished"])
 def test_missing_field_is_named(tmp_path, name):
     path, tree = _tree(tmp_path)
     del tree["record"][name]

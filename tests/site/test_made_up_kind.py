@@ -69,7 +69,7 @@ from lidarops.figures.kind_figures import KindFigures, View
 from lidarops.figures.panels import Axis, Curve, Figure, Panel
 
 
-def read(product, source):
+def read(product, columns):
     return product.sizes["time"]
 
 

@@ -15,7 +15,7 @@ from lidarops.site.quality import read_quality
 
 def entry(available: int, profiles: int = 100, kind: str = "raman", lacking: str = "") -> Entry:
     return Entry(
-        path="odesa/lidar/x.nc", sha256="", size=1, page="product/odesa/x.html", thumbnail="x.png",
+        path="odesa/lidar/x.nc", sha256="", size=1,
         digests=(), campaign="odesa", station="odesa", place="Odesa", instrument="lidar",
         name="Lidar", kind=kind, channel="photon_355o", light="355 nm", latitude=None,
         longitude=None, altitude=None, license="", start="2026-03-01T10:00:00",
@@ -33,7 +33,7 @@ def test_the_calendar_states_the_share_of_usable_profiles():
     day = words(pages.day("odesa", "2026-03-01", by_day, None, None))
     assert "1 product; 16.0 % of profiles usable" in day.replace("\N{NO-BREAK SPACE}", " ")
     page = words(pages.year("odesa", 2026, [entry(16)], ["2026"]))
-    assert "16 % of profiles usable, 1 product" in page
+    assert "16.0 % of profiles usable, 1 product" in page.replace("\N{NO-BREAK SPACE}", " ")
 
 
 def test_availability_is_the_mean_over_retrievals():

@@ -212,8 +212,8 @@ def test_equal_archives_give_equal_bytes_for_any_number_of_workers(
 _PAGE = build._page
 
 
-def _deadly_page(kept: None, task: build._Task) -> build._Outcome:
-    if task.path == sorted(product_paths(task.products))[0]:
+def _deadly_page(kept: build._Kept, task: build._Task) -> build._Outcome:
+    if task[0] == sorted(product_paths(kept[0]))[0]:
         os._exit(9)
     return _PAGE(kept, task)
 

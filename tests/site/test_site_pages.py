@@ -78,12 +78,12 @@ def test_values_are_summarised_as_in_the_file(output: Path, kind: str) -> None:
     factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
     with xr.open_dataset(file, decode_timedelta=False) as product:
         row = read_values(product, kind).rows[0]
-        name = row.title.partition(" (")[0].lower().replace(" ", "_")
+        name = row["quantity"].partition(" (")[0].lower().replace(" ", "_")
         usable = (product["usable"] < 2) & np.isfinite(product[name])
         values = factor * product[name].astype(float).values[usable]
         errors = factor * product[f"{name}_standard_error"].astype(float).values[usable]
-    assert row.usable == percent(float(usable.mean()))
-    stated = (row.low, row.middle, row.high, row.error)
+    assert row["usable"] == percent(float(usable.mean()))
+    stated = (row["5 %"], row["median"], row["95 %"], row["median error"])
     expected = (*np.percentile(values, (5, 50, 95)), np.median(errors))
     assert stated == tuple(number(float(f"{value:.3g}")) for value in expected)
     assert all(words in page.read_text("utf-8") for words in stated)
@@ -101,10 +101,10 @@ def test_values_without_flags_are_usable_where_they_are_known(tmp_path: Path) ->
     product = xr.load_dataset(add_unknown(tmp_path)).drop_vars("quality_flag")
     product["quality_flag"] = "time", np.ones(product.sizes["time"], np.int32)
     (row,) = read_values(product, "wind").rows
-    assert (row.usable, row.error) == ("100 %", "0.2")
+    assert (row["usable"], row["median error"]) == ("100 %", "0.2")
     product["speed"][:] = np.nan
     (row,) = read_values(product, "wind").rows
-    assert (row.usable, row.middle) == ("0 %", "\u2013")
+    assert (row["usable"], row["median"]) == ("0 %", "\u2013")
 
 
 def test_only_values_that_are_shown_are_read(

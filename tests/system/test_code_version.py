@@ -70,7 +70,7 @@ def test_line_ends_change_nothing(copy: Copy):
         ("site/values.py", True),
         ("site/templates/site.css", True),
         ("figures/figures.js", True),
-        ("figures/page.css", True),
+        ("figures/templates/page.css", True),
         ("reports/run_record.py", False),
         ("products/raman/retrieval.py", False),
         ("run/staleness.py", False),

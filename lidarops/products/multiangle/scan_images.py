@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.kind_figures import ProductSource
 from lidarops.figures.panels import Axis, Curve, Figure, Image, Mark, Panel, codes_of, finite
 from lidarops.figures.raster import COLUMNS, ROWS
 from lidarops.figures.series_data import require
@@ -59,7 +58,7 @@ class Scan:
     """(beam,) m, range from which the beam is blocked; NaN for a free beam."""
 
 
-def read_scan(product: xr.Dataset, _: ProductSource) -> Scan | None:
+def read_scan(product: xr.Dataset, _: int) -> Scan | None:
     """Return the beams of the cycle with the most signals.
 
     Of a volume, those of the lowest elevation with the most azimuths, else those of the vertical

@@ -1,16 +1,18 @@
-"""The figures of the ``visibility`` product: series at crossings with the truth, a map of beams."""
+"""The figures of the ``visibility`` product: series at crossings, a map of beams."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from lidarops.figures.kind_figures import KindFigures, ProductSource, View
+from lidarops.figures.kind_figures import KindFigures, View
 from lidarops.figures.panels import (
     SERIES_MARKS,
     Axis,
@@ -22,21 +24,11 @@ from lidarops.figures.panels import (
     Words,
     number,
 )
-from lidarops.figures.series_data import (
-    Comparison,
-    SeriesEstimate,
-    TimeSeries,
-    compare,
-    float_values,
-    join,
-    require,
-)
+from lidarops.figures.series_data import TimeSeries, float_values, join, require
 from lidarops.figures.series_panels import Quantity, series_figures
-from lidarops.figures.time_axis import Times
 from lidarops.figures.wording import counted
 from lidarops.kinds import flags_of
 from lidarops.products.visibility.network import NAME
-from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
 
 Floats = NDArray[np.float64]
@@ -48,19 +40,19 @@ _EXTINCTION: Final = (
 )
 _VISIBILITY: Final = ("visibility_in_air", "visibility_in_air_lower", "visibility_in_air_upper")
 _ANGLES: Final = ("latitude", "longitude", "altitude", "zenith_angle", "azimuth")
-_SHARED: Final = ("time", "crossing_id", "beam_range", "quality_flag")
-CROSSING_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY, "time_bnds", "beam_zenith_angle")
+_SHARED: Final = ("time", "crossing_id", "quality_flag")
+CROSSING_VARIABLES: Final = (*_SHARED, *_EXTINCTION, *_VISIBILITY)
 """Variables that `read_crossings` needs."""
 MAP_VARIABLES: Final = (
     *_SHARED,
+    "beam_range",
     "visibility_in_air",
     *(f"beam_{name}" for name in _ANGLES),
     *_ANGLES[:3],
+    "provenance",
 )
 """Variables that `read_map` needs."""
 _PAIR: Final = ("time", "crossing")
-_SAME_BEAM: Final = 0.2
-"""degree; files of the truth within this zenith angle of a beam belong to it."""
 _FLAT: Final = 0.2
 """Smallest horizontal extent of a map that shows the ground, relative to the larger extent."""
 _HEIGHT: Final = 464.0
@@ -90,34 +82,24 @@ class NetworkMap:
     """Instrument of each beam."""
 
 
-def instruments_of(scene: SceneOutcome) -> tuple[str, ...]:
-    """Return the instrument of each beam of a scene from its plan; empty if it lists none."""
-    steps = scene.plan.steps if scene.plan else ()
-    for step in steps:
-        if step.name == step.product == NAME:
-            return tuple(beam["instrument"] for beam in step.settings["beams"])
-    return ()
+def instruments_of(product: xr.Dataset) -> tuple[str, ...]:
+    """Return the instrument of each beam by the plan of a product; numbers if it states none."""
+    try:
+        entities = json.loads(str(product["provenance"].item()))["entity"]
+        steps = json.loads(entities["lidarops:plan"]["lidarops:json"])["steps"]
+        beams = next(step["settings"]["beams"] for step in steps if step["name"] == NAME)
+        return tuple(str(beam["instrument"]) for beam in beams)
+    except (ValueError, LookupError, TypeError, StopIteration):
+        return tuple(f"beam {beam}" for beam in range(product.sizes["beam"]))
 
 
-def read_crossings(
-    product: xr.Dataset, truth: xr.Dataset | None = None, *, instruments: Sequence[str] = ()
-) -> list[TimeSeries]:
-    """Return the series at each crossing of a product.
+def read_crossings(product: xr.Dataset) -> list[TimeSeries]:
+    """Return the series at each crossing of a product; errors include the systematic error.
 
     Parameters
     ----------
     product : Dataset
         Kind ``visibility``.
-    truth : Dataset, optional
-        Truth of a simulated campaign.
-    instruments : sequence of str, optional
-        Instrument of each beam, to select its truth; empty for no truth.
-
-    Returns
-    -------
-    list of TimeSeries
-        Standard errors include the systematic error. The truth is the mean over the beams at the
-        crossing.
 
     Raises
     ------
@@ -126,50 +108,38 @@ def read_crossings(
     """
     require(
         product,
-        {"time": ("time",), "crossing_id": ("crossing",), "beam_range": ("beam", "crossing")}
+        {"time": ("time",), "crossing_id": ("crossing",)}
         | dict.fromkeys((*_EXTINCTION, *_VISIBILITY, "quality_flag"), _PAIR),
     )
     value, random, systematic = (float_values(product, name) for name in _EXTINCTION)
-    visibility, lower, upper = (float_values(product, name) for name in _VISIBILITY)
-    flags = product["quality_flag"].values.astype(np.int64)
-    true_extinction = _truth(product, truth, instruments)
+    visibility, lower, upper = (float_values(product, name) / 1e3 for name in _VISIBILITY)
+    values = {
+        "flag": product["quality_flag"].values.astype(np.int64),
+        "total_extinction": value,
+        "total_extinction_standard_error": np.hypot(random, systematic),
+        "visibility": visibility,
+        "visibility_standard_error": np.abs(upper - lower) / 2.0,
+    }
     time = product["time"].values.astype("datetime64[ns]")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        true_visibility = np.where(
-            true_extinction > 0, _contrast_constant(value, visibility) / true_extinction, np.nan
-        )
+    rejecting = flags_of("visibility").rejecting
     return [
         TimeSeries(
-            time=time,
-            flag=flags[:, v],
-            rejecting=flags_of("visibility").rejecting,
-            estimates={
-                "total_extinction": SeriesEstimate(
-                    value[:, v], np.hypot(random, systematic)[:, v], true_extinction[:, v], "m-1"
-                ),
-                "visibility": SeriesEstimate(
-                    visibility[:, v] / 1e3,
-                    np.abs(upper - lower)[:, v] / 2e3,
-                    true_visibility[:, v] / 1e3,
-                    "km",
-                ),
-            },
-            label=f"crossing {number}",
-            key=(number,),
+            pd.DataFrame({name: both[:, v] for name, both in values.items()}, time),
+            rejecting,
+            f"crossing {number}",
+            (number,),
         )
         for v, number in enumerate(product["crossing_id"].values.tolist())
     ]
 
 
-def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap:
+def read_map(product: xr.Dataset, _: int = 0) -> NetworkMap:
     """Return beams and crossings of a product, projected on two axes.
 
     Parameters
     ----------
     product : Dataset
         Kind ``visibility``.
-    instruments : sequence of str, optional
-        Instrument of each beam; beams are numbered without it.
 
     Raises
     ------
@@ -207,7 +177,7 @@ def read_map(product: xr.Dataset, instruments: Sequence[str] = ()) -> NetworkMap
         numbers=tuple(int(number) for number in product["crossing_id"].values),
         visibility=np.array(medians),
         axes=names,
-        instruments=tuple(instruments) or tuple(f"beam {beam}" for beam in range(len(beams))),
+        instruments=instruments_of(product),
     )
 
 
@@ -221,82 +191,17 @@ def _plane(points: Floats) -> tuple[list[int], tuple[str, str]]:
     return [0, 1], labels
 
 
-def _contrast_constant(extinction: Floats, visibility: Floats) -> float:
-    """Return visibility times extinction, -ln(contrast); NaN if it is not constant."""
-    known = np.isfinite(extinction) & np.isfinite(visibility)
-    if not known.any():
-        return float("nan")
-    products = extinction[known] * visibility[known]
-    # It varies where the conversion to another wavelength depends on visibility.
-    return float(np.median(products)) if np.ptp(products) < 0.01 * products.mean() else np.nan
-
-
-def _truth(product: xr.Dataset, truth: xr.Dataset | None, instruments: Sequence[str]) -> Floats:
-    shape = product["total_extinction"].shape
-    if truth is None or len(instruments) != product.sizes["beam"]:
-        return np.full(shape, np.nan)
-    bounds = product["time_bnds"].values.astype("datetime64[ns]")
-    zenith, ranges = float_values(product, "beam_zenith_angle"), float_values(product, "beam_range")
-    total, count = np.zeros(shape), np.zeros(shape)
-    for beam, name in enumerate(instruments):
-        for crossing in np.flatnonzero(np.isfinite(ranges[beam])):
-            times, true_values = _along(truth, name, zenith[beam], ranges[beam, crossing])
-            for row, (start, stop) in enumerate(bounds):
-                inside = true_values[(times >= start) & (times <= stop)]
-                if inside.size:
-                    total[row, crossing] += inside.mean()
-                    count[row, crossing] += 1
-    with np.errstate(invalid="ignore"):
-        return np.asarray(total / np.where(count > 0, count, np.nan))
-
-
-def _along(
-    truth: xr.Dataset, instrument: str, zenith: float, distance: float
-) -> tuple[Times, Floats]:
-    """Return times and true extinction at a distance along a beam."""
-    suffix = instrument.replace("-", "_")
-    names = np.asarray(truth["instrument"].values, dtype=np.str_)
-    if f"profile_granule_{suffix}" not in truth:
-        rows = np.flatnonzero(names == instrument)
-        true_values = float_values(truth, "total_extinction")[rows]
-    else:
-        rows = truth[f"profile_granule_{suffix}"].values.astype(np.intp)
-        middle = float_values(truth, f"range_{suffix}")
-        field = np.asarray(
-            truth[f"profile_total_extinction_{suffix}"].values[:, 0], dtype=np.float64
-        )
-        true_values = np.array([np.interp(distance, middle, row) for row in field])
-    times = truth["time"].values.astype("datetime64[ns]")[rows]
-    if "zenith_angle" in truth:
-        same_beam = np.abs(float_values(truth, "zenith_angle")[rows] - zenith) < _SAME_BEAM
-        times, true_values = times[same_beam], true_values[same_beam]
-    finite = np.isfinite(true_values)
-    return times[finite], true_values[finite]
-
-
 # Figures -----------------------------------------------------------------------------------------
 
 
-def _read_crossings(product: xr.Dataset, source: ProductSource) -> list[TimeSeries] | None:
-    instruments = instruments_of(source.scene) if source.scene else ()
-    return read_crossings(product, source.truth, instruments=instruments) or None
-
-
-def _read_map(product: xr.Dataset, source: ProductSource) -> NetworkMap:
-    return read_map(product, instruments_of(source.scene) if source.scene else ())
-
-
-def _crossings(contents: Sequence[list[TimeSeries]]) -> list[TimeSeries]:
-    return join(crossing for crossings in contents for crossing in crossings)
+def _read_crossings(product: xr.Dataset, _: int) -> list[TimeSeries] | None:
+    return read_crossings(product) or None
 
 
 def _draw_crossings(contents: Sequence[list[TimeSeries]]) -> Iterator[Figure]:
+    crossings = join(crossing for crossings in contents for crossing in crossings)
     title = "Visibility and extinction at the crossings"
-    return series_figures(_crossings(contents), _QUANTITIES, title)
-
-
-def _compare(contents: Sequence[list[TimeSeries]]) -> Iterator[Comparison | None]:
-    return (compare(crossing, "total_extinction") for crossing in _crossings(contents))
+    return series_figures(crossings, _QUANTITIES, title)
 
 
 def _draw_map(contents: Sequence[NetworkMap]) -> list[Figure]:
@@ -348,8 +253,8 @@ def _points(points: Floats, style: str, mark: Mark | None = None, label: str = "
 
 FIGURES: Final = KindFigures(
     (
-        View("visibility", CROSSING_VARIABLES, _read_crossings, _draw_crossings, _compare),
-        View("network", MAP_VARIABLES, _read_map, _draw_map, first=True),
+        View("visibility", CROSSING_VARIABLES, _read_crossings, _draw_crossings),
+        View("network", MAP_VARIABLES, read_map, _draw_map, first=True),
     ),
     preferred="visibility_in_air",
     values=(Quantity("visibility_in_air", 1e-3, "km"), Quantity("total_extinction", 1e3, "km⁻¹")),

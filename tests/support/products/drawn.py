@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarops.figures import browser
-from lidarops.figures.kind_figures import ProductSource, figures_of
+from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import BLANK, FIRST, Axis, Band, Curve, Figure, Image, Panel
 from lidarops.figures.raster import COLUMNS
 
@@ -25,10 +25,10 @@ def views(kind: str) -> dict[str, Any]:
     return {view.name: view for view in figures.views}
 
 
-def figures(kind: str, name: str, products: Sequence[Any], **source: Any) -> list[Figure]:
+def figures(kind: str, name: str, products: Sequence[Any], columns: int = COLUMNS) -> list[Figure]:
     """Return the figures of a view of products, each of which can be drawn."""
     view = views(kind)[name]
-    contents = [view.read(product, ProductSource(**source)) for product in products]
+    contents = [view.read(product, columns) for product in products]
     drawn = list(view.draw([content for content in contents if content is not None]))
     for figure in drawn:
         content = browser.inline(figure)

@@ -1,4 +1,4 @@
-"""Synthetic products, truth and run records, as the package would write them."""
+"""Synthetic products and run records, as the package would write them."""
 
 from __future__ import annotations
 
@@ -152,32 +152,6 @@ def signal(
             "wavelength": ((), 532.0, {"units": "nm"}),
         },
         attrs={"lidarops_kind": "signal"},
-    )
-
-
-def truth_of(time: np.ndarray, *, instrument: str = "horizontal", other: int = 3) -> xr.Dataset:
-    """Return the truth of one instrument, with `other` granules of a second instrument."""
-    count = time.size + other
-    all_times = np.concatenate([time, np.repeat(time[:1], other)])
-    extinction = np.concatenate([true_extinction(time), np.full(other, np.nan)])
-    path = [f"raw/h{i:05d}" for i in range(time.size)] + [f"raw/v{i:05d}" for i in range(other)]
-    return xr.Dataset(
-        {
-            "path": ("granule", np.array(path, dtype=object)),
-            "instrument": (
-                "granule",
-                np.array([instrument] * time.size + ["vertical"] * other, dtype=object),
-            ),
-            "time": ("granule", all_times),
-            "total_extinction": ("granule", extinction, {"units": "m-1"}),
-            f"background_{CHANNEL}": (
-                "granule",
-                np.concatenate([true_background(time), np.full(other, 9.0)]),
-                {"units": "MHz"},
-            ),
-            f"amplitude_{CHANNEL}": ("granule", np.full(count, 2.0e7)),
-            "damage": ("granule", np.array([""] * count, dtype=object)),
-        }
     )
 
 

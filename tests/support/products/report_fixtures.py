@@ -15,7 +15,6 @@ from support.products.fabricated import (
     run_record,
     signal,
     times,
-    truth_of,
 )
 
 
@@ -26,15 +25,13 @@ def archive(tmp_path: Path) -> Archive:
 
 
 @pytest.fixture
-def simulated(archive: Archive, tmp_path: Path) -> RunRecord:
-    """Return the record of a simulated run over one day, with truth."""
+def simulated(archive: Archive) -> RunRecord:
+    """Return the record of a run over one day."""
     time = times(START, 96, 900.0)
-    truth = tmp_path / "truth.nc"
-    truth_of(time).to_netcdf(truth)
     products = (
         archive.write("h/extinction.nc", homogeneous(time), "homogeneous"),
         archive.write("h/signal.nc", signal(time, bins=200), "signal"),
     )
     inputs = tuple(InputRecord(f"raw/h{i:05d}", Role.SIGNAL, "b" * 64) for i in range(96))
     scene = outcome("horizontal_20240301T000000", granules=96, products=products, inputs=inputs)
-    return run_record(archive.root, [scene], truth=str(truth))
+    return run_record(archive.root, [scene])
