@@ -9,7 +9,7 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
@@ -418,26 +418,19 @@ class Database:
         file = Path(self._url.database or "")
         if not self._sqlite or not self._url.database or os.access(file.parent, os.W_OK):
             return self._url
-        try:
-            return self._read_only(file)
-        except FileNotFoundError:
-            # Another user has closed it meanwhile, which removes the journal.
-            return self._as_uri(file, immutable="1")
-
-    def _read_only(self, file: Path) -> sa.URL:
         journal, index = Path(f"{file}-wal"), Path(f"{file}-shm")
-        has_journal = journal.exists()
-        if has_journal and index.exists():
+        if journal.exists() and index.exists():
             # Another user may write now.
             return self._as_uri(file, mode="ro")
-        if not has_journal or not journal.stat().st_size:
-            # Nobody has it open. SQLite would make files beside it.
-            return self._as_uri(file, immutable="1")
-        # Left by a killed process; SQLite would make its index.
-        folder = self._copied.enter_context(tempfile.TemporaryDirectory(prefix="lidarops-"))
-        for part in (file, journal):
-            shutil.copy(part, folder)
-        return self._url.set(database=str(Path(folder, file.name)))
+        with suppress(FileNotFoundError):
+            if journal.stat().st_size:
+                # Left by a killed process; SQLite would make its index.
+                folder = self._copied.enter_context(tempfile.TemporaryDirectory(prefix="lidarops-"))
+                for part in (file, journal):
+                    shutil.copy(part, folder)
+                return self._url.set(database=str(Path(folder, file.name)))
+        # Nobody has it open, or no longer: that removes the journal. SQLite would make files.
+        return self._as_uri(file, immutable="1")
 
     def _as_uri(self, file: Path, **query: str) -> sa.URL:
         return self._url.set(database=file.absolute().as_uri(), query={"uri": "true", **query})
@@ -590,22 +583,17 @@ def _tune_sqlite(connection: Any, _record: Any) -> None:
     cursor = connection.cursor()
     cursor.execute(f"PRAGMA busy_timeout={1000 * _PATIENCE}")
     # Query first, because setting it writes.
-    if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
-        _set_journal(cursor)
-    cursor.execute("PRAGMA synchronous=NORMAL")
-    cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.close()
-
-
-def _set_journal(cursor: Any) -> None:
+    is_set = cursor.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
     end = time.monotonic() + _PATIENCE
-    while True:
+    while not is_set:
         try:
             cursor.execute("PRAGMA journal_mode=WAL")
+            is_set = True
         except sqlite3.OperationalError as error:
             # Two processes that set it at once would wait for each other: SQLite waits for neither.
             if "locked" not in str(error) or time.monotonic() > end:
                 raise
             time.sleep(_PAUSE)
-        else:
-            return
+    cursor.execute("PRAGMA synchronous=NORMAL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.close()

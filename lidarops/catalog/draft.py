@@ -115,7 +115,7 @@ def draft_campaign(
     CatalogError
         If the folder holds no raw file that can be used.
     """
-    known, lone = _instruments(contents)
+    known, lone = drafted_instruments(contents)
     if not known:
         reasons = [reason for _, reason in contents.refused[:1]]
         packed = "".join(f"unpack {path}, or " for path in _packed(contents)[:1])
@@ -150,15 +150,13 @@ def draft_campaign(
     return "\n".join([*lines, *_left_out(contents, archive, lone), ""])
 
 
-def drafted_instruments(contents: FolderContents) -> dict[str, InstrumentHeaders]:
-    """Return the instruments of a draft by their keys; none where no raw file can be used."""
-    return _instruments(contents)[0]
-
-
-def _instruments(
+def drafted_instruments(
     contents: FolderContents,
 ) -> tuple[dict[str, InstrumentHeaders], list[FileGroup]]:
-    """Return the instruments of a draft by their keys, and groups of beams that are left out."""
+    """Return the instruments of a draft by their keys, and groups of beams that are left out.
+
+    There is none where no raw file can be used.
+    """
     tests = [group for group in contents.groups if group.purpose not in _USED]
     if not any(group.purpose is Purpose.MEASUREMENT for group in contents.groups):
         tests = []
@@ -198,7 +196,7 @@ def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
     Longitude is first, unless the second one cannot be a latitude.
     """
     low, high = _ALTITUDES
-    altitude = group.altitude
+    altitude = group.headers[0].altitude
     known = altitude if altitude is not None and low <= altitude <= high else None
     coordinates = group.coordinates
     if coordinates is None or max(map(abs, coordinates)) > 180.0:
@@ -254,7 +252,10 @@ def _instrument(
     if doubtful:
         yield f"    name_times: ignored  # ? {doubtful[0].time_doubt}"
     yield from _facts(headers, estimates=estimates)
-    yield from _products(headers)
+    yield "    products:"
+    for kind in kinds_of(Scope.CHANNEL):
+        if kind.draft:
+            yield from (f"      {line}" for line in kind.draft(headers))
 
 
 def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
@@ -349,9 +350,10 @@ def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:
 
 def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
     angles = sorted({angle for group in headers.signal for angle in group.zenith_angles})
-    sides = {side for group in headers.signal for side in group.azimuths}
+    stated = [header for group in headers.signal for header in group.headers]
+    sides = {header.azimuth for header in stated if not header.doubt} - {None}
     doubts = [doubt for group in headers.signal for doubt in group.doubts]
-    refused = headers.without_zenith if doubts else 0
+    refused = sum(group.without_zenith for group in headers.signal) if doubts else 0
     # A fact would hold for the files with doubtful pointings too.
     mark = "# " if refused else ""
     if not angles:
@@ -362,19 +364,12 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
             f" headers, over {len(sides) or 'no known'} azimuths"
         )
     else:
-        notes = {note for group in headers.signal for note in group.notes if POINTING_NOTE in note}
+        notes = {note for header in stated for note in header.notes if POINTING_NOTE in note}
         source = "; ".join(sorted(notes)) or f"headers state {angles[0]:g}"
         yield f"{mark}zenith_angle: {abs(angles[0]):g}  # ? degree, {source}"
     if refused:
         yield f"# ? {refused} files state no sure pointing and are refused without zenith_angle"
         yield from (f"#   {doubt}" for doubt in doubts[:1])
-
-
-def _products(headers: InstrumentHeaders) -> Iterator[str]:
-    yield "    products:"
-    for kind in kinds_of(Scope.CHANNEL):
-        if kind.draft:
-            yield from (f"      {line}" for line in kind.draft(headers))
 
 
 def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from lidarops.catalog.sources import RawFile, Source, printable
+from lidarops.catalog.sources import Source, printable
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, read_start
 from lidarops.raw.header import RawHeader
@@ -29,6 +29,7 @@ from lidarops.records import (
     Status,
     day_of,
 )
+from lidarops.system.stores import Stored
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, Station
@@ -66,7 +67,7 @@ class GranuleRow(NamedTuple):
 class UnreadFile(NamedTuple):
     """A file whose header must be read."""
 
-    file: RawFile
+    file: Stored
     instrument: str
     role: Role
     rivals: tuple[str, ...]

@@ -13,9 +13,6 @@ from pathlib import Path
 from lidarops.errors import UnavailableError
 from lidarops.system.stores import RemoteStore, Stored
 
-RawFile = Stored
-"""A file of the archive, as the file system lists it."""
-
 
 def printable(path: str) -> str:
     """Return a path that can be stored and shown: names may hold bytes that are not UTF-8."""
@@ -58,7 +55,7 @@ class Source:
     def files(
         self,
         is_used: Callable[[str], bool] = lambda _: True,  # noqa: ARG002 - sizes cost nothing here
-    ) -> Iterator[RawFile]:
+    ) -> Iterator[Stored]:
         """List files, sorted by path; those that are not used may have no size."""
         self.refuse_absent()
         yield from self._files_below(str(self._root), "")
@@ -77,7 +74,7 @@ class Source:
                 remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
             )
 
-    def _files_below(self, folder: str, prefix: str) -> Iterator[RawFile]:
+    def _files_below(self, folder: str, prefix: str) -> Iterator[Stored]:
         try:
             with os.scandir(folder) as listing:
                 entries = [(entry, entry.is_dir(follow_symlinks=False)) for entry in listing]
@@ -96,9 +93,9 @@ class Source:
                 status = entry.stat()
             except OSError:
                 # A broken link is listed too, so that it is reported as unreadable.
-                yield RawFile(path, 0, 0)
+                yield Stored(path, 0, 0)
             else:
-                yield RawFile(path, status.st_size, status.st_mtime_ns)
+                yield Stored(path, status.st_size, status.st_mtime_ns)
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""

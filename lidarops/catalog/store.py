@@ -91,20 +91,6 @@ class NewProduct:
     inputs: tuple[InputRecord, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class SceneEntry:
-    """The outcome of one scene, entered as it ends."""
-
-    outcome: SceneOutcome
-    day: int
-    key: str
-    final: bool
-    """Whether another try on the same inputs would end the same way."""
-    products: tuple[NewProduct, ...] = ()
-    digests: Mapping[str, str] = field(default_factory=dict)
-    """SHA-256 of raw files by path, as far as the catalog does not have them yet."""
-
-
 class RawSet(NamedTuple):
     """Raw files of one role that belong to some products."""
 
@@ -121,6 +107,7 @@ class LastTry(NamedTuple):
     internal: str
     """Traceback if the error is internal, a bug of lidarops; else empty."""
     final: bool
+    """Whether another try on the same inputs would end the same way."""
     crashes: int
     day: int
 
@@ -265,26 +252,41 @@ class Store(Granules):
             statement = self.insert(SCENE).on_conflict_do_update(index_elements=keys, set_=again)
             connection.execute(statement, row)
 
-    def record(self, entry: SceneEntry, run: str, token: str) -> None:
-        """Enter the outcome of a scene in one transaction: products, inputs, digests, timings."""
-        outcome = entry.outcome
+    def record(
+        self,
+        outcome: SceneOutcome,
+        products: Collection[NewProduct],
+        digests: Mapping[str, str],
+        tried: LastTry,
+        *,
+        run: str,
+        token: str,
+    ) -> None:
+        """Enter the outcome of a scene in one transaction, as it ends.
+
+        Parameters
+        ----------
+        outcome : SceneOutcome
+        products : collection of NewProduct
+        digests : mapping of str to str
+            SHA-256 of raw files by path, as far as the catalog does not have them yet.
+        tried : LastTry
+        run, token : str
+        """
+        ours = {"campaign": self.campaign, "scene": outcome.scene}
         with self._writing(token) as connection:
-            self._enter_products(connection, entry, run)
-            row = {
-                "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
-                "key": entry.key, "run": run, "error": outcome.error,
-                "internal": outcome.internal, "final": entry.final, "crashes": 0,
-            }  # fmt: skip
-            connection.execute(self.upsert(SCENE), row)
+            if products:
+                self._enter_products(connection, products, {**ours, "day": tried.day, "run": run})
+            connection.execute(self.upsert(SCENE), {**ours, "run": run, **tried._asdict()})
             place = {"run": run, "scene": outcome.scene}
             stages = [{**place, "stage": name, "seconds": s} for name, s in outcome.seconds.items()]
             if stages:
                 connection.execute(self.upsert(STAGE, replacing=False), stages)
             if outcome.error:
-                day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == entry.day
+                day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == tried.day
                 connection.execute(sa.delete(VERDICT).where(*day))
-            if entry.digests:
-                connection.execute(*self._digests(entry.digests))
+            if digests:
+                connection.execute(*self._digests(digests))
             self._refuse(connection, outcome.refused)
             connection.execute(
                 sa.update(RUN)
@@ -297,14 +299,14 @@ class Store(Granules):
                 )
             )
 
-    def _enter_products(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
-        made = {new.record.path: new for new in entry.products}
-        if not made:
-            return
+    def _enter_products(
+        self, connection: sa.Connection, products: Iterable[NewProduct], scene: Mapping[str, Any]
+    ) -> None:
+        made = {new.record.path: new for new in products}
         ours = {"campaign": self.campaign}
         self._drop_products(connection, made)
-        scene = {**ours, "scene": entry.outcome.scene, "day": entry.day, "run": run}
-        connection.execute(sa.insert(PRODUCT), [scene | _product_row(new) for new in made.values()])
+        rows = [{**scene, **_product_row(new)} for new in made.values()]
+        connection.execute(sa.insert(PRODUCT), rows)
         sets: dict[str, list[InputRecord]] = {}
         links = []
         for path, new in made.items():

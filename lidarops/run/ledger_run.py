@@ -6,7 +6,7 @@ import logging
 import secrets
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
@@ -16,7 +16,7 @@ from lidarops import __version__
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import NewProduct, Run, RunStatus, SceneEntry, Store, Verdict
+from lidarops.catalog.store import LastTry, NewProduct, Run, RunStatus, Store, Verdict
 from lidarops.errors import CatalogError
 from lidarops.records import (
     Findings,
@@ -39,24 +39,24 @@ MOST_EMPTY_SCENES: Final = 1000
 _LOG = logging.getLogger(__name__)
 
 
+@dataclass(slots=True)
 class JudgedDays:
     """What the judging of some days told, as they were judged last."""
 
-    def __init__(self) -> None:
-        self.orphans: dict[str, Orphan] = {}
-        """By path."""
-        self.set_aside: dict[str, Granule] = {}
-        """By path."""
-        self.held: dict[str, Judgement] = {}
-        """By scene."""
-        self.frozen: dict[str, str] = {}
-        """Product of a frozen period that would be replaced -> why."""
-        self.empty_scenes: dict[str, str] = {}
-        """Scene -> why it can give no product."""
-        self.verdicts: dict[int, Verdict] = {}
-        """Of settled days, without signature; of those in `open` once all their scenes succeed."""
-        self.open: dict[int, set[str]] = defaultdict(set)
-        """Days with stale products -> scenes."""
+    orphans: dict[str, Orphan] = field(default_factory=dict)
+    """By path."""
+    set_aside: dict[str, Granule] = field(default_factory=dict)
+    """By path."""
+    held: dict[str, Judgement] = field(default_factory=dict)
+    """By scene."""
+    frozen: dict[str, str] = field(default_factory=dict)
+    """Product of a frozen period that would be replaced -> why."""
+    empty_scenes: dict[str, str] = field(default_factory=dict)
+    """Scene -> why it can give no product."""
+    verdicts: dict[int, Verdict] = field(default_factory=dict)
+    """Of settled days, without signature; of those in `open` once all their scenes succeed."""
+    open: dict[int, set[str]] = field(default_factory=lambda: defaultdict(set))
+    """Days with stale products -> scenes."""
 
     def note(self, judged: DaysJudged) -> None:
         """Note what was told of some days, in place of what was told before."""
@@ -152,14 +152,10 @@ class LedgerRun:
         raw = (*judged.scene.granules, *judged.scene.dark)
         known = {granule.path: granule.sha256 for granule in raw}
         read = {used.path: used.sha256 for used in outcome.inputs if used.path in known}
-        entry = SceneEntry(
-            outcome=outcome,
-            day=judged.day,
-            key=judge.key(judged, internal=True) if outcome.internal else judged.key,
-            final=final and len(new) == reported,
-            products=tuple(new),
-            digests=dict(read.items() - known.items()),
-        )
+        key = judge.key(judged, internal=True) if outcome.internal else judged.key
+        final = final and len(new) == reported
+        tried = LastTry(key, outcome.error, outcome.internal, final, crashes=0, day=judged.day)
+        digests = dict(read.items() - known.items())
         planned = set(() if outcome.plan is None else outcome.plan.left_out)
         others = tuple(left for left in judged.requested.left_out if left not in planned)
         # Share equal tuples: nearly all scenes of an instrument have the same.
@@ -172,7 +168,8 @@ class LedgerRun:
         # First, so that whatever the ledger knows is in the report, also of a run that is killed.
         if self._journal:
             self._journal.write(brief)
-        self._store.record(entry, run.id, self._lock.token)
+        token = self._lock.token
+        self._store.record(outcome, new, digests, tried, run=run.id, token=token)
         if _went_as_planned(judged, outcome, known):
             self.fresh.add(judged.scene.id)
         now = {record.path: record.sha256 for record in outcome.products}

@@ -103,7 +103,10 @@ class Pass:
         """
         options, told = self.options, self.told
         clean = unused(self.known, self.signatures.keys() - set(self.days))
-        self._forget(self.store.scenes_of_other_days(self.signatures))
+        gone = self.store.scenes_of_other_days(self.signatures)
+        if gone:
+            self.lock.acquire_unchanged()
+            self.store.forget_scenes(gone)
         status = RunStatus.FINISHED
         if self.days:
             if options.workers > 1 and not options.cluster and self.client is None:
@@ -181,26 +184,28 @@ class Pass:
                 self.lock.acquire_unchanged()
                 client = self._cluster(stack, self.options.workers)
             if first is not None:
-                note = client is None
-                ended = process_jobs(
-                    chain([first], jobs),
-                    client=client,
-                    stop=self.stop,
-                    taken=lambda job: self.run.take(self.judgements[job.scene.id], note=note),
-                    memory=_bytes(self.options.memory),
-                )
-                self._enter(ended)
+                self._make(chain([first], jobs), client)
             if self.suspects and not self.stop:
                 client = client or self._cluster(stack, 1)
                 if client is not None:
-                    ended = process_jobs(
-                        self.suspects,
-                        client=client,
-                        stop=self.stop,
-                        taken=lambda job: self.run.take(self.judgements[job.scene.id]),
-                        alone=True,
-                    )
-                    self._enter(ended)
+                    self._make(self.suspects, client, alone=True)
+
+    def _make(self, jobs: Iterable[Job], client: Client | None, *, alone: bool = False) -> None:
+        """Carry out jobs, here where there is no cluster, and enter them as they end."""
+        memory = None
+        if self.options.memory is not None:
+            from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
+
+            memory = int(parse_bytes(self.options.memory))
+        ended = process_jobs(
+            jobs,
+            client=client,
+            stop=self.stop,
+            taken=lambda job: self.run.take(self.judgements[job.scene.id], note=client is None),
+            memory=memory,
+            alone=alone,
+        )
+        self._enter(ended)
 
     def _cluster(self, stack: ExitStack, workers: int) -> Client | None:
         """Start or reach a cluster; None if a signal came first, which then ends the run."""
@@ -275,12 +280,7 @@ class Pass:
             self.lock.acquire_unchanged()
             self.store.store_digests(judged.digests)
             self.store.touch_products(judged.touched)
-            self._forget(judged.gone)
-
-    def _forget(self, scenes: Collection[str]) -> None:
-        if scenes:
-            self.lock.acquire_unchanged()
-            self.store.forget_scenes(scenes)
+            self.store.forget_scenes(judged.gone)
 
     def _settle(self, *, stopped: bool) -> None:
         """Record the days on which everything is fresh; they are not judged again until changed."""
@@ -310,15 +310,6 @@ class Pass:
         if new:
             self.lock.acquire_unchanged()
             self.store.store_verdicts(new)
-
-
-def _bytes(size: str | None) -> int | None:
-    """Return a size such as ``2GiB`` in bytes."""
-    if size is None:
-        return None
-    from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
-
-    return int(parse_bytes(size))
 
 
 def _signed(

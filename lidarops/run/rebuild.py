@@ -13,7 +13,7 @@ from typing import Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.store import Dependence, NewProduct, RunStatus, SceneEntry, Store
+from lidarops.catalog.store import Dependence, LastTry, NewProduct, RunStatus, Store
 from lidarops.errors import LidarOpsError, ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import product_path
@@ -101,10 +101,11 @@ def rebuild_ledger(
             present = {judged.scene.id for judged in judge.days(batch).judgements}
             scenes = ((day, *group) for day in batch for group in groupby(read(days[day]), _scene))
             for day, scene, products in scenes:
-                entry = _entry(day, tuple(products))
-                store.record(entry, run.begin().id, lock.token)
-                rebuilt.entered += len(entry.products)
-                rebuilt.without_scene += 0 if scene in present else len(entry.products)
+                outcome, new = _outcome(tuple(products))
+                tried = LastTry("", "", "", final=False, crashes=0, day=day)
+                store.record(outcome, new, {}, tried, run=run.begin().id, token=lock.token)
+                rebuilt.entered += len(new)
+                rebuilt.without_scene += 0 if scene in present else len(new)
         run.conclude(RunStatus.FINISHED, Findings(), JudgedDays())
     return rebuilt
 
@@ -180,7 +181,8 @@ def _verdicts(file: Path) -> Verdicts:
     return counts.verdicts
 
 
-def _entry(day: int, products: tuple[_Product, ...]) -> SceneEntry:
+def _outcome(products: tuple[_Product, ...]) -> tuple[SceneOutcome, tuple[NewProduct, ...]]:
+    """Return the outcome of a scene that gave some products, and these."""
     recipe = products[0][0]
     keys, scene = recipe.settings["keys"], recipe.plan.scene
     inputs = [used for stated, _ in products for used in stated.inputs]
@@ -194,4 +196,4 @@ def _entry(day: int, products: tuple[_Product, ...]) -> SceneEntry:
         plan=None,
         products=tuple(entry.record for entry in new),
     )
-    return SceneEntry(outcome=outcome, day=day, key="", final=False, products=new)
+    return outcome, new

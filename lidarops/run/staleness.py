@@ -7,10 +7,9 @@ other product is stale, and the reason is stated.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any, Final
 
@@ -55,6 +54,7 @@ from lidarops.run.scenes import (
     cut_scenes,
     months_of_products,
     name_unused,
+    start_time,
 )
 from lidarops.scene import dependence
 from lidarops.scene.dependence import ProductKey, ancillary_files
@@ -212,14 +212,17 @@ class Judge(DayStates):
 
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
+        counts = Counter[int]()
+        for day_sum in self.store.day_sums():
+            counts[day_sum.day] += day_sum.good
         group: list[int] = []
         held = 0
         for day in sorted(days):
-            if group and held + self._counts[day] > MOST_GRANULES:
+            if group and held + counts[day] > MOST_GRANULES:
                 yield tuple(group)
                 group, held = [], 0
             group.append(day)
-            held += self._counts[day]
+            held += counts[day]
         if group:
             yield tuple(group)
 
@@ -320,14 +323,6 @@ class Judge(DayStates):
         return Source.of(self.campaign.archive)
 
     @cached_property
-    def _counts(self) -> dict[int, int]:
-        """Number of good granules of each day."""
-        counts: dict[int, int] = defaultdict(int)
-        for day_sum in self.store.day_sums():
-            counts[day_sum.day] += day_sum.good
-        return counts
-
-    @cached_property
     def lost(self) -> Lost:
         """Raw files of products that the archive no longer gives; looked up once."""
         return find_lost(self.campaign, self.store)
@@ -339,16 +334,19 @@ class Judge(DayStates):
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
         kept, refused, noted = without_outlying(granules, used, self._header, self._ahead)
-        aside = [granule for granule in refused if day_of(_moment(granule)) in days]
+        aside = [granule for granule in refused if day_of(start_time(granule)) in days]
         cut = cut_scenes(
             self.campaign,
             [
                 granule
                 for granule in kept
-                if granule.role is Role.DARK or day_of(_moment(granule)) in days
+                if granule.role is Role.DARK or day_of(start_time(granule)) in days
             ],
         )
-        unused = [*self.refused, *(RefusedFile(granule, _moment(granule)) for granule in refused)]
+        unused = [
+            *self.refused,
+            *(RefusedFile(granule, start_time(granule)) for granule in refused),
+        ]
         recorded = defaultdict[str, list[RecordedProduct]](list)
         for product in products:
             recorded[product.scene].append(product)
@@ -364,7 +362,7 @@ class Judge(DayStates):
             file_notes=tuple(
                 FileNote(granule.instrument, note, contradicts=False, files=1)
                 for granule, note in noted
-                if day_of(_moment(granule)) in days
+                if day_of(start_time(granule)) in days
             ),
         )
 
@@ -373,7 +371,7 @@ class Judge(DayStates):
         instrument = self.campaign.instruments[granule.instrument]
         if instrument.name_times == "ignored":
             return None
-        return instrument.facts_at(_moment(granule)).clock_offset
+        return instrument.facts_at(start_time(granule)).clock_offset
 
     def _months(self, days: set[int]) -> Iterator[Scene]:
         """Yield the months that begin on some days, of which products are made."""
@@ -682,7 +680,7 @@ def _verdicts(
             if judged.empty_reason:
                 verdict.empty_scenes[judged.scene.id] = judged.empty_reason
     for granule in set_aside:
-        if verdict := verdicts.get(day_of(_moment(granule))):
+        if verdict := verdicts.get(day_of(start_time(granule))):
             verdict.set_aside[granule.path] = granule.reason
     return verdicts
 
@@ -704,7 +702,3 @@ def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> st
             others = f" and {len(files) - 1} more" if len(files) > 1 else ""
             changes.append(f"{word}: {first.role.value} {first.path}{others}")
     return "; ".join(changes) or "its inputs changed"
-
-
-def _moment(granule: Granule) -> datetime:
-    return granule.start or datetime.min.replace(tzinfo=UTC)

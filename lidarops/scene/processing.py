@@ -260,7 +260,11 @@ class _Work(ABC):
 
     def _add(self, rows: xr.Dataset, writer: ProductWriter) -> None:
         self.laps.end("retrieve")
-        writer.add(_told_from_gaps(rows))
+        flags = {str(name): rows[name] for name in rows if str(name).endswith(QUALITY_FLAG)}
+        dark, missing = int(Quality.NO_SIGNAL), int(Quality.INPUT_MISSING)
+        # Where there is no light, no data are missing.
+        flags = {n: f.where((f & dark) == 0, f & ~missing) for n, f in flags.items()}
+        writer.add(rows.assign(flags))
         self.laps.end("write")
 
 
@@ -369,13 +373,6 @@ class _Instrument(_Work):
                 compared.append(Retrieved(common, contexts[kind], frame, tuple(results)))
             else:
                 self._write(contexts[kind], itertools.chain([frame], results))
-
-
-def _told_from_gaps(rows: xr.Dataset) -> xr.Dataset:
-    """Return rows of a product in whose flags no data are missing where there is no light."""
-    flags = {str(name): rows[name] for name in rows if str(name).endswith(QUALITY_FLAG)}
-    dark, missing = int(Quality.NO_SIGNAL), int(Quality.INPUT_MISSING)
-    return rows.assign({n: f.where((f & dark) == 0, f & ~missing) for n, f in flags.items()})
 
 
 def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> xr.Dataset:
