@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import sqlite
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.sources import Source
+from lidarops.catalog.raw_files import Source
 from lidarops.errors import CatalogError, LidarOpsError, UnavailableError
 
 SCHEMA_VERSION: Final = 12

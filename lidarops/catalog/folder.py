@@ -14,8 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.catalog.headers import HEADER_BYTES
-from lidarops.catalog.sources import Source, literal_pattern, path_pattern, printable
+from lidarops.catalog.raw_files import (
+    HEADER_BYTES,
+    Source,
+    literal_pattern,
+    path_pattern,
+    printable,
+)
 from lidarops.constants import FIXED, STEEPEST
 from lidarops.errors import RawFormatError, RetrievalInputError
 from lidarops.raw.formats import parse_raw_header, time_in_path

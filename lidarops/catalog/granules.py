@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import sqlalchemy as sa
 
 from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
-from lidarops.catalog.headers import NO_NOTES, GranuleRow
+from lidarops.catalog.raw_files import NO_NOTES, GranuleRow
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
     INVALID,

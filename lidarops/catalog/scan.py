@@ -15,8 +15,17 @@ from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
-from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row, unread_row
-from lidarops.catalog.sources import RemoteSource, Source, path_pattern, printable
+from lidarops.catalog.raw_files import (
+    GranuleRow,
+    Headers,
+    RemoteSource,
+    Source,
+    UnreadFile,
+    path_pattern,
+    printable,
+    read_row,
+    unread_row,
+)
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import UNREADABLE, IdlePattern, Role, Status, digest

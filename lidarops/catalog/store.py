@@ -26,8 +26,8 @@ from lidarops.catalog.database import (
     VERDICT,
 )
 from lidarops.catalog.granules import Granules
-from lidarops.catalog.headers import RETRY, row_of
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.raw_files import RETRY, row_of
 from lidarops.errors import CatalogError
 from lidarops.kinds import kinds
 from lidarops.records import (

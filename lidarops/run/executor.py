@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from lidarops.errors import SceneError
 from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.run.clusters import WORKER_TIMEOUT, ClusterError
-from lidarops.scene.job import Failure, Job, guarded
-from lidarops.scene.memory import scene_memory
+from lidarops.scene.job import Failure, Job, guarded, scene_memory
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.processes import keep_memory
 

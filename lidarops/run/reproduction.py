@@ -285,15 +285,11 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
         yield Difference("processing", recipe.plan.scene, problem)
         return
     if record.sha256 != sha256_of(recipe.file):
-        yield from _compared(recipe.file, out / "products" / record.path)
-
-
-def _compared(before: Path, after: Path) -> list[Difference]:
-    """Return the differences between two NetCDF files whose bytes differ."""
-    old, new = (opened_product(file, decode_cf=False) for file in (before, after))
-    same = Difference("bytes", before.name, "the same content, stored in other bytes")
-    with old as recorded, new as made:
-        return list(_differences(recorded, made)) or [same]
+        files = (recipe.file, out / "products" / record.path)
+        old, new = (opened_product(file, decode_cf=False) for file in files)
+        same = Difference("bytes", recipe.file.name, "the same content, stored in other bytes")
+        with old as recorded, new as made:
+            yield from list(_differences(recorded, made)) or [same]
 
 
 def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[Difference]:

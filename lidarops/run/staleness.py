@@ -14,8 +14,7 @@ from functools import cached_property
 from typing import Any, Final
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.headers import HEADER_BYTES
-from lidarops.catalog.sources import Source
+from lidarops.catalog.raw_files import HEADER_BYTES, Source
 from lidarops.catalog.store import Dependence, LastTry, RecordedProduct, Store, Verdict
 from lidarops.errors import ProductError, RawFormatError
 from lidarops.kinds import kinds

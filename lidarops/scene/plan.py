@@ -44,8 +44,8 @@ from lidarops.scene.case import (
     prepared_channels,
     product_channel,
 )
-from lidarops.scene.dependence import ProductKey, scene_facts
-from lidarops.scene.pipe import AIR, PIPE, plan_stages
+from lidarops.scene.dependence import ProductKey, places_by_need, scene_facts
+from lidarops.scene.pipe import AIR, plan_molecular, plan_stages
 from lidarops.scene.retrieval import Derivation, NetworkCase, NetworkRetrieval, Retrieval, making
 from lidarops.settings import ChannelProduct
 
@@ -223,7 +223,7 @@ def _channel_entries(case: ChannelCase[Any]) -> list[Entry]:
         elif not kind.reads:
             products.append(own.leave(kind.name, NOT_REQUESTED, rule=REQUEST))
     needed = any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep))
-    return [*stages, *([PIPE[AIR](case)] if needed else []), *products]
+    return [*stages, *([plan_molecular(case)] if needed else []), *products]
 
 
 def _linked(entries: Sequence[Entry]) -> list[Entry]:
@@ -231,12 +231,6 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
 
     A product also needs those with which it is compared: of channels that measure the same.
     """
-    # A product of a whole network needs entries of every member.
-    held = {
-        (e.channel, instrument, e.product, e.name)
-        for e in entries
-        for instrument in (e.instrument, "")
-    }
     steps = [entry for entry in entries if isinstance(entry, PlannedStep)]
     wavelengths = {s.channel: s.settings["wavelength"] for s in steps if s.name == READ_STEP}
     alike: defaultdict[tuple[str, float], list[str]] = defaultdict(list)
@@ -246,18 +240,17 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
         if kind.common and not kind.reads:
             alike[kind.name, wavelengths[step.channel]].append(step.channel)
     linked: list[Entry] = []
-    for entry in entries:
+    for entry, found in zip(entries, places_by_need(entries), strict=True):
         if isinstance(entry, LeftOut):
             linked.append(entry)
             continue
+        # Products that are read are there, of the scene or of the month.
         read = kinds()[entry.name].reads if entry in products else ()
-        needs = []
-        for need in entry.needs:
-            channel, _, name = need.rpartition("/")
-            place = channel or entry.channel, entry.instrument
-            # Products that are read are there, of the scene or of the month.
-            if name in read or {(*place, "", name), (*place, entry.product, name)} & held:
-                needs.append(need)
+        needs = [
+            need
+            for need, places in zip(entry.needs, found, strict=True)
+            if places or need.rpartition("/")[2] in read
+        ]
         compared = alike.get((entry.name, wavelengths.get(entry.channel, 0.0)), ())
         needs += [f"{other}/{entry.name}" for other in compared if other != entry.channel]
         linked.append(replace(entry, needs=tuple(needs)))

@@ -18,8 +18,7 @@ from lidarops.errors import SceneError
 from lidarops.run.archive import Options, reprocess
 from lidarops.run.clusters import local_client
 from lidarops.run.executor import USABLE, fitted
-from lidarops.scene.job import Job
-from lidarops.scene.memory import PROCESS, SceneMemory, scene_memory
+from lidarops.scene.job import PROCESS, Job, SceneMemory, scene_memory
 
 
 @pytest.fixture
