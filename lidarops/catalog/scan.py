@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from itertools import chain
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
@@ -72,8 +72,7 @@ class ScanSummary:
     """Patterns of the campaign that match no file."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Claim:
+class _Claim(NamedTuple):
     """A file pattern of one role of one instrument."""
 
     instrument: str

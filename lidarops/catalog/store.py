@@ -64,8 +64,7 @@ class Dependence:
     code_version: str
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedProduct:
+class RecordedProduct(NamedTuple):
     """A product in the ledger."""
 
     path: str
@@ -81,8 +80,7 @@ class RecordedProduct:
     stamp: Stamp
 
 
-@dataclass(frozen=True, slots=True)
-class NewProduct:
+class NewProduct(NamedTuple):
     """A new product for the ledger."""
 
     record: ProductRecord

@@ -414,7 +414,6 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
         Memory limit of a worker, such as ``2GiB``; default an equal share of the machine's memory.
         A worker that exceeds it is restarted, and its scene is tried again.
     """
-    import dask  # noqa: PLC0415 - takes a second to import
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
     started = {"distributed.worker.multiprocessing-method": start_method()}
@@ -502,7 +501,11 @@ def scaled_deployment(
 
 def _scale(api: str, namespace: str, deployment: str, replicas: int) -> None:
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/{deployment}/scale"
-    connection = _to_api(api)
+    address = urlsplit(api)
+    connection = HTTPConnection(address.netloc, timeout=_API_TIMEOUT)
+    if address.scheme == "https":
+        context = ssl.create_default_context(cafile=str(IDENTITY / "ca.crt"))
+        connection = HTTPSConnection(address.netloc, timeout=_API_TIMEOUT, context=context)
     try:
         connection.request(
             "PATCH",
@@ -521,11 +524,3 @@ def _scale(api: str, namespace: str, deployment: str, replicas: int) -> None:
         connection.close()
     if response.status >= 300:
         raise ConnectionError(f"{api}{path}: {response.status} {text[:500]}")
-
-
-def _to_api(api: str) -> HTTPConnection:
-    address = urlsplit(api)
-    if address.scheme == "http":
-        return HTTPConnection(address.netloc, timeout=_API_TIMEOUT)
-    context = ssl.create_default_context(cafile=str(IDENTITY / "ca.crt"))
-    return HTTPSConnection(address.netloc, timeout=_API_TIMEOUT, context=context)

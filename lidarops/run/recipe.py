@@ -69,7 +69,10 @@ class Recipe:
                 inputs=_inputs(entities, document["used"]),
                 code_version=software["lidarops:code_version"],
                 versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
-                stamp=_stamp(attributes_of_file),
+                stamp=Stamp(
+                    int(attributes_of_file["product_version"]),
+                    datetime.fromisoformat(str(attributes_of_file["date_modified"])),
+                ),
             )
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise _insufficient(file, repr(error)) from error
@@ -155,9 +158,8 @@ class Recipe:
         keys = part["keys"]
         start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
         raw = (record for record in inputs if record.role in RAW)
-        granules = [_granule(archive, record, keys["instrument"], part["facts"]) for record in raw]
-        granules = [_named(granule, self.plan, part["facts"]) for granule in granules]
-        granules.sort(key=_order)
+        read = (_granule(archive, record, keys["instrument"], part["facts"]) for record in raw)
+        granules = sorted((_named(g, self.plan, part["facts"]) for g in read), key=_order)
         return Scene(
             id=self.plan.scene,
             campaign=self.campaign_name,
@@ -224,11 +226,6 @@ def _inputs(
         )
         for use in numbered
     )
-
-
-def _stamp(attributes: Mapping[str, Any]) -> Stamp:
-    written = datetime.fromisoformat(str(attributes["date_modified"]))
-    return Stamp(int(attributes["product_version"]), written)
 
 
 def _instrument(settings: Mapping[str, Any], products: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -132,37 +131,32 @@ def _staged(
 ) -> Iterator[tuple[Path, list[Difference]]]:
     """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
-        staged = Path(name)
+        staged, fetched = Path(name, "staged"), Path(name, "fetched")
+        staged.mkdir()
         store = RemoteStore(archive) if is_url(archive) else None
         place = archive if store is None else store.url
-        source = Path(archive) if store is None else store
-        _bring(source, staged, {record.path: record.path for record in records})
+
+        def bring(names: Mapping[str, str]) -> None:
+            """Link to files of the folder, or fetch those of the store: recorded -> present."""
+            if store is not None:
+                store.fetch(sorted(set(names.values())), fetched)
+            for old, now in names.items():
+                file = Path(archive if store is None else fetched, now).absolute()
+                if file.is_file():
+                    target = staged / old
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    target.unlink(missing_ok=True)
+                    target.symlink_to(file)
+
+        bring({record.path: record.path for record in records})
         wrong = list(_changed(staged, records, place))
         lost = [record for record in records if record.path in {each.name for each in wrong}]
         moved = _moved(recipe, lost, catalog)
         if moved:
-            _bring(source, staged, moved)
+            bring(moved)
             still = {each.name for each in _changed(staged, lost, place)}
             wrong = [each for each in wrong if each.name in still]
         yield staged, wrong
-
-
-def _bring(source: Path | RemoteStore, staged: Path, names: Mapping[str, str]) -> None:
-    """Link to files of a folder, or copy those of a store: recorded name -> present name."""
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as fetched:
-        folder = source if isinstance(source, Path) else Path(fetched)
-        if not isinstance(source, Path):
-            source.fetch(sorted(set(names.values())), folder)
-        for old, now in names.items():
-            if (folder / now).is_file():
-                target = staged / old
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.unlink(missing_ok=True)
-                if folder is source:
-                    target.symlink_to((folder / now).absolute())
-                else:
-                    # Not moved: two recorded names may have the same present name.
-                    shutil.copyfile(folder / now, target)
 
 
 def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:

@@ -62,8 +62,7 @@ MOST_IN_DOUBT: Final = 10
 _ALWAYS: Final = (datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
 
 
-@dataclass(frozen=True, slots=True)
-class Cut:
+class Cut(NamedTuple):
     """Scenes, and the granules that belong to no scene."""
 
     scenes: tuple[Scene, ...]

@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.raw_files import HEADER_BYTES, Source
@@ -152,8 +152,7 @@ class Judgement:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class DaysJudged:
+class DaysJudged(NamedTuple):
     """Judgements of the scenes of some days."""
 
     judgements: tuple[Judgement, ...]
@@ -354,8 +353,7 @@ class Judge(DayStates):
             scene: [file for product in made for file in self.lost.unused.get(product.path, ())]
             for scene, made in recorded.items()
         }
-        return replace(
-            cut,
+        return cut._replace(
             scenes=(*name_unused(known, unused, lost), *self._months(days)),
             set_aside=(*cut.set_aside, *aside),
             file_notes=tuple(
