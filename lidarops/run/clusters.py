@@ -74,9 +74,6 @@ _API_TIMEOUT: Final = 30.0
 
 _LOG = logging.getLogger(__name__)
 
-# Exceptions of a cluster that is absent, refuses, or is configured wrongly.
-_FAILURES = (OSError, TimeoutError, RuntimeError, ValueError, TypeError)
-
 Memory = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$", description="such as 2GiB")]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$", max_length=63)]
 Workers = Annotated[int, Field(ge=1, le=10_000)]
@@ -314,7 +311,8 @@ def connect_client(cluster: Cluster) -> Iterator[Client]:
     with ExitStack() as stack:
         try:
             client = _connect(cluster, stack)
-        except _FAILURES as error:
+        # The cluster is absent, refuses, or is configured wrongly.
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
             raise ClusterError(
                 f"no {cluster.kind} cluster: {error!r}",
                 field="cluster",

@@ -26,7 +26,7 @@ from lidarops.records import (
     UnusedFile,
     products_of,
 )
-from lidarops.scene.case import DARK_FILES, READ_STEP, sources
+from lidarops.scene.case import ANCILLARY_FILES, DARK_FILES, READ_STEP, sources
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
@@ -38,12 +38,6 @@ ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
-_FILES: Final = {
-    "overlap_profile": Role.OVERLAP,
-    "molecular_profile": Role.MOLECULAR,
-    "lidar_ratio_profile": Role.LIDAR_RATIO,
-}
-"""Settings of a plan that name ancillary files, with their roles."""
 
 
 def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
@@ -248,7 +242,7 @@ def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
     return {
         path: role
         for step in steps
-        for key, role in _FILES.items()
+        for key, role in ANCILLARY_FILES.items()
         if (path := step.settings.get(key)) is not None
     }
 

@@ -65,7 +65,7 @@ from lidarops.scene.profiles import (
 )
 from lidarops.settings import SettingsModel, quantity
 
-_Power = npt.NDArray[np.float64]
+Array = npt.NDArray[np.float64]
 
 
 class LagSettings(SettingsModel):
@@ -139,7 +139,7 @@ def glue(settings: GlueSettings, signal: ChannelSignal, *, estimated: bool) -> G
 
 def _groups(
     archive: xr.Dataset, analog: FileProfiles, photon: FileProfiles
-) -> Iterator[tuple[_Power, _Power]]:
+) -> Iterator[tuple[Array, Array]]:
     """Yield the power of the first profiles of a scene in both channels, (time, range)."""
     for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
         counts = archive.isel(time=rows)
@@ -156,8 +156,6 @@ def _samples(
         counts = archive.isel(time=rows[first : first + together])
         yield analog.of(counts), photon.of(counts)
 
-
-Array = npt.NDArray[np.float64]
 
 _NEAR_THE_SCENE: Final = f"within {DARK_REACH / timedelta(hours=1):g} h of the scene"
 _ASSUMED_DEAD_TIME: Final = f"{1e9 * DEFAULT_DEAD_TIME:g} ns"
