@@ -45,7 +45,7 @@ from lidarops.records import (
 )
 from lidarops.reports.run_record import Journal, save_run_record
 from lidarops.run.leftovers import Orphan
-from lidarops.run.recipe import Recipe
+from lidarops.run.reproduction import Recipe
 from lidarops.run.scenes import MONTH, parse_scene_id
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, settings_digest
 from lidarops.scene import dependence
