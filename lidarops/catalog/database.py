@@ -48,6 +48,13 @@ _NAME = sa.String(40)
 _SCENE = sa.String(160)
 _DIGEST = sa.String(64)
 
+
+def _of_campaigns(name: str, *columns: Any) -> sa.Table:
+    """Return a table whose rows belong to campaigns."""
+    campaign = sa.Column("campaign", _NAME, primary_key=True)
+    return sa.Table(name, METADATA, campaign, *columns, sqlite_with_rowid=False)
+
+
 SCHEMA = sa.Table("schema_version", METADATA, sa.Column("version", sa.Integer, primary_key=True))
 
 LAYOUT = sa.Table(
@@ -57,10 +64,8 @@ LAYOUT = sa.Table(
     sa.Column("channels", sa.Text, nullable=False),
 )
 
-GRANULE = sa.Table(
+GRANULE = _of_campaigns(
     "granule",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("path", _PATH, primary_key=True),
     sa.Column("size", sa.BigInteger, nullable=False),
     sa.Column("mtime_ns", sa.BigInteger, nullable=False),
@@ -90,18 +95,14 @@ GRANULE = sa.Table(
     sa.Column("stamp_low", sa.BigInteger, nullable=False),
     sa.Column("stamp_high", sa.BigInteger, nullable=False),
     sa.Index("granule_by_day", "campaign", "day", "role", "status", "stamp_low", "stamp_high"),
-    sqlite_with_rowid=False,
 )
 
-CHANNEL_NAME = sa.Table(
+CHANNEL_NAME = _of_campaigns(
     "channel_name",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("instrument", _NAME, primary_key=True),
     sa.Column("name", sa.Text, primary_key=True),
     # JSON of the recorder that has this name for good.
     sa.Column("recorder", sa.Text, nullable=False),
-    sqlite_with_rowid=False,
 )
 
 RUN_COUNTS: Final = ("scenes", "products", "granules", "failed", "refused")
@@ -124,10 +125,8 @@ RUN = sa.Table(
     sa.Index("run_by_time", "campaign", "started"),
 )
 
-PRODUCT = sa.Table(
+PRODUCT = _of_campaigns(
     "product",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("path", _PATH, primary_key=True),
     sa.Column("scene", _SCENE, nullable=False),
     sa.Column("day", sa.Integer, nullable=False),
@@ -149,19 +148,15 @@ PRODUCT = sa.Table(
     # How it differs from the product that it replaced, as JSON; empty for a new one.
     sa.Column("change", sa.Text, nullable=False),
     sa.Index("product_by_day", "campaign", "day"),
-    sqlite_with_rowid=False,
 )
 
-PRODUCT_INPUT = sa.Table(
+PRODUCT_INPUT = _of_campaigns(
     "product_input",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("product", _PATH, primary_key=True),
     sa.Column("role", sa.String(16), primary_key=True),
     # The products of a scene share their files, so each set of files is stored once.
     sa.Column("file_set", sa.String(32), nullable=False),
     sa.Index("product_input_by_set", "file_set"),
-    sqlite_with_rowid=False,
 )
 
 FILE_SET = sa.Table(
@@ -173,10 +168,8 @@ FILE_SET = sa.Table(
     sqlite_with_rowid=False,
 )
 
-SCENE = sa.Table(
+SCENE = _of_campaigns(
     "scene",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("scene", _SCENE, primary_key=True),
     sa.Column("day", sa.Integer, nullable=False),
     # Digest of everything that could affect the outcome of the last try.
@@ -190,7 +183,6 @@ SCENE = sa.Table(
     # Number of tries that started and did not end because the process died.
     sa.Column("crashes", sa.Integer, nullable=False),
     sa.Index("scene_by_day", "campaign", "day"),
-    sqlite_with_rowid=False,
 )
 
 STAGE = sa.Table(
@@ -203,16 +195,13 @@ STAGE = sa.Table(
     sqlite_with_rowid=False,
 )
 
-VERDICT = sa.Table(
+VERDICT = _of_campaigns(
     "verdict",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("day", sa.Integer, primary_key=True),
     # State of the day (see Signature) when all its requested products were fresh.
     sa.Column("signature", _DIGEST, nullable=False),
     # JSON of the other fields of `Verdict`.
     sa.Column("facts", sa.Text, nullable=False),
-    sqlite_with_rowid=False,
 )
 
 LOCK = sa.Table(

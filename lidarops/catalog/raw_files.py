@@ -242,15 +242,18 @@ def _start(head: bytes, instrument: Instrument) -> datetime | None:
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
+    return _granule(due, Status.REFUSED, reason=reason, start=start)
+
+
+def _granule(due: UnreadFile, status: Status, **stated: Any) -> Granule:
     return Granule(
         path=printable(due.file.path),
         size=due.file.size,
         mtime_ns=due.file.mtime_ns,
         instrument=due.instrument,
         role=due.role,
-        status=Status.REFUSED,
-        reason=reason,
-        start=start,
+        status=status,
+        **stated,
     )
 
 
@@ -285,13 +288,9 @@ def _accepted(
         "longitude": longitude,
         "notes": (*header.notes, *_overridden(header, facts, instrument, station)),
     }
-    return Granule(
-        path=due.file.path,
-        size=due.file.size,
-        mtime_ns=due.file.mtime_ns,
-        instrument=due.instrument,
-        role=due.role,
-        status=Status.GOOD,
+    return _granule(
+        due,
+        Status.GOOD,
         contradictions=tuple(_contradictions(header, position, instrument, station)),
         **{name: getattr(header, name) for name in _STATED} | of_campaign,
     )

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from operator import attrgetter
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.catalog.granules import DatedFile
@@ -125,20 +125,12 @@ def months_of_products(
         window = month_of(start)
         if day_of(window[0]) in days and not scene.endswith(MONTH):
             held[instrument, window].append(product)
-    for (name, (start, stop)), own in sorted(held.items()):
+    for (name, window), own in sorted(held.items()):
         owner = campaign.instruments.get(name)
         requested = owner.products.requested if owner else ()
         if owner and any(kind.name in requested for kind in kinds_of(Scope.MONTH)):
-            yield Scene(
-                id=f"{name}_{start:{STAMP}}{MONTH}",
-                campaign=campaign.name,
-                station=owner.station,
-                instrument=name,
-                start=start,
-                stop=stop,
-                granules=(),
-                products=tuple(sorted(own, key=attrgetter("path"))),
-            )
+            read = tuple(sorted(own, key=attrgetter("path")))
+            yield _scene(campaign, name, window, MONTH, granules=(), products=read)
 
 
 def _of_network(
@@ -163,13 +155,11 @@ def _of_network(
         for members in combinations:
             suffix = f"-{_grids_key(members)}" if len(combinations) > 1 else ""
             scenes.append(
-                Scene(
-                    id=f"{key}_{window[0]:{STAMP}}{suffix}",
-                    campaign=campaign.name,
-                    station=key,
-                    instrument=key,
-                    start=window[0],
-                    stop=window[1],
+                _scene(
+                    campaign,
+                    key,
+                    window,
+                    suffix,
                     granules=_in_time(g for member in members for g in member.granules),
                     dark=_in_time(g for member in members for g in member.dark),
                     members=members,
@@ -181,6 +171,20 @@ def _of_network(
                 )
             )
     return scenes
+
+
+def _scene(campaign: Campaign, key: str, window: Window, suffix: str, **held: Any) -> Scene:
+    """Return the scene of an instrument or network in a window, with what it holds."""
+    owner = campaign.instruments.get(key)
+    return Scene(
+        id=f"{key}_{window[0]:{STAMP}}{suffix}",
+        campaign=campaign.name,
+        station=owner.station if owner else key,
+        instrument=key,
+        start=window[0],
+        stop=window[1],
+        **held,
+    )
 
 
 def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
@@ -305,13 +309,11 @@ def _by_layout(
     for key, group in sorted(layouts.items()):
         suffix = f"-{key}" if len(layouts) > 1 else ""
         scenes.append(
-            Scene(
-                id=f"{instrument}_{window[0]:{STAMP}}{suffix}",
-                campaign=campaign.name,
-                station=owner.station,
-                instrument=instrument,
-                start=window[0],
-                stop=window[1],
+            _scene(
+                campaign,
+                instrument,
+                window,
+                suffix,
                 granules=tuple(group),
                 dark=tuple(
                     granule
