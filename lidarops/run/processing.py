@@ -48,8 +48,6 @@ class Pass:
         Since which no file was refused.
     lock : Lock
     options : Options
-    client : distributed.Client or None
-        A cluster to run on.
     summary : ScanSummary
     days : sequence of int
         To be judged.
@@ -64,7 +62,6 @@ class Pass:
         states: DayStates,
         lock: Lock,
         options: Options,
-        client: Client | None,
         summary: ScanSummary,
         days: Sequence[int],
         signatures: Mapping[int, Signature],
@@ -72,7 +69,7 @@ class Pass:
     ) -> None:
         campaign, self.store = states.campaign, states.store
         self.campaign, self.states, self.lock, self.options = campaign, states, lock, options
-        self.client, self.summary = client, summary
+        self.summary = summary
         self.days, self.signatures, self.known = days, signatures, known
         self.run = LedgerRun(campaign, self.store, lock, journal=options.journal)
         self.told = JudgedDays()
@@ -91,7 +88,7 @@ class Pass:
         """Whether days are judged again, and whether for their months."""
         self.failing = 0
         """Number of scenes in a row that failed for a cause that may pass."""
-        self.on_workers = client is not None or bool(options.cluster) or options.workers > 1
+        self.on_workers = bool(options.cluster) or options.workers > 1
 
     def carry_out(self) -> Result:
         """Return what was done, and the state of the archive after it.
@@ -109,7 +106,7 @@ class Pass:
             self.store.forget_scenes(gone)
         status = RunStatus.FINISHED
         if self.days:
-            if options.workers > 1 and not options.cluster and self.client is None:
+            if options.workers > 1 and not options.cluster:
                 # The modules load while this process judges the scenes.
                 preload_modules(_WORKER_MODULES)
             with self.stop as stop:
@@ -178,8 +175,8 @@ class Pass:
         if first is None and not self.suspects:
             return
         with ExitStack() as stack:
-            client = self.client
-            if client is None and self.on_workers:
+            client = None
+            if self.on_workers:
                 # Take the lock first: another run may leave nothing to do.
                 self.lock.acquire_unchanged()
                 client = self._cluster(stack, self.options.workers)
