@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from lidarops import __version__
 from lidarops.campaign.model import Campaign
@@ -45,13 +45,15 @@ from lidarops.records import (
 )
 from lidarops.reports.run_record import Journal, save_run_record
 from lidarops.run.leftovers import Orphan
-from lidarops.run.reproduction import Recipe
 from lidarops.run.scenes import MONTH, parse_scene_id
 from lidarops.run.staleness import DaysJudged, Judge, Judgement, settings_digest
 from lidarops.scene import dependence
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.files import product_paths, sha256_of
 from lidarops.system.stores import without_keys
+
+if TYPE_CHECKING:
+    from lidarops.run.reproduction import Recipe
 
 MOST_INPUTS: Final = 100_000
 """Granules that the record of a run names; the ledger names all."""
@@ -406,7 +408,7 @@ def rebuild_ledger(
     return rebuilt
 
 
-_Product = tuple[Recipe, NewProduct]
+_Product = tuple["Recipe", NewProduct]
 """What a product file says of itself, and its entry."""
 
 
@@ -438,6 +440,8 @@ def _read_products(
 
 
 def _read_product(campaign: Campaign, path: str) -> _Product:
+    from lidarops.run.reproduction import Recipe  # noqa: PLC0415 - loads what makes products
+
     file = campaign.products_root / path
     with reading(file):
         recipe = Recipe.of(file)
