@@ -6,7 +6,6 @@ processes that read headers load them, so they import little, and no database.
 
 from __future__ import annotations
 
-import errno
 import fnmatch
 import hashlib
 import json
@@ -33,6 +32,7 @@ from lidarops.records import (
     Status,
     day_of,
 )
+from lidarops.system.files import opened_regular, sha256_of
 from lidarops.system.stores import RemoteStore, Stored
 
 if TYPE_CHECKING:
@@ -145,23 +145,12 @@ class Source:
 
     def head(self, path: str, size: int) -> bytes:
         """Return the first bytes of a file."""
-        descriptor = self._opened(path)
-        try:
-            return os.read(descriptor, size)
-        finally:
-            os.close(descriptor)
+        with opened_regular(self._root / path) as stream:
+            return stream.read(size)
 
     def digest(self, path: str) -> str:
         """Return the SHA-256 of a file."""
-        with open(self._opened(path), "rb") as stream:  # noqa: PTH123 - is open already
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-
-    def _opened(self, path: str) -> int:
-        file = f"{self._root}/{path}"
-        # Opening a pipe would block for ever.
-        if not os.path.isfile(file):  # noqa: PTH113 - a Path costs as much as reading the file
-            raise OSError(errno.EINVAL, "is no regular file, or a broken link")
-        return os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+        return sha256_of(self._root / path)
 
 
 class RemoteSource(RemoteStore, Source):

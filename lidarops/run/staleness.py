@@ -210,12 +210,12 @@ class Judge(DayStates):
 
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
-        counts = Counter[int]()
-        for day_sum in self.store.day_sums():
+        days, counts = sorted(days), Counter[int]()
+        for day_sum in self.store.day_sums() if days else ():
             counts[day_sum.day] += day_sum.good
         group: list[int] = []
         held = 0
-        for day in sorted(days):
+        for day in days:
             if group and held + counts[day] > MOST_GRANULES:
                 yield tuple(group)
                 group, held = [], 0
@@ -434,7 +434,6 @@ class Judge(DayStates):
         stale: list[Stale] = []
         frozen: list[Stale] = []
         kept: list[Stale] = []
-        frozen_period = not self._thaw and self.campaign.is_frozen(scene.start)
         kinds_ = self.selection.kinds
         requested = dependence.plan_of_kinds(whole, kinds_) if kinds_ else whole
         products = requested.product_keys
@@ -449,7 +448,9 @@ class Judge(DayStates):
                 one = Stale(kind, channel, reason, known, restored)
                 if known and known.path in self.lost.protected:
                     kept.append(one)
-                elif known and not restored and frozen_period:
+                elif (
+                    known and not (restored or self._thaw) and self.campaign.is_frozen(scene.start)
+                ):
                     if not (self.campaign.products_root / path).exists():
                         remedy = "only a copy restores this version, --thaw makes a new one"
                         one = replace(one, reason=f"{reason}; {remedy}")

@@ -7,7 +7,7 @@ is a sentence that a user can check against the campaign file.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -96,7 +96,7 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
     layout = scene.layout
     glued = joined_layout(layout, named_channels(wanted))
     yield from missing_channels(layout, glued, wanted, facts)
-    cases = list(_cases(scene, campaign, facts, glued))
+    cases = list(_cases(scene, campaign, facts, wanted, layout, glued))
     entries = [entry for case in cases for entry in _channel_entries(case)]
     yield from entries
     # Those of all channels are decided by now.
@@ -125,11 +125,11 @@ def _cases(
     scene: Scene,
     campaign: Campaign,
     facts: InstrumentFacts,
+    wanted: Mapping[str, ChannelProduct],
+    layout: Sequence[ChannelLayout],
     glued: Sequence[ChannelLayout],
 ) -> Iterator[ChannelCase[Any]]:
     """Yield the cases of the channels of the files, and of those glued from them."""
-    layout = scene.layout
-    wanted = campaign.instruments[scene.instrument].products.requested
     requested = {kind: one for kind, one in wanted.items() if not kinds()[kind].reads}
     readers: defaultdict[str, dict[str, None]] = defaultdict(dict)
     for other in glued:
