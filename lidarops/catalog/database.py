@@ -9,7 +9,7 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import sqlite
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.sources import Source
+from lidarops.catalog.raw_files import Source
 from lidarops.errors import CatalogError, LidarOpsError, UnavailableError
 
 SCHEMA_VERSION: Final = 12
@@ -48,6 +48,13 @@ _NAME = sa.String(40)
 _SCENE = sa.String(160)
 _DIGEST = sa.String(64)
 
+
+def _of_campaigns(name: str, *columns: Any) -> sa.Table:
+    """Return a table whose rows belong to campaigns."""
+    campaign = sa.Column("campaign", _NAME, primary_key=True)
+    return sa.Table(name, METADATA, campaign, *columns, sqlite_with_rowid=False)
+
+
 SCHEMA = sa.Table("schema_version", METADATA, sa.Column("version", sa.Integer, primary_key=True))
 
 LAYOUT = sa.Table(
@@ -57,10 +64,8 @@ LAYOUT = sa.Table(
     sa.Column("channels", sa.Text, nullable=False),
 )
 
-GRANULE = sa.Table(
+GRANULE = _of_campaigns(
     "granule",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("path", _PATH, primary_key=True),
     sa.Column("size", sa.BigInteger, nullable=False),
     sa.Column("mtime_ns", sa.BigInteger, nullable=False),
@@ -90,18 +95,14 @@ GRANULE = sa.Table(
     sa.Column("stamp_low", sa.BigInteger, nullable=False),
     sa.Column("stamp_high", sa.BigInteger, nullable=False),
     sa.Index("granule_by_day", "campaign", "day", "role", "status", "stamp_low", "stamp_high"),
-    sqlite_with_rowid=False,
 )
 
-CHANNEL_NAME = sa.Table(
+CHANNEL_NAME = _of_campaigns(
     "channel_name",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("instrument", _NAME, primary_key=True),
     sa.Column("name", sa.Text, primary_key=True),
     # JSON of the recorder that has this name for good.
     sa.Column("recorder", sa.Text, nullable=False),
-    sqlite_with_rowid=False,
 )
 
 RUN_COUNTS: Final = ("scenes", "products", "granules", "failed", "refused")
@@ -124,10 +125,8 @@ RUN = sa.Table(
     sa.Index("run_by_time", "campaign", "started"),
 )
 
-PRODUCT = sa.Table(
+PRODUCT = _of_campaigns(
     "product",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("path", _PATH, primary_key=True),
     sa.Column("scene", _SCENE, nullable=False),
     sa.Column("day", sa.Integer, nullable=False),
@@ -149,19 +148,15 @@ PRODUCT = sa.Table(
     # How it differs from the product that it replaced, as JSON; empty for a new one.
     sa.Column("change", sa.Text, nullable=False),
     sa.Index("product_by_day", "campaign", "day"),
-    sqlite_with_rowid=False,
 )
 
-PRODUCT_INPUT = sa.Table(
+PRODUCT_INPUT = _of_campaigns(
     "product_input",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("product", _PATH, primary_key=True),
     sa.Column("role", sa.String(16), primary_key=True),
     # The products of a scene share their files, so each set of files is stored once.
     sa.Column("file_set", sa.String(32), nullable=False),
     sa.Index("product_input_by_set", "file_set"),
-    sqlite_with_rowid=False,
 )
 
 FILE_SET = sa.Table(
@@ -173,10 +168,8 @@ FILE_SET = sa.Table(
     sqlite_with_rowid=False,
 )
 
-SCENE = sa.Table(
+SCENE = _of_campaigns(
     "scene",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("scene", _SCENE, primary_key=True),
     sa.Column("day", sa.Integer, nullable=False),
     # Digest of everything that could affect the outcome of the last try.
@@ -190,7 +183,6 @@ SCENE = sa.Table(
     # Number of tries that started and did not end because the process died.
     sa.Column("crashes", sa.Integer, nullable=False),
     sa.Index("scene_by_day", "campaign", "day"),
-    sqlite_with_rowid=False,
 )
 
 STAGE = sa.Table(
@@ -203,16 +195,13 @@ STAGE = sa.Table(
     sqlite_with_rowid=False,
 )
 
-VERDICT = sa.Table(
+VERDICT = _of_campaigns(
     "verdict",
-    METADATA,
-    sa.Column("campaign", _NAME, primary_key=True),
     sa.Column("day", sa.Integer, primary_key=True),
     # State of the day (see Signature) when all its requested products were fresh.
     sa.Column("signature", _DIGEST, nullable=False),
     # JSON of the other fields of `Verdict`.
     sa.Column("facts", sa.Text, nullable=False),
-    sqlite_with_rowid=False,
 )
 
 LOCK = sa.Table(
@@ -418,26 +407,19 @@ class Database:
         file = Path(self._url.database or "")
         if not self._sqlite or not self._url.database or os.access(file.parent, os.W_OK):
             return self._url
-        try:
-            return self._read_only(file)
-        except FileNotFoundError:
-            # Another user has closed it meanwhile, which removes the journal.
-            return self._as_uri(file, immutable="1")
-
-    def _read_only(self, file: Path) -> sa.URL:
         journal, index = Path(f"{file}-wal"), Path(f"{file}-shm")
-        has_journal = journal.exists()
-        if has_journal and index.exists():
+        if journal.exists() and index.exists():
             # Another user may write now.
             return self._as_uri(file, mode="ro")
-        if not has_journal or not journal.stat().st_size:
-            # Nobody has it open. SQLite would make files beside it.
-            return self._as_uri(file, immutable="1")
-        # Left by a killed process; SQLite would make its index.
-        folder = self._copied.enter_context(tempfile.TemporaryDirectory(prefix="lidarops-"))
-        for part in (file, journal):
-            shutil.copy(part, folder)
-        return self._url.set(database=str(Path(folder, file.name)))
+        with suppress(FileNotFoundError):
+            if journal.stat().st_size:
+                # Left by a killed process; SQLite would make its index.
+                folder = self._copied.enter_context(tempfile.TemporaryDirectory(prefix="lidarops-"))
+                for part in (file, journal):
+                    shutil.copy(part, folder)
+                return self._url.set(database=str(Path(folder, file.name)))
+        # Nobody has it open, or no longer: that removes the journal. SQLite would make files.
+        return self._as_uri(file, immutable="1")
 
     def _as_uri(self, file: Path, **query: str) -> sa.URL:
         return self._url.set(database=file.absolute().as_uri(), query={"uri": "true", **query})
@@ -590,22 +572,17 @@ def _tune_sqlite(connection: Any, _record: Any) -> None:
     cursor = connection.cursor()
     cursor.execute(f"PRAGMA busy_timeout={1000 * _PATIENCE}")
     # Query first, because setting it writes.
-    if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
-        _set_journal(cursor)
-    cursor.execute("PRAGMA synchronous=NORMAL")
-    cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.close()
-
-
-def _set_journal(cursor: Any) -> None:
+    is_set = cursor.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
     end = time.monotonic() + _PATIENCE
-    while True:
+    while not is_set:
         try:
             cursor.execute("PRAGMA journal_mode=WAL")
+            is_set = True
         except sqlite3.OperationalError as error:
             # Two processes that set it at once would wait for each other: SQLite waits for neither.
             if "locked" not in str(error) or time.monotonic() > end:
                 raise
             time.sleep(_PAUSE)
-        else:
-            return
+    cursor.execute("PRAGMA synchronous=NORMAL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.close()

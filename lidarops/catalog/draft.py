@@ -194,7 +194,7 @@ def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
     Longitude is first, unless the second one cannot be a latitude.
     """
     low, high = _ALTITUDES
-    altitude = group.altitude
+    altitude = group.headers[0].altitude
     known = altitude if altitude is not None and low <= altitude <= high else None
     coordinates = group.coordinates
     if coordinates is None or max(map(abs, coordinates)) > 180.0:
@@ -344,9 +344,10 @@ def _unknown(channel: ChannelLayout, *, estimated: bool) -> str:
 
 def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
     angles = sorted({angle for group in headers.signal for angle in group.zenith_angles})
-    sides = {side for group in headers.signal for side in group.azimuths}
+    stated = [header for group in headers.signal for header in group.headers]
+    sides = {header.azimuth for header in stated if not header.doubt} - {None}
     doubts = [doubt for group in headers.signal for doubt in group.doubts]
-    refused = headers.without_zenith if doubts else 0
+    refused = sum(group.without_zenith for group in headers.signal) if doubts else 0
     # A fact would hold for the files with doubtful pointings too.
     mark = "# " if refused else ""
     if not angles:
@@ -357,7 +358,7 @@ def _pointing(headers: InstrumentHeaders) -> Iterator[str]:
             f" headers, over {len(sides) or 'no known'} azimuths"
         )
     else:
-        notes = {note for group in headers.signal for note in group.notes if POINTING_NOTE in note}
+        notes = {note for header in stated for note in header.notes if POINTING_NOTE in note}
         source = "; ".join(sorted(notes)) or f"headers state {angles[0]:g}"
         yield f"{mark}zenith_angle: {abs(angles[0]):g}  # ? degree, {source}"
     if refused:

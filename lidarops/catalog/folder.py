@@ -14,9 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from lidarops.catalog.headers import HEADER_BYTES
-from lidarops.catalog.sources import (
-    RawFile,
+from lidarops.catalog.raw_files import (
+    HEADER_BYTES,
     Source,
     literal_pattern,
     path_pattern,
@@ -29,6 +28,7 @@ from lidarops.raw.header import HeaderPointing, RawHeader, named_layout, recorde
 from lidarops.records import FEWEST_ALIKE, UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
+from lidarops.system.stores import Stored
 
 _LASERS: Final = (355e-9, 532e-9, 1064e-9)
 """m; lines of Nd:YAG lasers."""
@@ -84,18 +84,12 @@ class FileGroup:
     """Paths relative to the root."""
     start: datetime
     stop: datetime
-    altitude: float | None
-    """m."""
     zenith_angles: tuple[float, ...]
-    """degree, distinct and rising."""
-    azimuths: tuple[float, ...]
     """degree, distinct and rising."""
     without_zenith: int
     """Number of files that state no zenith angle, or a doubtful one."""
     doubts: tuple[str, ...]
     """Why pointings are doubtful, in words."""
-    notes: tuple[str, ...]
-    """Oddities of the headers, in words."""
     headers: tuple[RawHeader, ...]
     """By file."""
     header_pointing: HeaderPointing = "stated"
@@ -170,11 +164,6 @@ class InstrumentHeaders:
             channel if channel.wavelength > 0 else replace(channel, wavelength=_undotted(channel))
             for channel in self.main.layout
         )
-
-    @property
-    def without_zenith(self) -> int:
-        """Number of its signal files that state no zenith angle, or a doubtful one."""
-        return sum(group.without_zenith for group in self.signal)
 
     @property
     def zenith_angle(self) -> float:
@@ -355,7 +344,7 @@ def _named(groups: Sequence[FileGroup]) -> Iterator[FileGroup]:
         yield from (replace(group, layout=named_layout(group.layout, names)) for group in own)
 
 
-def _is_copy(source: Source, file: RawFile, files: Sequence[RawFile]) -> bool:
+def _is_copy(source: Source, file: Stored, files: Sequence[Stored]) -> bool:
     """Return whether a file of the acquisition has the content of another file of its folder."""
     folder, stem = _split(file.path)
     if stem != _SCRATCH:
@@ -372,7 +361,7 @@ def _is_copy(source: Source, file: RawFile, files: Sequence[RawFile]) -> bool:
         return False
 
 
-def _header(source: Source, file: RawFile) -> RawHeader:
+def _header(source: Source, file: Stored) -> RawHeader:
     if printable(file.path) != file.path:
         raise RawFormatError("has a name that is not UTF-8", remedy="rename it")
     return parse_raw_header(source.head(file.path, HEADER_BYTES), file=file.path, size=file.size)
@@ -435,12 +424,9 @@ def _group(members: Sequence[tuple[str, RawHeader]], pointing: HeaderPointing) -
         files=tuple(path for path, _ in members),
         start=min(header.start for header in headers),
         stop=max(header.stop for header in headers),
-        altitude=first.altitude,
         zenith_angles=tuple(sorted(set(angles))),
-        azimuths=tuple(sorted({h.azimuth for h in known if h.azimuth is not None})),
         without_zenith=len(headers) - len(angles),
         doubts=doubts,
-        notes=tuple(sorted({note for header in headers for note in header.notes})),
         headers=tuple(headers),
         header_pointing=pointing,
     )

@@ -7,14 +7,14 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
 
 from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
-from lidarops.catalog.headers import NO_NOTES, GranuleRow
+from lidarops.catalog.raw_files import NO_NOTES, GranuleRow
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
     INVALID,
@@ -66,8 +66,7 @@ class DatedFile(NamedTuple):
     start: datetime
 
 
-@dataclass(frozen=True, slots=True)
-class DaySum:
+class DaySum(NamedTuple):
     """Sums over the granules of one role on one day; unchanged if no row changed."""
 
     day: int
@@ -97,11 +96,7 @@ class Granules(Database):
         """Yield path, size and start of good granules without SHA-256 (never read in full)."""
         query = (
             sa.select(_C.path, _C.size, _C.start)
-            .where(
-                _C.campaign == self.campaign,
-                _C.status == Status.GOOD.value,
-                _C.sha256.is_(None),
-            )
+            .where(*self._good(), _C.sha256.is_(None))
             .order_by(_C.path)
         )
         with self.stream(query) as rows:
@@ -183,50 +178,42 @@ class Granules(Database):
         """Return when the first good signal file of each day starts, of those below a folder."""
         query = (
             sa.select(sa.func.min(_C.start))
-            .where(
-                *self._good_below(folder),
-                _C.instrument == instrument,
-                _C.role == Role.SIGNAL.value,
-            )
+            .where(*self._good_below(folder, Role.SIGNAL), _C.instrument == instrument)
             .group_by(_C.day)
         )
         return sorted(start for (start,) in self.read(query, tuple))
 
-    def _good_below(self, folder: str) -> list[sa.ColumnElement[bool]]:
+    def _good(self, role: Role | None = None) -> list[sa.ColumnElement[bool]]:
         conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
-        if folder:
-            # All paths that begin so: "0" follows "/".
-            conditions += [_C.path > f"{folder}/", _C.path < f"{folder}0"]
-        return conditions
+        return conditions if role is None else [*conditions, _C.role == role.value]
 
-    def count(self, *, status: Status | None = None) -> int:
+    def _good_below(self, folder: str, role: Role | None = None) -> list[sa.ColumnElement[bool]]:
+        # All paths that begin so: "0" follows "/".
+        below = [_C.path > f"{folder}/", _C.path < f"{folder}0"] if folder else []
+        return [*self._good(role), *below]
+
+    def count(self, *conditions: sa.ColumnElement[bool]) -> int:
         """Return the number of granules."""
-        conditions = [] if status is None else [_C.status == status.value]
         query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *conditions)
         return int(self.read(query, tuple)[0][0])
 
     def count_refused(self) -> int:
         """Return the number of refused granules that the campaign does not declare invalid."""
-        unexpected = _C.status == Status.REFUSED.value, _C.reason.not_like(f"{INVALID}%")
-        query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *unexpected)
-        return int(self.read(query, tuple)[0][0])
+        refused = _C.status == Status.REFUSED.value
+        return self.count(refused, _C.reason.not_like(f"{INVALID}%"))
 
     def day_sums(self) -> list[DaySum]:
         """Return the sums of the stamps of good granules by day and role."""
         sums = sa.func.count(), sa.func.sum(_C.stamp_low), sa.func.sum(_C.stamp_high)
         query = (
             sa.select(_C.day, _C.role, *sums)
-            .where(_C.campaign == self.campaign, _C.status == Status.GOOD.value)
+            .where(*self._good())
             .group_by(_C.day, _C.role)
             .order_by(_C.day, _C.role)
         )
         return self.read(
             query, lambda row: DaySum(row[0], Role(row[1]), row[2], int(row[3]), int(row[4]))
         )
-
-    def _signals(self) -> tuple[sa.ColumnElement[bool], ...]:
-        good, signal = Status.GOOD.value, Role.SIGNAL.value
-        return _C.campaign == self.campaign, _C.status == good, _C.role == signal
 
     def holdings(self, edges: Sequence[datetime]) -> list[Holding]:
         """Return how many good signal granules hold which channels, by instrument and period.
@@ -246,7 +233,7 @@ class Granules(Database):
         period = sa.case(*reversed(later), else_=0) if later else sa.literal_column("0")
         signal = (
             sa.select(_C.instrument, period.label("period"), _C.layout, _C.start)
-            .where(*self._signals())
+            .where(*self._good(Role.SIGNAL))
             .subquery()
         )
         *columns, start = signal.c
@@ -297,7 +284,7 @@ class Granules(Database):
             Days outside of these do not count.
         """
         query = sa.select(_C.instrument, sa.func.min(_C.day), sa.func.max(_C.day))
-        query = query.where(*self._signals()).group_by(_C.instrument)
+        query = query.where(*self._good(Role.SIGNAL)).group_by(_C.instrument)
         limits = [] if first is None else [_C.day >= first]
         limits += [] if last is None else [_C.day <= last]
         return {name: (begin, end) for name, begin, end in self.read(query.where(*limits), tuple)}
@@ -311,11 +298,10 @@ class Granules(Database):
         """
         noted = sa.or_(_C.notes != NO_NOTES, _C.contradictions != NO_NOTES)
         columns = (_C.instrument, _C.notes, _C.contradictions)
-        query = (
-            sa.select(*columns, sa.func.count()).where(*self._signals(), noted).group_by(*columns)
-        )
+        query = sa.select(*columns, sa.func.count()).where(*self._good(Role.SIGNAL), noted)
         rows = self.read(
-            query, lambda row: (row, _sentences(row.notes), _sentences(row.contradictions))
+            query.group_by(*columns),
+            lambda row: (row, _sentences(row.notes), _sentences(row.contradictions)),
         )
         return joined_notes(
             FileNote(instrument, text, contradicts, count)

@@ -11,10 +11,9 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import sqlalchemy as sa
 
@@ -37,31 +36,20 @@ class OvertakenError(Exception):
     """Another run has worked on the catalog since it was read."""
 
 
-@dataclass(frozen=True, slots=True)
-class Holder:
-    """The holder of a lock."""
+Holder = sa.Row[Any]
+"""The row of a lock, with the time since its last heartbeat as ``silent``, s."""
 
-    token: str
-    name: str
-    machine: str
-    process: int
-    process_started: str
-    acquired: float
-    heartbeat: float
-    silent: float
-    """s since the last heartbeat, by the clock of the database."""
 
-    @property
-    def dead(self) -> bool:
-        """Whether the holder no longer works: it is silent, or its process has ended."""
-        if self.silent > SILENCE:
-            return True
-        if self.machine != _machine():
-            return False
-        if self.process == os.getpid() and self.token not in _held:
-            # A lock of this process that it could not release, because the disk was full.
-            return True
-        return process_start(self.process) != self.process_started
+def _is_dead(holder: Holder) -> bool:
+    """Return whether a holder no longer works: it is silent, or its process has ended."""
+    if holder.silent > SILENCE:
+        return True
+    if holder.machine != _machine():
+        return False
+    if holder.process == os.getpid() and holder.token not in _held:
+        # A lock of this process that it could not release, because the disk was full.
+        return True
+    return process_start(holder.process) != str(holder.process_started)
 
 
 class Lock(AbstractContextManager["Lock"]):
@@ -126,7 +114,7 @@ class Lock(AbstractContextManager["Lock"]):
 
     def is_taken(self, *, by_others: bool = False) -> bool:
         """Return whether a living process holds the lock, or that of another campaign."""
-        return not all(holder.dead for holder in self._holders(others=by_others))
+        return not all(map(_is_dead, self._holders(others=by_others)))
 
     def wait_for(self, attempt: Callable[[], bool]) -> bool:
         """Repeat an attempt until it succeeds; return whether it failed at first.
@@ -171,12 +159,11 @@ class Lock(AbstractContextManager["Lock"]):
         """Return the holder, or those of the locks of other campaigns of the database."""
         silent = (self._database.clock() - _L.heartbeat).label("silent")
         query = sa.select(LOCK, silent).where((_L.campaign != self._database.campaign) == others)
-        rows = self._database.read(query, tuple)
-        return [Holder(*known) for _campaign, *known in rows]
+        return self._database.read(query, lambda holder: holder)
 
     def _try(self) -> bool:
         current = self.holder()
-        if current is not None and not (current.dead or self._is_still(current)):
+        if current is not None and not (_is_dead(current) or self._is_still(current)):
             return False
         database = self._database
         clock = database.clock()
@@ -228,7 +215,7 @@ class Lock(AbstractContextManager["Lock"]):
         problem = "another run holds the catalog"
         if current is not None:
             since = datetime.fromtimestamp(current.acquired, UTC)
-            problem = f"held by {current.name} since {since:%Y-%m-%d %H:%M:%S} UTC"
+            problem = f"held by {current.holder} since {since:%Y-%m-%d %H:%M:%S} UTC"
         return UnavailableError(
             problem,
             file=self._database.place,
@@ -252,17 +239,7 @@ def process_start(process: int) -> str:
     """Return the start time of a process in units of its system; empty if it does not run."""
     # The program name, in brackets, may hold blanks.
     fields = _text_of_file(f"/proc/{process}/stat").rpartition(")")[2].split()
-    if len(fields) > 19:
-        return "" if fields[0] == "Z" else fields[19]
-    if Path("/proc/self/stat").exists():
-        return ""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return ""
-    except PermissionError:
-        pass
-    return "alive"
+    return fields[19] if len(fields) > 19 and fields[0] != "Z" else ""
 
 
 def _text_of_file(path: str) -> str:

@@ -18,7 +18,7 @@ from typing import Final
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.lock import Lock, process_start
-from lidarops.catalog.sources import Source
+from lidarops.catalog.raw_files import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import Role
@@ -49,13 +49,6 @@ def _kept(output: Path, product: str, sha256: str) -> Path:
     """Return the file that keeps a version of a product."""
     path = output / FOLDER / product
     return path.with_suffix(f".{sha256[:12]}{path.suffix}")
-
-
-def kept_versions(output: Path) -> Iterator[tuple[str, str]]:
-    """Yield the path below `output` of each kept version, and the begin of its SHA-256."""
-    for path in sorted((output / FOLDER).rglob("*")):
-        if path.is_file() and not path.name.startswith("."):
-            yield path.relative_to(output).as_posix(), path.stem.rpartition(".")[2]
 
 
 def keep(output: Path, product: str, sha256: str) -> None:
@@ -220,8 +213,10 @@ def verify_archive(
     if unlisted and not _is_written(store):
         for path in sorted(unlisted - store.made_by_any_campaign(unlisted)):
             yield CheckedFile("unlisted", path, _UNLISTED)
-    for path, sha256 in kept_versions(output):
-        yield CheckedFile("superseded", path, _problem(_digests_below(output), path, sha256))
+    for kept in sorted((output / FOLDER).rglob("*")):
+        if kept.is_file() and not kept.name.startswith("."):
+            path, sha256 = kept.relative_to(output).as_posix(), kept.stem.rpartition(".")[2]
+            yield CheckedFile("superseded", path, _problem(_digests_below(output), path, sha256))
     if inputs:
         yield from _check_inputs(campaign, store)
 

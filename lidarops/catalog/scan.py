@@ -10,19 +10,28 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from itertools import chain
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.granules import Fingerprint
-from lidarops.catalog.headers import GranuleRow, Headers, UnreadFile, read_row, unread_row
-from lidarops.catalog.sources import RawFile, RemoteSource, Source, path_pattern, printable
+from lidarops.catalog.raw_files import (
+    GranuleRow,
+    Headers,
+    RemoteSource,
+    Source,
+    UnreadFile,
+    path_pattern,
+    printable,
+    read_row,
+    unread_row,
+)
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import UNREADABLE, IdlePattern, Role, Status, digest
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import CRASHED, Processes
-from lidarops.system.stores import without_keys
+from lidarops.system.stores import Stored, without_keys
 
 _BATCH = 2000
 _TOGETHER = 250
@@ -63,8 +72,7 @@ class ScanSummary:
     """Patterns of the campaign that match no file."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Claim:
+class _Claim(NamedTuple):
     """A file pattern of one role of one instrument."""
 
     instrument: str
@@ -130,8 +138,8 @@ def scan_archive(
 
 
 def _joined(
-    files: Iterator[RawFile], known: Iterator[Fingerprint]
-) -> Iterator[tuple[RawFile | None, Fingerprint | None]]:
+    files: Iterator[Stored], known: Iterator[Fingerprint]
+) -> Iterator[tuple[Stored | None, Fingerprint | None]]:
     """Pair the files of the archive with those of the catalog; both are sorted by path."""
     before, last = next(known, None), None
     for file in chain(files, [None]):
@@ -167,7 +175,10 @@ class _Scan:
         self._folder: str | None = None
         self._near: list[_Claim] = []
         self._idle = set(self._claims)
-        self._unclaimed = _Unclaimed()
+        self._alike: dict[str, list[tuple[float, str]]] = defaultdict(list)
+        """Likeness, negative, and names of files without claim that resemble a pattern."""
+        self._first: tuple[str, int] = "", 0
+        """Folder of the last of them, and how many it held."""
         self._files = self._changed = 0
         self._judged: deque[Fingerprint | None] = deque()
         self._pending: list[GranuleRow] = []
@@ -179,7 +190,7 @@ class _Scan:
         """Whether a file could be read, now or when the catalog got to know it."""
 
     def due(
-        self, pairs: Iterable[tuple[RawFile | None, Fingerprint | None]]
+        self, pairs: Iterable[tuple[Stored | None, Fingerprint | None]]
     ) -> Iterator[UnreadFile]:
         """Compare each file with the catalog, and yield those whose header must be read."""
         for file, before in pairs:
@@ -187,7 +198,7 @@ class _Scan:
             if self._idle and file is not None:
                 self._idle.difference_update(owners)
                 if not owners:
-                    self._unclaimed.compare(file.path, {claim.pattern for claim in self._idle})
+                    self._compare(file.path, {claim.pattern for claim in self._idle})
             if file is None or not owners:
                 if before is not None:
                     self._gone.append(before)
@@ -206,7 +217,18 @@ class _Scan:
             else:
                 self._readable = True
 
-    def _is_known(self, before: Fingerprint, file: RawFile, key: str) -> bool:
+    def _compare(self, path: str, patterns: Iterable[str]) -> None:
+        """Compare a file without claim with patterns, if it is among the first of its folder."""
+        folder = path.rpartition("/")[0]
+        last, number = self._first
+        self._first = folder, number + 1 if folder == last else 1
+        for pattern in patterns if self._first[1] <= _NAMES_OF_FOLDER else ():
+            likeness = _likeness(pattern.lower(), path.lower())
+            if likeness >= _LEAST_LIKENESS:
+                alike = sorted({*self._alike[pattern], (-likeness, path)})
+                self._alike[pattern] = alike[:_NAMES_SHOWN]
+
+    def _is_known(self, before: Fingerprint, file: Stored, key: str) -> bool:
         """Return whether the catalog holds what a file is; a damaged one may have been repaired."""
         known = before.size, before.mtime_ns, before.scan_key
         same = known == (file.size, file.mtime_ns, key)
@@ -308,7 +330,7 @@ class _Scan:
                     claim.instrument,
                     "dark_files" if claim.role is Role.DARK else "files",
                     claim.pattern,
-                    self._unclaimed.near(claim.pattern),
+                    tuple(path for _, path in self._alike[claim.pattern]),
                 )
                 for claim in self._claims
                 if claim in self._idle
@@ -357,30 +379,6 @@ def _likeness(pattern: str, path: str) -> float:
     return difflib.SequenceMatcher(None, f"{folder}/{name}", begin).ratio()
 
 
-class _Unclaimed:
-    """The names of files without claim that resemble patterns without file."""
-
-    def __init__(self) -> None:
-        self._best: dict[str, list[tuple[float, str]]] = defaultdict(list)
-        self._folder = ""
-        self._names = 0
-
-    def compare(self, path: str, patterns: Iterable[str]) -> None:
-        """Compare a file with patterns, if it is among the first of its folder."""
-        folder = path.rpartition("/")[0]
-        self._names = self._names + 1 if folder == self._folder else 1
-        self._folder = folder
-        for pattern in patterns if self._names <= _NAMES_OF_FOLDER else ():
-            likeness = _likeness(pattern.lower(), path.lower())
-            if likeness >= _LEAST_LIKENESS:
-                best = sorted({*self._best[pattern], (-likeness, path)})
-                self._best[pattern] = best[:_NAMES_SHOWN]
-
-    def near(self, pattern: str) -> tuple[str, ...]:
-        """Return the names that resemble a pattern most."""
-        return tuple(path for _, path in self._best[pattern])
-
-
 def _claims(campaign: Campaign) -> list[_Claim]:
     claims: list[_Claim] = []
     version = reading_version()
@@ -407,16 +405,11 @@ def _claims(campaign: Campaign) -> list[_Claim]:
                 ],
             ]
             scan_key = digest(settings)[:16]
-            claims.extend(
-                _Claim(key, role, *_split(pattern), pattern, scan_key) for pattern in patterns
-            )
+            for pattern in patterns:
+                folder, slash, name = pattern.rpartition("/")
+                # Files of a folder share the first. But "**" also matches files in subfolders.
+                whole = "**" in name
+                begin = None if whole else path_pattern(folder + slash)
+                end = path_pattern(pattern if whole else name)
+                claims.append(_Claim(key, role, begin, end, pattern, scan_key))
     return claims
-
-
-def _split(pattern: str) -> tuple[re.Pattern[str] | None, re.Pattern[str]]:
-    """Split a pattern into folder and name, because files of a folder share the first."""
-    folder, slash, name = pattern.rpartition("/")
-    if "**" in name:
-        # Such a name also matches files in subfolders.
-        return None, path_pattern(pattern)
-    return path_pattern(folder + slash), path_pattern(name)

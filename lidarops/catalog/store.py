@@ -26,8 +26,8 @@ from lidarops.catalog.database import (
     VERDICT,
 )
 from lidarops.catalog.granules import Granules
-from lidarops.catalog.headers import RETRY, row_of
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.raw_files import RETRY, row_of
 from lidarops.errors import CatalogError
 from lidarops.kinds import kinds
 from lidarops.records import (
@@ -64,8 +64,7 @@ class Dependence:
     code_version: str
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedProduct:
+class RecordedProduct(NamedTuple):
     """A product in the ledger."""
 
     path: str
@@ -81,28 +80,13 @@ class RecordedProduct:
     stamp: Stamp
 
 
-@dataclass(frozen=True, slots=True)
-class NewProduct:
+class NewProduct(NamedTuple):
     """A new product for the ledger."""
 
     record: ProductRecord
     mtime_ns: int
     depends_on: Dependence
     inputs: tuple[InputRecord, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class SceneEntry:
-    """The outcome of one scene, entered as it ends."""
-
-    outcome: SceneOutcome
-    day: int
-    key: str
-    final: bool
-    """Whether another try on the same inputs would end the same way."""
-    products: tuple[NewProduct, ...] = ()
-    digests: Mapping[str, str] = field(default_factory=dict)
-    """SHA-256 of raw files by path, as far as the catalog does not have them yet."""
 
 
 class RawSet(NamedTuple):
@@ -121,6 +105,7 @@ class LastTry(NamedTuple):
     internal: str
     """Traceback if the error is internal, a bug of lidarops; else empty."""
     final: bool
+    """Whether another try on the same inputs would end the same way."""
     crashes: int
     day: int
 
@@ -265,26 +250,41 @@ class Store(Granules):
             statement = self.insert(SCENE).on_conflict_do_update(index_elements=keys, set_=again)
             connection.execute(statement, row)
 
-    def record(self, entry: SceneEntry, run: str, token: str) -> None:
-        """Enter the outcome of a scene in one transaction: products, inputs, digests, timings."""
-        outcome = entry.outcome
+    def record(
+        self,
+        outcome: SceneOutcome,
+        products: Collection[NewProduct],
+        digests: Mapping[str, str],
+        tried: LastTry,
+        *,
+        run: str,
+        token: str,
+    ) -> None:
+        """Enter the outcome of a scene in one transaction, as it ends.
+
+        Parameters
+        ----------
+        outcome : SceneOutcome
+        products : collection of NewProduct
+        digests : mapping of str to str
+            SHA-256 of raw files by path, as far as the catalog does not have them yet.
+        tried : LastTry
+        run, token : str
+        """
+        ours = {"campaign": self.campaign, "scene": outcome.scene}
         with self._writing(token) as connection:
-            self._enter_products(connection, entry, run)
-            row = {
-                "campaign": self.campaign, "scene": outcome.scene, "day": entry.day,
-                "key": entry.key, "run": run, "error": outcome.error,
-                "internal": outcome.internal, "final": entry.final, "crashes": 0,
-            }  # fmt: skip
-            connection.execute(self.upsert(SCENE), row)
+            if products:
+                self._enter_products(connection, products, {**ours, "day": tried.day, "run": run})
+            connection.execute(self.upsert(SCENE), {**ours, "run": run, **tried._asdict()})
             place = {"run": run, "scene": outcome.scene}
             stages = [{**place, "stage": name, "seconds": s} for name, s in outcome.seconds.items()]
             if stages:
                 connection.execute(self.upsert(STAGE, replacing=False), stages)
             if outcome.error:
-                day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == entry.day
+                day = VERDICT.c.campaign == self.campaign, VERDICT.c.day == tried.day
                 connection.execute(sa.delete(VERDICT).where(*day))
-            if entry.digests:
-                connection.execute(*self._digests(entry.digests))
+            if digests:
+                connection.execute(*self._digests(digests))
             self._refuse(connection, outcome.refused)
             connection.execute(
                 sa.update(RUN)
@@ -297,14 +297,14 @@ class Store(Granules):
                 )
             )
 
-    def _enter_products(self, connection: sa.Connection, entry: SceneEntry, run: str) -> None:
-        made = {new.record.path: new for new in entry.products}
-        if not made:
-            return
+    def _enter_products(
+        self, connection: sa.Connection, products: Iterable[NewProduct], scene: Mapping[str, Any]
+    ) -> None:
+        made = {new.record.path: new for new in products}
         ours = {"campaign": self.campaign}
         self._drop_products(connection, made)
-        scene = {**ours, "scene": entry.outcome.scene, "day": entry.day, "run": run}
-        connection.execute(sa.insert(PRODUCT), [scene | _product_row(new) for new in made.values()])
+        rows = [{**scene, **_product_row(new)} for new in made.values()]
+        connection.execute(sa.insert(PRODUCT), rows)
         sets: dict[str, list[InputRecord]] = {}
         links = []
         for path, new in made.items():

@@ -108,7 +108,7 @@ def catalog(
         summary = update_catalog(settings, progress=bar.advance, wait=wait, workers=workers)
         rebuilt = None
         if rebuild:
-            from lidarops.run.rebuild import rebuild_ledger
+            from lidarops.run.ledger_run import rebuild_ledger
 
             rebuilt = rebuild_ledger(settings, wait=wait, progress=bar.advance)
     with Store(settings.catalog_url, settings.name) as store:

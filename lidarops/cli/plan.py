@@ -189,7 +189,7 @@ def _show_rest(
 
 def _memory(judged: Judgement) -> dict[str, float]:
     """Return the memory that a scene needs, in bytes, for what is to be made and for everything."""
-    from lidarops.scene.memory import scene_memory
+    from lidarops.scene.job import scene_memory
 
     return {
         "to_be_made": scene_memory(judged.scene, judged.needed()).total,

@@ -32,8 +32,6 @@ from lidarops.system.files import only_one
 from lidarops.system.processes import objects_frozen
 
 if TYPE_CHECKING:
-    from distributed import Client
-
     from lidarops.reports.run_page import RunReport
     from lidarops.run.staleness import Judgement
 
@@ -67,10 +65,9 @@ def reprocess(
     *,
     selection: Selection | None = None,
     options: Options | None = None,
-    client: Client | None = None,
 ) -> RunRecord | None:
     """Do what `bring_up_to_date` does, and return the record; None if there was nothing to do."""
-    return bring_up_to_date(campaign, selection=selection, options=options, client=client).record
+    return bring_up_to_date(campaign, selection=selection, options=options).record
 
 
 def bring_up_to_date(
@@ -78,7 +75,6 @@ def bring_up_to_date(
     *,
     selection: Selection | None = None,
     options: Options | None = None,
-    client: Client | None = None,
 ) -> Result:
     """Bring catalog and products up to date: make all stale products, and nothing else.
 
@@ -90,8 +86,6 @@ def bring_up_to_date(
     selection : Selection, optional
         What to process; default everything.
     options : Options, optional
-    client : distributed.Client, optional
-        A cluster to run on.
 
     Returns
     -------
@@ -119,7 +113,7 @@ def bring_up_to_date(
         lock.wait_for(lambda: not lock.is_taken())
         while True:
             try:
-                return _pass(DayStates(campaign, store, selection), lock, options, client)
+                return _pass(DayStates(campaign, store, selection), lock, options)
             except OvertakenError:
                 _LOG.info("another run has ended: judging again")
 
@@ -244,7 +238,7 @@ def _days_to_judge(
     return states.selection.days(sorted({*changed, *states.months(changed)}))
 
 
-def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None) -> Result:
+def _pass(states: DayStates, lock: Lock, options: Options) -> Result:
     """Update the catalog, and do what the days that changed need."""
     campaign, store, write = states.campaign, states.store, lock.acquire_unchanged
     summary = scan_archive(campaign, store, before_write=write, workers=options.workers)
@@ -253,7 +247,7 @@ def _pass(states: DayStates, lock: Lock, options: Options, client: Client | None
     if days or _is_something_left(states, signatures):
         from lidarops.run.processing import Pass  # noqa: PLC0415 - loads the numerics
 
-        work = Pass(states, lock, options, client, summary, days, signatures, verdicts)
+        work = Pass(states, lock, options, summary, days, signatures, verdicts)
         return work.carry_out()
     empty_scenes, set_aside = unused(verdicts, signatures)
     return Result(

@@ -74,9 +74,6 @@ _API_TIMEOUT: Final = 30.0
 
 _LOG = logging.getLogger(__name__)
 
-# Exceptions of a cluster that is absent, refuses, or is configured wrongly.
-_FAILURES = (OSError, TimeoutError, RuntimeError, ValueError, TypeError)
-
 Memory = Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$", description="such as 2GiB")]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$", max_length=63)]
 Workers = Annotated[int, Field(ge=1, le=10_000)]
@@ -314,7 +311,8 @@ def connect_client(cluster: Cluster) -> Iterator[Client]:
     with ExitStack() as stack:
         try:
             client = _connect(cluster, stack)
-        except _FAILURES as error:
+        # The cluster is absent, refuses, or is configured wrongly.
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
             raise ClusterError(
                 f"no {cluster.kind} cluster: {error!r}",
                 field="cluster",
@@ -414,7 +412,6 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
         Memory limit of a worker, such as ``2GiB``; default an equal share of the machine's memory.
         A worker that exceeds it is restarted, and its scene is tried again.
     """
-    import dask  # noqa: PLC0415 - takes a second to import
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
     started = {"distributed.worker.multiprocessing-method": start_method()}
@@ -502,7 +499,11 @@ def scaled_deployment(
 
 def _scale(api: str, namespace: str, deployment: str, replicas: int) -> None:
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/{deployment}/scale"
-    connection = _to_api(api)
+    address = urlsplit(api)
+    connection = HTTPConnection(address.netloc, timeout=_API_TIMEOUT)
+    if address.scheme == "https":
+        context = ssl.create_default_context(cafile=str(IDENTITY / "ca.crt"))
+        connection = HTTPSConnection(address.netloc, timeout=_API_TIMEOUT, context=context)
     try:
         connection.request(
             "PATCH",
@@ -521,11 +522,3 @@ def _scale(api: str, namespace: str, deployment: str, replicas: int) -> None:
         connection.close()
     if response.status >= 300:
         raise ConnectionError(f"{api}{path}: {response.status} {text[:500]}")
-
-
-def _to_api(api: str) -> HTTPConnection:
-    address = urlsplit(api)
-    if address.scheme == "http":
-        return HTTPConnection(address.netloc, timeout=_API_TIMEOUT)
-    context = ssl.create_default_context(cafile=str(IDENTITY / "ca.crt"))
-    return HTTPSConnection(address.netloc, timeout=_API_TIMEOUT, context=context)

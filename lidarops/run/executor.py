@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from lidarops.errors import SceneError
 from lidarops.records import Plan, Scene, SceneOutcome
 from lidarops.run.clusters import WORKER_TIMEOUT, ClusterError
-from lidarops.scene.job import Failure, Job, guarded
-from lidarops.scene.memory import scene_memory
+from lidarops.scene.job import Failure, Job, guarded, scene_memory
 from lidarops.system.code_version import joint_code_version
 from lidarops.system.processes import keep_memory
 
@@ -255,17 +254,6 @@ def _submit(client: Client, job: Job) -> Future:
     return client.submit(_on_worker, *arguments, pure=False)
 
 
-@contextmanager
-def _process_ended_after(seconds: float) -> Iterator[None]:
-    """End this process where the body takes longer, with the tracebacks of its threads."""
-    # Not by a thread of Python, which would wait for a library that holds the interpreter.
-    faulthandler.dump_traceback_later(seconds, exit=True)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-
-
 def _on_worker(pickled: bytes, code: str, seconds: float) -> tuple[SceneOutcome, bool, bool] | str:
     """Process a scene; return how it ended, or why it was not tried."""
     from distributed import get_worker  # noqa: PLC0415 - takes a second to import
@@ -274,8 +262,13 @@ def _on_worker(pickled: bytes, code: str, seconds: float) -> tuple[SceneOutcome,
     if joint_code_version() != code:
         return f"the worker has other code of lidarops: {joint_code_version()}, not {code}"
     job: Job = pickle.loads(pickled)  # noqa: S301 - from the process that started this scene
-    with _process_ended_after(seconds):
+    # Ends a process that takes longer, with the tracebacks of its threads. Not by a thread of
+    # Python, which would wait for a library that holds the interpreter.
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    try:
         return _attempt(job, get_worker().memory_manager.memory_limit)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 class _Workers:

@@ -21,7 +21,6 @@ from lidarops.records import (
     Findings,
     Holding,
     IdlePattern,
-    Role,
     Unmade,
     Unmet,
     UnusableFile,
@@ -32,6 +31,7 @@ from lidarops.run.day_states import FIRST, LAST, DayStates
 from lidarops.run.options import Selection, requested_products
 from lidarops.scene.case import (
     ABSENT,
+    ANCILLARY_FILES,
     LAG_STEP,
     UNMATCHED,
     joined_layout,
@@ -139,16 +139,10 @@ def _unusable_files(
     for name in instruments:
         named = {
             (key, path): role
-            for fact in states.campaign.instruments[name].facts
-            for key, path, role in (
-                ("molecular_profile", fact.molecular_profile, Role.MOLECULAR),
-                ("overlap_profile", fact.overlap_profile, Role.OVERLAP),
-                *(
-                    ("lidar_ratio_profile", channel.lidar_ratio_profile, Role.LIDAR_RATIO)
-                    for channel in fact.channels.values()
-                ),
-            )
-            if path is not None and path not in usable
+            for facts in states.campaign.instruments[name].facts
+            for key, role in ANCILLARY_FILES.items()
+            for part in (facts, *facts.channels.values())
+            if (path := getattr(part, key, None)) is not None and path not in usable
         }
         for (key, path), role in named.items():
             problem = states.file_problem(path, role)

@@ -30,7 +30,7 @@ from lidarops.catalog.folder import (
 from lidarops.errors import LidarOpsError, SceneError
 from lidarops.netcdf.read import open_product
 from lidarops.raw.archive import open_archive
-from lidarops.records import RunRecord, Scene, file_channels, is_glued
+from lidarops.records import Scene, SceneOutcome, file_channels, is_glued
 from lidarops.reports.rejections import rejection_rows
 from lidarops.retrieve.signal.light import FEWEST, MEDIAN_OF_NORMAL
 from lidarops.run.archive import bring_up_to_date
@@ -63,6 +63,7 @@ _OF_ONE_PROFILE: Final = ("overlap:", "dead_time:", "lag:", "read:")
 """Entries of a plan whose flags a longer average does not change."""
 
 Floats = NDArray[np.float64]
+Scenes = tuple[SceneOutcome, ...]
 
 
 def look_at_data(
@@ -135,17 +136,17 @@ class _Look:
         products["elastic"]["channels"] = candidates
         if nitrogen:
             products["raman"] = {"channels": list(nitrogen), "nitrogen": nitrogen}
-        record = self._processed(products, full_overlap or 0.0)
+        scenes = self._processed(products, full_overlap or 0.0)
         shares = {
             channel: share
-            for channel, path in self._made(record, "elastic")
+            for channel, path in self._made(scenes, "elastic")
             if (share := _usable_share(path)) > 0.0
         }
-        raman = (name for name, path in self._made(record, "raman") if _usable_share(path) > 0.0)
-        reasons = {name: self._reason(record, name) for name in candidates if name not in shares}
+        raman = (name for name, path in self._made(scenes, "raman") if _usable_share(path) > 0.0)
+        reasons = {name: self._reason(scenes, name) for name in candidates if name not in shares}
         return FirstLook(len(self.files), shares, reasons, frozenset(raman), full_overlap)
 
-    def _processed(self, products: Mapping[str, Any], full_overlap: float) -> RunRecord | None:
+    def _processed(self, products: Mapping[str, Any], full_overlap: float) -> Scenes:
         """Process the sample with these products, and dead times that are estimated."""
         drafted = self.drafted["instruments"][self.key]
         facts = {**drafted["facts"][0], "full_overlap_range": full_overlap}
@@ -171,19 +172,19 @@ class _Look:
         errors = [scene.error for scene in result.scenes if scene.error]
         if errors:
             raise SceneError(errors[0])
-        return result.record
+        return result.scenes
 
-    def _made(self, record: RunRecord | None, kind: str) -> Iterator[tuple[str, Path]]:
-        for scene in record.scenes if record else ():
+    def _made(self, scenes: Scenes, kind: str) -> Iterator[tuple[str, Path]]:
+        for scene in scenes:
             for product in scene.products:
                 if product.kind == kind:
                     yield product.channel, self.folder / "out/products" / product.path
 
-    def _reason(self, record: RunRecord | None, channel: str) -> str:
+    def _reason(self, scenes: Scenes, channel: str) -> str:
         """Return why a channel has no usable value: flags, or what its plan left out."""
         flags: Counter[str] = Counter()
         left_out: list[str] = []
-        for scene in record.scenes if record else ():
+        for scene in scenes:
             for product in scene.products:
                 if (product.kind, product.channel) == ("elastic", channel):
                     flags.update(product.flagged)
@@ -199,10 +200,10 @@ class _Look:
         """
         # The last one is analog where there is such a record, which counts no pile-up.
         channels = [names[-1] for names in self.headers.candidates]
-        record = self._processed({"signal": {"channels": channels}}, 0.0)
+        scenes = self._processed({"signal": {"channels": channels}}, 0.0)
         ends: dict[str, list[float]] = defaultdict(list)
         begins: list[float] = []
-        for channel, path in self._made(record, "signal"):
+        for channel, path in self._made(scenes, "signal"):
             with open_product(path, ("signal", "range")) as product:
                 known = np.isfinite(product["signal"].values)
                 total = np.where(known, product["signal"].values, 0.0).sum(axis=0)

@@ -12,10 +12,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.sources import path_pattern
+from lidarops.catalog.raw_files import path_pattern
 from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import product_path
 from lidarops.records import (
@@ -44,8 +44,7 @@ Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""
 
 
-@dataclass(frozen=True, slots=True)
-class Orphan:
+class Orphan(NamedTuple):
     """A product that would not be made again."""
 
     product: RecordedProduct

@@ -48,8 +48,6 @@ class Pass:
         Since which no file was refused.
     lock : Lock
     options : Options
-    client : distributed.Client or None
-        A cluster to run on.
     summary : ScanSummary
     days : sequence of int
         To be judged.
@@ -64,7 +62,6 @@ class Pass:
         states: DayStates,
         lock: Lock,
         options: Options,
-        client: Client | None,
         summary: ScanSummary,
         days: Sequence[int],
         signatures: Mapping[int, Signature],
@@ -72,7 +69,7 @@ class Pass:
     ) -> None:
         campaign, self.store = states.campaign, states.store
         self.campaign, self.states, self.lock, self.options = campaign, states, lock, options
-        self.client, self.summary = client, summary
+        self.summary = summary
         self.days, self.signatures, self.known = days, signatures, known
         self.run = LedgerRun(campaign, self.store, lock, journal=options.journal)
         self.told = JudgedDays()
@@ -91,7 +88,7 @@ class Pass:
         """Whether days are judged again, and whether for their months."""
         self.failing = 0
         """Number of scenes in a row that failed for a cause that may pass."""
-        self.on_workers = client is not None or bool(options.cluster) or options.workers > 1
+        self.on_workers = bool(options.cluster) or options.workers > 1
 
     def carry_out(self) -> Result:
         """Return what was done, and the state of the archive after it.
@@ -103,10 +100,13 @@ class Pass:
         """
         options, told = self.options, self.told
         clean = unused(self.known, self.signatures.keys() - set(self.days))
-        self._forget(self.store.scenes_of_other_days(self.signatures))
+        gone = self.store.scenes_of_other_days(self.signatures)
+        if gone:
+            self.lock.acquire_unchanged()
+            self.store.forget_scenes(gone)
         status = RunStatus.FINISHED
         if self.days:
-            if options.workers > 1 and not options.cluster and self.client is None:
+            if options.workers > 1 and not options.cluster:
                 # The modules load while this process judges the scenes.
                 preload_modules(_WORKER_MODULES)
             with self.stop as stop:
@@ -175,32 +175,34 @@ class Pass:
         if first is None and not self.suspects:
             return
         with ExitStack() as stack:
-            client = self.client
-            if client is None and self.on_workers:
+            client = None
+            if self.on_workers:
                 # Take the lock first: another run may leave nothing to do.
                 self.lock.acquire_unchanged()
                 client = self._cluster(stack, self.options.workers)
             if first is not None:
-                note = client is None
-                ended = process_jobs(
-                    chain([first], jobs),
-                    client=client,
-                    stop=self.stop,
-                    taken=lambda job: self.run.take(self.judgements[job.scene.id], note=note),
-                    memory=_bytes(self.options.memory),
-                )
-                self._enter(ended)
+                self._make(chain([first], jobs), client)
             if self.suspects and not self.stop:
                 client = client or self._cluster(stack, 1)
                 if client is not None:
-                    ended = process_jobs(
-                        self.suspects,
-                        client=client,
-                        stop=self.stop,
-                        taken=lambda job: self.run.take(self.judgements[job.scene.id]),
-                        alone=True,
-                    )
-                    self._enter(ended)
+                    self._make(self.suspects, client, alone=True)
+
+    def _make(self, jobs: Iterable[Job], client: Client | None, *, alone: bool = False) -> None:
+        """Carry out jobs, here where there is no cluster, and enter them as they end."""
+        memory = None
+        if self.options.memory is not None:
+            from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
+
+            memory = int(parse_bytes(self.options.memory))
+        ended = process_jobs(
+            jobs,
+            client=client,
+            stop=self.stop,
+            taken=lambda job: self.run.take(self.judgements[job.scene.id], note=client is None),
+            memory=memory,
+            alone=alone,
+        )
+        self._enter(ended)
 
     def _cluster(self, stack: ExitStack, workers: int) -> Client | None:
         """Start or reach a cluster; None if a signal came first, which then ends the run."""
@@ -275,12 +277,7 @@ class Pass:
             self.lock.acquire_unchanged()
             self.store.store_digests(judged.digests)
             self.store.touch_products(judged.touched)
-            self._forget(judged.gone)
-
-    def _forget(self, scenes: Collection[str]) -> None:
-        if scenes:
-            self.lock.acquire_unchanged()
-            self.store.forget_scenes(scenes)
+            self.store.forget_scenes(judged.gone)
 
     def _settle(self, *, stopped: bool) -> None:
         """Record the days on which everything is fresh; they are not judged again until changed."""
@@ -310,15 +307,6 @@ class Pass:
         if new:
             self.lock.acquire_unchanged()
             self.store.store_verdicts(new)
-
-
-def _bytes(size: str | None) -> int | None:
-    """Return a size such as ``2GiB`` in bytes."""
-    if size is None:
-        return None
-    from dask.utils import parse_bytes  # noqa: PLC0415 - most runs have no limit
-
-    return int(parse_bytes(size))
 
 
 def _signed(

@@ -1,27 +1,43 @@
-"""Make a product again from its own provenance, and compare the bytes."""
+"""Make a product again from what it says of campaign, plan and inputs, and compare the bytes."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import xarray as xr
+from pydantic import ValidationError
 
-from lidarops.campaign.model import CATALOG_VARIABLE
+from lidarops.campaign.model import CATALOG_VARIABLE, Campaign
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, ProductError
 from lidarops.netcdf.context import package_versions
-from lidarops.netcdf.read import opened_product
-from lidarops.records import InputRecord, Role
-from lidarops.run.recipe import RAW, Recipe, stays_inside
+from lidarops.netcdf.read import opened_product, read_origin
+from lidarops.raw.formats import RawFile, read_raw_header
+from lidarops.raw.header import named_layout, recorder_names
+from lidarops.records import (
+    Granule,
+    InputRecord,
+    LeftOut,
+    Plan,
+    PlannedStep,
+    Role,
+    Scene,
+    Stamp,
+    Status,
+    UnusedFile,
+    after_pulse,
+)
+from lidarops.scene.dependence import UNUSED
 from lidarops.scene.job import Job, Place
 from lidarops.scene.processing import process_scene
 from lidarops.system.code_version import code_version
@@ -37,6 +53,255 @@ _IF_MOVED: Final = (
     "Moved raw files are found by content in an up-to-date catalog: run lidarops catalog, and give"
     " its URL with --catalog if it is not in a folder above the product."
 )
+
+
+_RAW: Final = (Role.SIGNAL, Role.DARK)
+"""Roles of files in the archive; paths of other inputs start from the campaign folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What a product was made from, and how, according to itself."""
+
+    file: Path
+    kind: str
+    channel: str
+    campaign_name: str
+    settings: Mapping[str, Any]
+    plan: Plan
+    inputs: tuple[InputRecord, ...]
+    code_version: str
+    versions: Mapping[str, str]
+    stamp: Stamp
+    """Version and time of writing that the product states."""
+
+    @classmethod
+    def of(cls, file: Path) -> Recipe:
+        """Read the provenance of a product; raise ProductError if it is insufficient."""
+        document, attributes_of_file = read_origin(file)
+        try:
+            entities = document["entity"]
+            attributes = entities["lidarops:product"]
+            software = document["agent"]["lidarops:software"]
+            recipe = cls(
+                file=file,
+                kind=str(attributes["lidarops:kind"]),
+                channel=str(attributes["lidarops:channel"]),
+                campaign_name=str(attributes["lidarops:campaign"]),
+                settings=json.loads(attributes["lidarops:settings"]),
+                plan=_plan(json.loads(entities["lidarops:plan"]["lidarops:json"])),
+                inputs=_inputs(entities, document["used"]),
+                code_version=software["lidarops:code_version"],
+                versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
+                stamp=Stamp(
+                    int(attributes_of_file["product_version"]),
+                    datetime.fromisoformat(str(attributes_of_file["date_modified"])),
+                ),
+            )
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise _insufficient(file, repr(error)) from error
+        for record in recipe.inputs:
+            # It is read, and copies are written under it: a forged product could choose it freely.
+            if not _stays_inside(record.path):
+                raise ProductError(
+                    f"names an input outside its archive: {record.path}",
+                    file=file,
+                    field="provenance",
+                    remedy="lidarops does not write such products: do not trust this one",
+                )
+        return recipe
+
+    def campaign(self, archive: Path, folder: Path, output: Path) -> Campaign:
+        """Return a campaign that gives only this product; its other inputs are in `folder`."""
+        settings = self.settings
+        try:
+            campaign = Campaign.model_validate(
+                {
+                    **settings["campaign"],
+                    "name": self.campaign_name,
+                    "archive": str(archive),
+                    "output": str(output),
+                    "metadata": settings["metadata"],
+                    **self._instruments(),
+                }
+            )
+        except (KeyError, TypeError, ValidationError) as error:
+            raise _insufficient(self.file, str(error)) from error
+        campaign._folder = str(folder)  # noqa: SLF001 - as `load_campaign` sets it
+        return campaign
+
+    def _instruments(self) -> dict[str, Any]:
+        """Return the stations, instruments and network that the product records."""
+        settings = self.settings
+        keys = settings["keys"]
+        if "network" in settings:
+            members = settings["members"]
+            return {
+                "stations": {
+                    member["keys"]["station"]: member["station"] for member in members.values()
+                },
+                "instruments": {name: _instrument(member, {}) for name, member in members.items()},
+                "networks": {keys["instrument"]: settings["network"]},
+            }
+        products = {self.kind: settings["products"]}
+        return {
+            "stations": {keys["station"]: settings["station"]},
+            "instruments": {keys["instrument"]: _instrument(settings, products)},
+        }
+
+    def scene(self, archive: Path) -> Scene:
+        """Return the scene of the product, from the headers of the raw files in a folder."""
+        settings = self.settings
+        try:
+            if "network" not in settings:
+                return self._scene_of(archive, settings, self.inputs)
+            members = tuple(
+                self._scene_of(archive, member, own)
+                # The members of a product are sorted by name; the network defines their order.
+                for name in settings["network"]["instruments"]
+                for member in [settings["members"].get(name)]
+                if member is not None
+                for own in [[used for used in self.inputs if used.path in set(member["files"])]]
+            )
+            whole = self._scene_of(archive, settings, ())
+        except (KeyError, TypeError, ValueError) as error:
+            raise _insufficient(self.file, repr(error)) from error
+        granules = (granule for member in members for granule in member.granules)
+        dark = (granule for member in members for granule in member.dark)
+        return replace(
+            whole,
+            granules=tuple(sorted(granules, key=_order)),
+            dark=tuple(sorted(dark, key=_order)),
+            members=members,
+        )
+
+    def _scene_of(
+        self, archive: Path, part: Mapping[str, Any], inputs: Iterable[InputRecord]
+    ) -> Scene:
+        """Return the scene of one instrument, with its part of the settings and inputs."""
+        keys = part["keys"]
+        start, stop = (datetime.fromisoformat(moment) for moment in self.settings["window"])
+        raw = (record for record in inputs if record.role in _RAW)
+        read = (_granule(archive, record, keys["instrument"], part["facts"]) for record in raw)
+        granules = sorted((_named(g, self.plan, part["facts"]) for g in read), key=_order)
+        return Scene(
+            id=self.plan.scene,
+            campaign=self.campaign_name,
+            station=keys["station"],
+            instrument=keys["instrument"],
+            start=start,
+            stop=stop,
+            notes=tuple(self.settings["notes"]),
+            unused=self.unused,
+            granules=tuple(granule for granule in granules if granule.role is Role.SIGNAL),
+            dark=tuple(granule for granule in granules if granule.role is Role.DARK),
+            products=tuple(record for record in self.inputs if record.role is Role.PRODUCT),
+        )
+
+    @property
+    def unused(self) -> tuple[UnusedFile, ...]:
+        """The raw files that the product states as unused."""
+        return tuple(
+            UnusedFile(str(file["path"]), Role(file["role"]), str(file["reason"]))
+            for file in self.settings.get(UNUSED, ())
+        )
+
+
+def _stays_inside(path: str) -> bool:
+    """Return whether a path stays in the folder that it is relative to."""
+    pure = PurePosixPath(path)
+    return not (pure.is_absolute() or ".." in pure.parts or "\0" in path)
+
+
+def _insufficient(file: Path, problem: str) -> ProductError:
+    return ProductError(
+        f"its provenance is not sufficient to make the product again: {problem}",
+        file=file,
+        field="provenance",
+        remedy="reprocess the campaign with this version of lidarops",
+    )
+
+
+def _plan(fields: Mapping[str, Any]) -> Plan:
+    return Plan(
+        fields["scene"],
+        tuple(PlannedStep(**step) for step in fields["steps"]),
+        tuple(LeftOut(**left) for left in fields["left_out"]),
+    )
+
+
+def _inputs(
+    entities: Mapping[str, Any], uses: Mapping[str, Mapping[str, Any]]
+) -> tuple[InputRecord, ...]:
+    """Return the inputs of a PROV document, in which files of equal content are one entity."""
+    paths = {
+        name: iter([paths] if isinstance(paths, str) else list(paths))
+        for name, entity in entities.items()
+        for paths in [entity.get("lidarops:path")]
+        if paths is not None
+    }
+    # The writer numbered the uses in sorted order; the paths of an entity have the same order.
+    numbered = [uses[name] for name in sorted(uses, key=lambda name: int(name[len("_:use") :]))]
+    return tuple(
+        InputRecord(
+            next(paths[use["prov:entity"]]),
+            Role(use["prov:role"]),
+            str(entities[use["prov:entity"]]["lidarops:sha256"]),
+        )
+        for use in numbered
+    )
+
+
+def _instrument(settings: Mapping[str, Any], products: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "station": settings["keys"]["station"],
+        "name": settings["instrument"],
+        "files": "*",
+        "facts": [settings["facts"]],
+        "products": products,
+    }
+
+
+def _order(granule: Granule) -> tuple[bool, datetime | None, str]:
+    return granule.start is not None, granule.start, granule.path
+
+
+def _granule(root: Path, record: InputRecord, instrument: str, facts: Mapping[str, Any]) -> Granule:
+    with RawFile(root / record.path) as file:
+        header = read_raw_header(file)
+    shift = timedelta(seconds=facts["clock_offset"])
+    return Granule(
+        path=record.path,
+        size=header.size,
+        mtime_ns=0,
+        instrument=instrument,
+        role=record.role,
+        status=Status.GOOD,
+        start=header.start - shift,
+        stop=header.stop - shift,
+        zenith_angle=header.zenith_angle,
+        azimuth=header.azimuth,
+        altitude=header.altitude,
+        layout=header.layout,
+        format=header.format,
+    )
+
+
+def _named(granule: Granule, plan: Plan, facts: Mapping[str, Any]) -> Granule:
+    """Return a granule with the channel names of a product, whose plan states their recorders.
+
+    Without the bins before the pulse.
+    """
+    own = {channel.name: channel.recorder for channel in granule.layout}
+    stated = {
+        step.channel: step.settings["recorder"]
+        for step in plan.steps
+        if step.settings.get("recorder", "") not in ("", own.get(step.channel))
+        and step.instrument in ("", granule.instrument)
+    }
+    names = recorder_names([(granule.layout, 1, datetime.fromtimestamp(0, UTC))], stated)
+    layout = named_layout(granule.layout, names)
+    return replace(granule, layout=after_pulse(layout, facts.get("pre_trigger", 0.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +364,7 @@ def reproduce_product(
         if folder is not None and not Path(folder).is_dir():
             raise CatalogError("is no folder", file=folder, field=field, wrong_use=True)
     recipe = Recipe.of(Path(product))
-    raw = [record for record in recipe.inputs if record.role in RAW]
+    raw = [record for record in recipe.inputs if record.role in _RAW]
     read = [record for record in recipe.inputs if record.role is Role.PRODUCT]
     others = [record for record in recipe.inputs if record not in (*raw, *read)]
     place = archive or (_folder(recipe, raw, "--archive", catalog) if raw else recipe.file.parent)
@@ -132,37 +397,32 @@ def _staged(
 ) -> Iterator[tuple[Path, list[Difference]]]:
     """Yield a local folder with the raw files under their recorded names, and their differences."""
     with tempfile.TemporaryDirectory(prefix="lidarops-") as name:
-        staged = Path(name)
+        staged, fetched = Path(name, "staged"), Path(name, "fetched")
+        staged.mkdir()
         store = RemoteStore(archive) if is_url(archive) else None
         place = archive if store is None else store.url
-        source = Path(archive) if store is None else store
-        _bring(source, staged, {record.path: record.path for record in records})
+
+        def bring(names: Mapping[str, str]) -> None:
+            """Link to files of the folder, or fetch those of the store: recorded -> present."""
+            if store is not None:
+                store.fetch(sorted(set(names.values())), fetched)
+            for old, now in names.items():
+                file = Path(archive if store is None else fetched, now).absolute()
+                if file.is_file():
+                    target = staged / old
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    target.unlink(missing_ok=True)
+                    target.symlink_to(file)
+
+        bring({record.path: record.path for record in records})
         wrong = list(_changed(staged, records, place))
         lost = [record for record in records if record.path in {each.name for each in wrong}]
         moved = _moved(recipe, lost, catalog)
         if moved:
-            _bring(source, staged, moved)
+            bring(moved)
             still = {each.name for each in _changed(staged, lost, place)}
             wrong = [each for each in wrong if each.name in still]
         yield staged, wrong
-
-
-def _bring(source: Path | RemoteStore, staged: Path, names: Mapping[str, str]) -> None:
-    """Link to files of a folder, or copy those of a store: recorded name -> present name."""
-    with tempfile.TemporaryDirectory(prefix="lidarops-") as fetched:
-        folder = source if isinstance(source, Path) else Path(fetched)
-        if not isinstance(source, Path):
-            source.fetch(sorted(set(names.values())), folder)
-        for old, now in names.items():
-            if (folder / now).is_file():
-                target = staged / old
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.unlink(missing_ok=True)
-                if folder is source:
-                    target.symlink_to((folder / now).absolute())
-                else:
-                    # Not moved: two recorded names may have the same present name.
-                    shutil.copyfile(folder / now, target)
 
 
 def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> dict[str, str]:
@@ -174,7 +434,7 @@ def _moved(recipe: Recipe, lost: Sequence[InputRecord], catalog: str | None) -> 
         else {}
     )
     names = {record.path: (present or {}).get(record.sha256, record.path) for record in lost}
-    return {old: new for old, new in names.items() if old != new and stays_inside(new)}
+    return {old: new for old, new in names.items() if old != new and _stays_inside(new)}
 
 
 def _answer_of_catalog(
@@ -285,15 +545,11 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
         yield Difference("processing", recipe.plan.scene, problem)
         return
     if record.sha256 != sha256_of(recipe.file):
-        yield from _compared(recipe.file, out / "products" / record.path)
-
-
-def _compared(before: Path, after: Path) -> list[Difference]:
-    """Return the differences between two NetCDF files whose bytes differ."""
-    old, new = (opened_product(file, decode_cf=False) for file in (before, after))
-    same = Difference("bytes", before.name, "the same content, stored in other bytes")
-    with old as recorded, new as made:
-        return list(_differences(recorded, made)) or [same]
+        files = (recipe.file, out / "products" / record.path)
+        old, new = (opened_product(file, decode_cf=False) for file in files)
+        same = Difference("bytes", recipe.file.name, "the same content, stored in other bytes")
+        with old as recorded, new as made:
+            yield from list(_differences(recorded, made)) or [same]
 
 
 def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[Difference]:

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from operator import attrgetter
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
 from lidarops.catalog.granules import DatedFile
@@ -62,8 +62,7 @@ MOST_IN_DOUBT: Final = 10
 _ALWAYS: Final = (datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
 
 
-@dataclass(frozen=True, slots=True)
-class Cut:
+class Cut(NamedTuple):
     """Scenes, and the granules that belong to no scene."""
 
     scenes: tuple[Scene, ...]
@@ -91,23 +90,17 @@ def cut_scenes(campaign: Campaign, granules: Iterable[Granule]) -> Cut:
     """
     good = sorted(
         (granule for granule in granules if granule.status is Status.GOOD),
-        key=lambda granule: (granule.instrument, _start(granule), granule.path),
+        key=lambda granule: (granule.instrument, start_time(granule), granule.path),
     )
     signal, twins = _without_twins([g for g in good if g.role is Role.SIGNAL])
     dark = [granule for granule in good if granule.role is Role.DARK]
-    groups: dict[tuple[str, datetime, datetime], list[Granule]] = {}
-    for instrument, own in itertools.groupby(signal, key=lambda granule: granule.instrument):
+    scenes: list[Scene] = []
+    for instrument, own in itertools.groupby(signal, key=attrgetter("instrument")):
         if instrument in campaign.instruments:
-            windows: dict[Window, list[Granule]] = defaultdict(list)
-            for granule, window in _in_windows(campaign, (instrument,), own):
-                windows[window].append(granule)
+            windows = _by_window(campaign, (instrument,), list(own))
             _keep_cycles_whole(windows, campaign.instruments[instrument].facts)
-            groups |= {(instrument, *window): own for window, own in windows.items() if own}
-    scenes = [
-        scene
-        for (instrument, start, stop), members in sorted(groups.items())
-        for scene in _by_layout(campaign, instrument, start, stop, members, dark)
-    ]
+            for window, members in sorted(windows.items()):
+                scenes += _by_layout(campaign, instrument, window, members, dark)
     for key in sorted(campaign.networks):
         scenes += _of_network(campaign, key, signal, dark)
     return Cut(tuple(scenes), tuple(twins))
@@ -132,20 +125,12 @@ def months_of_products(
         window = month_of(start)
         if day_of(window[0]) in days and not scene.endswith(MONTH):
             held[instrument, window].append(product)
-    for (name, (start, stop)), own in sorted(held.items()):
+    for (name, window), own in sorted(held.items()):
         owner = campaign.instruments.get(name)
         requested = owner.products.requested if owner else ()
         if owner and any(kind.name in requested for kind in kinds_of(Scope.MONTH)):
-            yield Scene(
-                id=f"{name}_{start:{STAMP}}{MONTH}",
-                campaign=campaign.name,
-                station=owner.station,
-                instrument=name,
-                start=start,
-                stop=stop,
-                granules=(),
-                products=tuple(sorted(own, key=attrgetter("path"))),
-            )
+            read = tuple(sorted(own, key=attrgetter("path")))
+            yield _scene(campaign, name, window, MONTH, granules=(), products=read)
 
 
 def _of_network(
@@ -157,30 +142,24 @@ def _of_network(
     the other members.
     """
     names = tuple(campaign.networks[key].instruments)
-    groups: dict[tuple[datetime, datetime], dict[str, list[Granule]]] = defaultdict(
-        lambda: defaultdict(list)
-    )
-    own = (granule for granule in signal if granule.instrument in names)
-    for granule, window in _in_windows(campaign, names, own):
-        groups[window][granule.instrument].append(granule)
+    groups = _by_window(campaign, names, [g for g in signal if g.instrument in names])
     scenes = []
-    for (start, stop), by_member in sorted(groups.items()):
+    for window, granules in sorted(groups.items()):
+        own = ([g for g in granules if g.instrument == name] for name in names)
         member_scenes = [
-            _by_layout(campaign, name, start, stop, by_member[name], dark)
-            for name in names
-            if name in by_member
+            _by_layout(campaign, members[0].instrument, window, members, dark)
+            for members in own
+            if members
         ]
         combinations = list(itertools.product(*member_scenes)) if len(member_scenes) > 1 else []
         for members in combinations:
             suffix = f"-{_grids_key(members)}" if len(combinations) > 1 else ""
             scenes.append(
-                Scene(
-                    id=f"{key}_{start:{STAMP}}{suffix}",
-                    campaign=campaign.name,
-                    station=key,
-                    instrument=key,
-                    start=start,
-                    stop=stop,
+                _scene(
+                    campaign,
+                    key,
+                    window,
+                    suffix,
                     granules=_in_time(g for member in members for g in member.granules),
                     dark=_in_time(g for member in members for g in member.dark),
                     members=members,
@@ -194,8 +173,22 @@ def _of_network(
     return scenes
 
 
+def _scene(campaign: Campaign, key: str, window: Window, suffix: str, **held: Any) -> Scene:
+    """Return the scene of an instrument or network in a window, with what it holds."""
+    owner = campaign.instruments.get(key)
+    return Scene(
+        id=f"{key}_{window[0]:{STAMP}}{suffix}",
+        campaign=campaign.name,
+        station=owner.station if owner else key,
+        instrument=key,
+        start=window[0],
+        stop=window[1],
+        **held,
+    )
+
+
 def _in_time(granules: Iterable[Granule]) -> tuple[Granule, ...]:
-    return tuple(sorted(granules, key=lambda granule: (_start(granule), granule.path)))
+    return tuple(sorted(granules, key=lambda granule: (start_time(granule), granule.path)))
 
 
 def _grids_key(members: Sequence[Scene]) -> str:
@@ -212,7 +205,8 @@ def as_recorded(scene: Scene, recorded: Collection[str]) -> Scene:
     return replace(scene, id=whole if whole in recorded else scene.id, members=members)
 
 
-def _start(granule: Granule) -> datetime:
+def start_time(granule: Granule) -> datetime:
+    """Return when a good granule starts."""
     if granule.start is None:
         raise SceneError("has no start time", file=granule.path)
     return granule.start
@@ -223,7 +217,7 @@ def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule
     twins: list[Granule] = []
     first: dict[tuple[str, datetime], Granule] = {}
     for granule in granules:
-        key = (granule.instrument, _start(granule))
+        key = (granule.instrument, start_time(granule))
         if key in first:
             reason = f"starts at the same time as {first[key].path}, which is used"
             twins.append(replace(granule, status=Status.REFUSED, reason=reason))
@@ -233,15 +227,25 @@ def _without_twins(granules: list[Granule]) -> tuple[list[Granule], list[Granule
     return kept, twins
 
 
-def _in_windows(
-    campaign: Campaign, instruments: Sequence[str], granules: Iterable[Granule]
-) -> Iterator[tuple[Granule, Window]]:
-    """Yield granules with their windows; fast where granules come in order of time."""
+def _windows(
+    campaign: Campaign, instruments: Sequence[str], times: Iterable[datetime]
+) -> Iterator[Window]:
+    """Yield the windows that hold some times; fast where these rise."""
     opens = closes = datetime.min.replace(tzinfo=UTC)
-    for granule in granules:
-        if not opens <= _start(granule) < closes:
-            opens, closes = window_at(campaign, instruments, _start(granule))
-        yield granule, (opens, closes)
+    for time in times:
+        if not opens <= time < closes:
+            opens, closes = window_at(campaign, instruments, time)
+        yield opens, closes
+
+
+def _by_window(
+    campaign: Campaign, instruments: Sequence[str], granules: Sequence[Granule]
+) -> dict[Window, list[Granule]]:
+    held: dict[Window, list[Granule]] = defaultdict(list)
+    windows = _windows(campaign, instruments, map(start_time, granules))
+    for granule, window in zip(granules, windows, strict=True):
+        held[window].append(granule)
+    return held
 
 
 def _keep_cycles_whole(
@@ -286,16 +290,15 @@ def _cycles(granules: Sequence[Granule]) -> list[int]:
 def _by_layout(
     campaign: Campaign,
     instrument: str,
-    start: datetime,
-    stop: datetime,
+    window: Window,
     members: list[Granule],
     dark: list[Granule],
 ) -> list[Scene]:
     layouts: dict[str, list[Granule]] = defaultdict(list)
     owner = campaign.instruments[instrument]
     dark = [granule for granule in dark if granule.instrument == instrument]
-    if any(fact.pre_trigger for fact in owner.facts):
-        before = owner.facts_at(_start(members[0])).pre_trigger
+    if members and any(fact.pre_trigger for fact in owner.facts):
+        before = owner.facts_at(start_time(members[0])).pre_trigger
         members, dark = (
             [replace(g, layout=after_pulse(g.layout, before)) for g in own]
             for own in (members, dark)
@@ -306,13 +309,11 @@ def _by_layout(
     for key, group in sorted(layouts.items()):
         suffix = f"-{key}" if len(layouts) > 1 else ""
         scenes.append(
-            Scene(
-                id=f"{instrument}_{start:{STAMP}}{suffix}",
-                campaign=campaign.name,
-                station=owner.station,
-                instrument=instrument,
-                start=start,
-                stop=stop,
+            _scene(
+                campaign,
+                instrument,
+                window,
+                suffix,
                 granules=tuple(group),
                 dark=tuple(
                     granule
@@ -320,9 +321,9 @@ def _by_layout(
                     if _layout_key(granule.layout) == key
                     and [c.recorder for c in granule.layout]
                     == [c.recorder for c in group[0].layout]
-                    and _start(group[0]) - DARK_REACH
-                    <= _start(granule)
-                    <= _start(group[-1]) + DARK_REACH
+                    and start_time(group[0]) - DARK_REACH
+                    <= start_time(granule)
+                    <= start_time(group[-1]) + DARK_REACH
                 ),
                 notes=_notes(group),
             )
@@ -469,7 +470,8 @@ class _Series:
 
     @classmethod
     def of(cls, campaign: Campaign, files: Sequence[DatedFile]) -> Self:
-        windows = list(_windows(campaign, files))
+        times = (file.start for file in files)
+        windows = [opens for opens, _ in _windows(campaign, (files[0].instrument,), times)]
         pairs = itertools.pairwise(zip(files, windows, strict=True))
         lengths = [
             _common_begin(a.path, b.path) for (a, first), (b, then) in pairs if first != then
@@ -490,21 +492,10 @@ class _Series:
     def times_around(self, path: str) -> tuple[datetime, datetime]:
         """Return the times of the files before and after a path; of no file, all times."""
         place = bisect(self.files, path, key=attrgetter("path"))
-        before, after = _ALWAYS
-        if place:
-            before = self.files[place - 1].start
-        if place < len(self.files):
-            after = self.files[place].start
+        before = self.files[place - 1].start if place else _ALWAYS[0]
+        after = self.files[place].start if place < len(self.files) else _ALWAYS[1]
         # The order of names need not be that of times.
         return min(before, after), max(before, after)
-
-
-def _windows(campaign: Campaign, files: Iterable[DatedFile]) -> Iterator[datetime]:
-    opens = closes = datetime.min.replace(tzinfo=UTC)
-    for file in files:
-        if not opens <= file.start < closes:
-            opens, closes = window_at(campaign, (file.instrument,), file.start)
-        yield opens
 
 
 def _common_begin(one: str, other: str) -> int:
@@ -536,7 +527,7 @@ def name_unused(
         # One that is empty or cannot be read is refused, and no longer gives what it gave.
         paths = {file.path for file in unused}
         unused |= {file for file in lost.get(scene.id, ()) if file.path not in paths}
-        named.append(replace(scene, unused=tuple(sorted(unused))) if unused else scene)
+        named.append(replace(scene, unused=tuple(sorted(unused))))
     return tuple(named)
 
 

@@ -7,16 +7,14 @@ other product is stale, and the reason is stated.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.headers import HEADER_BYTES
-from lidarops.catalog.sources import Source
+from lidarops.catalog.raw_files import HEADER_BYTES, Source
 from lidarops.catalog.store import Dependence, LastTry, RecordedProduct, Store, Verdict
 from lidarops.errors import ProductError, RawFormatError
 from lidarops.kinds import kinds
@@ -55,6 +53,7 @@ from lidarops.run.scenes import (
     cut_scenes,
     months_of_products,
     name_unused,
+    start_time,
 )
 from lidarops.scene import dependence
 from lidarops.scene.dependence import ProductKey, ancillary_files
@@ -153,8 +152,7 @@ class Judgement:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class DaysJudged:
+class DaysJudged(NamedTuple):
     """Judgements of the scenes of some days."""
 
     judgements: tuple[Judgement, ...]
@@ -212,14 +210,17 @@ class Judge(DayStates):
 
     def batches(self, days: Iterable[int]) -> Iterator[tuple[int, ...]]:
         """Group days so that the granules of a group fit in memory."""
+        days, counts = sorted(days), Counter[int]()
+        for day_sum in self.store.day_sums() if days else ():
+            counts[day_sum.day] += day_sum.good
         group: list[int] = []
         held = 0
-        for day in sorted(days):
-            if group and held + self._counts[day] > MOST_GRANULES:
+        for day in days:
+            if group and held + counts[day] > MOST_GRANULES:
                 yield tuple(group)
                 group, held = [], 0
             group.append(day)
-            held += self._counts[day]
+            held += counts[day]
         if group:
             yield tuple(group)
 
@@ -320,14 +321,6 @@ class Judge(DayStates):
         return Source.of(self.campaign.archive)
 
     @cached_property
-    def _counts(self) -> dict[int, int]:
-        """Number of good granules of each day."""
-        counts: dict[int, int] = defaultdict(int)
-        for day_sum in self.store.day_sums():
-            counts[day_sum.day] += day_sum.good
-        return counts
-
-    @cached_property
     def lost(self) -> Lost:
         """Raw files of products that the archive no longer gives; looked up once."""
         return find_lost(self.campaign, self.store)
@@ -339,16 +332,19 @@ class Judge(DayStates):
         granules = list(map(self.names.granule, stored))
         used = {day + near for day in days for near in range(-DARK_DAYS, DARK_DAYS + 1)}
         kept, refused, noted = without_outlying(granules, used, self._header, self._ahead)
-        aside = [granule for granule in refused if day_of(_moment(granule)) in days]
+        aside = [granule for granule in refused if day_of(start_time(granule)) in days]
         cut = cut_scenes(
             self.campaign,
             [
                 granule
                 for granule in kept
-                if granule.role is Role.DARK or day_of(_moment(granule)) in days
+                if granule.role is Role.DARK or day_of(start_time(granule)) in days
             ],
         )
-        unused = [*self.refused, *(RefusedFile(granule, _moment(granule)) for granule in refused)]
+        unused = [
+            *self.refused,
+            *(RefusedFile(granule, start_time(granule)) for granule in refused),
+        ]
         recorded = defaultdict[str, list[RecordedProduct]](list)
         for product in products:
             recorded[product.scene].append(product)
@@ -357,14 +353,13 @@ class Judge(DayStates):
             scene: [file for product in made for file in self.lost.unused.get(product.path, ())]
             for scene, made in recorded.items()
         }
-        return replace(
-            cut,
+        return cut._replace(
             scenes=(*name_unused(known, unused, lost), *self._months(days)),
             set_aside=(*cut.set_aside, *aside),
             file_notes=tuple(
                 FileNote(granule.instrument, note, contradicts=False, files=1)
                 for granule, note in noted
-                if day_of(_moment(granule)) in days
+                if day_of(start_time(granule)) in days
             ),
         )
 
@@ -373,7 +368,7 @@ class Judge(DayStates):
         instrument = self.campaign.instruments[granule.instrument]
         if instrument.name_times == "ignored":
             return None
-        return instrument.facts_at(_moment(granule)).clock_offset
+        return instrument.facts_at(start_time(granule)).clock_offset
 
     def _months(self, days: set[int]) -> Iterator[Scene]:
         """Yield the months that begin on some days, of which products are made."""
@@ -439,7 +434,6 @@ class Judge(DayStates):
         stale: list[Stale] = []
         frozen: list[Stale] = []
         kept: list[Stale] = []
-        frozen_period = not self._thaw and self.campaign.is_frozen(scene.start)
         kinds_ = self.selection.kinds
         requested = dependence.plan_of_kinds(whole, kinds_) if kinds_ else whole
         products = requested.product_keys
@@ -454,7 +448,9 @@ class Judge(DayStates):
                 one = Stale(kind, channel, reason, known, restored)
                 if known and known.path in self.lost.protected:
                     kept.append(one)
-                elif known and not restored and frozen_period:
+                elif (
+                    known and not (restored or self._thaw) and self.campaign.is_frozen(scene.start)
+                ):
                     if not (self.campaign.products_root / path).exists():
                         remedy = "only a copy restores this version, --thaw makes a new one"
                         one = replace(one, reason=f"{reason}; {remedy}")
@@ -682,7 +678,7 @@ def _verdicts(
             if judged.empty_reason:
                 verdict.empty_scenes[judged.scene.id] = judged.empty_reason
     for granule in set_aside:
-        if verdict := verdicts.get(day_of(_moment(granule))):
+        if verdict := verdicts.get(day_of(start_time(granule))):
             verdict.set_aside[granule.path] = granule.reason
     return verdicts
 
@@ -704,7 +700,3 @@ def _difference(before: Sequence[InputRecord], now: Sequence[InputRecord]) -> st
             others = f" and {len(files) - 1} more" if len(files) > 1 else ""
             changes.append(f"{word}: {first.role.value} {first.path}{others}")
     return "; ".join(changes) or "its inputs changed"
-
-
-def _moment(granule: Granule) -> datetime:
-    return granule.start or datetime.min.replace(tzinfo=UTC)

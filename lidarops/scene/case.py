@@ -19,6 +19,7 @@ from lidarops.records import (
     DetectionMode,
     LeftOut,
     PlannedStep,
+    Role,
     Scene,
     file_channels,
     glued_parts,
@@ -39,6 +40,12 @@ NO_PRODUCT: Final = "products_read"
 """Name of the rule that leaves out what is made of products that are missing."""
 REQUEST: Final = "request"
 """Name of the rule that leaves out what the campaign does not request."""
+ANCILLARY_FILES: Final = {
+    "molecular_profile": Role.MOLECULAR,
+    "overlap_profile": Role.OVERLAP,
+    "lidar_ratio_profile": Role.LIDAR_RATIO,
+}
+"""Facts, and settings of a plan, that name ancillary files, with their roles."""
 
 Entry = PlannedStep | LeftOut
 Entries = Iterator[Entry]

@@ -7,8 +7,9 @@ not depend on must neither appear in it nor make it stale.
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -25,7 +26,7 @@ from lidarops.records import (
     UnusedFile,
     products_of,
 )
-from lidarops.scene.case import DARK_FILES, READ_STEP, sources
+from lidarops.scene.case import ANCILLARY_FILES, DARK_FILES, READ_STEP, sources
 
 UNUSABLE_FILE: Final = "ancillary"
 """Rule by which a product is left out because a file that it needs cannot be used."""
@@ -37,12 +38,6 @@ ProductKey = tuple[str, str]
 """Kind and channel of a product."""
 
 _EDGES: Final = frozenset({"valid_from", "valid_to"})
-_FILES: Final = {
-    "overlap_profile": Role.OVERLAP,
-    "molecular_profile": Role.MOLECULAR,
-    "lidar_ratio_profile": Role.LIDAR_RATIO,
-}
-"""Settings of a plan that name ancillary files, with their roles."""
 
 
 def read_products(step: PlannedStep) -> tuple[ProductKey, ...]:
@@ -134,21 +129,29 @@ def without_unusable_files(plan: Plan, problems: Mapping[str, str]) -> Plan:
     return replace(plan, steps=steps, left_out=(*plan.left_out, *left_out))
 
 
-def needed_places(entries: Sequence[PlannedStep | LeftOut]) -> list[list[int]]:
-    """Return, for each entry of a plan, the places of the entries that it names as needed."""
+def places_by_need(entries: Sequence[PlannedStep | LeftOut]) -> Iterator[list[list[int]]]:
+    """Yield, for each entry of a plan, the places of the entries that each of its needs names."""
     places: dict[tuple[str, str], list[int]] = defaultdict(list)
     for place, entry in enumerate(entries):
         places[entry.channel, entry.name].append(place)
-    needed: list[list[int]] = [[] for _ in entries]
-    for found, entry in zip(needed, entries, strict=True):
-        for need in entry.needs if isinstance(entry, PlannedStep) else ():
-            channel, _, name = need.rpartition("/")
-            for place in places.get((channel or entry.channel, name), ()):
-                other = entries[place]
-                of_member = not entry.instrument or other.instrument == entry.instrument
-                if of_member and other.product in ("", entry.product):
-                    found.append(place)
-    return [sorted(found) for found in needed]
+    for entry in entries:
+        needs = entry.needs if isinstance(entry, PlannedStep) else ()
+        parts = (need.rpartition("/") for need in needs)
+        yield [
+            [
+                place
+                for place in places.get((channel or entry.channel, name), ())
+                # A product of a whole network needs entries of every member.
+                if entry.instrument in ("", entries[place].instrument)
+                and entries[place].product in ("", entry.product)
+            ]
+            for channel, _, name in parts
+        ]
+
+
+def needed_places(entries: Sequence[PlannedStep | LeftOut]) -> list[list[int]]:
+    """Return, for each entry of a plan, the places of the entries that it names as needed."""
+    return [sorted(itertools.chain(*found)) for found in places_by_need(entries)]
 
 
 def plan_of_kinds(plan: Plan, selected: Collection[str]) -> Plan:
@@ -239,7 +242,7 @@ def ancillary_files(steps: Iterable[PlannedStep]) -> dict[str, Role]:
     return {
         path: role
         for step in steps
-        for key, role in _FILES.items()
+        for key, role in ANCILLARY_FILES.items()
         if (path := step.settings.get(key)) is not None
     }
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, timedelta
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Final, Literal, cast
 
 import numpy as np
@@ -66,7 +65,7 @@ from lidarops.scene.profiles import (
 )
 from lidarops.settings import SettingsModel, quantity
 
-_Power = npt.NDArray[np.float64]
+Array = npt.NDArray[np.float64]
 
 
 class LagSettings(SettingsModel):
@@ -140,7 +139,7 @@ def glue(settings: GlueSettings, signal: ChannelSignal, *, estimated: bool) -> G
 
 def _groups(
     archive: xr.Dataset, analog: FileProfiles, photon: FileProfiles
-) -> Iterator[tuple[_Power, _Power]]:
+) -> Iterator[tuple[Array, Array]]:
     """Yield the power of the first profiles of a scene in both channels, (time, range)."""
     for rows in profile_groups(min(labeled_gluing.LAG_PROFILES, archive.sizes["time"])):
         counts = archive.isel(time=rows)
@@ -157,8 +156,6 @@ def _samples(
         counts = archive.isel(time=rows[first : first + together])
         yield analog.of(counts), photon.of(counts)
 
-
-Array = npt.NDArray[np.float64]
 
 _NEAR_THE_SCENE: Final = f"within {DARK_REACH / timedelta(hours=1):g} h of the scene"
 _ASSUMED_DEAD_TIME: Final = f"{1e9 * DEFAULT_DEAD_TIME:g} ns"
@@ -460,23 +457,9 @@ def plan_molecular(case: ChannelCase[Any]) -> Entry:
     return case.run("molecular", reason, MolecularSettings(molecular_profile=source or None))
 
 
-PIPE: Final[Mapping[str, Callable[[ChannelCase[Any]], Entry]]] = MappingProxyType(
-    {
-        "read": plan_read,
-        "overlap": plan_overlap,
-        "range_offset": plan_range_offset,
-        "dark": plan_dark,
-        "dead_time": plan_dead_time,
-        "noise": plan_noise,
-        "lag": plan_lag,
-        "glue": plan_glue,
-        "molecular": plan_molecular,
-    }
-)
-"""What decides on a stage, by its name, in the order in which stages run."""
-_OF_FILES: Final = ("read", "overlap", "range_offset", "dark", "dead_time", "noise")
-"""From the counts of a channel of the files to its profiles."""
-_OF_GLUED: Final = ("read", "overlap", "lag", "glue")
+_OF_FILES: Final = (plan_overlap, plan_range_offset, plan_dark, plan_dead_time, plan_noise)
+"""From the counts of a channel of the files to its profiles, in the order in which stages run."""
+_OF_GLUED: Final = (plan_overlap, plan_lag, plan_glue)
 """From two channels of the files to the profiles of the glued one."""
 AIR: Final = "molecular"
 """Stage that runs once a channel, if one of its products needs it."""
@@ -501,11 +484,11 @@ def plan_stages(case: ChannelCase[Any]) -> list[Entry]:
 
     Only that it is not read, if no product needs the channel.
     """
-    reading, *others = _OF_GLUED if is_glued(case.channel.name) else _OF_FILES
-    read = PIPE[reading](case)
+    read = plan_read(case)
     if isinstance(read, LeftOut):
         return [read]
-    return [read, *(PIPE[name](case) for name in others)]
+    decided = _OF_GLUED if is_glued(case.channel.name) else _OF_FILES
+    return [read, *(stage(case) for stage in decided)]
 
 
 def channel_signal(source: Source, steps: Sequence[PlannedStep], channel: str) -> ChannelSignal:

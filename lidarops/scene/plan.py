@@ -7,7 +7,7 @@ is a sentence that a user can check against the campaign file.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -44,8 +44,8 @@ from lidarops.scene.case import (
     prepared_channels,
     product_channel,
 )
-from lidarops.scene.dependence import ProductKey, scene_facts
-from lidarops.scene.pipe import AIR, PIPE, plan_stages
+from lidarops.scene.dependence import ProductKey, places_by_need, scene_facts
+from lidarops.scene.pipe import AIR, plan_molecular, plan_stages
 from lidarops.scene.retrieval import Derivation, NetworkCase, NetworkRetrieval, Retrieval, making
 from lidarops.settings import ChannelProduct
 
@@ -96,7 +96,7 @@ def _entries(scene: Scene, campaign: Campaign) -> Entries:
     layout = scene.layout
     glued = joined_layout(layout, named_channels(wanted))
     yield from missing_channels(layout, glued, wanted, facts)
-    cases = list(_cases(scene, campaign, facts, glued))
+    cases = list(_cases(scene, campaign, facts, wanted, layout, glued))
     entries = [entry for case in cases for entry in _channel_entries(case)]
     yield from entries
     # Those of all channels are decided by now.
@@ -125,11 +125,11 @@ def _cases(
     scene: Scene,
     campaign: Campaign,
     facts: InstrumentFacts,
+    wanted: Mapping[str, ChannelProduct],
+    layout: Sequence[ChannelLayout],
     glued: Sequence[ChannelLayout],
 ) -> Iterator[ChannelCase[Any]]:
     """Yield the cases of the channels of the files, and of those glued from them."""
-    layout = scene.layout
-    wanted = campaign.instruments[scene.instrument].products.requested
     requested = {kind: one for kind, one in wanted.items() if not kinds()[kind].reads}
     readers: defaultdict[str, dict[str, None]] = defaultdict(dict)
     for other in glued:
@@ -223,7 +223,7 @@ def _channel_entries(case: ChannelCase[Any]) -> list[Entry]:
         elif not kind.reads:
             products.append(own.leave(kind.name, NOT_REQUESTED, rule=REQUEST))
     needed = any(AIR in entry.needs for entry in products if isinstance(entry, PlannedStep))
-    return [*stages, *([PIPE[AIR](case)] if needed else []), *products]
+    return [*stages, *([plan_molecular(case)] if needed else []), *products]
 
 
 def _linked(entries: Sequence[Entry]) -> list[Entry]:
@@ -231,12 +231,6 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
 
     A product also needs those with which it is compared: of channels that measure the same.
     """
-    # A product of a whole network needs entries of every member.
-    held = {
-        (e.channel, instrument, e.product, e.name)
-        for e in entries
-        for instrument in (e.instrument, "")
-    }
     steps = [entry for entry in entries if isinstance(entry, PlannedStep)]
     wavelengths = {s.channel: s.settings["wavelength"] for s in steps if s.name == READ_STEP}
     alike: defaultdict[tuple[str, float], list[str]] = defaultdict(list)
@@ -246,18 +240,17 @@ def _linked(entries: Sequence[Entry]) -> list[Entry]:
         if kind.common and not kind.reads:
             alike[kind.name, wavelengths[step.channel]].append(step.channel)
     linked: list[Entry] = []
-    for entry in entries:
+    for entry, found in zip(entries, places_by_need(entries), strict=True):
         if isinstance(entry, LeftOut):
             linked.append(entry)
             continue
+        # Products that are read are there, of the scene or of the month.
         read = kinds()[entry.name].reads if entry in products else ()
-        needs = []
-        for need in entry.needs:
-            channel, _, name = need.rpartition("/")
-            place = channel or entry.channel, entry.instrument
-            # Products that are read are there, of the scene or of the month.
-            if name in read or {(*place, "", name), (*place, entry.product, name)} & held:
-                needs.append(need)
+        needs = [
+            need
+            for need, places in zip(entry.needs, found, strict=True)
+            if places or need.rpartition("/")[2] in read
+        ]
         compared = alike.get((entry.name, wavelengths.get(entry.channel, 0.0)), ())
         needs += [f"{other}/{entry.name}" for other in compared if other != entry.channel]
         linked.append(replace(entry, needs=tuple(needs)))

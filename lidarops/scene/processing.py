@@ -117,7 +117,7 @@ def attempt(job: Job) -> tuple[SceneOutcome, bool]:
 
 
 def _process(job: Job) -> tuple[SceneOutcome, bool]:
-    laps = _Laps()
+    began = time.perf_counter()
     failure = Failure("").outcome(job.scene, job.plan)
     order = job.plan.product_keys
     if not order:
@@ -125,20 +125,20 @@ def _process(job: Job) -> tuple[SceneOutcome, bool]:
     with local_files(job.campaign.archive, job.scene) as (root, denied):
         read_all = job.campaign.all_steps
         usable, inputs, refused = check_files(job.scene, root, read_all=read_all, denied=denied)
-        laps.end("digest")
+        seconds = {"digest": time.perf_counter() - began}
         failure = replace(failure, refused=refused, inputs=inputs)
         if refused:
             # Without them the scene is another one, of another plan.
             lost = "" if usable.granules else "no granule of the scene can be read"
             return replace(failure, error=lost), not lost
         process = _Network if usable.members else _Instrument
-        work = process(job, usable, inputs, root, laps)
+        work = process(job, usable, inputs, root, seconds)
         failed = guarded(work.all_products)
     outcome = replace(
         failure,
         inputs=work.inputs,
         refused=work.refused,
-        seconds=laps.seconds,
+        seconds=work.seconds,
         notes=tuple(work.notes),
         disagreements=work.disagreements,
         # Also those before a failure: they are on the disk, so that the ledger must know them.
@@ -150,20 +150,6 @@ def _process(job: Job) -> tuple[SceneOutcome, bool]:
     return replace(outcome, error=error, internal=failed.internal), failed.final
 
 
-class _Laps:
-    """Wall time by stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._began = time.perf_counter()
-
-    def end(self, stage: str) -> None:
-        """Add the time since the end of the last stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._began
-        self._began = now
-
-
 class _Work(ABC):
     """What the processing of a scene of an instrument and of a network share."""
 
@@ -173,10 +159,13 @@ class _Work(ABC):
         scene: Scene,
         inputs: tuple[InputRecord, ...],
         root: Path,
-        laps: _Laps,
+        seconds: dict[str, float],
     ) -> None:
         self.job, self.inputs = job, inputs
-        self.scene, self.root, self.laps = scene, root, laps
+        self.scene, self.root = scene, root
+        self.seconds = seconds
+        """Wall time by stage."""
+        self.began = time.perf_counter()
         self.made: list[ProductRecord] = []
         """Products that are written, in the order in which they were complete."""
         self.notes: dict[str, None] = {}
@@ -197,6 +186,12 @@ class _Work(ABC):
     @abstractmethod
     def products(self) -> None:
         """Make the products."""
+
+    def end(self, stage: str) -> None:
+        """Add the time since the end of the last stage."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.began
+        self.began = now
 
     def _source(
         self,
@@ -250,7 +245,7 @@ class _Work(ABC):
         record = writer.record
         stays = record.change is not None and record.change.grade is Grade.NONE
         self.made.append(replace(record, stamp=place.former) if stays else record)
-        self.laps.end("write")
+        self.end("write")
 
     def _write(self, context: Context, results: Iterator[xr.Dataset]) -> None:
         """Write a product from its frame and the rows that follow."""
@@ -259,9 +254,13 @@ class _Work(ABC):
                 self._add(rows, writer)
 
     def _add(self, rows: xr.Dataset, writer: ProductWriter) -> None:
-        self.laps.end("retrieve")
-        writer.add(_told_from_gaps(rows))
-        self.laps.end("write")
+        self.end("retrieve")
+        flags = {str(name): rows[name] for name in rows if str(name).endswith(QUALITY_FLAG)}
+        dark, missing = int(Quality.NO_SIGNAL), int(Quality.INPUT_MISSING)
+        # Where there is no light, no data are missing.
+        flags = {n: f.where((f & dark) == 0, f & ~missing) for n, f in flags.items()}
+        writer.add(rows.assign(flags))
+        self.end("write")
 
 
 class _Instrument(_Work):
@@ -279,7 +278,7 @@ class _Instrument(_Work):
             for channel in channels:
                 self._make_products(source, channel, compared)
         judged, pairs = compare_channels(compared) if compared else ([], ())
-        self.laps.end("retrieve")
+        self.end("retrieve")
         # Pairs of two products that stand were reported when these were made.
         self.disagreements = tuple(
             pair
@@ -355,7 +354,7 @@ class _Instrument(_Work):
                     if kind in writers:
                         self._add(rows, writers[kind])
                     else:
-                        self.laps.end("retrieve")
+                        self.end("retrieve")
                         frame = _with_words(rows, contexts[kind], signal)
                         writer = self._writer(frame, contexts[kind])
                         writers[kind] = until_written.enter_context(writer)
@@ -369,13 +368,6 @@ class _Instrument(_Work):
                 compared.append(Retrieved(common, contexts[kind], frame, tuple(results)))
             else:
                 self._write(contexts[kind], itertools.chain([frame], results))
-
-
-def _told_from_gaps(rows: xr.Dataset) -> xr.Dataset:
-    """Return rows of a product in whose flags no data are missing where there is no light."""
-    flags = {str(name): rows[name] for name in rows if str(name).endswith(QUALITY_FLAG)}
-    dark, missing = int(Quality.NO_SIGNAL), int(Quality.INPUT_MISSING)
-    return rows.assign({n: f.where((f & dark) == 0, f & ~missing) for n, f in flags.items()})
 
 
 def _with_words(frame: xr.Dataset, context: Context, signal: ChannelSignal) -> xr.Dataset:
@@ -405,7 +397,7 @@ class _Network(_Work):
                     for chunk in chunks(source, channels, (), profiles):
                         stream.add(member, chunk)
             made = stream.result()
-            self.laps.end("retrieve")
+            self.end("retrieve")
             first = next(m for m in self.job.scene.members if m.instrument == members[0].instrument)
             context = product_context(
                 self.job,

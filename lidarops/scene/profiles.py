@@ -64,61 +64,33 @@ def bin_ranges(archive: xr.Dataset, channel: str, offset: float) -> npt.NDArray[
     return np.asarray(distance, dtype=np.float64)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
 class FileProfiles:
-    """Profiles of a channel that the files hold.
+    """Profiles of a channel that the files hold."""
 
-    Parameters
-    ----------
-    channel : str
-    range : ndarray of float64
-        Ranges of the bin centres, m.
-    dark : DarkSignals or None
-        The dark signals that are subtracted.
-    condition : callable
-        `lidarops.retrieve.signal.labeled.condition` with its settings.
-    of_before : callable, optional
-        As `condition`, of the bins before the pulse.
-    """
-
-    def __init__(
-        self,
-        channel: str,
-        range: npt.NDArray[np.float64],  # noqa: A002 - the field's word
-        dark: DarkSignals | None,
-        condition: Callable[[xr.Dataset, str], xr.Dataset],
-        of_before: Callable[[xr.Dataset, str], xr.Dataset] | None = None,
-    ) -> None:
-        self.range = range
-        self._channel, self._dark, self._condition = channel, dark, condition
-        self._of_before = of_before
+    channel: str
+    range: npt.NDArray[np.float64]
+    """Ranges of the bin centres, m."""
+    dark: DarkSignals | None
+    """The dark signals that are subtracted."""
+    condition: Callable[[xr.Dataset, str], xr.Dataset]
+    """`lidarops.retrieve.signal.labeled.condition` with its settings."""
+    of_before: Callable[[xr.Dataset, str], xr.Dataset] | None = None
+    """As `condition`, of the bins before the pulse."""
 
     def shots(self, counts: xr.Dataset) -> xr.DataArray:
         """Return the number of laser shots of each profile."""
-        return counts[f"{self._channel}_shots"]
+        return counts[f"{self.channel}_shots"]
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles."""
-        conditioned = self._condition(counts, self._channel)
-        if (dark := f"{self._channel}_{LIGHTLESS}") in counts:
+        conditioned = self.condition(counts, self.channel)
+        if (dark := f"{self.channel}_{LIGHTLESS}") in counts:
             conditioned["quality"][counts[dark].to_numpy()] = np.int32(Quality.NO_SIGNAL)
-        if self._of_before is None:
+        if self.of_before is None:
             return conditioned
-        before = self._of_before(counts, f"{BEFORE}{self._channel}")
+        before = self.of_before(counts, f"{BEFORE}{self.channel}")
         return conditioned.assign({labeled.SKY: (("time", "sky_part"), labeled.sky_before(before))})
-
-    def sums(
-        self, geometry: xr.Dataset, shots: xr.DataArray, seconds: float, parts: int, lag: int
-    ) -> IntervalSums:
-        """Return the sums over clock intervals, still without profiles."""
-        return IntervalSums(
-            geometry,
-            self.range,
-            seconds=seconds,
-            shots=shots,
-            shared_variance=None if self._dark is None else self._dark.variance,
-            parts=parts,
-            lag=lag,
-        )
 
     @property
     def recorded(self) -> tuple[tuple[FileProfiles, int], ...]:
@@ -131,40 +103,30 @@ class FileProfiles:
         return own
 
 
+@dataclass(frozen=True, eq=False, slots=True)
 class GluedProfiles:
-    """Profiles that are glued from those of an analog and a photon-counting channel.
+    """Profiles that are glued from those of an analog and a photon-counting channel."""
 
-    Parameters
-    ----------
-    analog, photon : FileProfiles
-    lag : ChannelLag
-        Lag of the analog record behind the photon-counting one.
-    slope : callable
-        Returns that of profiles that cannot be glued. Kinds that take means do not compare them.
-    """
-
-    def __init__(
-        self,
-        analog: FileProfiles,
-        photon: FileProfiles,
-        lag: ChannelLag,
-        slope: Callable[[], labeled_gluing.Slope],
-    ) -> None:
-        self._analog, self._photon, self._lag, self._slope = analog, photon, lag, slope
+    analog: FileProfiles
+    photon: FileProfiles
+    lag: ChannelLag
+    """Lag of the analog record behind the photon-counting one."""
+    slope: Callable[[], labeled_gluing.Slope]
+    """Returns that of profiles that cannot be glued. Kinds that take means do not compare them."""
 
     @property
     def range(self) -> npt.NDArray[np.float64]:
         """Ranges of the bin centres, m."""
-        return self._photon.range[: self._analog.range.size]
+        return self.photon.range[: self.analog.range.size]
 
     def shots(self, counts: xr.Dataset) -> xr.DataArray:
         """Return the number of laser shots of each profile."""
-        return self._photon.shots(counts)
+        return self.photon.shots(counts)
 
     def of(self, counts: xr.Dataset) -> xr.Dataset:
         """Return power, variance and quality of profiles, and the variables of the gluing."""
-        records = self._analog.of(counts), self._photon.of(counts)
-        return labeled_gluing.glue(*records, self._lag, self._slope())
+        records = self.analog.of(counts), self.photon.of(counts)
+        return labeled_gluing.glue(*records, self.lag, self.slope())
 
     @property
     def recorded(self) -> tuple[tuple[FileProfiles, int], ...]:
@@ -172,12 +134,12 @@ class GluedProfiles:
 
         The photon-counting one comes last, whose bins are those of the channel.
         """
-        return (self._analog, round(self._lag.bins)), (self._photon, 0)
+        return (self.analog, round(self.lag.bins)), (self.photon, 0)
 
     def joined(self, *means: xr.Dataset, cells: bool = False) -> xr.Dataset:
         """Return the glued means of both records, with those of cells where these are screened."""
         analog, photon = means
-        glued = labeled_gluing.glue(analog, photon, self._lag)
+        glued = labeled_gluing.glue(analog, photon, self.lag)
         kept = photon.isel(range=slice(glued.sizes["range"])).drop_vars(_PARTS)
         kept = kept.drop_vars(labeled.SKY, errors="ignore")
         joined = kept.assign(glued.variables)
@@ -223,12 +185,14 @@ class Averages:
         width = float(np.median(np.diff(first))) if first.size > 1 else 1.0
         parts = THRESHOLDS.most_parts if self._screened else 1
         records = [
-            record.sums(
+            IntervalSums(
                 geometry,
-                shots,
-                seconds,
-                parts,
-                lag + round((first[0] - channel.range[0]) / width),
+                record.range,
+                seconds=seconds,
+                shots=shots,
+                shared_variance=None if record.dark is None else record.dark.variance,
+                parts=parts,
+                lag=lag + round((first[0] - channel.range[0]) / width),
             )
             for channel in channels
             for record, lag in channel.recorded

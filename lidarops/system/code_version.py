@@ -25,7 +25,7 @@ _EVERY_PRODUCT: Final = (
     "lidarops.netcdf.write",
 )
 """Modules that every product passes through."""
-_CATALOGUES: Final = "lidarops.catalog.headers"
+_CATALOGUES: Final = "lidarops.catalog.raw_files"
 """Module that makes an entry of the catalog from the header of a raw file."""
 _OF_KIND: Final = ("settings", "retrieval", "variables")
 """Modules of a kind that make its products, as far as it has them."""

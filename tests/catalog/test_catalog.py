@@ -18,10 +18,10 @@ from support import factories
 from support.archives import raw_archives
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog import headers
+from lidarops.catalog import raw_files
 from lidarops.catalog import scan as scan_module
 from lidarops.catalog.database import GRANULE, LAYOUT
-from lidarops.catalog.headers import GranuleRow, row_of
+from lidarops.catalog.raw_files import GranuleRow, row_of
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
@@ -50,13 +50,13 @@ def store(campaign: Campaign) -> Iterator[Store]:
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List that collects the names of files whose headers are parsed."""
     names: list[str] = []
-    parse = headers.parse_raw_header
+    parse = raw_files.parse_raw_header
 
     def counting(buffer: bytes, *, file: str, size: int) -> object:
         names.append(file)
         return parse(buffer, file=file, size=size)
 
-    monkeypatch.setattr(headers, "parse_raw_header", counting)
+    monkeypatch.setattr(raw_files, "parse_raw_header", counting)
     return names
 
 
@@ -170,7 +170,7 @@ def test_a_file_of_the_future_is_refused_until_it_is_past(
     assert granule.path == "coast/h9"
     assert granule.reason.startswith("starts in the future")
     # By a wrong clock of this machine, too: it is tried again.
-    monkeypatch.setattr(headers, "_CLOCKS_DIFFER", timedelta(days=20))
+    monkeypatch.setattr(raw_files, "_CLOCKS_DIFFER", timedelta(days=20))
     assert scan_archive(campaign, store).refused == 0
 
 
@@ -418,11 +418,11 @@ def test_a_damaged_catalog_says_that_a_new_one_can_be_made(damage: str, campaign
         damaged.granules()
 
 
-def _deadly(read: headers.Headers, due: headers.UnreadFile) -> GranuleRow:
+def _deadly(read: raw_files.Headers, due: raw_files.UnreadFile) -> GranuleRow:
     """End the process at a file."""
     if due.file.path == "coast/h13":
         os._exit(9)
-    return headers.read_row(read, due)
+    return raw_files.read_row(read, due)
 
 
 def _forbid() -> None:

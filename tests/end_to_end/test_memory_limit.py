@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +19,7 @@ from lidarops.errors import SceneError
 from lidarops.run.archive import Options, reprocess
 from lidarops.run.clusters import local_client
 from lidarops.run.executor import USABLE, fitted
-from lidarops.scene.job import Job
-from lidarops.scene.memory import PROCESS, SceneMemory, scene_memory
+from lidarops.scene.job import PROCESS, Job, SceneMemory, scene_memory
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_a_refused_scene_is_tried_again_with_a_larger_limit(archive: Archive) ->
 def test_workers_refuse_by_their_own_limit(archive: Archive) -> None:
     campaign = archive.write()
     with local_client(1, memory="400MiB") as client:
-        record = reprocess(campaign, client=client)
+        record = reprocess(campaign, options=Options(cluster=lambda: nullcontext(client)))
     assert record is not None
     assert record.scenes
     assert all("the limit of the workers" in scene.error for scene in record.scenes)
@@ -129,7 +129,7 @@ def test_a_worker_of_700_mib_processes_a_scene_of_101_mb(tmp_path: Path) -> None
     )
     peaks.write_files(tmp_path / "raw", 101)
     with local_client(1, memory="700MiB") as client:
-        record = reprocess(campaign, client=client)
+        record = reprocess(campaign, options=Options(cluster=lambda: nullcontext(client)))
     assert record is not None
     assert [scene.error for scene in record.scenes] == [""]
     assert {product.kind for product in record.scenes[0].products} == {

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.store import Store
 from lidarops.cli import app
-from lidarops.run import rebuild
+from lidarops.run import ledger_run
 from lidarops.run.archive import bring_up_to_date, reprocess, update_catalog
-from lidarops.run.rebuild import rebuild_ledger
+from lidarops.run.ledger_run import rebuild_ledger
 
 _OF_THE_RUN = {"run"}
 
@@ -55,7 +55,7 @@ def test_a_lost_ledger_is_restored_row_by_row(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Quality flags are read a profile at a time.
-    monkeypatch.setattr(rebuild, "_BLOCK", 1)
+    monkeypatch.setattr(ledger_run, "_BLOCK", 1)
     campaign = archive.write()
     before = _rows(campaign)
     contents = archive.contents("out/products")

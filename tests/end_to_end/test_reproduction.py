@@ -369,7 +369,7 @@ def _forge(monkeypatch: pytest.MonkeyPatch, product: Path, renamed: dict[str, st
         if path in renamed:
             entity["lidarops:path"] = renamed.pop(path)
     assert not renamed
-    monkeypatch.setattr("lidarops.run.recipe.read_origin", lambda _: (document, attributes))
+    monkeypatch.setattr("lidarops.run.reproduction.read_origin", lambda _: (document, attributes))
 
 
 @pytest.mark.parametrize("escape", ["{outside}", "../outside", "coast/h\0"])

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from support import factories
 
-from lidarops.catalog.headers import row_of
+from lidarops.catalog.raw_files import row_of
 from lidarops.catalog.store import Store
 from lidarops.records import Granule, Role, Unmet
 from lidarops.run.day_states import validity_edges

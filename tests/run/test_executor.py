@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
     # A separate cluster, because dask may lose workers that it restarts.
     with local_client(2) as client:
         client.register_plugin(Poison(scene))
-        result = bring_up_to_date(campaign, client=client)
+        result = bring_up_to_date(campaign, options=Options(cluster=lambda: nullcontext(client)))
     assert set(result.failures) == {scene}
     assert "died 3 times" in result.failures[scene]
     assert "its worker died" in caplog.text
@@ -121,7 +122,7 @@ def test_a_scene_that_hangs_is_ended_and_tried_once_more(archive: Archive) -> No
     with local_client(2) as client:
         client.register_plugin(Sleep(scene))
         begin = time.monotonic()
-        result = bring_up_to_date(campaign, client=client)
+        result = bring_up_to_date(campaign, options=Options(cluster=lambda: nullcontext(client)))
         assert time.monotonic() - begin < 60.0
     assert set(result.failures) == {scene}
     assert "takes longer than 8 s" in result.failures[scene]

@@ -6,6 +6,7 @@ import errno
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -182,7 +183,9 @@ def test_bugs_on_a_worker_come_back_with_the_traceback_of_the_worker(
     with local_client(1) as client:
         client.run(bugs.insert, error, DAY)
         client.run(bugs.insert_in_the_worker, error, "2026-03-03")
-        result = bring_up_to_date(archive.write(), client=client)
+        result = bring_up_to_date(
+            archive.write(), options=Options(cluster=lambda: nullcontext(client))
+        )
     assert _made_in(result.record) >= {"rich_20260301T000000", "rich_20260304T000000"}
     assert set(result.internal) == {SCENE, "rich_20260303T000000"}
     for scene, module in ((SCENE, "processing.py"), ("rich_20260303T000000", "executor.py")):

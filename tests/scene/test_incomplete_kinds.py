@@ -13,7 +13,7 @@ from lidarops import kinds as all_kinds
 from lidarops.errors import LidarOpsError
 from lidarops.kinds import Kind
 from lidarops.products.signal import SignalSettings
-from lidarops.scene.pipe import PIPE
+from lidarops.scene.pipe import Stages
 from lidarops.scene.retrieval import Making, Retrieval, making
 
 
@@ -62,7 +62,7 @@ def test_a_kind_of_channels_is_no_kind_of_networks(package: Path) -> None:
 
 @each("kind", all_kinds.kinds())
 def test_entries_of_a_kind_have_names_of_their_own(kind: str) -> None:
-    assert not set(making(kind, Making).settings.model_fields) & set(PIPE)
+    assert not set(making(kind, Making).settings.model_fields) & set(Stages.model_fields)
 
 
 def test_a_kind_reads_only_kinds_that_are_made_before_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from support import factories
 
 from lidarops.records import Plan, Scene
 from lidarops.run.scenes import cut_scenes
-from lidarops.scene.memory import scene_memory
+from lidarops.scene.job import scene_memory
 from lidarops.scene.plan import plan_scene
 
 LEVEL = {"homogeneous": {"channels": ["photon_532o"], "sections": [[750, 4500]]}}

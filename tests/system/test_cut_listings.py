@@ -11,7 +11,7 @@ import pytest
 from fsspec.implementations.local import LocalFileSystem
 from support.servers.stand_ins import SCHEMES, StandIn, served
 
-from lidarops.catalog.sources import Source
+from lidarops.catalog.raw_files import Source
 from lidarops.errors import CatalogError
 
 FILES = [f"coast/{day}/h{k}" for day in "ab" for k in range(4)]

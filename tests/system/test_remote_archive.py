@@ -18,8 +18,8 @@ from support.archives import raw_archives
 
 from lidarops.campaign.model import Campaign
 from lidarops.catalog.folder import instruments_of, read_folder
+from lidarops.catalog.raw_files import Source
 from lidarops.catalog.scan import scan_archive
-from lidarops.catalog.sources import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError
 from lidarops.records import Status

@@ -1,21 +1,24 @@
-"""Make granules from the headers of raw files, and rows of the catalog from granules.
+"""The raw files of an archive: list them, read their headers, and make rows of the catalog.
 
-Its sources decide whether a header is read again, and processes that read headers load it, so it
-imports little, and no database.
+An archive is a folder, or behind a URL. These sources decide whether a header is read again, and
+processes that read headers load them, so they import little, and no database.
 """
 
 from __future__ import annotations
 
+import fnmatch
 import hashlib
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, fields
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from lidarops.catalog.sources import RawFile, Source, printable
-from lidarops.errors import RawFormatError
+from lidarops.errors import RawFormatError, UnavailableError
 from lidarops.raw.formats import parse_raw_header, read_start
 from lidarops.raw.header import RawHeader
 from lidarops.records import (
@@ -29,9 +32,12 @@ from lidarops.records import (
     Status,
     day_of,
 )
+from lidarops.system.files import opened_regular, sha256_of
+from lidarops.system.stores import RemoteStore, Stored
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts, Station
+
 
 RETRY: Final = ""
 """Scan key of a file that could not be read: every scan tries it again."""
@@ -54,6 +60,106 @@ _ROUNDING_OF_ANGLES: Final = 1.0
 """degree; headers hold whole degrees."""
 
 
+def printable(path: str) -> str:
+    """Return a path that can be stored and shown: names may hold bytes that are not UTF-8."""
+    return path if path.isascii() else path.encode("utf-8", "backslashreplace").decode()
+
+
+def path_pattern(pattern: str) -> re.Pattern[str]:
+    """Return the expression of a pattern of paths: that of a shell, whose ** stands for folders."""
+    expressions = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+    tokens = re.split(r"(\*\*/|\*\*|\*|\?|\[[!^]?\]?[^]/]*\])", pattern)
+    expression = "".join(
+        expressions.get(token) or (_choice(token) if number % 2 else re.escape(token))
+        for number, token in enumerate(tokens)
+    )
+    return re.compile(expression + r"\Z")
+
+
+def _choice(brackets: str) -> str:
+    """Return the expression of characters in brackets, such as [67], [a-f], [!0]."""
+    translated = fnmatch.translate(re.sub(r"^\[\^", "[!", brackets))
+    return "(?!/)" + translated.removeprefix("(?s:")[: -len(r")\Z")]
+
+
+def literal_pattern(path: str) -> str:
+    """Return the pattern that matches one path only, whatever characters it holds."""
+    return re.sub(r"[*?\[{]", r"[\g<0>]", path)
+
+
+class Source:
+    """An archive in a local folder."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    @staticmethod
+    def of(archive: str) -> Source:
+        """Return the source of an archive, given its folder or URL."""
+        return RemoteSource(archive) if "://" in archive else Source(Path(archive))
+
+    def files(
+        self,
+        is_used: Callable[[str], bool] = lambda _: True,  # noqa: ARG002 - sizes cost nothing here
+    ) -> Iterator[Stored]:
+        """List files, sorted by path; those that are not used may have no size."""
+        self.refuse_absent()
+        yield from self._files_below(str(self._root), "")
+
+    def refuse_absent(self) -> None:
+        """Raise an error if the folder does not exist.
+
+        Raises
+        ------
+        CatalogError
+        """
+        if not self._root.is_dir():
+            raise UnavailableError(
+                "the archive is not a folder",
+                file=self._root,
+                remedy="set archive in the campaign file, --archive or LIDAROPS_ARCHIVE",
+            )
+
+    def _files_below(self, folder: str, prefix: str) -> Iterator[Stored]:
+        try:
+            with os.scandir(folder) as listing:
+                entries = [(entry, entry.is_dir(follow_symlinks=False)) for entry in listing]
+        except OSError as error:
+            raise UnavailableError(
+                f"cannot be listed: {error.strerror}", file=folder, remedy="check its permissions"
+            ) from error
+        # In the order of the paths of their files.
+        entries.sort(key=lambda item: printable(item[0].name) + "/" * item[1])
+        for entry, is_folder in entries:
+            path = f"{prefix}{entry.name}"
+            if is_folder:
+                yield from self._files_below(entry.path, f"{path}/")
+                continue
+            try:
+                status = entry.stat()
+            except OSError:
+                # A broken link is listed too, so that it is reported as unreadable.
+                yield Stored(path, 0, 0)
+            else:
+                yield Stored(path, status.st_size, status.st_mtime_ns)
+
+    def head(self, path: str, size: int) -> bytes:
+        """Return the first bytes of a file."""
+        with opened_regular(self._root / path) as stream:
+            return stream.read(size)
+
+    def digest(self, path: str) -> str:
+        """Return the SHA-256 of a file."""
+        return sha256_of(self._root / path)
+
+
+class RemoteSource(RemoteStore, Source):
+    """An archive behind an fsspec URL."""
+
+    def refuse_absent(self) -> None:
+        """Do nothing: checking a store may take as long as listing it."""
+
+
 class GranuleRow(NamedTuple):
     """A granule for the catalog."""
 
@@ -66,7 +172,7 @@ class GranuleRow(NamedTuple):
 class UnreadFile(NamedTuple):
     """A file whose header must be read."""
 
-    file: RawFile
+    file: Stored
     instrument: str
     role: Role
     rivals: tuple[str, ...]
@@ -75,8 +181,7 @@ class UnreadFile(NamedTuple):
     """Digest of the settings that affect its granule."""
 
 
-@dataclass(frozen=True, slots=True)
-class Headers:
+class Headers(NamedTuple):
     """The source of raw files and the campaign with which their headers are read."""
 
     source: Source
@@ -126,15 +231,18 @@ def _start(head: bytes, instrument: Instrument) -> datetime | None:
 
 
 def _refused(due: UnreadFile, reason: str, start: datetime | None = None) -> Granule:
+    return _granule(due, Status.REFUSED, reason=reason, start=start)
+
+
+def _granule(due: UnreadFile, status: Status, **stated: Any) -> Granule:
     return Granule(
         path=printable(due.file.path),
         size=due.file.size,
         mtime_ns=due.file.mtime_ns,
         instrument=due.instrument,
         role=due.role,
-        status=Status.REFUSED,
-        reason=reason,
-        start=start,
+        status=status,
+        **stated,
     )
 
 
@@ -169,13 +277,9 @@ def _accepted(
         "longitude": longitude,
         "notes": (*header.notes, *_overridden(header, facts, instrument, station)),
     }
-    return Granule(
-        path=due.file.path,
-        size=due.file.size,
-        mtime_ns=due.file.mtime_ns,
-        instrument=due.instrument,
-        role=due.role,
-        status=Status.GOOD,
+    return _granule(
+        due,
+        Status.GOOD,
         contradictions=tuple(_contradictions(header, position, instrument, station)),
         **{name: getattr(header, name) for name in _STATED} | of_campaign,
     )
