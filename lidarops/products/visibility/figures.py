@@ -35,7 +35,7 @@ from lidarops.figures.series_panels import Quantity, series_figures
 from lidarops.figures.time_axis import Times
 from lidarops.figures.wording import counted
 from lidarops.kinds import flags_of
-from lidarops.products.visibility.network import NAME
+from lidarops.products.visibility import NAME
 from lidarops.records import SceneOutcome
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
 
