@@ -14,7 +14,7 @@ from support.cases import each
 from support.factories import ANALOG, DAY, PHOTON
 
 from lidarops.campaign.model import Campaign
-from lidarops.products.visibility.network import angle_between
+from lidarops.products.visibility.retrieval import angle_between
 from lidarops.records import Granule, Plan, Scene
 from lidarops.run.scenes import cut_scenes
 from lidarops.scene.plan import plan_scene

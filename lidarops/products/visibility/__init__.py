@@ -22,6 +22,7 @@ from lidarops.settings import (
 if TYPE_CHECKING:
     from lidarops.catalog.folder import InstrumentHeaders
 
+NAME: Final = "visibility"
 PriorName = Literal["block", "none"]
 MultiplierValue = Annotated[float, Field(ge=0, le=1)] | Literal["chosen"]
 
@@ -126,7 +127,7 @@ def _section(members: Sequence[InstrumentHeaders]) -> tuple[str, ...]:
 
 
 KIND: Final = Kind(
-    name="visibility",
+    name=NAME,
     title="Visibility",
     package=__name__,
     settings=VisibilityProductSettings,

@@ -28,7 +28,7 @@ from lidarops.figures.series_data import TimeSeries, float_values, join, require
 from lidarops.figures.series_panels import Quantity, series_figures
 from lidarops.figures.wording import counted
 from lidarops.kinds import flags_of
-from lidarops.products.visibility.network import NAME
+from lidarops.products.visibility import NAME
 from lidarops.retrieve.network.geometry import Beam, local_axes, locate, to_earth_centred
 
 Floats = NDArray[np.float64]

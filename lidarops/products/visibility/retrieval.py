@@ -1,32 +1,41 @@
-"""The product ``visibility`` of a network: its decision, and its making."""
+"""The product ``visibility`` of a network: its beams, its decision, and its making."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.campaign.model import ChannelFacts, InstrumentFacts
+from lidarops.campaign.model import (
+    Campaign,
+    ChannelFacts,
+    InstrumentFacts,
+    Station,
+    channel_facts,
+)
 from lidarops.flags import Quality
 from lidarops.products.visibility import (
+    NAME,
     MultiplierValue,
     PriorName,
     VisibilityProductSettings,
 )
-from lidarops.products.visibility.network import (
-    NAME,
-    SAME_POINTING,
-    BeamPlan,
-    MemberCase,
-    angle_between,
-    crossings,
-)
 from lidarops.products.visibility.variables import LAYOUT
-from lidarops.records import DetectionMode, LeftOut, PlannedStep, file_channels, is_glued
+from lidarops.records import (
+    ChannelLayout,
+    DetectionMode,
+    Granule,
+    LeftOut,
+    PlannedStep,
+    Scene,
+    file_channels,
+    is_glued,
+)
 from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
@@ -40,6 +49,8 @@ from lidarops.scene.case import (
     Entries,
     Entry,
     NoSettings,
+    channel_ranges,
+    joined_layout,
     member_channel,
     product_channel,
 )
@@ -55,16 +66,163 @@ from lidarops.scene.choices import (
     merged,
     tail,
 )
-from lidarops.scene.pipe import plan_stages
+from lidarops.scene.dependence import scene_facts
+from lidarops.scene.pipe import NO_WAVELENGTH, plan_stages
 from lidarops.scene.profiles import Averages, Chunk, Indices
 from lidarops.scene.retrieval import Member, NetworkCase, NetworkRetrieval, NetworkStream, Workload
 from lidarops.settings import SettingsModel, VisibilitySettings
 
 Case = ChannelCase[VisibilityProductSettings]
 
+_SAME_POINTING: Final = 0.1
+"""degree; pointings of one instrument within this angle are one beam (resolution of headers)."""
 _SAME_WAVELENGTH: Final = 1e-9
 """m; largest difference between equal wavelengths of instruments."""
 _EPOCH: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+
+
+# Beams of members ---------------------------------------------------------------------------------
+
+
+class BeamPlan(SettingsModel):
+    """One beam of one member of a network."""
+
+    instrument: str
+    zenith_angle: float
+    """degree."""
+    azimuth: float
+    """degree."""
+    nearest: float
+    """m, smallest range at which the signal is used."""
+    farthest: float
+    """m."""
+    exponent: float
+
+
+@dataclass(frozen=True, slots=True)
+class _MemberCase:
+    """The scene of one member of a network, as the rules see it."""
+
+    scene: Scene
+    """Scene of the member."""
+    campaign: Campaign
+    settings: VisibilityProductSettings
+
+    @property
+    def facts(self) -> InstrumentFacts:
+        """Facts about the instrument."""
+        return scene_facts(self.campaign, self.scene)
+
+    @property
+    def channel(self) -> ChannelLayout:
+        """The channel that the network uses."""
+        return member_channel(self.scene.layout, self.settings.channel)
+
+    def channel_case(self, channel: ChannelLayout) -> ChannelCase[VisibilityProductSettings]:
+        """Return the case of a channel."""
+        return ChannelCase(
+            self.scene,
+            channel,
+            self.facts,
+            channel_facts(self.facts, channel.name),
+            self.settings,
+            all_steps=self.campaign.all_steps,
+            member=self.scene.instrument,
+            requesters=(NAME,),
+        )
+
+    def why_not(self) -> tuple[str, float | None]:
+        """Return why a member cannot take part (empty where it can), and the deciding number."""
+        name, facts = self.settings.channel, self.facts
+        glued = joined_layout(self.scene.layout, [name])
+        held = [channel.name for channel in (*self.scene.layout, *glued)]
+        if name not in held:
+            return f"the files hold no {name}, only {', '.join(held)}", None
+        photon = channel_facts(facts, name)
+        if math.isnan(photon.wavelength or self.channel.wavelength):
+            return NO_WAVELENGTH, None
+        if not (facts.overlap_profile or facts.full_overlap_range > 0):
+            return (
+                "the campaign gives neither full_overlap_range nor overlap_profile: an overlap"
+                " error of 1 percent at the nearest crossing changes extinction there by 5 percent"
+            ), facts.full_overlap_range
+        last = self.channel.bins * self.channel.bin_width
+        if self.settings.background_range and self.settings.background_range[0] >= last:
+            return f"background_range begins beyond the last bin, which ends at {last:g} m", last
+        if any(_granule_pointing(granule, facts) is None for granule in self.scene.granules):
+            return "neither headers nor campaign give the pointing of all beams", None
+        return "", None
+
+    def pointings(self) -> Iterator[BeamPlan]:
+        """Yield the beams of the member, each once."""
+        directions = sorted(
+            {
+                direction
+                for granule in self.scene.granules
+                if (direction := _granule_pointing(granule, self.facts)) is not None
+            }
+        )
+        end = float(channel_ranges(self.channel, channel_facts(self.facts, self.channel.name))[-1])
+        farthest = min(end, self.settings.farthest or end)
+        distinct: list[tuple[float, float]] = []
+        for direction in directions:
+            if not any(angle_between(direction, other) <= _SAME_POINTING for other in distinct):
+                distinct.append(direction)
+        for zenith, azimuth in distinct:
+            yield BeamPlan(
+                instrument=self.scene.instrument,
+                zenith_angle=zenith,
+                azimuth=azimuth,
+                nearest=self.facts.full_overlap_range,
+                farthest=farthest,
+                exponent=self.settings.exponent_of(self.scene.instrument),
+            )
+
+
+def _granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
+    """Return zenith angle and azimuth of a granule; facts of the campaign override headers."""
+    zenith = granule.zenith_angle if facts.zenith_angle is None else facts.zenith_angle
+    azimuth = granule.azimuth if facts.azimuth is None else facts.azimuth
+    if zenith is None or azimuth is None:
+        return None
+    return zenith, azimuth % 360.0
+
+
+def angle_between(pointing: tuple[float, float], other: tuple[float, float]) -> float:
+    """Return the angle between two pointings (zenith angle, azimuth), all in degree."""
+    first, second = (
+        (
+            math.sin(math.radians(zenith)) * math.sin(math.radians(azimuth)),
+            math.sin(math.radians(zenith)) * math.cos(math.radians(azimuth)),
+            math.cos(math.radians(zenith)),
+        )
+        for zenith, azimuth in (pointing, other)
+    )
+    return math.degrees(2.0 * math.asin(min(1.0, 0.5 * math.dist(first, second))))
+
+
+def crossings(
+    beams: Sequence[BeamPlan],
+    stations: Mapping[str, Station],
+    tolerance: float,
+    smallest_angle: float,
+) -> geometry.Network:
+    """Return the crossings of beams of instruments at stations; see `geometry.build_network`."""
+    owners = [stations[beam.instrument] for beam in beams]
+    places = [(owner.latitude, owner.longitude, owner.altitude) for owner in owners]
+    return geometry.build_network(
+        [
+            geometry.Beam(*place, beam.azimuth, 90.0 - beam.zenith_angle)
+            for place, beam in zip(places, beams, strict=True)
+        ],
+        tolerance=tolerance,
+        nearest=[beam.nearest for beam in beams],
+        farthest=[beam.farthest for beam in beams],
+        smallest_angle=smallest_angle,
+    )
+
+
+# Decision -----------------------------------------------------------------------------------------
 
 
 def _window(case: Case, farthest: float) -> Entry:
@@ -169,7 +327,7 @@ class _NetworkPlan:
     def __init__(self, case: NetworkCase[VisibilityProductSettings]) -> None:
         self._scene, self._campaign, self._settings = case.scene, case.campaign, case.request
         self._members = [
-            MemberCase(member, case.campaign, case.request) for member in case.scene.members
+            _MemberCase(member, case.campaign, case.request) for member in case.scene.members
         ]
         self._stations = {
             member.instrument: case.campaign.stations[member.station]
@@ -221,7 +379,7 @@ class _NetworkPlan:
         case = replace(self._joint_case, member=member)
         return case.leave(NAME, reason, number=number, rule=rule)
 
-    def _prepared(self, member: MemberCase) -> Entries:
+    def _prepared(self, member: _MemberCase) -> Entries:
         """Yield the steps from the counts of an instrument to its signal."""
         name = self._settings.channel
         for channel in dict.fromkeys((*file_channels(name), name)):
@@ -271,7 +429,7 @@ class _NetworkPlan:
 
     def _joint(self, beams: Sequence[BeamPlan], wavelength: float) -> Entries:
         """Yield the read windows of the instruments, and the steps of the whole network."""
-        network = self._crossings(beams)
+        network, settings = self._crossings(beams), self._settings
         for member in self._members:
             name = member.scene.instrument
             numbers = [n for n, beam in enumerate(beams) if beam.instrument == name]
@@ -281,20 +439,14 @@ class _NetworkPlan:
                 yield _window(case, farthest)
         case = self._joint_case
         reason = "signals are averaged before the retrieval: noise biases means of retrieved values"
-        yield average(case, self._settings.average, reason)
+        yield average(case, settings.average, reason)
         yield _prior(case)
-        yield self._visibility(beams, network, wavelength)
-
-    def _visibility(
-        self, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
-    ) -> Entry:
-        settings = self._settings
         by_triangles = (
             ""
             if settings.multiplier is None
             else f"; solved by triangles with the multiplier {settings.multiplier}"
         )
-        return self._joint_case.run(
+        yield case.run(
             NAME,
             f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
             f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones"
@@ -311,6 +463,9 @@ class _NetworkPlan:
             ),
             number=float(network.crossings),
         )  # fmt: skip
+
+
+# Making -------------------------------------------------------------------------------------------
 
 
 class _NetworkStream(NetworkStream):
@@ -406,14 +561,8 @@ def _profiles_of(geometry_of_all: xr.Dataset, beam: BeamPlan) -> Indices:
     """Return the numbers of the profiles of a beam."""
     planned = (beam.zenith_angle, beam.azimuth)
     angles = (geometry_of_all[name].to_numpy() for name in ("zenith_angle", "azimuth"))
-    return np.array(
-        [
-            number
-            for number, pointing in enumerate(zip(*angles, strict=True))
-            if angle_between(pointing, planned) <= SAME_POINTING
-        ],
-        dtype=np.int64,
-    )
+    pointings = zip(*angles, strict=True)
+    return np.flatnonzero([angle_between(one, planned) <= _SAME_POINTING for one in pointings])
 
 
 def _intervals(moments: npt.NDArray[np.datetime64], seconds: float) -> Indices:

@@ -22,7 +22,7 @@ from lidarops.retrieve.network._condensed_signals import (
     median,
     places,
 )
-from lidarops.retrieve.network.geometry import Network
+from lidarops.retrieve.network.geometry import Network, per_beam
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
@@ -219,7 +219,7 @@ def prepare_signals(
     )
     block = _blocks(blocks, leading)
     nearest, overlap_function = _overlap(overlap, full_overlap_range, ranges)
-    exponents = _per_beam(exponent, network.beams, "exponent", *THRESHOLDS.exponents)
+    exponents = per_beam(exponent, network.beams, "exponent", *THRESHOLDS.exponents)
     bins = THRESHOLDS.fit_bins
     layout = _condensed_signals.lay_out_fits(network, ranges, overlap_function, nearest, bins)
     signal = np.where(np.isnan(ranges), np.nan, signal)
@@ -276,7 +276,7 @@ def _overlap(
             " changes extinction there by 5 percent",
         )
     limits = 0.0 if nearest is None else nearest
-    first = _per_beam(limits, len(ranges), "full_overlap_range", 0.0, np.inf)
+    first = per_beam(limits, len(ranges), "full_overlap_range")
     if overlap is None:
         return first, None
     array = inputs.real_array(overlap, "overlap").astype(np.float64)
@@ -285,18 +285,6 @@ def _overlap(
             "is not between 0 and 1.5", field="overlap", remedy="give 1 for full overlap"
         )
     return first, inputs.broadcast(array, ranges.shape, "overlap")
-
-
-def _per_beam(values: npt.ArrayLike, beams: int, name: str, low: float, high: float) -> Array:
-    """Return one value per beam, which lie within limits."""
-    array = inputs.real_array(values, name).astype(np.float64)
-    if array.shape not in {(), (beams,)} or not np.all((array >= low) & (array <= high)):
-        raise RetrievalInputError(
-            f"is not from {low:g} to {high:g}, or of a wrong shape",
-            field=name,
-            remedy=f"give one value, or one per beam ({beams})",
-        )
-    return np.broadcast_to(array, (beams,)).copy()
 
 
 def _blocks(blocks: npt.ArrayLike | None, leading: tuple[int, ...]) -> Indices:

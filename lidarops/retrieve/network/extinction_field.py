@@ -107,7 +107,7 @@ def retrieve_network(
     exponent: npt.ArrayLike = 1.0,
     blocks: npt.ArrayLike | None = None,
     prior: str = "block",
-    multiplier: npt.ArrayLike | Literal["chosen"] | None = None,
+    multiplier: float | Literal["chosen"] | None = None,
 ) -> NetworkResult:
     """Retrieve extinction and visibility where the beams of several lidars cross.
 
@@ -137,7 +137,7 @@ def retrieve_network(
         in time: give missing ones as NaN.
     prior : {"block", "none"}
         "none" solves each profile alone; undetermined crossings are NaN.
-    multiplier : float or (..., crossing) float or "chosen", optional
+    multiplier : float or "chosen", optional
         Lambda of the paper, 0 to 1: each crossing is solved by one triangle of beams
         (`lidarops.retrieve.network.triangles`), without prior, instead of all beams together.
         "chosen" is the one with the smallest expected error in the block.
@@ -162,6 +162,12 @@ def retrieve_network(
             field="network",
             remedy="point the lidars at common volumes, or widen the tolerance of the geometry",
         )
+    chosen = isinstance(multiplier, str) and multiplier == CHOSEN
+    number = isinstance(multiplier, int | float) and 0 <= multiplier <= 1
+    if not (multiplier is None or number or chosen):
+        raise RetrievalInputError(
+            "is not from 0 to 1", field="multiplier", remedy=f"give one number, or {CHOSEN!r}"
+        )
     together = multiplier is None and field_prior is FieldPrior.BLOCK
     beams = _beam_signals.prepare_signals(
         power, range, network, variance=variance, overlap=overlap,
@@ -173,15 +179,14 @@ def retrieve_network(
 
 
 def _solve_blocks(
-    beams: BeamSignals, position: Array, multiplier: npt.ArrayLike | str | None
+    beams: BeamSignals, position: Array, multiplier: float | Literal["chosen"] | None
 ) -> Estimates:
     """Solve each block, and return the values of all."""
     out = Estimates.missing(beams.block.size, beams.layout)
-    given = None if multiplier is None else _multipliers(multiplier, beams)
     responses = []
     for rows, block in beams.blocks(position):
         if multiplier is not None:
-            part = solve_triangles(block, None if given is None else given[rows])
+            part = solve_triangles(block, multiplier)
         else:
             part = solve_block(block) if beams.together else solve_alone(block)
         responses.append((rows, part.respond))
@@ -197,22 +202,6 @@ def _solve_blocks(
         return change * out.extinction[..., np.newaxis]
 
     return replace(out, respond=respond)
-
-
-def _multipliers(multiplier: npt.ArrayLike | str, beams: BeamSignals) -> Array | None:
-    """Return (profile, crossing) multipliers, None where they are to be chosen."""
-    if isinstance(multiplier, str) and multiplier == CHOSEN:
-        return None
-    array = inputs.real_array(multiplier, "multiplier").astype(np.float64)
-    shape = (*beams.leading, beams.layout.crossings)
-    # NaN where a result that is given back has no value.
-    if array.shape not in {(), shape} or not np.all((array >= 0) & (array <= 1) | np.isnan(array)):
-        raise RetrievalInputError(
-            "is not from 0 to 1, or of a wrong shape",
-            field="multiplier",
-            remedy=f"give one number, or {shape}, or {CHOSEN!r}",
-        )
-    return np.broadcast_to(array, shape).reshape(beams.block.size, -1)
 
 
 def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:

@@ -224,8 +224,8 @@ def build_network(
     return _network_of_beams(
         tuple(beams),
         float(tolerance),
-        _per_beam(nearest, len(beams), "nearest"),
-        _per_beam(farthest, len(beams), "farthest"),
+        tuple(per_beam(nearest, len(beams), "nearest").tolist()),
+        tuple(per_beam(farthest, len(beams), "farthest").tolist()),
         float(smallest_angle),
     )
 
@@ -257,10 +257,7 @@ def network_of_lines(
     length = np.linalg.norm(along, axis=1, keepdims=True)
     if not (np.isfinite(start).all() and np.isfinite(length).all() and (length > 0).all()):
         raise RetrievalInputError("is not finite, or zero", field="direction")
-    limits = (
-        _per_beam(nearest, len(start), "nearest"),
-        _per_beam(farthest, len(start), "farthest"),
-    )
+    limits = per_beam(nearest, len(start), "nearest"), per_beam(farthest, len(start), "farthest")
     return _find_crossings(start, along / length, tolerance, limits, smallest_angle)
 
 
@@ -275,7 +272,8 @@ def _network_of_beams(
     if not beams:
         raise RetrievalInputError("are none", field="beams")
     origin, direction = locate(beams)
-    network = _find_crossings(origin, direction, tolerance, (nearest, farthest), smallest_angle)
+    limits = np.array(nearest), np.array(farthest)
+    network = _find_crossings(origin, direction, tolerance, limits, smallest_angle)
     axes = local_axes(beams[0].latitude, beams[0].longitude)
     first = to_earth_centred(beams[0].latitude, beams[0].longitude, beams[0].altitude)
     return _freeze(replace(network, geodetic=to_geodetic(first + network.crossing @ axes)))
@@ -285,7 +283,7 @@ def _find_crossings(
     origin: Array,
     direction: Array,
     tolerance: float,
-    limits: tuple[tuple[float, ...], tuple[float, ...]],
+    limits: tuple[Array, Array],
     smallest_angle: float,
 ) -> Network:
     if not 0 < tolerance < np.inf:
@@ -326,7 +324,7 @@ def _beam_groups(
     origin: Array,
     direction: Array,
     tolerance: float,
-    limits: tuple[tuple[float, ...], tuple[float, ...]],
+    limits: tuple[Array, Array],
     smallest_angle: float,
 ) -> list[tuple[int, ...]]:
     """Return the beams of each crossing: meeting pairs, merged where several meet at one place."""
@@ -351,12 +349,11 @@ def _meeting_pairs(
     origin: Array,
     direction: Array,
     tolerance: float,
-    limits: tuple[tuple[float, ...], tuple[float, ...]],
+    limits: tuple[Array, Array],
     smallest_angle: float,
 ) -> list[tuple[float, int, int]]:
     """Return (nearer of both ranges, beam, beam) of each pair of beams that meet."""
-    nearest = np.maximum(limits[0], tolerance)
-    farthest = np.asarray(limits[1])
+    nearest, farthest = np.maximum(limits[0], tolerance), limits[1]
     pairs = []
     for i, j in itertools.combinations(range(len(origin)), 2):
         cosine = float(direction[i] @ direction[j])
@@ -410,17 +407,24 @@ def _check_beams(values: Array) -> None:
             )
 
 
-def _per_beam(value: float | Sequence[float], beams: int, name: str) -> tuple[float, ...]:
-    values = np.asarray(value, dtype=np.float64)
-    if values.ndim > 1 or (values.ndim == 1 and values.size != beams):
+def per_beam(
+    values: npt.ArrayLike, beams: int, name: str, low: float = 0.0, high: float = np.inf
+) -> Array:
+    """Return one value per beam, which lie within limits.
+
+    Raises
+    ------
+    RetrievalInputError
+        Where they do not, or are neither one nor as many as the beams.
+    """
+    array = inputs.real_array(values, name).astype(np.float64)
+    if array.shape not in {(), (beams,)} or not np.all((array >= low) & (array <= high)):
         raise RetrievalInputError(
-            f"has the shape {values.shape}",
+            f"is not from {low:g} to {high:g}, or of a wrong shape",
             field=name,
-            remedy=f"give one, or one per beam ({beams})",
+            remedy=f"give one value, or one per beam ({beams})",
         )
-    if np.any(np.isnan(values)) or np.any(values < 0):
-        raise RetrievalInputError("is negative or NaN", field=name)
-    return tuple(float(v) for v in np.broadcast_to(values, (beams,)))
+    return np.broadcast_to(array, (beams,)).copy()
 
 
 def _freeze(net: Network) -> Network:

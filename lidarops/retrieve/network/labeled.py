@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -137,8 +137,9 @@ def retrieve_network(
     )  # fmt: skip
     errors = _errors(result, signals, network, settings)
     near = np.flatnonzero(network.near_crossing)
-    extinction = result.extinction[:, near]
-    random, systematic = errors.random[:, near], errors.systematic[:, near]
+    extinction, random, systematic = (
+        values[:, near] for values in (result.extinction, *errors[:2])
+    )
     freedom = result.degrees_of_freedom
     dimensions = ("time", "crossing")
     visibility = visibility_of_extinction(extinction, random, systematic, settings.visibility)
@@ -230,19 +231,15 @@ def _bins_used(grid: Array, network: Network) -> int:
     return max(reached) + THRESHOLDS.bins_beyond
 
 
-class _Errors(NamedTuple):
-    """(interval, crossing) errors of extinction, m-1; NaN where there is no value."""
-
-    random: Array
-    """From noise and background."""
-    systematic: Array
-    tail_signal: Array
-    """Part of the systematic error from signal in the background."""
-
-
 def _errors(
     result: NetworkResult, signals: _Signals, network: Network, settings: NetworkSettings
-) -> _Errors:
+) -> tuple[Array, Array, Array]:
+    """Return (interval, crossing) errors of extinction, m-1; NaN where there is no value.
+
+    Random ones from noise and background, systematic ones, and the part of these from signal in
+    the background.
+    """
+
     def of_each_beam(error: Array) -> Array:
         added = np.broadcast_to(np.nan_to_num(error), signals.power.shape)
         beams = np.flatnonzero(added.any(axis=(0, 2)))
@@ -265,7 +262,7 @@ def _errors(
         result.multiplier_error,
     ]
     random = root_sum_square([np.sqrt(np.maximum(stated, 0.0)), by_background])
-    return _Errors(random, root_sum_square(contributions), tail_signal)
+    return random, root_sum_square(contributions), tail_signal
 
 
 def lidar_ratio_error(
@@ -296,18 +293,22 @@ def lidar_ratio_error(
 
 
 def _quality_flags(
-    result: NetworkResult, errors: _Errors, signals: _Signals, network: Network
+    result: NetworkResult,
+    errors: tuple[Array, Array, Array],
+    signals: _Signals,
+    network: Network,
 ) -> Flags:
     """Return the quality bits of each value, with a reason for each missing one."""
     bits = result.quality.copy()
+    random, systematic, tail_signal = errors
     for index, crossing in zip(network.passages.beam, network.passages.crossing, strict=True):
         bits[:, crossing] |= signals.warnings[:, index]
     # Light of other beams gives a value.
     bits[(bits & np.int32(Quality.INPUT_MISSING)) == 0] &= ~np.int32(Quality.NO_SIGNAL)
     with np.errstate(invalid="ignore"):
-        error = np.hypot(errors.random, errors.systematic)
+        error = np.hypot(random, systematic)
         uncertain = ~(error < THRESHOLDS.largest_relative_error * result.extinction)
-    background_doubt = shifts(errors.tail_signal, errors.random)
+    background_doubt = shifts(tail_signal, random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(
         uncertain & np.isfinite(result.extinction),

@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ from lidarops.retrieve.network._condensed_signals import Beams, FitLayout, place
 
 __all__ = ["CHOSEN", "MULTIPLIERS", "solve_triangles", "systematic_error"]
 
-CHOSEN: Final = "chosen"
+CHOSEN: Final[Literal["chosen"]] = "chosen"
 """Multiplier with the smallest sum of squared bias and variance in the block."""
 MULTIPLIERS: Final[Array] = 1.0 - np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 61)])
 """Multipliers to choose from: 15 per decade of the difference from 1, which grows with the noise
@@ -87,14 +87,14 @@ class Triangle:
     """(3,) m, exponent times length, negative towards the lidar."""
 
 
-def solve_triangles(block: Block, multiplier: Array | None) -> Estimates:
+def solve_triangles(block: Block, multiplier: float | Literal["chosen"]) -> Estimates:
     """Solve the triangle of each crossing, and return its values with their errors.
 
     Parameters
     ----------
     block : Block
-    multiplier : (profile, crossing) float, optional
-        Chosen for each crossing where not given.
+    multiplier : float or "chosen"
+        Chosen for each crossing.
     """
     out = Estimates.missing(len(block.reach), block.layout)
     out.multiplier_error[:], out.open[:] = np.nan, True
@@ -107,8 +107,7 @@ def solve_triangles(block: Block, multiplier: Array | None) -> Estimates:
         rows = _Rows.of(beams, block.layout, triangle)
         members = np.flatnonzero(rows.usable)
         if members.size:
-            given = None if multiplier is None else multiplier[members, crossing]
-            _solve(rows.take(members), triangle, given, out, carried, (members, crossing))
+            _solve(rows.take(members), triangle, multiplier, out, carried, (members, crossing))
     out.variance[:] *= out.extinction**2
 
     def respond(causes: Causes) -> Array:
@@ -151,12 +150,9 @@ def _cycles(layout: FitLayout, exponent: Array) -> Iterator[Triangle]:
                     if third not in (start, second):
                         first = [number, place[middle, second], place[closing, third]]
                         last = [far, place[middle, third], place[closing, start]]
-                        yield _triangle(np.array(first), np.array(last), layout, exponent)
-
-
-def _triangle(first: Indices, last: Indices, layout: FitLayout, exponent: Array) -> Triangle:
-    run = layout.passages.range[last] - layout.passages.range[first]
-    return Triangle(first, last, np.sign(run), run * exponent[layout.passages.beam[first]])
+                        run = passages.range[last] - passages.range[first]
+                        depth = run * exponent[beam[first]]
+                        yield Triangle(np.array(first), np.array(last), np.sign(run), depth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,20 +200,19 @@ class _Rows:
         The (profile, row, 3) derivatives are those of the logarithm by ln start, ln end and the
         integral.
         """
-        sums = _sum_rows(self.start, self.end, self.integral, multiplier)
-        by_integral = sums.by_integral / sums.reciprocal[:, np.newaxis]
-        by_ratio = sums.by_ratio / sums.reciprocal[:, np.newaxis]
+        reciprocal, *derivatives = _sum_rows(self.start, self.end, self.integral, multiplier)
+        by_integral, by_ratio = (each / reciprocal[:, np.newaxis] for each in derivatives)
         derivative = np.stack(
             [-by_ratio - by_integral * self.integral, by_ratio, by_integral], axis=-1
         )
         variance = np.einsum("nri,nrij,nrj->n", derivative, self.covariance, derivative)
-        return sums.reciprocal, variance, derivative
+        return reciprocal, variance, derivative
 
 
 def _solve(
     rows: _Rows,
     triangle: Triangle,
-    multiplier: Array | None,
+    requested: float | Literal["chosen"],
     out: Estimates,
     carried: Array,
     place: tuple[Indices, int],
@@ -227,8 +222,8 @@ def _solve(
         # The extinction of homogeneous air that the first beam shows.
         level = float(np.median((rows.start[:, 0] - rows.end[:, 0]) / rows.integral[:, 0]))
         depth = triangle.depth * level
-        if multiplier is None:
-            multiplier = np.full(len(rows.usable), _choose(rows, depth, level))
+        number = _choose(rows, depth, level) if requested == CHOSEN else float(requested)
+        multiplier = np.full(len(rows.usable), number)
         reciprocal, variance, derivative = rows.solve(multiplier)
         solved = (reciprocal > 0.0) & np.isfinite(variance)
         extinction = np.where(solved, 1.0 / reciprocal, np.nan)
@@ -259,19 +254,13 @@ def _choose(rows: _Rows, depth: Array, level: float) -> float:
     return float(MULTIPLIERS[np.argmin(risk)])
 
 
-class _Sums(NamedTuple):
-    """The sum of the rows of a cycle, and its derivatives."""
+def _sum_rows(
+    start: Array, end: Array, integral: Array, multiplier: Array
+) -> tuple[Array, Array, Array]:
+    r"""Return the reciprocal extinction (m) at the first crossing of a cycle, and its derivatives.
 
-    reciprocal: Array
-    """(...) m."""
-    by_integral: Array
-    """(..., row) derivative by the integrals."""
-    by_ratio: Array
-    """(..., row) derivative by the logarithm of end over start, at the same integral over start."""
-
-
-def _sum_rows(start: Array, end: Array, integral: Array, multiplier: Array) -> _Sums:
-    r"""Return the reciprocal extinction at the first crossing of a cycle, and its derivatives.
+    These are (profile, row): by the integrals, and by the logarithm of end over start, at the same
+    integral over start.
 
     .. math::
         \frac{1}{\hat\sigma_1} = \frac{\sum_j \mu_j Q_{j-1} J_j / \alpha_j}{1 - \mu_K Q_K},
@@ -287,11 +276,8 @@ def _sum_rows(start: Array, end: Array, integral: Array, multiplier: Array) -> _
     determinant = 1.0 - closing
     reciprocal = terms.sum(axis=-1, keepdims=True) / determinant
     later = terms[..., ::-1].cumsum(axis=-1)[..., ::-1] - terms
-    return _Sums(
-        reciprocal[..., 0],
-        powers * before / start / determinant,
-        (later + reciprocal * closing) / determinant,
-    )
+    by_ratio = (later + reciprocal * closing) / determinant
+    return reciprocal[..., 0], powers * before / start / determinant, by_ratio
 
 
 def _powers(multiplier: Array, rows: int) -> Array:

@@ -282,37 +282,19 @@ def least_sum(information: Array, weight: float, response: Array) -> Array:
 
 
 @compiled
-def _forward(near: Array, far: Array, right: Array) -> None:
-    """Replace right-hand sides (cell, side) by the solutions of L."""
-    cells, sides = right.shape
-    for i in range(1, cells):
-        for k in range(sides):
-            right[i, k] -= near[i - 1] * right[i - 1, k]
-        if i > 1:
-            for k in range(sides):
-                right[i, k] -= far[i - 2] * right[i - 2, k]
-
-
-@compiled
-def _backward(pivot: Array, near: Array, far: Array, right: Array) -> None:
-    """Replace right-hand sides (cell, side) by the solutions of d and the transposed L."""
-    cells, sides = right.shape
-    for i in range(cells - 1, -1, -1):
-        for k in range(sides):
-            right[i, k] /= pivot[i]
-        if i < cells - 1:
-            for k in range(sides):
-                right[i, k] -= near[i] * right[i + 1, k]
-        if i < cells - 2:
-            for k in range(sides):
-                right[i, k] -= far[i] * right[i + 2, k]
-
-
-@compiled
 def _substitute(pivot: Array, near: Array, far: Array, right: Array) -> None:
     """Replace right-hand sides (cell, side) by their solutions."""
-    _forward(near, far, right)
-    _backward(pivot, near, far, right)
+    cells = len(right)
+    for i in range(1, cells):
+        right[i] -= near[i - 1] * right[i - 1]
+        if i > 1:
+            right[i] -= far[i - 2] * right[i - 2]
+    for i in range(cells - 1, -1, -1):
+        right[i] /= pivot[i]
+        if i < cells - 1:
+            right[i] -= near[i] * right[i + 1]
+        if i < cells - 2:
+            right[i] -= far[i] * right[i + 2]
 
 
 @compiled
@@ -324,17 +306,12 @@ def solve(information: Array, weight: float, right: Array) -> Array:
     pivot, near, far, _, _ = factor(information, weight, np.zeros(information.size))
     solved = right.copy()
     _substitute(pivot, near, far, solved)
-    cells, sides = right.shape
-    left = np.empty((cells, sides))
-    for i in range(cells):
-        for k in range(sides):
-            left[i, k] = right[i, k] - information[i] * solved[i, k]
-    for i in range(cells - 2):
-        for k in range(sides):
-            bend = weight * (solved[i, k] - 2.0 * solved[i + 1, k] + solved[i + 2, k])
-            left[i, k] -= bend
-            left[i + 1, k] += 2.0 * bend
-            left[i + 2, k] -= bend
+    left = right - information.reshape(-1, 1) * solved
+    for i in range(len(right) - 2):
+        bend = weight * (solved[i] - 2.0 * solved[i + 1] + solved[i + 2])
+        left[i] -= bend
+        left[i + 1] += 2.0 * bend
+        left[i + 2] -= bend
     _substitute(pivot, near, far, left)
     return np.asarray(solved + left)
 

@@ -243,9 +243,10 @@ def _joined(
         rows = [missing if one is None else row(one) for one in solved]
         return np.where(hidden, np.nan, np.reshape(rows, quality.shape))
 
-    nothing = np.zeros(quality.shape, dtype=np.bool_)
-    weak = stacked(lambda one: one.profile.fit.certain, nothing) != 1.0
-    first = np.array([0 if one is None else one.profile.fit.first for one in solved])
+    fits = [None if one is None else one.profile.fit for one in solved]
+    certain = [np.isfinite(missing) if fit is None else fit.certain for fit in fits]
+    weak = ~np.array(certain, dtype=np.bool_).reshape(quality.shape)
+    first = np.array([0 if fit is None else fit.first for fit in fits], dtype=np.intp)
     no_slope = weak | ((quality & np.int32(Quality.INCOMPLETE_OVERLAP)) != 0)
     no_slope |= np.arange(missing.size) < first[:, np.newaxis]
 

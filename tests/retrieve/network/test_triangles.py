@@ -173,15 +173,14 @@ def test_the_chosen_multiplier_falls_with_the_noise():
     assert 0.85 < chosen[1] < 0.95
 
 
-def test_multipliers_of_a_result_give_it_again():
+def test_a_block_has_one_multiplier():
     net = triangle()
     distance = grid(net)
     power, variance = noisy(net, distance, signals(net, distance, plume), 0.05, 60)
     given = {"variance": variance, "full_overlap_range": 100.0, "blocks": np.arange(60) // 20}
     chosen = retrieve_network(power, distance, net, multiplier="chosen", **given)
-    again = retrieve_network(power, distance, net, multiplier=chosen.multiplier, **given)
-    np.testing.assert_array_equal(again.extinction, chosen.extinction)
     assert np.unique(chosen.multiplier[:20, 0]).size == 1
+    assert np.unique(chosen.multiplier[:, 0]).size > 1
 
 
 def test_a_crossing_without_a_triangle_is_not_measured():
