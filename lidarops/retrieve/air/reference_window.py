@@ -55,8 +55,6 @@ class Thresholds(NamedTuple):
     preferred, because particles decrease with height. In the published Raman simulation,
     particles of the best determined windows make backscatter at 532 nm too small by a quarter
     (`tests/retrieve/raman/test_raman_published.py`)."""
-    most_windows: int = 10_000
-    """Candidates; more are taken for a mistake of units. Assumed."""
 
 
 THRESHOLDS: Final = Thresholds()
@@ -159,22 +157,17 @@ def candidate_windows(lowest: float, highest: float, width: float, step: float) 
     Raises
     ------
     RetrievalInputError
-        Where no window fits, or more than 10 000 do.
+        Where no window fits.
     """
-    numbers = np.array([lowest, highest, width, step], dtype=np.float64)
-    if not np.all(np.isfinite(numbers)) or width <= 0 or step <= 0 or highest - lowest < width:
+    if not (0.0 < width <= highest - lowest and step > 0.0):
         raise RetrievalInputError(
             f"no window of {width:g} m, moved by {step:g} m, fits between {lowest:g} and"
             f" {highest:g} m",
             field="candidates",
             remedy="give m, with the width and step positive",
         )
-    count = np.floor((highest - lowest - width) / step + 1e-9) + 1
-    if count > THRESHOLDS.most_windows:
-        raise RetrievalInputError(
-            f"makes {count:.0f} windows", field="step", remedy="give a larger step in m"
-        )
-    bottom = lowest + step * np.arange(int(count))
+    count = math.floor((highest - lowest - width) / step + 1e-9) + 1
+    bottom = lowest + step * np.arange(count)
     return np.stack([bottom, bottom + width], axis=-1)
 
 
@@ -184,10 +177,10 @@ def choose_reference(
     variance: npt.ArrayLike,
     *,
     molecular_attenuated: npt.ArrayLike,
-    candidates: npt.ArrayLike,
+    candidates: Array,
     background_standard_error: npt.ArrayLike = 0.0,
     baseline_standard_error: npt.ArrayLike = 0.0,
-    exclude: npt.NDArray[np.bool_] | None = None,
+    exclude: Booleans | None = None,
 ) -> ReferenceWindow:
     r"""Return the cleanest window; of equally clean ones, the highest that is well determined.
 
@@ -244,16 +237,16 @@ def choose_reference(
     Raises
     ------
     RetrievalInputError
-        For invalid arguments, among them candidates outside the range.
+        For invalid arguments.
     """
     grid = inputs.range_grid(range)
     rows, leading, shape = inputs.profiles_and_air(power, molecular_attenuated, grid)
-    windows, edges = _edges(candidates, grid)
-    mask = np.zeros(grid.size, dtype=np.bool_) if exclude is None else np.asarray(exclude)
-    if mask.dtype != np.bool_:
-        raise RetrievalInputError(f"holds {mask.dtype}, not booleans", field="exclude")
-    excluded = inputs.noise_rows(mask.astype(np.float64), "exclude", grid, leading)
-    statistics = np.full((rows.shape[0], windows.shape[0], FIELDS), np.nan)
+    first = np.searchsorted(grid, candidates[:, 0], side="left")
+    stop = np.searchsorted(grid, candidates[:, 1], side="right")
+    edges = np.stack([first, stop], axis=-1).astype(np.int64)
+    mask = np.zeros(grid.size) if exclude is None else exclude.astype(np.float64)
+    excluded = inputs.noise_rows(mask, "exclude", grid, leading)
+    statistics = np.full((rows.shape[0], len(candidates), FIELDS), np.nan)
     _compare_with_air(
         frozen(rows),
         frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
@@ -280,39 +273,17 @@ def choose_reference(
 
     return ReferenceWindow(
         chosen=chosen.reshape(leading),
-        bottom=of_chosen(windows[index, 0]),
-        top=of_chosen(windows[index, 1]),
+        bottom=of_chosen(candidates[index, 0]),
+        top=of_chosen(candidates[index, 1]),
         scale=of_chosen(statistics[profile, index, SCALE]),
         scale_standard_error=of_chosen(statistics[profile, index, SCALE_ERROR]),
         comparison_standard_error=of_chosen(comparison_error),
         excess=of_chosen(excess),
         detection_limit=of_chosen(
-            _detection_limit(statistics, rejections, level_error, windows, index)
+            _detection_limit(statistics, rejections, level_error, candidates, index)
         ),
-        rejections=rejections.reshape(*leading, windows.shape[0]),
+        rejections=rejections.reshape(*leading, len(candidates)),
     )
-
-
-def _edges(candidates: npt.ArrayLike, grid: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    windows = inputs.real_array(candidates, "candidates").astype(np.float64)
-    if windows.ndim == 1:
-        windows = windows[np.newaxis]
-    if windows.ndim != 2 or windows.shape[1] != 2 or windows.shape[0] == 0:
-        raise RetrievalInputError(
-            f"has the shape {windows.shape}", field="candidates", remedy="give (candidate, 2) in m"
-        )
-    if not np.all(np.isfinite(windows)) or not np.all(windows[:, 0] < windows[:, 1]):
-        raise RetrievalInputError(
-            "holds windows that are not finite or end before they begin", field="candidates"
-        )
-    first = np.searchsorted(grid, windows[:, 0], side="left")
-    stop = np.searchsorted(grid, windows[:, 1], side="right")
-    if not np.any(stop > first):
-        raise RetrievalInputError(
-            f"hold no bin of the range, which reaches from {grid[0]:g} to {grid[-1]:g} m",
-            field="candidates",
-        )
-    return windows, np.stack([first, stop], axis=-1).astype(np.int64)
 
 
 def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
