@@ -39,7 +39,7 @@ def bridge_outliers(
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     variance: npt.ArrayLike,
     *,
-    background: npt.ArrayLike | None = None,
+    background: npt.ArrayLike = 0.0,
 ) -> BridgedProfiles:
     r"""Replace isolated outlying bins by interpolation between their neighbours.
 
@@ -66,8 +66,8 @@ def bridge_outliers(
         m.
     variance : (..., range) float
         Noise variance in the square of the power's unit, broadcast against `power`.
-    background : (...) float, optional
-        Rough background of the power; 0 where not given.
+    background : (...) float
+        Rough background of the power.
 
     Raises
     ------
@@ -77,8 +77,7 @@ def bridge_outliers(
     grid = inputs.range_grid(range)
     profiles, leading = inputs.profiles(power, grid)
     rows = profiles.astype(np.float64, copy=False)
-    given = inputs.profile_values(background, "background", leading)
-    level = np.zeros(1) if given is None else given
+    level = inputs.profile_values(background, "background", leading)
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     signal = rows - level[:, np.newaxis]
     outlying = np.zeros(rows.shape, dtype=np.bool_)

@@ -134,8 +134,8 @@ def glue(
         for v, name in ((analog_variance, "analog_variance"), (photon_variance, "photon_variance"))
     )
     sky = inputs.profile_values(photon_background, "photon_background", leading)
-    highest = THRESHOLDS.count_rates[1] - (np.zeros(1) if sky is None else sky)
-    first, past = _search(x, y, xv, np.broadcast_to(highest, len(x)))
+    highest = np.broadcast_to(THRESHOLDS.count_rates[1] - sky, len(x))
+    first, past = _search(x, y, xv, highest)
     near = np.arange(grid.size) < ((first + past) // 2)[:, np.newaxis]
     line = fit_lines(x, y, xv, yv, first, past)
     length = inputs.profile_values(analog_correlation_length, "analog_correlation_length", leading)
@@ -170,7 +170,7 @@ def glue(
 
 
 def _correlated_share(
-    xv: Array, yv: Array, slope: Array, first: Indices, past: Indices, length: Array | None
+    xv: Array, yv: Array, slope: Array, first: Indices, past: Indices, length: Array
 ) -> Array:
     """Return the noise of means of both channels over that of independent bins, (profile,)."""
     index = np.arange(xv.shape[1])
@@ -178,7 +178,7 @@ def _correlated_share(
     analog = slope**2 * np.where(inside, xv, 0.0).sum(axis=-1)
     photons = np.where(inside, yv, 0.0).sum(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = (analog * (1.0 if length is None else length) + photons) / (analog + photons)
+        share = (analog * length + photons) / (analog + photons)
     return np.where(np.isfinite(share), share, 1.0)
 
 
