@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen, usable
+from lidarops.retrieve.common.arrays import Array, Booleans, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
 
 _HALF: Final = 4
@@ -151,37 +151,15 @@ def _most_equal(j: int, power: Array) -> int:
 
 
 @compiled
-def _may_hold_outliers(
-    power: Array, variance: Array, factor_below: Array, factor_above: Array
-) -> bool:
-    """Return whether a bin is missing, or beyond both adjacent bins by more than noise."""
-    suspects = 0
-    for i in range(1, power.size - 1):
-        value = power[i]
-        below = value - factor_below[i] * power[i - 1]
-        above = value - factor_above[i] * power[i + 1]
-        peak = (below * above > 0.0) & (below * below > THRESHOLDS.outlying**2 * variance[i])
-        missing = not ((abs(value) < HUGE) & (variance[i] >= 0.0) & (variance[i] < HUGE))
-        suspects += 1 if peak | missing else 0
-    return suspects > 0
-
-
-@compiled
 def _mark_outliers(
     power: Array, variance: Array, range_: Array, work: Array, outlying: Booleans
 ) -> None:
     """Mark the outlying bins of all profiles."""
-    bins = range_.size
-    factor_below, factor_above = np.zeros(bins), np.zeros(bins)
-    factor_below[1:] = (range_[:-1] / range_[1:]) ** 2
-    factor_above[:-1] = (range_[1:] / range_[:-1]) ** 2
     usable_range, q, noise, index, usable_power = work[0], work[1], work[2], work[3], work[4]
     for p in range(power.shape[0]):
         row = variance[p % variance.shape[0]]
-        if not _may_hold_outliers(power[p], row, factor_below, factor_above):
-            continue
         count = 0
-        for i in range(bins):
+        for i in range(range_.size):
             value, value_variance = power[p, i], row[i]
             if usable(value, value_variance):
                 square = range_[i] * range_[i]
