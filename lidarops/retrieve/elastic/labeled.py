@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy import ndimage
 
 from lidarops.constants import HIGHEST_CLOUD
 from lidarops.flags import WITHHELD, Quality
@@ -221,14 +222,7 @@ def _negative(solution: _elastic.ElasticResult) -> Booleans:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
     error = solution.backscatter_standard_error
     low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
-    length = THRESHOLDS.negative_bins
-    if low.shape[-1] < length:
-        return np.zeros_like(low)
-    runs = np.lib.stride_tricks.sliding_window_view(low, length, axis=-1).all(axis=-1)
-    negative = np.zeros_like(low)
-    for first in range(length):
-        negative[:, first : first + runs.shape[-1]] |= runs
-    return negative
+    return np.asarray(ndimage.binary_opening(low, np.ones((1, THRESHOLDS.negative_bins))))
 
 
 def _with_beyond(mask: Booleans, distance: Array, window: _reference.ReferenceWindow) -> Booleans:
