@@ -443,31 +443,6 @@ def _fit(
         out[CURVATURE] = (y2 - c * y0 - b * (y1 - a * y0)) / math.sqrt(norm2)
 
 
-@inlined
-def _fit_windows(
-    values: Array,
-    inverse: Array,
-    shape: Array,
-    range_: Array,
-    excluded: Array,
-    edges: npt.NDArray[np.int64],
-    place: Array,
-    out: Array,
-) -> None:
-    for j in range(edges.shape[0]):
-        first, stop = edges[j, 0], edges[j, 1]
-        if stop <= first:
-            continue
-        middle = 0.5 * (range_[first] + range_[stop - 1])
-        half = max(0.5 * (range_[stop - 1] - range_[first]), _SHORTEST)
-        out[j, EXCLUDED_BINS] = 0.0
-        for i in range(first, stop):
-            place[i] = (range_[i] - middle) / half
-            out[j, EXCLUDED_BINS] += excluded[i]
-        bins = slice(first, stop)
-        _fit(values[bins], inverse[bins], shape[bins], place[bins], half, out[j])
-
-
 @compiled
 def _compare_with_air(
     power: Array,
@@ -503,4 +478,15 @@ def _compare_with_air(
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
         masked = excluded[k % excluded.shape[0]]
         _weigh(power[k], noise, masked, inverse, values)
-        _fit_windows(values, inverse, air, range_, masked, edges, place, out[k])
+        for j in range(edges.shape[0]):
+            first, stop = edges[j, 0], edges[j, 1]
+            if stop <= first:
+                continue
+            middle = 0.5 * (range_[first] + range_[stop - 1])
+            half = max(0.5 * (range_[stop - 1] - range_[first]), _SHORTEST)
+            out[k, j, EXCLUDED_BINS] = 0.0
+            for i in range(first, stop):
+                place[i] = (range_[i] - middle) / half
+                out[k, j, EXCLUDED_BINS] += masked[i]
+            bins = slice(first, stop)
+            _fit(values[bins], inverse[bins], air[bins], place[bins], half, out[k, j])

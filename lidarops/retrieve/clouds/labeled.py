@@ -208,7 +208,7 @@ class MeanProfiles:
         return summed(power) / air, np.sqrt(summed(self.variance)) / air
 
     @property
-    def _cloud(self) -> dict[str, Any]:
+    def cloud(self) -> dict[str, Any]:
         """What a cloud differs from, and by how much."""
         return {
             "molecular_attenuated": self.air.shape,
@@ -218,13 +218,7 @@ class MeanProfiles:
 
     def find_clouds(self, power: Array) -> Booleans:
         """Return the bins in clouds of a signal without background."""
-        return _layers.find_layers(power, self.distance, self.variance, **self._cloud)
-
-    def visible_air(self, power: Array, cloudy: Booleans) -> Booleans:
-        """Return where noise would not hide a cloud in a signal without background."""
-        return _layers.find_visible_air(
-            power, self.distance, self.variance, cloudy=cloudy, **self._cloud
-        )
+        return _layers.find_layers(power, self.distance, self.variance, **self.cloud)
 
 
 def signal_and_clouds(
@@ -246,8 +240,10 @@ def signal_and_clouds(
     mask = (layers | (fraction == 1.0)) & ~doubtful
     unknown = (doubtful | ~np.isfinite(signal.power)) & ~mask & np.isnan(fraction)
     clouds = Clouds(mask, fraction, unknown)
-    hidden = np.isfinite(signal.power) & ~means.visible_air(signal.power, clouds.any)
-    unknown |= hidden & ~clouds.any
+    visible = _layers.find_visible_air(
+        signal.power, means.distance, means.variance, cloudy=clouds.any, **means.cloud
+    )
+    unknown |= np.isfinite(signal.power) & ~visible & ~clouds.any
     fraction = np.where((mask | unknown) & (fraction == 0.0), np.nan, fraction)
     return signal, Clouds(mask, fraction, unknown)
 

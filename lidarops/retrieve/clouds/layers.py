@@ -14,7 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Integers, frozen, usable
-from lidarops.retrieve.common.compiled_code import compiled, inlined
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
@@ -327,7 +327,7 @@ def _steepest(
     return best, length
 
 
-@inlined
+@compiled
 def _next_base(
     sums: Array,
     start: int,
