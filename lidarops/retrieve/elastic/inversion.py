@@ -52,15 +52,6 @@ class Thresholds(NamedTuple):
 
 
 THRESHOLDS: Final = Thresholds()
-_LIMITS: Final = np.array(
-    [
-        THRESHOLDS.longest_gap,
-        THRESHOLDS.least_denominator,
-        THRESHOLDS.least_certainty**2,
-        THRESHOLDS.skewed**2,
-    ]
-)
-"""Limits of the kernel."""
 
 
 class Air(NamedTuple):
@@ -298,7 +289,9 @@ class _Solution:
         out = np.empty((_fernald.FIELDS, *self._rows.shape))
         scalars = np.empty((len(self._rows), _fernald.SCALARS))
         state = np.empty(self._rows.shape, dtype=np.uint8)
-        _fernald.invert_fernald(frozen(rows), self._given, _LIMITS, out, scalars, state)
+        t = THRESHOLDS
+        limits = np.array([t.longest_gap, t.least_denominator, t.least_certainty**2, t.skewed**2])
+        _fernald.invert_fernald(frozen(rows), self._given, limits, out, scalars, state)
         return out, scalars, state
 
     def shifted(self, *changes: Array) -> Array:

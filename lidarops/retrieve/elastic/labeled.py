@@ -201,9 +201,15 @@ def _sky_flags(
     window: _reference.ReferenceWindow,
 ) -> Flags:
     """Return the bits of clouds, of backscatter below zero and of an unknown overlap."""
+    # The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
+    # that was assumed in the cloud.
+    near = means.distance < np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
 
     def with_beyond(mask: Booleans) -> Booleans:
-        return _with_beyond(mask, means.distance, window)
+        """Return the bins of a mask, and those beyond one as seen from the reference window."""
+        above = np.logical_or.accumulate(mask & ~near, axis=-1)
+        below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
+        return np.asarray(above | below)
 
     cloudy = with_beyond(with_margin(clouds.mask, means.distance))
     partly = with_beyond(with_margin(clouds.partly, means.distance))
@@ -223,19 +229,6 @@ def _negative(solution: _elastic.ElasticResult) -> Booleans:
     error = solution.backscatter_standard_error
     low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
     return np.asarray(ndimage.binary_opening(low, np.ones((1, THRESHOLDS.negative_bins))))
-
-
-def _with_beyond(mask: Booleans, distance: Array, window: _reference.ReferenceWindow) -> Booleans:
-    """Return the bins of a mask, and those beyond one as seen from the reference window.
-
-    The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
-    that was assumed in the cloud.
-    """
-    bottom = np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
-    near, far = distance < bottom, distance >= bottom
-    above = np.logical_or.accumulate(mask & far, axis=-1)
-    below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
-    return np.asarray(above | below)
 
 
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
