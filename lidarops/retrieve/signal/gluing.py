@@ -209,9 +209,11 @@ def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Ind
     with np.errstate(invalid="ignore"):
         usable = (rate >= THRESHOLDS.count_rates[0]) & (rate <= highest[:, np.newaxis])
     usable &= _is_lit(x, xv)
-    first, past = np.zeros((2, len(x)), dtype=np.intp)
-    longest_runs(usable, first, past)
     index = np.arange(rate.shape[1])
+    # Number of usable bins up to each, whose largest is the longest run.
+    run = index - np.maximum.accumulate(np.where(usable, -1, index), axis=1)
+    past = run.argmax(axis=1) + 1
+    first = past - run.max(axis=1)
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
     highest_rate = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
     lowest_rate = np.where(inside, rate, np.inf).min(axis=1, initial=np.inf)
@@ -281,20 +283,6 @@ def running_means(values: Array, half: int, out: Array) -> None:
                 count -= 1
             if i >= 0:
                 out[k, i] = total / count if count > 0 else math.nan
-
-
-@compiled
-def longest_runs(valid: Booleans, first: Indices, past: Indices) -> None:
-    """Write the longest run of true bins of each row, the first of equals; (0, 0) for none."""
-    for k in range(valid.shape[0]):
-        start = best = 0
-        first[k] = past[k] = 0
-        for i in range(valid.shape[1]):
-            if not valid[k, i]:
-                start = i + 1
-            elif i + 1 - start > best:
-                best = i + 1 - start
-                first[k], past[k] = start, i + 1
 
 
 @compiled
