@@ -110,7 +110,7 @@ def fit_known_shape(
     exposure: npt.ArrayLike | None = None,
     start: npt.ArrayLike | None = None,
     stop: npt.ArrayLike | None = None,
-    mask: npt.ArrayLike | None = None,
+    mask: Booleans | None = None,
 ) -> KnownShapeResult:
     r"""Fit background and amplitude of a signal whose shape is known, by weighted least squares.
 
@@ -221,7 +221,7 @@ def _exposures(
 
 def _weights(
     variance: npt.ArrayLike | None,
-    mask: npt.ArrayLike | None,
+    mask: Booleans | None,
     air: Array,
     grid: Array,
     leading: tuple[int, ...],
@@ -232,12 +232,7 @@ def _weights(
         weights = 1.0 / noise
     usable = (weights > 0) & (weights < HUGE) & (air > 0) & (air < HUGE)
     if mask is not None:
-        allowed = np.asarray(mask)
-        if allowed.dtype != np.bool_:
-            raise RetrievalInputError(
-                f"holds {allowed.dtype}", field="mask", remedy="give True where a bin may be used"
-            )
-        usable = usable & (inputs.noise_rows(allowed.astype(float), "mask", grid, leading) > 0)
+        usable = usable & (inputs.noise_rows(mask.astype(float), "mask", grid, leading) > 0)
     return frozen(np.where(usable, weights, 0.0))
 
 

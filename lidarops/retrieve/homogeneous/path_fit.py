@@ -331,26 +331,26 @@ def _fit_above(
         decay = np.exp(-2.0 * fit.extinction[:, np.newaxis] * problem.range)
         signal = fit.amplitude[:, np.newaxis] * decay / problem.range**2
         pull = weights * signal
-        norm, lever = _row_sum(pull * signal), -2.0 * problem.range
-        lever = lever - (_row_sum(lever * pull * signal) / norm)[:, np.newaxis]
+        norm, lever = (pull * signal).sum(axis=-1), -2.0 * problem.range
+        lever = lever - ((lever * pull * signal).sum(axis=-1) / norm)[:, np.newaxis]
         centroid = np.asarray(near + 0.5 * lever[:, 0])
         # Without the background, then through it.
-        extinction = lever * pull / _row_sum(lever**2 * pull * signal)[:, np.newaxis]
+        extinction = lever * pull / (lever**2 * pull * signal).sum(axis=-1)[:, np.newaxis]
         logarithm = pull / norm[:, np.newaxis] + 2.0 * centroid[:, np.newaxis] * extinction
         extinction = extinction + fit.extinction_slope[:, np.newaxis] * gradients
         logarithm = logarithm + fit.amplitude_slope[:, np.newaxis] * gradients
         used = weights > 0.0
-        bent = _row_sum(np.where(used, gradients * signal, 0.0) * (problem.range - middle) ** 2)
+        bent = np.where(used, gradients * signal, 0.0) * (problem.range - middle) ** 2
+        bend = bent.sum(axis=-1) / length
         variance = np.where(used, 1.0 / weights, 0.0)
-    bend = bent / length
     fit = replace(
         fit,
         status=np.where(np.isnan(background), np.nan, fit.status),
         background=background,
-        background_variance=_row_sum(gradients**2 * variance),
+        background_variance=(gradients**2 * variance).sum(axis=-1),
         background_slope_variance=np.zeros(1),
-        amplitude_relative_variance=_row_sum(logarithm**2 * variance),
-        extinction_variance=_row_sum(extinction**2 * variance),
+        amplitude_relative_variance=(logarithm**2 * variance).sum(axis=-1),
+        extinction_variance=(extinction**2 * variance).sum(axis=-1),
         background_bend=bend,
         extinction_bend=fit.extinction_bend + fit.extinction_slope * bend,
     )
@@ -362,10 +362,6 @@ def _weights(problem: PathProblem) -> Array:
     weights = 1.0 / problem.noise
     usable = (np.abs(problem.power) < HUGE) & (weights > 0.0) & (weights < HUGE)
     return np.where(usable, weights, 0.0)
-
-
-def _row_sum(values: Array) -> Array:
-    return np.asarray(values.sum(axis=-1))
 
 
 def _estimate(problem: PathProblem, given: Array, kind: int = _direct.BACKGROUND) -> PathEstimate:
