@@ -227,20 +227,29 @@ def systematic_changes(profiles: xr.Dataset, background: xr.DataArray) -> dict[s
         In the unit of the power, over its dimensions: ``dead_time`` of photon counting,
         ``baseline`` (`baseline_error`) of analog, both of glued signals.
     """
-    power, changes = profiles["power"], {}
-    error = power.attrs.get(DEAD_TIME_ERROR)
-    if error is not None:
-        per_square = error * 1e6
+    changes, of_power = {}, dead_time_change(profiles)
+    if of_power is not None:
+        changes["dead_time"] = profiles["power"].copy(data=of_power[0])
         # In place, because these are the largest arrays of a chunk.
-        if "dead_time_error" in profiles:
-            change = profiles["dead_time_error"].to_numpy().copy()
-        else:
-            change = power.to_numpy() ** 2
-            change *= per_square
-        changes["dead_time"] = power.copy(data=change)
-        changes["dead_time"] -= background**2 * per_square
+        changes["dead_time"] -= background**2 * of_power[1]
     baseline = baseline_error(profiles)
     return changes if baseline is None else {**changes, "baseline": baseline}
+
+
+def dead_time_change(profiles: xr.Dataset) -> tuple[Block, float] | None:
+    """Return the change of power with one standard error of the dead time, and a factor.
+
+    That of a background is the factor times its square; None for analog. The array is a new one.
+    """
+    error = profiles["power"].attrs.get(DEAD_TIME_ERROR)
+    if error is None:
+        return None
+    per_square = error * 1e6
+    if "dead_time_error" in profiles:
+        return profiles["dead_time_error"].to_numpy().copy(), per_square
+    change = profiles["power"].to_numpy() ** 2
+    change *= per_square
+    return change, per_square
 
 
 def correct_for_range(
