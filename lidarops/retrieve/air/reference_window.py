@@ -126,18 +126,6 @@ class ReferenceWindow:
         """Return the relative error of the scattering ratio: stated, and by hidden particles."""
         return np.hypot(stated, self.undetected_particles)
 
-    @property
-    def variables(self) -> dict[str, tuple[str, npt.NDArray[np.generic]]]:
-        """What products state of the windows of their profiles, over time."""
-        limit = np.where(np.isinf(self.detection_limit), np.nan, self.detection_limit)
-        rejections = np.bitwise_or.reduce(self.rejections, axis=-1).astype(np.int32)
-        return {
-            "reference_bottom": ("time", self.bottom),
-            "reference_top": ("time", self.top),
-            "reference_detection_limit": ("time", limit),
-            "reference_rejections": ("time", rejections),
-        }
-
 
 def candidate_windows(lowest: float, highest: float, width: float, step: float) -> Array:
     """Return windows of equal width at regular steps.

@@ -105,10 +105,6 @@ class Clouds:
         """Bins that are cloudy in some profiles or the mean."""
         return np.asarray(self.mask | self.partly)
 
-    def within(self, bins: slice) -> Clouds:
-        """Return the clouds in some bins."""
-        return Clouds(self.mask[:, bins], self.fraction[:, bins], self.unknown[:, bins])
-
 
 def air_along(
     molecules: MolecularProfile, altitude: Array, distance: Array, wavelength: float
@@ -305,10 +301,9 @@ def _cells_in(averages: xr.Dataset, distance: Array) -> tuple[int, slice, slice]
 
 
 def cloud_heights(
-    clouds: Clouds, distance: Array, station_altitude: float, climb: float
+    mask: Booleans, distance: Array, station_altitude: float, climb: float
 ) -> dict[str, tuple[str, Array]]:
     """Return where the lowest cloud begins and the highest one ends, as variables; NaN for none."""
-    mask = clouds.any
     cloudy = mask.any(axis=-1)
     base = np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan)
     last = mask.shape[-1] - 1 - np.argmax(mask[:, ::-1], axis=-1)
@@ -324,8 +319,13 @@ def window_variables(
     window: _reference.ReferenceWindow, reference: Reference, station_altitude: float, climb: float
 ) -> dict[str, Any]:
     """Return the variables of the reference windows, and of what is assumed in them."""
+    limit = window.detection_limit
+    rejections = np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32)
     return {
-        **window.variables,
+        "reference_bottom": ("time", window.bottom),
+        "reference_top": ("time", window.top),
+        "reference_detection_limit": ("time", np.where(np.isinf(limit), np.nan, limit)),
+        "reference_rejections": ("time", rejections),
         "reference_bottom_altitude": ("time", station_altitude + climb * window.bottom),
         "reference_top_altitude": ("time", station_altitude + climb * window.top),
         "reference_scattering_ratio": reference.scattering_ratio,

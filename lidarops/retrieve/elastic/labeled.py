@@ -136,8 +136,7 @@ def invert_elastic(
         **_systematic_errors(averages, means, signal),
         noise_correlation_length=means.correlation_length,
     )
-    quality = means.quality | _solution_flags(solution, window, signal, means.quality)
-    quality |= _sky_flags(solution, means, clouds, window)
+    quality = means.quality | _flags(solution, window, signal, means, clouds)
     profiles = {
         name: np.where(solution.valid, values, np.nan)
         for name, values in _profile_variables(solution).items()
@@ -153,7 +152,7 @@ def invert_elastic(
             **window_variables(window, reference, station_altitude, climb),
             "cloud_mask": (("time", "range"), clouds.state),
             "cloud_fraction": (("time", "range"), clouds.fraction),
-            **cloud_heights(clouds.within(used), distance[used], station_altitude, climb),
+            **cloud_heights(clouds.any[:, used], distance[used], station_altitude, climb),
             "background": ("time", signal.background),
             "background_standard_error": ("time", signal.background_standard_error),
             "quality_flag": (("time", "range"), quality),
@@ -179,28 +178,14 @@ def _systematic_errors(
     return errors
 
 
-def _solution_flags(
+def _flags(
     solution: _elastic.ElasticResult,
     window: _reference.ReferenceWindow,
     signal: MeanSignal,
-    quality: Flags,
-) -> Flags:
-    """Return the bits of reference, background and inversion."""
-    bits = np.zeros(solution.valid.shape, dtype=np.int32)
-    bits[~window.chosen] |= np.int32(ElasticQuality.NO_REFERENCE)
-    bits[signal.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
-    unsolved = window.chosen[:, np.newaxis] & ~solution.valid & ((quality & WITHHELD) == 0)
-    bits[unsolved] |= np.int32(ElasticQuality.UNSTABLE_INVERSION)
-    return bits
-
-
-def _sky_flags(
-    solution: _elastic.ElasticResult,
     means: MeanProfiles,
     clouds: Clouds,
-    window: _reference.ReferenceWindow,
 ) -> Flags:
-    """Return the bits of clouds, of backscatter below zero and of an unknown overlap."""
+    """Return the bits of the inversion, its reference and background, clouds and overlap."""
     # The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
     # that was assumed in the cloud.
     near = means.distance < np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
@@ -211,16 +196,23 @@ def _sky_flags(
         below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
         return np.asarray(above | below)
 
+    chosen = window.chosen[:, np.newaxis]
     cloudy = with_beyond(with_margin(clouds.mask, means.distance))
     partly = with_beyond(with_margin(clouds.partly, means.distance))
     bits = np.zeros(solution.valid.shape, dtype=np.int32)
     for mask, bit in (
+        (~chosen, ElasticQuality.NO_REFERENCE),
+        (signal.uncertain[:, np.newaxis], Quality.BACKGROUND_UNCERTAIN),
+        (
+            chosen & ~solution.valid & ((means.quality & WITHHELD) == 0),
+            ElasticQuality.UNSTABLE_INVERSION,
+        ),
         (cloudy, ElasticQuality.CLOUD),
         (partly & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
         (with_beyond(_negative(solution)), ElasticQuality.NEGATIVE_BACKSCATTER),
         (means.unknown_overlap, ElasticQuality.UNKNOWN_OVERLAP),
     ):
-        bits[mask] |= np.int32(bit)
+        bits |= np.where(mask, np.int32(bit), np.int32(0))
     return bits
 
 
