@@ -12,10 +12,8 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Flags, frozen
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
-
-Codes = npt.NDArray[np.int32]
 
 _SHORTEST: Final = 1e-9
 """m; half length of a window of one bin, to divide by."""
@@ -103,13 +101,8 @@ class ReferenceWindow:
     detection_limit: Array
     """Scattering ratio minus 1 of particles in the window that the comparison with other windows
     shows with a probability of 0.95. Infinite where no other window is comparable."""
-    rejections: Codes
+    rejections: Flags
     """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
-
-    @property
-    def edges(self) -> tuple[Array, Array]:
-        """Bottom and top in m, the `reference` of `inversion.invert_elastic`."""
-        return self.bottom, self.top
 
     @property
     def undetected_particles(self) -> Array:
@@ -274,7 +267,7 @@ def choose_reference(
     )
 
 
-def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
+def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Flags:
     """Return the bits of `Rejection` of each window; 0 for those that pass all tests."""
     f, most = np.moveaxis(statistics, -1, 0), THRESHOLDS.most_deviation
     count = np.nan_to_num(f[COUNT])
@@ -298,7 +291,7 @@ def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
 
 
 def _pick(
-    statistics: Array, rejections: Codes, level_error: Array, noise: Array
+    statistics: Array, rejections: Flags, level_error: Array, noise: Array
 ) -> tuple[npt.NDArray[np.int64], Array, Array]:
     """Return the index of the chosen window or -1, its comparison with the anchor, and its excess.
 
@@ -340,7 +333,7 @@ def _pick(
 
 def _detection_limit(
     statistics: Array,
-    rejections: Codes,
+    rejections: Flags,
     level_error: Array,
     windows: Array,
     index: npt.NDArray[np.int64],

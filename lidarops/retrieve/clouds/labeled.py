@@ -183,11 +183,6 @@ class MeanProfiles:
         """Flag bins in which the overlap is incomplete."""
         self.quality = self.quality | np.where(partial, _INCOMPLETE_OVERLAP, np.int32(0))
 
-    def minus(self, background: Array) -> Array:
-        """Return the signal without background, corrected for overlap."""
-        power = (self.raw - background[:, np.newaxis]) / self.overlap
-        return np.where((self.quality & WITHHELD) != 0, np.nan, power)
-
     def ratio_to_air(self, power: Array) -> tuple[Array, Array]:
         """Return the ratio of a signal to air and its error, in means over the bins before each."""
         step = float(np.median(np.diff(self.distance)))
@@ -446,9 +441,9 @@ def _subtract_background(means: MeanProfiles, usable: Booleans, *, known_shape: 
         sky = estimate.from_known_shape(
             raw, r, noise, means.air.shape, mask=usable, exposure=means.exposure
         )
-    return MeanSignal(
-        means.minus(sky.background), sky.background, sky.standard_error, sky.uncertain
-    )
+    power = (means.raw - sky.background[:, np.newaxis]) / means.overlap
+    power[(means.quality & WITHHELD) != 0] = np.nan
+    return MeanSignal(power, sky.background, sky.standard_error, sky.uncertain)
 
 
 def reference_window(

@@ -336,11 +336,6 @@ def _attenuate(
 def _withhold(
     power: Array, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
 ) -> None:
-    invalid = 0
-    for i in range(state.size):
-        invalid |= state[i] ^ VALID
-    if invalid == 0:
-        return
     for i in range(state.size):
         if state[i] == VALID:
             continue

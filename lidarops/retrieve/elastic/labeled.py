@@ -127,7 +127,7 @@ def invert_elastic(
         air=_elastic.Air(air.backscatter, air.extinction, molecular_relative_error),
         lidar_ratio=ratio,
         reference=_elastic.Reference(
-            window.edges,
+            (window.bottom, window.top),
             reference.scattering_ratio,
             window.relative_error(reference.relative_error),
         ),

@@ -42,16 +42,15 @@ class HomogeneousMethod(StrEnum):
     KNOWN_EXTINCTION = "known_extinction"
 
 
-_NEEDS: Final[dict[str, set[HomogeneousMethod]]] = {
+_TAKES: Final = {
     "extinction": {HomogeneousMethod.LINEARIZED, HomogeneousMethod.KNOWN_EXTINCTION},
     "background": {HomogeneousMethod.KNOWN_BACKGROUND},
-}
-"""Arguments that these methods require and no other accepts."""
-_TAKES: Final = {
     "background_standard_error": {HomogeneousMethod.KNOWN_BACKGROUND},
     "lag": {HomogeneousMethod.CUBIC},
 }
 """Arguments that only these methods accept."""
+_REQUIRED: Final = ("extinction", "background")
+"""Of these, those that they require."""
 
 
 class Noise(NamedTuple):
@@ -258,14 +257,14 @@ def _known_extinction(extinction: npt.ArrayLike, length: float, leading: tuple[i
 
 def _check_arguments(method: HomogeneousMethod, given: Mapping[str, object]) -> None:
     for name, value in given.items():
-        methods = (_NEEDS | _TAKES)[name]
+        methods = _TAKES[name]
         if value is not None and method not in methods:
             raise RetrievalInputError(
                 f"is not accepted by the method {str(method)!r}",
                 field=name,
                 remedy=f"leave it out, or choose {' or '.join(sorted(methods))}",
             )
-        if value is None and name in _NEEDS and method in methods:
+        if value is None and name in _REQUIRED and method in methods:
             raise RetrievalInputError(f"is required by the method {str(method)!r}", field=name)
 
 

@@ -236,7 +236,7 @@ def test_profiles_are_independent_and_their_windows_fit_the_inversion():
 
     solution = invert_elastic(
         power, RANGE, molecular_backscatter=BACKSCATTER, molecular_extinction=EXTINCTION,
-        lidar_ratio=50.0, reference=tuple(edge.reshape(20) for edge in whole.edges),
+        lidar_ratio=50.0, reference=(whole.bottom.reshape(20), whole.top.reshape(20)),
     )  # fmt: skip
     assert np.array_equal(solution.calibrated, whole.chosen.reshape(20))
 
