@@ -9,7 +9,7 @@ import numpy as np
 from lidarops.retrieve.homogeneous.path_fit import Noise
 
 
-def by_weights(weights: Any, correlation_length: Any = None) -> dict[str, Any]:
+def by_weights(weights: Any, correlation_length: Any = 1.0) -> dict[str, Any]:
     """Return the arguments of a fit in which bins have weights, without those of weight 0."""
     with np.errstate(divide="ignore"):
         variance = 1.0 / np.asarray(weights, dtype=np.float64)

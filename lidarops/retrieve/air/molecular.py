@@ -261,19 +261,15 @@ class MolecularProfile:
         _check_balance(self.altitude, self.pressure, self.temperature)
 
     @classmethod
-    def us_standard(cls, altitude: ArrayLike | None = None) -> Self:
+    def us_standard(cls) -> Self:
         """Return the US Standard Atmosphere 1976.
 
-        Parameters
-        ----------
-        altitude : array_like, m, optional
-            Ascending, -5 to 84 km. Where not given, levels are every 100 m and where the lapse
-            rate changes, which interpolates the number density to 6e-6.
+        Levels are every 100 m and where the lapse rate changes, which interpolates the number
+        density to 6e-6.
         """
-        if altitude is None:
-            layer_bases = _EARTH_RADIUS * _BASE / (_EARTH_RADIUS - _BASE)
-            altitude = np.union1d(np.linspace(LOWEST, HIGHEST, 891), layer_bases)
-        return cls(np.asarray(altitude, dtype=np.float64), *us_standard(altitude), standard=True)
+        layer_bases = _EARTH_RADIUS * _BASE / (_EARTH_RADIUS - _BASE)
+        altitude = np.union1d(np.linspace(LOWEST, HIGHEST, 891), layer_bases)
+        return cls(altitude, *us_standard(altitude), standard=True)
 
     @classmethod
     def from_profile(

@@ -12,10 +12,8 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Flags, frozen
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
-
-Codes = npt.NDArray[np.int32]
 
 _SHORTEST: Final = 1e-9
 """m; half length of a window of one bin, to divide by."""
@@ -55,8 +53,6 @@ class Thresholds(NamedTuple):
     preferred, because particles decrease with height. In the published Raman simulation,
     particles of the best determined windows make backscatter at 532 nm too small by a quarter
     (`tests/retrieve/raman/test_raman_published.py`)."""
-    most_windows: int = 10_000
-    """Candidates; more are taken for a mistake of units. Assumed."""
 
 
 THRESHOLDS: Final = Thresholds()
@@ -105,13 +101,8 @@ class ReferenceWindow:
     detection_limit: Array
     """Scattering ratio minus 1 of particles in the window that the comparison with other windows
     shows with a probability of 0.95. Infinite where no other window is comparable."""
-    rejections: Codes
+    rejections: Flags
     """(..., candidate): bits of `Rejection`; 0 for the chosen one and those equally clean."""
-
-    @property
-    def edges(self) -> tuple[Array, Array]:
-        """Bottom and top in m, the `reference` of `inversion.invert_elastic`."""
-        return self.bottom, self.top
 
     @property
     def undetected_particles(self) -> Array:
@@ -127,18 +118,6 @@ class ReferenceWindow:
     def relative_error(self, stated: float) -> Array:
         """Return the relative error of the scattering ratio: stated, and by hidden particles."""
         return np.hypot(stated, self.undetected_particles)
-
-    @property
-    def variables(self) -> dict[str, tuple[str, npt.NDArray[np.generic]]]:
-        """What products state of the windows of their profiles, over time."""
-        limit = np.where(np.isinf(self.detection_limit), np.nan, self.detection_limit)
-        rejections = np.bitwise_or.reduce(self.rejections, axis=-1).astype(np.int32)
-        return {
-            "reference_bottom": ("time", self.bottom),
-            "reference_top": ("time", self.top),
-            "reference_detection_limit": ("time", limit),
-            "reference_rejections": ("time", rejections),
-        }
 
 
 def candidate_windows(lowest: float, highest: float, width: float, step: float) -> Array:
@@ -159,22 +138,17 @@ def candidate_windows(lowest: float, highest: float, width: float, step: float) 
     Raises
     ------
     RetrievalInputError
-        Where no window fits, or more than 10 000 do.
+        Where no window fits.
     """
-    numbers = np.array([lowest, highest, width, step], dtype=np.float64)
-    if not np.all(np.isfinite(numbers)) or width <= 0 or step <= 0 or highest - lowest < width:
+    if not (0.0 < width <= highest - lowest and step > 0.0):
         raise RetrievalInputError(
             f"no window of {width:g} m, moved by {step:g} m, fits between {lowest:g} and"
             f" {highest:g} m",
             field="candidates",
             remedy="give m, with the width and step positive",
         )
-    count = np.floor((highest - lowest - width) / step + 1e-9) + 1
-    if count > THRESHOLDS.most_windows:
-        raise RetrievalInputError(
-            f"makes {count:.0f} windows", field="step", remedy="give a larger step in m"
-        )
-    bottom = lowest + step * np.arange(int(count))
+    count = math.floor((highest - lowest - width) / step + 1e-9) + 1
+    bottom = lowest + step * np.arange(count)
     return np.stack([bottom, bottom + width], axis=-1)
 
 
@@ -184,10 +158,10 @@ def choose_reference(
     variance: npt.ArrayLike,
     *,
     molecular_attenuated: npt.ArrayLike,
-    candidates: npt.ArrayLike,
+    candidates: Array,
     background_standard_error: npt.ArrayLike = 0.0,
     baseline_standard_error: npt.ArrayLike = 0.0,
-    exclude: npt.NDArray[np.bool_] | None = None,
+    exclude: Booleans | None = None,
 ) -> ReferenceWindow:
     r"""Return the cleanest window; of equally clean ones, the highest that is well determined.
 
@@ -244,16 +218,16 @@ def choose_reference(
     Raises
     ------
     RetrievalInputError
-        For invalid arguments, among them candidates outside the range.
+        For invalid arguments.
     """
     grid = inputs.range_grid(range)
     rows, leading, shape = inputs.profiles_and_air(power, molecular_attenuated, grid)
-    windows, edges = _edges(candidates, grid)
-    mask = np.zeros(grid.size, dtype=np.bool_) if exclude is None else np.asarray(exclude)
-    if mask.dtype != np.bool_:
-        raise RetrievalInputError(f"holds {mask.dtype}, not booleans", field="exclude")
-    excluded = inputs.noise_rows(mask.astype(np.float64), "exclude", grid, leading)
-    statistics = np.full((rows.shape[0], windows.shape[0], FIELDS), np.nan)
+    first = np.searchsorted(grid, candidates[:, 0], side="left")
+    stop = np.searchsorted(grid, candidates[:, 1], side="right")
+    edges = np.stack([first, stop], axis=-1).astype(np.int64)
+    mask = np.zeros(grid.size) if exclude is None else exclude.astype(np.float64)
+    excluded = inputs.noise_rows(mask, "exclude", grid, leading)
+    statistics = np.full((rows.shape[0], len(candidates), FIELDS), np.nan)
     _compare_with_air(
         frozen(rows),
         frozen(inputs.noise_rows(variance, "variance", grid, leading, negative=False)),
@@ -280,42 +254,20 @@ def choose_reference(
 
     return ReferenceWindow(
         chosen=chosen.reshape(leading),
-        bottom=of_chosen(windows[index, 0]),
-        top=of_chosen(windows[index, 1]),
+        bottom=of_chosen(candidates[index, 0]),
+        top=of_chosen(candidates[index, 1]),
         scale=of_chosen(statistics[profile, index, SCALE]),
         scale_standard_error=of_chosen(statistics[profile, index, SCALE_ERROR]),
         comparison_standard_error=of_chosen(comparison_error),
         excess=of_chosen(excess),
         detection_limit=of_chosen(
-            _detection_limit(statistics, rejections, level_error, windows, index)
+            _detection_limit(statistics, rejections, level_error, candidates, index)
         ),
-        rejections=rejections.reshape(*leading, windows.shape[0]),
+        rejections=rejections.reshape(*leading, len(candidates)),
     )
 
 
-def _edges(candidates: npt.ArrayLike, grid: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    windows = inputs.real_array(candidates, "candidates").astype(np.float64)
-    if windows.ndim == 1:
-        windows = windows[np.newaxis]
-    if windows.ndim != 2 or windows.shape[1] != 2 or windows.shape[0] == 0:
-        raise RetrievalInputError(
-            f"has the shape {windows.shape}", field="candidates", remedy="give (candidate, 2) in m"
-        )
-    if not np.all(np.isfinite(windows)) or not np.all(windows[:, 0] < windows[:, 1]):
-        raise RetrievalInputError(
-            "holds windows that are not finite or end before they begin", field="candidates"
-        )
-    first = np.searchsorted(grid, windows[:, 0], side="left")
-    stop = np.searchsorted(grid, windows[:, 1], side="right")
-    if not np.any(stop > first):
-        raise RetrievalInputError(
-            f"hold no bin of the range, which reaches from {grid[0]:g} to {grid[-1]:g} m",
-            field="candidates",
-        )
-    return windows, np.stack([first, stop], axis=-1).astype(np.int64)
-
-
-def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
+def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Flags:
     """Return the bits of `Rejection` of each window; 0 for those that pass all tests."""
     f, most = np.moveaxis(statistics, -1, 0), THRESHOLDS.most_deviation
     count = np.nan_to_num(f[COUNT])
@@ -339,7 +291,7 @@ def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Codes:
 
 
 def _pick(
-    statistics: Array, rejections: Codes, level_error: Array, noise: Array
+    statistics: Array, rejections: Flags, level_error: Array, noise: Array
 ) -> tuple[npt.NDArray[np.int64], Array, Array]:
     """Return the index of the chosen window or -1, its comparison with the anchor, and its excess.
 
@@ -381,7 +333,7 @@ def _pick(
 
 def _detection_limit(
     statistics: Array,
-    rejections: Codes,
+    rejections: Flags,
     level_error: Array,
     windows: Array,
     index: npt.NDArray[np.int64],
@@ -472,31 +424,6 @@ def _fit(
         out[CURVATURE] = (y2 - c * y0 - b * (y1 - a * y0)) / math.sqrt(norm2)
 
 
-@inlined
-def _fit_windows(
-    values: Array,
-    inverse: Array,
-    shape: Array,
-    range_: Array,
-    excluded: Array,
-    edges: npt.NDArray[np.int64],
-    place: Array,
-    out: Array,
-) -> None:
-    for j in range(edges.shape[0]):
-        first, stop = edges[j, 0], edges[j, 1]
-        if stop <= first:
-            continue
-        middle = 0.5 * (range_[first] + range_[stop - 1])
-        half = max(0.5 * (range_[stop - 1] - range_[first]), _SHORTEST)
-        out[j, EXCLUDED_BINS] = 0.0
-        for i in range(first, stop):
-            place[i] = (range_[i] - middle) / half
-            out[j, EXCLUDED_BINS] += excluded[i]
-        bins = slice(first, stop)
-        _fit(values[bins], inverse[bins], shape[bins], place[bins], half, out[j])
-
-
 @compiled
 def _compare_with_air(
     power: Array,
@@ -532,4 +459,15 @@ def _compare_with_air(
         noise, air = variance[k % variance.shape[0]], shape[k % shape.shape[0]]
         masked = excluded[k % excluded.shape[0]]
         _weigh(power[k], noise, masked, inverse, values)
-        _fit_windows(values, inverse, air, range_, masked, edges, place, out[k])
+        for j in range(edges.shape[0]):
+            first, stop = edges[j, 0], edges[j, 1]
+            if stop <= first:
+                continue
+            middle = 0.5 * (range_[first] + range_[stop - 1])
+            half = max(0.5 * (range_[stop - 1] - range_[first]), _SHORTEST)
+            out[k, j, EXCLUDED_BINS] = 0.0
+            for i in range(first, stop):
+                place[i] = (range_[i] - middle) / half
+                out[k, j, EXCLUDED_BINS] += masked[i]
+            bins = slice(first, stop)
+            _fit(values[bins], inverse[bins], air[bins], place[bins], half, out[k, j])

@@ -43,9 +43,13 @@ class Background:
     """The far range does not fit the method, or `left` cannot be estimated."""
     uncertain: Booleans
     """`unjudged`, or `left` is detected and matters beside the standard error."""
-    quality: Flags
-    """BACKGROUND_UNCERTAIN where `uncertain`; INPUT_MISSING, or for the cubic NO_REAL_SOLUTION,
-    where there is no background."""
+    absent: Flags
+    """INPUT_MISSING, or for the cubic NO_REAL_SOLUTION, where there is no background."""
+
+    @property
+    def quality(self) -> Flags:
+        """`absent`, and BACKGROUND_UNCERTAIN where `uncertain`."""
+        return self.absent | self.uncertain * np.int32(Quality.BACKGROUND_UNCERTAIN)
 
     def where(self, chosen: Booleans, other: Background) -> Background:
         """Return this background for the profiles that are chosen, else the other one."""
@@ -155,7 +159,7 @@ def from_known_shape(
         * np.hypot(tail.standard_error, fit.background_standard_error),
         unjudged=doubtful,
         uncertain=doubtful,
-        quality=_bits(doubtful, np.zeros(doubtful.shape, np.int32)),
+        absent=np.zeros(doubtful.shape, np.int32),
     )
     return fitted_sky.where(usable, tail)
 
@@ -187,7 +191,7 @@ def from_bounded_tail(
         left_standard_error=np.zeros_like(most),
         unjudged=tail.unjudged,
         uncertain=tail.unjudged,
-        quality=_bits(tail.unjudged, tail.quality & np.int32(Quality.INPUT_MISSING)),
+        absent=tail.absent,
     )
 
 
@@ -274,12 +278,7 @@ def _judged(
 ) -> Background:
     unjudged = unjudged & np.isfinite(value)
     uncertain = unjudged | shifts(detected(*left), error)
-    return Background(value, error, *left, unjudged, uncertain, _bits(uncertain, absent))
-
-
-def _bits(uncertain: Booleans, absent: Flags) -> Flags:
-    doubt = np.where(uncertain, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
-    return np.asarray(absent | doubt, dtype=np.int32)
+    return Background(value, error, *left, unjudged, uncertain, absent)
 
 
 def _bins(range_: Array, span: tuple[float, float] | None) -> slice:

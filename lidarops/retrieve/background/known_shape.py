@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,10 @@ from lidarops.retrieve.background import _shape_fit
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Flags, Integers, frozen
+
+_UNKNOWN: Final = frozen(np.full(1, np.nan))
+_ENDLESS: Final = frozen(np.full(1, np.inf))
+"""Ends of a window that are not given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +110,7 @@ def fit_known_shape(
     exposure: npt.ArrayLike | None = None,
     start: npt.ArrayLike | None = None,
     stop: npt.ArrayLike | None = None,
-    mask: npt.ArrayLike | None = None,
+    mask: Booleans | None = None,
 ) -> KnownShapeResult:
     r"""Fit background and amplitude of a signal whose shape is known, by weighted least squares.
 
@@ -171,17 +176,15 @@ def fit_known_shape(
     air = inputs.noise_rows(shape, "shape", grid, leading)
     counts = _exposures(variance, exposure, leading)
     weights = _weights(variance, mask, air, grid, leading)
-    starts = inputs.profile_values(start, "start", leading)
-    if starts is not None and np.any(starts > grid[-1]):
+    edges = (
+        _UNKNOWN if start is None else frozen(inputs.profile_values(start, "start", leading)),
+        _ENDLESS if stop is None else frozen(inputs.profile_values(stop, "stop", leading)),
+    )
+    if np.any(edges[0] > grid[-1]):
         raise RetrievalInputError(
             f"lies beyond the range, which ends at {grid[-1]:g} m", field="start"
         )
-    stops = inputs.profile_values(stop, "stop", leading)
-    edges = (
-        frozen(np.full(1, np.nan) if starts is None else starts),
-        frozen(np.full(1, np.inf) if stops is None else stops),
-    )
-    limits = _limits(THRESHOLDS.rejection, _shape_fit.WINDOWS if starts is None else 1)
+    limits = _limits(THRESHOLDS.rejection, _shape_fit.WINDOWS if start is None else 1)
     out = np.full(len(rows), np.nan, _shape_fit.ROW)
     usable_air = np.where(weights > 0, air, 0.0)
     # Squares of shapes and of powers must stay in the range of floats together.
@@ -206,17 +209,19 @@ def _exposures(
             field="variance",
             remedy="give the exposure of counts, else the variance",
         )
+    if exposure is None:
+        return frozen(np.zeros(1))
     counts = inputs.profile_values(exposure, "exposure", leading)
-    if counts is not None and np.any(counts <= 0):
+    if np.any(counts <= 0):
         raise RetrievalInputError(
             "is not positive", field="exposure", remedy="mask profiles without shots"
         )
-    return frozen(np.zeros(1) if counts is None else counts)
+    return frozen(counts)
 
 
 def _weights(
     variance: npt.ArrayLike | None,
-    mask: npt.ArrayLike | None,
+    mask: Booleans | None,
     air: Array,
     grid: Array,
     leading: tuple[int, ...],
@@ -227,12 +232,7 @@ def _weights(
         weights = 1.0 / noise
     usable = (weights > 0) & (weights < HUGE) & (air > 0) & (air < HUGE)
     if mask is not None:
-        allowed = np.asarray(mask)
-        if allowed.dtype != np.bool_:
-            raise RetrievalInputError(
-                f"holds {allowed.dtype}", field="mask", remedy="give True where a bin may be used"
-            )
-        usable = usable & (inputs.noise_rows(allowed.astype(float), "mask", grid, leading) > 0)
+        usable = usable & (inputs.noise_rows(mask.astype(float), "mask", grid, leading) > 0)
     return frozen(np.where(usable, weights, 0.0))
 
 

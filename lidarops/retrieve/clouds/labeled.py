@@ -105,10 +105,6 @@ class Clouds:
         """Bins that are cloudy in some profiles or the mean."""
         return np.asarray(self.mask | self.partly)
 
-    def within(self, bins: slice) -> Clouds:
-        """Return the clouds in some bins."""
-        return Clouds(self.mask[:, bins], self.fraction[:, bins], self.unknown[:, bins])
-
 
 def air_along(
     molecules: MolecularProfile, altitude: Array, distance: Array, wavelength: float
@@ -187,11 +183,6 @@ class MeanProfiles:
         """Flag bins in which the overlap is incomplete."""
         self.quality = self.quality | np.where(partial, _INCOMPLETE_OVERLAP, np.int32(0))
 
-    def minus(self, background: Array) -> Array:
-        """Return the signal without background, corrected for overlap."""
-        power = (self.raw - background[:, np.newaxis]) / self.overlap
-        return np.where((self.quality & WITHHELD) != 0, np.nan, power)
-
     def ratio_to_air(self, power: Array) -> tuple[Array, Array]:
         """Return the ratio of a signal to air and its error, in means over the bins before each."""
         step = float(np.median(np.diff(self.distance)))
@@ -208,7 +199,7 @@ class MeanProfiles:
         return summed(power) / air, np.sqrt(summed(self.variance)) / air
 
     @property
-    def _cloud(self) -> dict[str, Any]:
+    def cloud(self) -> dict[str, Any]:
         """What a cloud differs from, and by how much."""
         return {
             "molecular_attenuated": self.air.shape,
@@ -218,13 +209,7 @@ class MeanProfiles:
 
     def find_clouds(self, power: Array) -> Booleans:
         """Return the bins in clouds of a signal without background."""
-        return _layers.find_layers(power, self.distance, self.variance, **self._cloud)
-
-    def visible_air(self, power: Array, cloudy: Booleans) -> Booleans:
-        """Return where noise would not hide a cloud in a signal without background."""
-        return _layers.find_visible_air(
-            power, self.distance, self.variance, cloudy=cloudy, **self._cloud
-        )
+        return _layers.find_layers(power, self.distance, self.variance, **self.cloud)
 
 
 def signal_and_clouds(
@@ -246,8 +231,10 @@ def signal_and_clouds(
     mask = (layers | (fraction == 1.0)) & ~doubtful
     unknown = (doubtful | ~np.isfinite(signal.power)) & ~mask & np.isnan(fraction)
     clouds = Clouds(mask, fraction, unknown)
-    hidden = np.isfinite(signal.power) & ~means.visible_air(signal.power, clouds.any)
-    unknown |= hidden & ~clouds.any
+    visible = _layers.find_visible_air(
+        signal.power, means.distance, means.variance, cloudy=clouds.any, **means.cloud
+    )
+    unknown |= np.isfinite(signal.power) & ~visible & ~clouds.any
     fraction = np.where((mask | unknown) & (fraction == 0.0), np.nan, fraction)
     return signal, Clouds(mask, fraction, unknown)
 
@@ -309,10 +296,9 @@ def _cells_in(averages: xr.Dataset, distance: Array) -> tuple[int, slice, slice]
 
 
 def cloud_heights(
-    clouds: Clouds, distance: Array, station_altitude: float, climb: float
+    mask: Booleans, distance: Array, station_altitude: float, climb: float
 ) -> dict[str, tuple[str, Array]]:
     """Return where the lowest cloud begins and the highest one ends, as variables; NaN for none."""
-    mask = clouds.any
     cloudy = mask.any(axis=-1)
     base = np.where(cloudy, distance[np.argmax(mask, axis=-1)], np.nan)
     last = mask.shape[-1] - 1 - np.argmax(mask[:, ::-1], axis=-1)
@@ -328,8 +314,13 @@ def window_variables(
     window: _reference.ReferenceWindow, reference: Reference, station_altitude: float, climb: float
 ) -> dict[str, Any]:
     """Return the variables of the reference windows, and of what is assumed in them."""
+    limit = window.detection_limit
+    rejections = np.bitwise_or.reduce(window.rejections, axis=-1).astype(np.int32)
     return {
-        **window.variables,
+        "reference_bottom": ("time", window.bottom),
+        "reference_top": ("time", window.top),
+        "reference_detection_limit": ("time", np.where(np.isinf(limit), np.nan, limit)),
+        "reference_rejections": ("time", rejections),
         "reference_bottom_altitude": ("time", station_altitude + climb * window.bottom),
         "reference_top_altitude": ("time", station_altitude + climb * window.top),
         "reference_scattering_ratio": reference.scattering_ratio,
@@ -450,9 +441,9 @@ def _subtract_background(means: MeanProfiles, usable: Booleans, *, known_shape: 
         sky = estimate.from_known_shape(
             raw, r, noise, means.air.shape, mask=usable, exposure=means.exposure
         )
-    return MeanSignal(
-        means.minus(sky.background), sky.background, sky.standard_error, sky.uncertain
-    )
+    power = (means.raw - sky.background[:, np.newaxis]) / means.overlap
+    power[(means.quality & WITHHELD) != 0] = np.nan
+    return MeanSignal(power, sky.background, sky.standard_error, sky.uncertain)
 
 
 def reference_window(

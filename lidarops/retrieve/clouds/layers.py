@@ -14,7 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Integers, frozen, usable
-from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
@@ -327,41 +327,7 @@ def _steepest(
     return best, length
 
 
-@summing
-def _may_rise(sums: Array, start: int, length: int, contrast: float, limit: float) -> int:
-    """Count bins from `start` on where means over a length may rise, by tests that vectorise."""
-    power, shape, variance = sums[POWER], sums[SHAPE], sums[VARIANCE]
-    last = power.size - 2 * length
-    first = min(max(start - length, 0), last)
-    below_power, here_power, above_power = (
-        power[first:last],
-        power[first + length :],
-        power[first + 2 * length :],
-    )
-    below_shape, here_shape, above_shape = (
-        shape[first:last],
-        shape[first + length :],
-        shape[first + 2 * length :],
-    )
-    below_noise, here_noise, above_noise = (
-        variance[first:last],
-        variance[first + length :],
-        variance[first + 2 * length :],
-    )
-    count = 0
-    for i in range(below_power.size):
-        near, far = below_shape[i] - here_shape[i], here_shape[i] - above_shape[i]
-        below = (below_power[i] - here_power[i]) * far
-        above = (here_power[i] - above_power[i]) * near
-        noise = (below_noise[i] - here_noise[i]) * far * far
-        noise += (here_noise[i] - above_noise[i]) * near * near
-        rise = above - below
-        likely = (above > contrast * below) & (rise > 0.0)
-        count += 1 if likely & (rise * rise >= limit * limit * noise) else 0
-    return count
-
-
-@inlined
+@compiled
 def _next_base(
     sums: Array,
     start: int,
@@ -372,13 +338,6 @@ def _next_base(
     margins: Array,
 ) -> tuple[int, int]:
     """Return the bin where the next layer begins and the window length that shows it; or -1."""
-    likely = 0
-    for k, length in enumerate(lengths):
-        if 2 * length < sums.shape[1]:
-            # A little less than the limit: the sums are rounded in another order.
-            likely += _may_rise(sums, start, length, contrast, (1.0 - _ROUNDING) * limits[k])
-    if likely == 0:
-        return -1, 0
     for i in range(start, sums.shape[1] - 1):
         for k, length in enumerate(lengths):
             if _rise(sums, i, length, contrast, certainty, limits[k], margins[k]) > 0.0:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen, usable
+from lidarops.retrieve.common.arrays import Array, Booleans, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
 
 _HALF: Final = 4
@@ -39,7 +39,7 @@ def bridge_outliers(
     range: npt.ArrayLike,  # noqa: A002 - the field's word
     variance: npt.ArrayLike,
     *,
-    background: npt.ArrayLike | None = None,
+    background: npt.ArrayLike = 0.0,
 ) -> BridgedProfiles:
     r"""Replace isolated outlying bins by interpolation between their neighbours.
 
@@ -66,8 +66,8 @@ def bridge_outliers(
         m.
     variance : (..., range) float
         Noise variance in the square of the power's unit, broadcast against `power`.
-    background : (...) float, optional
-        Rough background of the power; 0 where not given.
+    background : (...) float
+        Rough background of the power.
 
     Raises
     ------
@@ -77,8 +77,7 @@ def bridge_outliers(
     grid = inputs.range_grid(range)
     profiles, leading = inputs.profiles(power, grid)
     rows = profiles.astype(np.float64, copy=False)
-    given = inputs.profile_values(background, "background", leading)
-    level = np.zeros(1) if given is None else given
+    level = inputs.profile_values(background, "background", leading)
     noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
     signal = rows - level[:, np.newaxis]
     outlying = np.zeros(rows.shape, dtype=np.bool_)
@@ -152,37 +151,15 @@ def _most_equal(j: int, power: Array) -> int:
 
 
 @compiled
-def _may_hold_outliers(
-    power: Array, variance: Array, factor_below: Array, factor_above: Array
-) -> bool:
-    """Return whether a bin is missing, or beyond both adjacent bins by more than noise."""
-    suspects = 0
-    for i in range(1, power.size - 1):
-        value = power[i]
-        below = value - factor_below[i] * power[i - 1]
-        above = value - factor_above[i] * power[i + 1]
-        peak = (below * above > 0.0) & (below * below > THRESHOLDS.outlying**2 * variance[i])
-        missing = not ((abs(value) < HUGE) & (variance[i] >= 0.0) & (variance[i] < HUGE))
-        suspects += 1 if peak | missing else 0
-    return suspects > 0
-
-
-@compiled
 def _mark_outliers(
     power: Array, variance: Array, range_: Array, work: Array, outlying: Booleans
 ) -> None:
     """Mark the outlying bins of all profiles."""
-    bins = range_.size
-    factor_below, factor_above = np.zeros(bins), np.zeros(bins)
-    factor_below[1:] = (range_[:-1] / range_[1:]) ** 2
-    factor_above[:-1] = (range_[1:] / range_[:-1]) ** 2
     usable_range, q, noise, index, usable_power = work[0], work[1], work[2], work[3], work[4]
     for p in range(power.shape[0]):
         row = variance[p % variance.shape[0]]
-        if not _may_hold_outliers(power[p], row, factor_below, factor_above):
-            continue
         count = 0
-        for i in range(bins):
+        for i in range(range_.size):
             value, value_variance = power[p, i], row[i]
             if usable(value, value_variance):
                 square = range_[i] * range_[i]

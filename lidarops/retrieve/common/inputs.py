@@ -163,17 +163,15 @@ def noise_rows(
 
 
 def profile_values(
-    values: npt.ArrayLike | None, name: str, leading: tuple[int, ...], *, finite: bool = True
-) -> Array | None:
-    """Return one value per profile as (profile or 1,); None for None.
+    values: npt.ArrayLike, name: str, leading: tuple[int, ...], *, finite: bool = True
+) -> Array:
+    """Return one value per profile as (profile or 1,).
 
     Raises
     ------
     RetrievalInputError
         Where they do not broadcast to the profiles, or are not finite although they must be.
     """
-    if values is None:
-        return None
     array = real_array(values, name).astype(np.float64, copy=False)
     spread = array if array.size == 1 else broadcast(array, leading, name)
     flat = np.ascontiguousarray(spread.reshape(-1))

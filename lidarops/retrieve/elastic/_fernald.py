@@ -35,10 +35,9 @@ SCALARS: Final = 2
 
 # Rows of the work array. For the denominator of each bin: its value, its derivative with respect
 # to the power of the bin, its variance by the other bins, its changes by the causes, and the
-# excess of its square over the least one that its errors allow; its inverse. Total backscatter.
+# excess of its square over the least one that its errors allow.
 DENOMINATOR, OWN_SHARE, OTHERS, BY_OFFSET, BY_RATIO, BY_AIR, CERTAINTY = 0, 1, 2, 3, 4, 5, 6
-INVERSE, TOTAL = 7, 8
-WORK_ROWS: Final = 9
+WORK_ROWS: Final = 7
 
 # The state of a bin.
 MISSING, VALID, UNSTABLE = 0, 1, 2
@@ -218,109 +217,48 @@ def _integrate(
 
 
 @compiled
-def _divide(power: Array, gain: Array, air: Array, work: Array, out: Array) -> None:
-    d, inverse, total = work[DENOMINATOR], work[INVERSE], work[TOTAL]
-    for i in range(out.size):
-        inverse[i] = 1.0 / d[i]
-        total[i] = gain[i] * power[i] * inverse[i]
-        out[i] = total[i] - air[i]
-
-
-@compiled
-def _propagate_noise(variance: Array, gain: Array, work: Array, out: Array) -> None:
-    inverse, total, share, other_variance = (
-        work[INVERSE],
-        work[TOTAL],
-        work[OWN_SHARE],
-        work[OTHERS],
-    )
-    for i in range(out.size):
-        own_change = gain[i] - total[i] * share[i]
-        square = own_change * own_change * variance[i] + total[i] * total[i] * other_variance[i]
-        out[i] = math.sqrt(square) * inverse[i]
-
-
-@compiled
-def _propagate_offset(offset: float, gain: Array, work: Array, out: Array) -> None:
-    inverse, total, change = work[INVERSE], work[TOTAL], work[BY_OFFSET]
-    for i in range(out.size):
-        out[i] = offset * (gain[i] - total[i] * change[i]) * inverse[i]
-
-
-@compiled
-def _propagate_reference(change: float, work: Array, out: Array) -> None:
-    inverse, total = work[INVERSE], work[TOTAL]
-    for i in range(out.size):
-        out[i] = -total[i] * change * inverse[i]
-
-
-@compiled
-def _propagate_path(gain: Array, change: Array, work: Array, out: Array) -> None:
-    """Propagate an error that changes the relative gain of a bin and the denominator."""
-    inverse, total = work[INVERSE], work[TOTAL]
-    for i in range(out.size):
-        out[i] = total[i] * (gain[i] - change[i] * inverse[i])
-
-
-@compiled
-def _measure_certainty(
-    variance: Array,
-    by_reference: float,
-    offset: float,
-    path: Array,
-    limits: Array,
-    work: Array,
-    noise_error: Array,
-) -> None:
-    """Compare denominators with their errors, less the changes that the gain of a bin shares.
-
-    `limits` are the least square of the denominator over its variance, and the ratio of that
-    square to the variance by noise below which noise errors are skewed; these are widened.
-    """
-    d, share, other_variance, certainty = (
-        work[DENOMINATOR],
-        work[OWN_SHARE],
-        work[OTHERS],
-        work[CERTAINTY],
-    )
-    by_offset, by_ratio, by_air = work[BY_OFFSET], work[BY_RATIO], work[BY_AIR]
-    reference = by_reference * by_reference
-    for i in range(variance.size):
-        noise = other_variance[i] + share[i] * share[i] * variance[i]
-        noise += offset * offset * by_offset[i] * by_offset[i]
-        square = noise + reference
-        ratio_change = by_ratio[i] - d[i] * path[GAIN_RATIO, i]
-        air_change = by_air[i] - d[i] * path[GAIN_AIR, i]
-        square += ratio_change * ratio_change + air_change * air_change
-        certainty[i] = d[i] * d[i] - limits[0] * square
-        skewed = limits[1] * noise / (d[i] * d[i])
-        noise_error[i] *= max(1.0, 0.98 + skewed * math.sqrt(skewed))
-
-
-@compiled
 def _solve_bins(
     power: Array,
     variance: Array,
     path: Array,
     by_reference: float,
     offset: float,
+    limits: Array,
     work: Array,
-    k: int,
+    state: Codes,
     out: Array,
 ) -> None:
-    """Write the backscatter of all bins and its error by each cause.
+    """Write the backscatter of all bins that are reached, and its error by each cause.
 
-    Loops without branches over few arrays are vectorised; `_withhold` then removes invalid bins.
+    Denominators are compared with their errors, less the changes that the gain of a bin shares.
+    `limits` are the least square of the denominator over its variance, and the ratio of that
+    square to the variance by noise below which noise errors are skewed; these are widened.
     """
-    _divide(power, path[GAIN], path[AIR], work, out[BACKSCATTER, k])
-    _propagate_noise(variance, path[GAIN], work, out[NOISE, k])
-    _propagate_offset(offset, path[GAIN], work, out[BACKGROUND, k])
-    _propagate_reference(by_reference, work, out[REFERENCE, k])
-    _propagate_path(path[GAIN_RATIO], work[BY_RATIO], work, out[LIDAR_RATIO, k])
-    _propagate_path(path[GAIN_AIR], work[BY_AIR], work, out[MOLECULAR, k])
-    molecular, own_air = out[MOLECULAR, k], path[OWN_AIR]
-    for i in range(own_air.size):
-        molecular[i] -= own_air[i]
+    for i in range(power.size):
+        if state[i] == MISSING:
+            continue
+        d, share, other_variance = work[DENOMINATOR, i], work[OWN_SHARE, i], work[OTHERS, i]
+        by_offset, by_ratio, by_air = work[BY_OFFSET, i], work[BY_RATIO, i], work[BY_AIR, i]
+        gain, inverse = path[GAIN, i], 1.0 / d
+        total = gain * power[i] * inverse
+        out[BACKSCATTER, i] = total - path[AIR, i]
+        out[BACKGROUND, i] = offset * (gain - total * by_offset) * inverse
+        out[REFERENCE, i] = -total * by_reference * inverse
+        # Errors that change the relative gain of a bin and the denominator.
+        out[LIDAR_RATIO, i] = total * (path[GAIN_RATIO, i] - by_ratio * inverse)
+        out[MOLECULAR, i] = total * (path[GAIN_AIR, i] - by_air * inverse) - path[OWN_AIR, i]
+        noise = other_variance + share * share * variance[i]
+        noise += offset * offset * by_offset * by_offset
+        square = noise + by_reference * by_reference
+        ratio_change = by_ratio - d * path[GAIN_RATIO, i]
+        air_change = by_air - d * path[GAIN_AIR, i]
+        square += ratio_change * ratio_change + air_change * air_change
+        work[CERTAINTY, i] = d * d - limits[0] * square
+        own_change = gain - total * share
+        square = own_change * own_change * variance[i] + total * total * other_variance
+        skewed = limits[1] * noise / (d * d)
+        widening = max(1.0, 0.98 + skewed * math.sqrt(skewed))
+        out[NOISE, i] = math.sqrt(square) * inverse * widening
 
 
 @compiled
@@ -398,11 +336,6 @@ def _attenuate(
 def _withhold(
     power: Array, variance: Array, calibrated: bool, state: Codes, k: int, out: Array
 ) -> None:
-    invalid = 0
-    for i in range(state.size):
-        invalid |= state[i] ^ VALID
-    if invalid == 0:
-        return
     for i in range(state.size):
         if state[i] == VALID:
             continue
@@ -468,8 +401,10 @@ def invert_fernald(
             # Means and integrals over many bins.
             work[OTHERS] *= cause[2]
             by_reference = -calibration[0] * cause[1] * calibration[4]
-            _solve_bins(power[k], noise, path, by_reference, cause[0], work, k, out)
-            _measure_certainty(noise, by_reference, cause[0], path, limits[2:], work, out[NOISE, k])
+            _solve_bins(
+                power[k], noise, path, by_reference, cause[0], limits[2:], work, state[k],
+                out[:, k],
+            )  # fmt: skip
             nearest = _mark_unstable(start, limits[1] * calibration[0], work, state[k])
         if nearest >= 0:
             scale = _scale(nearest, noise, range_, path, by_reference, cause[0], work, out[:, k])

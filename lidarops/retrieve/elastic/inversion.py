@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,15 +52,6 @@ class Thresholds(NamedTuple):
 
 
 THRESHOLDS: Final = Thresholds()
-_LIMITS: Final = np.array(
-    [
-        THRESHOLDS.longest_gap,
-        THRESHOLDS.least_denominator,
-        THRESHOLDS.least_certainty**2,
-        THRESHOLDS.skewed**2,
-    ]
-)
-"""Limits of the kernel."""
 
 
 class Air(NamedTuple):
@@ -298,7 +289,9 @@ class _Solution:
         out = np.empty((_fernald.FIELDS, *self._rows.shape))
         scalars = np.empty((len(self._rows), _fernald.SCALARS))
         state = np.empty(self._rows.shape, dtype=np.uint8)
-        _fernald.invert_fernald(frozen(rows), self._given, _LIMITS, out, scalars, state)
+        t = THRESHOLDS
+        limits = np.array([t.longest_gap, t.least_denominator, t.least_certainty**2, t.skewed**2])
+        _fernald.invert_fernald(frozen(rows), self._given, limits, out, scalars, state)
         return out, scalars, state
 
     def shifted(self, *changes: Array) -> Array:
@@ -378,7 +371,7 @@ def _air(
 
 def _scattering_ratio(reference: Reference, leading: tuple[int, ...]) -> Array:
     name = "reference_scattering_ratio"
-    ratio = _profile_values(reference.scattering_ratio, name, leading)
+    ratio = inputs.profile_values(reference.scattering_ratio, name, leading, finite=False)
     _require(ratio > 0.0, ratio, name, "give 1 where air is free of particles")
     return ratio
 
@@ -386,7 +379,7 @@ def _scattering_ratio(reference: Reference, leading: tuple[int, ...]) -> Array:
 def _causes(causes: dict[str, npt.ArrayLike], leading: tuple[int, ...]) -> Array:
     columns = []
     for name, values in causes.items():
-        column = _profile_values(values, name, leading)
+        column = inputs.profile_values(values, name, leading, finite=False)
         least = 1.0 if name == "noise_correlation_length" else 0.0
         _require(
             (column >= least) | np.isnan(column), column, name, f"give a value of {least:g} or more"
@@ -408,20 +401,13 @@ def _require(acceptable: Booleans, values: Array, name: str, remedy: str) -> Non
         raise RetrievalInputError(f"holds {values[invalid][0]:g}", field=name, remedy=remedy)
 
 
-def _profile_values(values: npt.ArrayLike, name: str, leading: tuple[int, ...]) -> Array:
-    """Return one value per profile as (profile or 1,), with NaN kept."""
-    return cast("Array", inputs.profile_values(values, name, leading, finite=False))
-
-
 def _window(
     edges: tuple[npt.ArrayLike, npt.ArrayLike], grid: Array, leading: tuple[int, ...]
 ) -> Booleans:
     """Return the bins of the reference window as (profile or 1, bin)."""
-    if not isinstance(edges, tuple) or len(edges) != 2:
-        raise RetrievalInputError(
-            "is not a pair of ranges", field="reference", remedy="give (bottom, top) in m"
-        )
-    bottom, top = (_profile_values(edge, "reference", leading) for edge in edges)
+    bottom, top = (
+        inputs.profile_values(edge, "reference", leading, finite=False) for edge in edges
+    )
     if np.any(bottom >= top):
         raise RetrievalInputError(
             "ends before it begins", field="reference", remedy="give (bottom, top) in m"

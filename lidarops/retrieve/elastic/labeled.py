@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy import ndimage
 
 from lidarops.constants import HIGHEST_CLOUD
 from lidarops.flags import WITHHELD, Quality
@@ -126,7 +127,7 @@ def invert_elastic(
         air=_elastic.Air(air.backscatter, air.extinction, molecular_relative_error),
         lidar_ratio=ratio,
         reference=_elastic.Reference(
-            window.edges,
+            (window.bottom, window.top),
             reference.scattering_ratio,
             window.relative_error(reference.relative_error),
         ),
@@ -135,8 +136,7 @@ def invert_elastic(
         **_systematic_errors(averages, means, signal),
         noise_correlation_length=means.correlation_length,
     )
-    quality = means.quality | _solution_flags(solution, window, signal, means.quality)
-    quality |= _sky_flags(solution, means, clouds, window)
+    quality = means.quality | _flags(solution, window, signal, means, clouds)
     profiles = {
         name: np.where(solution.valid, values, np.nan)
         for name, values in _profile_variables(solution).items()
@@ -152,7 +152,7 @@ def invert_elastic(
             **window_variables(window, reference, station_altitude, climb),
             "cloud_mask": (("time", "range"), clouds.state),
             "cloud_fraction": (("time", "range"), clouds.fraction),
-            **cloud_heights(clouds.within(used), distance[used], station_altitude, climb),
+            **cloud_heights(clouds.any[:, used], distance[used], station_altitude, climb),
             "background": ("time", signal.background),
             "background_standard_error": ("time", signal.background_standard_error),
             "quality_flag": (("time", "range"), quality),
@@ -178,42 +178,41 @@ def _systematic_errors(
     return errors
 
 
-def _solution_flags(
+def _flags(
     solution: _elastic.ElasticResult,
     window: _reference.ReferenceWindow,
     signal: MeanSignal,
-    quality: Flags,
-) -> Flags:
-    """Return the bits of reference, background and inversion."""
-    bits = np.zeros(solution.valid.shape, dtype=np.int32)
-    bits[~window.chosen] |= np.int32(ElasticQuality.NO_REFERENCE)
-    bits[signal.uncertain] |= np.int32(Quality.BACKGROUND_UNCERTAIN)
-    unsolved = window.chosen[:, np.newaxis] & ~solution.valid & ((quality & WITHHELD) == 0)
-    bits[unsolved] |= np.int32(ElasticQuality.UNSTABLE_INVERSION)
-    return bits
-
-
-def _sky_flags(
-    solution: _elastic.ElasticResult,
     means: MeanProfiles,
     clouds: Clouds,
-    window: _reference.ReferenceWindow,
 ) -> Flags:
-    """Return the bits of clouds, of backscatter below zero and of an unknown overlap."""
+    """Return the bits of the inversion, its reference and background, clouds and overlap."""
+    # The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
+    # that was assumed in the cloud.
+    near = means.distance < np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
 
     def with_beyond(mask: Booleans) -> Booleans:
-        return _with_beyond(mask, means.distance, window)
+        """Return the bins of a mask, and those beyond one as seen from the reference window."""
+        above = np.logical_or.accumulate(mask & ~near, axis=-1)
+        below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
+        return np.asarray(above | below)
 
+    chosen = window.chosen[:, np.newaxis]
     cloudy = with_beyond(with_margin(clouds.mask, means.distance))
     partly = with_beyond(with_margin(clouds.partly, means.distance))
     bits = np.zeros(solution.valid.shape, dtype=np.int32)
     for mask, bit in (
+        (~chosen, ElasticQuality.NO_REFERENCE),
+        (signal.uncertain[:, np.newaxis], Quality.BACKGROUND_UNCERTAIN),
+        (
+            chosen & ~solution.valid & ((means.quality & WITHHELD) == 0),
+            ElasticQuality.UNSTABLE_INVERSION,
+        ),
         (cloudy, ElasticQuality.CLOUD),
         (partly & ~cloudy, ElasticQuality.PARTLY_CLOUDY),
         (with_beyond(_negative(solution)), ElasticQuality.NEGATIVE_BACKSCATTER),
         (means.unknown_overlap, ElasticQuality.UNKNOWN_OVERLAP),
     ):
-        bits[mask] |= np.int32(bit)
+        bits |= np.where(mask, np.int32(bit), np.int32(0))
     return bits
 
 
@@ -221,27 +220,7 @@ def _negative(solution: _elastic.ElasticResult) -> Booleans:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
     error = solution.backscatter_standard_error
     low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
-    length = THRESHOLDS.negative_bins
-    if low.shape[-1] < length:
-        return np.zeros_like(low)
-    runs = np.lib.stride_tricks.sliding_window_view(low, length, axis=-1).all(axis=-1)
-    negative = np.zeros_like(low)
-    for first in range(length):
-        negative[:, first : first + runs.shape[-1]] |= runs
-    return negative
-
-
-def _with_beyond(mask: Booleans, distance: Array, window: _reference.ReferenceWindow) -> Booleans:
-    """Return the bins of a mask, and those beyond one as seen from the reference window.
-
-    The inversion starts in the window. Beyond a cloud it depends on the lidar ratio of aerosol
-    that was assumed in the cloud.
-    """
-    bottom = np.nan_to_num(window.bottom, nan=0.0)[:, np.newaxis]
-    near, far = distance < bottom, distance >= bottom
-    above = np.logical_or.accumulate(mask & far, axis=-1)
-    below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
-    return np.asarray(above | below)
+    return np.asarray(ndimage.binary_opening(low, np.ones((1, THRESHOLDS.negative_bins))))
 
 
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:

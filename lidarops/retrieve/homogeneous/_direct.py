@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Integers
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
-from lidarops.retrieve.homogeneous._misfit import Left, judge_residuals
+from lidarops.retrieve.homogeneous._fit_quality import Left, judge_residuals
 from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._projection import (
     BLOCK,

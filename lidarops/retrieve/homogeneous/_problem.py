@@ -96,11 +96,10 @@ class PathProblem:
     """Lowest and highest extinction, m-1."""
     correlation_length: Array
     """(profile or 1,), bins, of the noise; 1 for independent bins."""
-    extinction: Array | None = None
-    """(profile or 1,), m-1: the prior of the linearised method, or the known extinction."""
-    background: Array | None = None
-    """(profile or 1,): the known background."""
-    background_variance: Array | None = None
+    given: Array
+    """(profile or 1,): the prior of the linearised method or the known extinction, m-1; or the
+    known background; NaN where all is fitted."""
+    background_variance: Array
     """(profile or 1,): variance of the known background."""
     exposure: Array | None = None
     """(profile or 1,): counts per unit of power; None where the noise is not that of counts."""
@@ -143,8 +142,6 @@ class HomogeneousResult:
     of the slope of `background_model_error` all along the section, and, in quadrature, the
     first-order change of extinction by the bend there. The second term dominates where extinction
     and background are hard to separate."""
-    signal_to_noise: Array
-    """Amplitude over its standard error at known extinction, with the sign of the amplitude."""
     reduced_chi2: Array
     """1 where the residuals are noise; relative to the estimated noise without a variance."""
     valid_bins: Flags

@@ -91,7 +91,7 @@ def fit_homogeneous_path(
     RetrievalInputError
         Where units, dimensions or sections are invalid.
     """
-    distance, edges = _distance(power), _edges(sections)
+    distance, edges = _distance(power), np.asarray(sections, dtype=np.float64)
     power = power.transpose(..., "range")
     given = {
         "power": power,
@@ -107,11 +107,11 @@ def fit_homogeneous_path(
         if values is not None
     }
     bins: dict[str, Block] = {name: arrays.pop(name) for name in _OF_BINS if name in arrays}
-    length = arrays.get("noise_correlation_length", 1.0)
+    length = arrays["noise_correlation_length"]
     of_profiles = {name: values[..., 0] for name, values in arrays.items()}
     noise = Noise(
         noise.relative,
-        of_profiles.pop("noise_correlation_length", None),
+        of_profiles.pop("noise_correlation_length"),
         of_profiles.pop("exposure", None),
     )
     known: dict[str, Any] = {**of_profiles, "noise": noise, "method": method, "lag": lag}
@@ -197,7 +197,7 @@ def not_level(result: xr.Dataset, zenith_angle: xr.DataArray) -> xr.DataArray:
 
 def _far_background(
     bins: Mapping[str, Block],
-    length: Block | float,
+    length: Block,
     distance: Array,
     background_range: tuple[float, float],
 ) -> Background:
@@ -254,13 +254,7 @@ def _solve(
 
 
 def _distance(power: xr.DataArray) -> Array:
-    """Return the range coordinate, in m and ascending."""
-    if "range" not in power.dims or "range" not in power.coords:
-        raise RetrievalInputError(
-            f"has the dimensions {power.dims} and coordinates {tuple(power.coords)}",
-            field="power",
-            remedy="give it a dimension range with a coordinate in m",
-        )
+    """Return the range coordinate, in m."""
     unit = power["range"].attrs.get("units")
     if unit not in _METRES:
         raise RetrievalInputError(
@@ -272,15 +266,3 @@ def _distance(power: xr.DataArray) -> Array:
     if not np.all(np.diff(distance) > 0):
         raise RetrievalInputError("is not finite, or does not ascend", field="range")
     return distance
-
-
-def _edges(sections: Sequence[tuple[float, float]]) -> Array:
-    try:
-        edges = np.asarray(sections, dtype=np.float64)
-    except (TypeError, ValueError):
-        edges = np.empty(0)
-    if edges.ndim != 2 or edges.shape[1] != 2 or not np.all(edges[:, 0] < edges[:, 1]):
-        raise RetrievalInputError(
-            f"is {sections!r}", field="sections", remedy="give pairs (near, far) in m, near first"
-        )
-    return edges

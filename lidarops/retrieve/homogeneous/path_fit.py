@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import StrEnum
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -42,16 +42,15 @@ class HomogeneousMethod(StrEnum):
     KNOWN_EXTINCTION = "known_extinction"
 
 
-_NEEDS: Final[dict[str, set[HomogeneousMethod]]] = {
+_TAKES: Final = {
     "extinction": {HomogeneousMethod.LINEARIZED, HomogeneousMethod.KNOWN_EXTINCTION},
     "background": {HomogeneousMethod.KNOWN_BACKGROUND},
-}
-"""Arguments that these methods require and no other accepts."""
-_TAKES: Final = {
     "background_standard_error": {HomogeneousMethod.KNOWN_BACKGROUND},
     "lag": {HomogeneousMethod.CUBIC},
 }
 """Arguments that only these methods accept."""
+_REQUIRED: Final = ("extinction", "background")
+"""Of these, those that they require."""
 
 
 class Noise(NamedTuple):
@@ -60,9 +59,9 @@ class Noise(NamedTuple):
     relative: bool = False
     """Whether the variance is known up to a common factor only, which the residuals of each profile
     give: for a variance that is estimated from the same data."""
-    correlation_length: npt.ArrayLike | None = None
+    correlation_length: npt.ArrayLike = 1.0
     """(...) float, bins, at least 1; the integral correlation length
-    (`lidarops.retrieve.signal.noise_correlation`). Bins are independent where not given."""
+    (`lidarops.retrieve.signal.noise_correlation`), 1 where bins are independent."""
     exposure: npt.ArrayLike | None = None
     """(...) float, of Poisson counts: counts per unit of power, as for
     `lidarops.retrieve.background.known_shape.fit_known_shape`. With few counts, the limits of
@@ -192,11 +191,17 @@ def fit_homogeneous_path(
     )
     grid = inputs.range_grid(range)
     rows, leading = inputs.profiles(power, grid)
-    error = inputs.profile_values(background_standard_error, "background_standard_error", leading)
-    if error is not None and np.any(error < 0):
+    stated = 0.0 if background_standard_error is None else background_standard_error
+    error = inputs.profile_values(stated, "background_standard_error", leading)
+    if np.any(error < 0):
         raise RetrievalInputError("is negative", field="background_standard_error")
     length = float(grid[-1] - grid[0]) if grid.size > 1 else 1.0
     known_variance = variance is not None and not noise.relative
+    given = np.full(1, np.nan)
+    if extinction is not None:
+        given = _known_extinction(extinction, length, leading)
+    elif background is not None:
+        given = inputs.profile_values(background, "background", leading)
     correlation_length, exposure = _noise_of_profiles(noise, leading, known_variance=known_variance)
     problem = PathProblem(
         power=rows,
@@ -208,9 +213,8 @@ def fit_homogeneous_path(
             THRESHOLDS.highest_optical_depth / length,
         ),
         correlation_length=correlation_length,
-        extinction=_known_extinction(extinction, length, leading),
-        background=inputs.profile_values(background, "background", leading),
-        background_variance=None if error is None else error**2,
+        given=given,
+        background_variance=error**2,
         exposure=exposure,
         lag=lag,
     )
@@ -221,28 +225,27 @@ def _noise_of_profiles(
     noise: Noise, leading: tuple[int, ...], *, known_variance: bool
 ) -> tuple[Array, Array | None]:
     """Return correlation length and exposure, (profile or 1,)."""
-    correlated = inputs.profile_values(
-        noise.correlation_length, "noise.correlation_length", leading
-    )
-    if correlated is not None and np.any(correlated < 1):
-        raise RetrievalInputError("is less than 1 bin", field="noise.correlation_length")
+    name = "noise.correlation_length"
+    correlated = inputs.profile_values(noise.correlation_length, name, leading)
+    if np.any(correlated < 1):
+        raise RetrievalInputError("is less than 1 bin", field=name)
+    if noise.exposure is None:
+        return correlated, None
     counted = inputs.profile_values(noise.exposure, "noise.exposure", leading)
-    if counted is not None and not (known_variance and np.all(counted > 0)):
+    if not (known_variance and np.all(counted > 0)):
         raise RetrievalInputError(
             "is not positive, or given without variance",
             field="noise.exposure",
             remedy="give counts per unit of power with the variance of the counts",
         )
-    return np.ones(1) if correlated is None else correlated, counted
+    return correlated, counted
 
 
-def _known_extinction(
-    extinction: npt.ArrayLike | None, length: float, leading: tuple[int, ...]
-) -> Array | None:
+def _known_extinction(extinction: npt.ArrayLike, length: float, leading: tuple[int, ...]) -> Array:
     """Return the prior or known extinction in m-1, (profile or 1,)."""
     prior = inputs.profile_values(extinction, "extinction", leading)
     limit = THRESHOLDS.largest_optical_depth / length
-    if prior is not None and np.any(np.abs(prior) > limit):
+    if np.any(np.abs(prior) > limit):
         raise RetrievalInputError(
             f"holds values up to {np.max(np.abs(prior)):g} m-1: it must be in m-1",
             field="extinction",
@@ -254,30 +257,28 @@ def _known_extinction(
 
 def _check_arguments(method: HomogeneousMethod, given: Mapping[str, object]) -> None:
     for name, value in given.items():
-        methods = (_NEEDS | _TAKES)[name]
+        methods = _TAKES[name]
         if value is not None and method not in methods:
             raise RetrievalInputError(
                 f"is not accepted by the method {str(method)!r}",
                 field=name,
                 remedy=f"leave it out, or choose {' or '.join(sorted(methods))}",
             )
-        if value is None and name in _NEEDS and method in methods:
+        if value is None and name in _REQUIRED and method in methods:
             raise RetrievalInputError(f"is required by the method {str(method)!r}", field=name)
 
 
 _NOTHING: Final = np.zeros(1, dtype=np.int32)
-_FITTED_BACKGROUND: Final = np.full(1, np.nan)
 
 
 def solve_by_direct_fit(problem: PathProblem) -> HomogeneousResult:
     """Solve by least squares for all three unknowns."""
-    return _solution(_estimate(problem, _FITTED_BACKGROUND), problem)
+    return _solution(_estimate(problem, problem.given), problem)
 
 
 def solve_by_linearization(problem: PathProblem) -> HomogeneousResult:
     """Solve by one linear step from the prior extinction."""
-    prior = np.zeros(1) if problem.extinction is None else problem.extinction
-    fit = _estimate(problem, prior, _direct.PRIOR)
+    fit = _estimate(problem, problem.given, _direct.PRIOR)
     # What one step neglects is about what another one would add.
     shifts = (fit.background_shift, fit.amplitude_shift, fit.extinction_shift)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -287,17 +288,13 @@ def solve_by_linearization(problem: PathProblem) -> HomogeneousResult:
 
 def solve_with_known_extinction(problem: PathProblem) -> HomogeneousResult:
     """Solve for background and amplitude at the given extinction."""
-    # `fit_homogeneous_path` has checked that it is given.
-    extinction = cast("Array", problem.extinction)
-    fit = _estimate(problem, extinction, _direct.EXTINCTION)
+    fit = _estimate(problem, problem.given, _direct.EXTINCTION)
     return _solution(fit, problem, unknowns=2)
 
 
 def solve_with_known_background(problem: PathProblem) -> HomogeneousResult:
     """Solve for amplitude and extinction above the given background."""
-    background = np.zeros(1) if problem.background is None else problem.background
-    variance = np.zeros(1) if problem.background_variance is None else problem.background_variance
-    fit = _estimate(problem, background)
+    fit, variance = _estimate(problem, problem.given), problem.background_variance
     with np.errstate(over="ignore", invalid="ignore"):
         by_slopes = (variance * slope**2 for slope in (fit.amplitude_slope, fit.extinction_slope))
         added = (variance, *by_slopes)
@@ -333,26 +330,26 @@ def _fit_above(
         decay = np.exp(-2.0 * fit.extinction[:, np.newaxis] * problem.range)
         signal = fit.amplitude[:, np.newaxis] * decay / problem.range**2
         pull = weights * signal
-        norm, lever = _row_sum(pull * signal), -2.0 * problem.range
-        lever = lever - (_row_sum(lever * pull * signal) / norm)[:, np.newaxis]
+        norm, lever = (pull * signal).sum(axis=-1), -2.0 * problem.range
+        lever = lever - ((lever * pull * signal).sum(axis=-1) / norm)[:, np.newaxis]
         centroid = np.asarray(near + 0.5 * lever[:, 0])
         # Without the background, then through it.
-        extinction = lever * pull / _row_sum(lever**2 * pull * signal)[:, np.newaxis]
+        extinction = lever * pull / (lever**2 * pull * signal).sum(axis=-1)[:, np.newaxis]
         logarithm = pull / norm[:, np.newaxis] + 2.0 * centroid[:, np.newaxis] * extinction
         extinction = extinction + fit.extinction_slope[:, np.newaxis] * gradients
         logarithm = logarithm + fit.amplitude_slope[:, np.newaxis] * gradients
         used = weights > 0.0
-        bent = _row_sum(np.where(used, gradients * signal, 0.0) * (problem.range - middle) ** 2)
+        bent = np.where(used, gradients * signal, 0.0) * (problem.range - middle) ** 2
+        bend = bent.sum(axis=-1) / length
         variance = np.where(used, 1.0 / weights, 0.0)
-    bend = bent / length
     fit = replace(
         fit,
         status=np.where(np.isnan(background), np.nan, fit.status),
         background=background,
-        background_variance=_row_sum(gradients**2 * variance),
+        background_variance=(gradients**2 * variance).sum(axis=-1),
         background_slope_variance=np.zeros(1),
-        amplitude_relative_variance=_row_sum(logarithm**2 * variance),
-        extinction_variance=_row_sum(extinction**2 * variance),
+        amplitude_relative_variance=(logarithm**2 * variance).sum(axis=-1),
+        extinction_variance=(extinction**2 * variance).sum(axis=-1),
         background_bend=bend,
         extinction_bend=fit.extinction_bend + fit.extinction_slope * bend,
     )
@@ -364,10 +361,6 @@ def _weights(problem: PathProblem) -> Array:
     weights = 1.0 / problem.noise
     usable = (np.abs(problem.power) < HUGE) & (weights > 0.0) & (weights < HUGE)
     return np.where(usable, weights, 0.0)
-
-
-def _row_sum(values: Array) -> Array:
-    return np.asarray(values.sum(axis=-1))
 
 
 def _estimate(problem: PathProblem, given: Array, kind: int = _direct.BACKGROUND) -> PathEstimate:
@@ -418,9 +411,6 @@ def _solution(
         background_error = np.sqrt(background_variance * level + of_background)
         relative_error = np.sqrt(fit.amplitude_relative_variance * level + of_amplitude)
         extinction_error = np.sqrt(fit.extinction_variance * level + of_extinction)
-        signal_to_noise = np.copysign(
-            np.sqrt(fit.signal_energy / verdict.noise / length), fit.amplitude
-        )
         amplitude_error = np.abs(fit.amplitude) * relative_error
 
     known = constant & problem.known_variance
@@ -437,7 +427,6 @@ def _solution(
         extinction=np.where(fitted, fit.extinction, np.nan),
         extinction_standard_error=np.where(fitted, extinction_error, np.nan),
         extinction_model_error=np.where(fitted, extinction_model, np.nan),
-        signal_to_noise=np.where(fitted, signal_to_noise, np.nan),
         reduced_chi2=np.where(fitted, verdict.reduced_chi2, np.nan),
         valid_bins=fit.bins.astype(np.int32),
         quality=verdict.quality | quality,

@@ -410,11 +410,13 @@ def _cloud_variables(
         quality = quality | np.where(near, np.int32(bit), np.int32(0))
     # Up to the last cell, beyond which no value has their bit.
     n = cells.stop
-    in_cells = _clouds.Clouds(clouds.mask[:, :n], clouds.fraction[:, :n], clouds.unknown[:, :n])
+    heights = _clouds.cloud_heights(
+        clouds.any[:, :n], distance[:n], beam.station_altitude, beam.climb
+    )
     return {
         "cloud_mask": (_PLANE, state),
         "cloud_fraction": (_PLANE, fraction),
-        **_clouds.cloud_heights(in_cells, distance[:n], beam.station_altitude, beam.climb),
+        **heights,
     }, quality
 
 

@@ -174,15 +174,6 @@ def _bins(s: _Sums, windows: Windows, complete: bool) -> Array:
 
 
 @compiled
-def _is_off(counts: npt.NDArray[np.int32]) -> bool:
-    """Return whether all counts are zero, as those of a recorder that is off."""
-    bits = np.int32(0)
-    for i in range(counts.size):
-        bits |= counts[i]
-    return bool(bits == 0)
-
-
-@compiled
 def _voltage(
     counts: npt.NDArray[np.int32],
     missing: bool,
@@ -229,7 +220,8 @@ def voltage_profiles(
         Output.
     """
     for k in range(counts.shape[0]):
-        missing = (not shots[k] > 0.0) | _is_off(counts[k])
+        # A recorder that is off counts nothing.
+        missing = (not shots[k] > 0.0) | (not counts[k].any())
         profile_dark = dark[k % dark.shape[0]]
         _voltage(counts[k], missing, step[k], full[k], profile_dark, overlap, power[k], quality[k])
 
@@ -361,7 +353,8 @@ def photon_profiles(
         Output.
     """
     for k in range(counts.shape[0]):
-        missing = (not shots[k] > 0.0) | _is_off(counts[k])
+        # A recorder that is off counts nothing.
+        missing = (not shots[k] > 0.0) | (not counts[k].any())
         complete = _rate(
             counts[k], missing, exposure[k], counter, overlap, s.sums, power[k], quality[k]
         )

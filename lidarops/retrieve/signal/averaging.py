@@ -182,20 +182,6 @@ def _add_profiles(
             number[i] += 1 if valid else 0
 
 
-@compiled
-def join_bits(
-    quality: npt.NDArray[np.int32],
-    groups: Indices,
-    passed: int,
-    bits: npt.NDArray[np.int32],
-) -> None:
-    """Add the bits of profiles, (time, range), that are `passed`, to those of their groups."""
-    for t in range(quality.shape[0]):
-        row, of_group = quality[t], bits[groups[t]]
-        for i in range(row.size):
-            of_group[i] |= row[i] & passed
-
-
 _SIGNS: Final = (1.0, -1.0)
 
 _CONTRAST_WAVELENGTH: Final = 532e-9
@@ -330,52 +316,16 @@ def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Boo
     excess = estimate_noise_correlation(cells.power, cells.variance).excess
     least = -float(ndtri(THRESHOLDS.false_alarm / (len(_SIGNS) * count * size)))
     margin = float(skewness_margin(least)) * cells.quantum
-    power, variance = (frozen(array[:, compared]) for array in (cells.power, cells.variance))
-    _mark_parts(power, variance, frozen(excess), frozen(margin), contrast, least, outlying)
+    power, variance = cells.power[:, compared], cells.variance[:, compared]
+    whole = np.isfinite(power + variance).all(axis=0)
+    for sign in _SIGNS:
+        signal, noise = sign * power[:, whole], variance[:, whole]
+        largest = np.argsort(-signal, axis=0, kind="stable")
+        for k in range(1, most + 1):
+            high, low = largest[k - 1 : k], largest[k : k + 1]
+            above = np.take_along_axis(signal, high, 0) - margin[high]
+            above -= contrast * np.maximum(np.take_along_axis(signal, low, 0), 0.0)
+            square = excess[high] * np.take_along_axis(noise, high, 0)
+            square += contrast * contrast * excess[low] * np.take_along_axis(noise, low, 0)
+            outlying[largest[:k, (above > least * np.sqrt(square))[0]]] = True
     return outlying if outlying.sum() <= most else np.zeros_like(outlying)
-
-
-@compiled
-def _mark_parts(
-    power: Array,
-    variance: Array,
-    excess: Array,
-    margin: Array,
-    contrast: float,
-    least: float,
-    outlying: Booleans,
-) -> None:
-    """Mark the parts that exceed all others in a cell, by the test of either sign."""
-    largest = np.empty(power.shape[0] // THRESHOLDS.fewest_parts + 1, dtype=np.intp)
-    for cell in range(power.shape[1]):
-        for sign in _SIGNS:
-            if not _find_largest(power, variance, cell, sign, largest):
-                continue
-            for k in range(largest.size - 1, 0, -1):
-                high, low = largest[k - 1], largest[k]
-                next_power = max(sign * power[low, cell], 0.0)
-                above = sign * power[high, cell] - margin[high] - contrast * next_power
-                noise = excess[high] * variance[high, cell]
-                noise += contrast * contrast * excess[low] * variance[low, cell]
-                if above > least * math.sqrt(noise):
-                    outlying[largest[:k]] = True
-                    break
-
-
-@compiled
-def _find_largest(power: Array, variance: Array, cell: int, sign: float, largest: Indices) -> bool:
-    """Find the parts with the largest power in a cell, descending; False where one is missing."""
-    filled = 0
-    for part in range(power.shape[0]):
-        value = sign * power[part, cell]
-        if not math.isfinite(value + variance[part, cell]):
-            return False
-        at = filled
-        while at > 0 and value > sign * power[largest[at - 1], cell]:
-            at -= 1
-        filled = min(filled + 1, largest.size)
-        for k in range(filled - 1, at, -1):
-            largest[k] = largest[k - 1]
-        if at < largest.size:
-            largest[at] = part
-    return True

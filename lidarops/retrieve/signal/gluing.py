@@ -134,8 +134,8 @@ def glue(
         for v, name in ((analog_variance, "analog_variance"), (photon_variance, "photon_variance"))
     )
     sky = inputs.profile_values(photon_background, "photon_background", leading)
-    highest = THRESHOLDS.count_rates[1] - (np.zeros(1) if sky is None else sky)
-    first, past = _search(x, y, xv, np.broadcast_to(highest, len(x)))
+    highest = np.broadcast_to(THRESHOLDS.count_rates[1] - sky, len(x))
+    first, past = _search(x, y, xv, highest)
     near = np.arange(grid.size) < ((first + past) // 2)[:, np.newaxis]
     line = fit_lines(x, y, xv, yv, first, past)
     length = inputs.profile_values(analog_correlation_length, "analog_correlation_length", leading)
@@ -170,7 +170,7 @@ def glue(
 
 
 def _correlated_share(
-    xv: Array, yv: Array, slope: Array, first: Indices, past: Indices, length: Array | None
+    xv: Array, yv: Array, slope: Array, first: Indices, past: Indices, length: Array
 ) -> Array:
     """Return the noise of means of both channels over that of independent bins, (profile,)."""
     index = np.arange(xv.shape[1])
@@ -178,7 +178,7 @@ def _correlated_share(
     analog = slope**2 * np.where(inside, xv, 0.0).sum(axis=-1)
     photons = np.where(inside, yv, 0.0).sum(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = (analog * (1.0 if length is None else length) + photons) / (analog + photons)
+        share = (analog * length + photons) / (analog + photons)
     return np.where(np.isfinite(share), share, 1.0)
 
 
@@ -209,9 +209,11 @@ def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Ind
     with np.errstate(invalid="ignore"):
         usable = (rate >= THRESHOLDS.count_rates[0]) & (rate <= highest[:, np.newaxis])
     usable &= _is_lit(x, xv)
-    first, past = np.zeros((2, len(x)), dtype=np.intp)
-    longest_runs(usable, first, past)
     index = np.arange(rate.shape[1])
+    # Number of usable bins up to each, whose largest is the longest run.
+    run = index - np.maximum.accumulate(np.where(usable, -1, index), axis=1)
+    past = run.argmax(axis=1) + 1
+    first = past - run.max(axis=1)
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
     highest_rate = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
     lowest_rate = np.where(inside, rate, np.inf).min(axis=1, initial=np.inf)
@@ -281,20 +283,6 @@ def running_means(values: Array, half: int, out: Array) -> None:
                 count -= 1
             if i >= 0:
                 out[k, i] = total / count if count > 0 else math.nan
-
-
-@compiled
-def longest_runs(valid: Booleans, first: Indices, past: Indices) -> None:
-    """Write the longest run of true bins of each row, the first of equals; (0, 0) for none."""
-    for k in range(valid.shape[0]):
-        start = best = 0
-        first[k] = past[k] = 0
-        for i in range(valid.shape[1]):
-            if not valid[k, i]:
-                start = i + 1
-            elif i + 1 - start > best:
-                best = i + 1 - start
-                first[k], past[k] = start, i + 1
 
 
 @compiled

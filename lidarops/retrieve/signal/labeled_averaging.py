@@ -17,12 +17,11 @@ import xarray as xr
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import WITHHELD, Quality
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, frozen
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.signal.averaging import (
     PartCells,
     RunningMean,
     cells_of_parts,
-    join_bits,
     outlying_parts,
     tail_of_cells,
 )
@@ -202,7 +201,8 @@ class IntervalSums:
         )
         scalars, errors = np.insert(sky, 0, length, axis=1), np.insert(sky[:, 1:], 0, 0.0, axis=1)
         self._lengths.add(scalars[:, :2], errors, groups=group, weights=weights)
-        join_bits(frozen(quality), frozen(group), int(~_MISSING), self._bits)
+        for number, bits in zip(group, quality, strict=True):
+            self._bits[number] |= bits & ~_MISSING
         self._added += len(power)
 
     def completed(self) -> Iterator[PartSums]:

@@ -349,7 +349,6 @@ def test_no_bit_depends_on_batch_or_layout():
         ({"start": 1e5}, "start"),
         ({"start": np.nan}, "start"),
         ({"stop": [1.0, 2.0]}, "stop"),
-        ({"mask": np.ones(1000)}, "mask"),
     ],
 )
 def test_invalid_arguments_are_refused(change, field):

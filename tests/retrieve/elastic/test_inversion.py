@@ -582,8 +582,6 @@ def test_the_unit_of_the_power_does_not_matter(scale):
         ({"molecular_extinction": np.nan}, "molecular_extinction"),
         ({"reference": (20e3, 21e3)}, "reference"),
         ({"reference": (9e3, 8e3)}, "reference"),
-        ({"reference": [8e3, 9e3]}, "reference"),
-        ({"reference": np.ones(7, dtype=bool)}, "reference"),
         ({"reference": (np.zeros(3), np.ones(3))}, "reference"),
         ({"reference_scattering_ratio": -1.0}, "reference_scattering_ratio"),
         ({"variance": -1.0}, "variance"),
