@@ -10,10 +10,9 @@ from typing import Annotated, Final
 
 import typer
 
-from lidarops.cli.app import command, no_url, progress_bar, show_rows
-
 # First of all, it sets the number of threads.
-from lidarops.run import command_options as options
+from lidarops.cli import options
+from lidarops.cli.app import command, no_url, progress_bar, show_rows
 
 # isort: split
 from benchmarks.accuracy import all_retrievals, elastic, homogeneous, multiangle, network

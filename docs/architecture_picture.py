@@ -84,7 +84,7 @@ def levels() -> list[list[str]]:
     contract = settings["tool"]["importlinter"]["contracts"][0]
     rows = [[name.strip() for name in layer.split("|")] for layer in contract["layers"]]
     kept = [[name for name in row if name in PURPOSES] for row in rows]
-    kept[1].insert(0, "flows")
+    kept.insert(1, ["flows"])
     return [row for row in kept if row] + [["vocabulary"]]
 
 

@@ -24,7 +24,7 @@ from lidarops.campaign.model import load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
-from lidarops.run import command_options as options
+from lidarops.cli import options
 from lidarops.run.archive import update_catalog
 
 

@@ -50,13 +50,13 @@ from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.product_files import publish_products
 from lidarops.catalog.store import RunStatus
+from lidarops.cli import options
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.kinds import kinds
 from lidarops.records import RunRecord, SceneOutcome
 from lidarops.reports import run_tables
 from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
-from lidarops.run import command_options as options
 from lidarops.run.archive import (
     Options,
     Result,

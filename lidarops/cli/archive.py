@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidarops.cli import options
 from lidarops.cli.app import (
     NO_SCENE,
     Table,
@@ -31,7 +32,6 @@ from lidarops.cli.app import (
     show_tables,
 )
 from lidarops.errors import UNAVAILABLE, LidarOpsError
-from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

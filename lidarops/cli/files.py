@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lidarops.cli import options
 from lidarops.cli.app import (
     command,
     exit_with_status,
@@ -19,7 +20,6 @@ from lidarops.cli.app import (
     show_tables,
 )
 from lidarops.errors import LidarOpsError
-from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from lidarops.catalog.store import Run

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lidarops.cli import options
 from lidarops.cli.app import (
     command,
     exit_with_status,
@@ -19,7 +20,6 @@ from lidarops.cli.app import (
     utc,
 )
 from lidarops.figures.wording import visible
-from lidarops.run import command_options as options
 from lidarops.site.paths import CALENDAR_HEIGHT
 
 if TYPE_CHECKING:

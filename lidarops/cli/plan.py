@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from lidarops.cli import options
 from lidarops.cli.app import (
     NO_SCENE,
     command,
@@ -30,7 +31,6 @@ from lidarops.cli.app import (
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
-from lidarops.run import command_options as options
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign

@@ -13,6 +13,7 @@ from typing import Annotated, Final
 
 import typer
 
+from lidarops.cli import options
 from lidarops.cli.app import (
     command,
     from_here,
@@ -21,7 +22,6 @@ from lidarops.cli.app import (
     say,
 )
 from lidarops.errors import SceneError
-from lidarops.run import command_options as options
 
 _SCHEMA: Final = "campaign.schema.json"
 _OUTPUT: Final = "out"

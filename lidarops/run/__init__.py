@@ -3,8 +3,7 @@
 - `scenes` cuts granules into scenes, without what `outlying_headers` finds, and names the refused
   files of each; `day_states` knows what has changed on a day, and the names of channels.
 - `archive`: catalog, plan, process and report; what the command line and the flows call.
-- `options`: how to run and which part of the campaign, and what a run returns; `command_options`:
-  the arguments and options that commands and flows share.
+- `options`: how to run and which part of the campaign, and what a run returns.
 - `staleness`: decides which products are stale, and why; `leftovers`: scenes without product, and
   products that the campaign no longer requests.
 - `executor`: processes scenes, in this process or on dask workers; `clusters` starts or reaches

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.campaign.simulated_instrument import AnalogRecorder
-from lidarops.simulate import _checks
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.counting import Array, Counts, Photoelectrons, limited_rate
+from lidarops.simulate.signal import SimulationInputError, check_positive
 
 _NEGLIGIBLE: Final = 20.0
 """Harmonics of less than exp(-20) = 2e-9 steps are left out."""
@@ -119,7 +118,7 @@ def sample_moments(
     recorder : AnalogRecorder
     bin_time : float, s
     """
-    _checks.positive("bin_time", bin_time, "s")
+    check_positive("bin_time", bin_time, "s")
     mean, variance, *_ = _moments_of(limited_rate(rate), _sample(recorder, bin_time))
     return mean, variance
 

@@ -31,8 +31,7 @@ from lidarops.retrieve.air.molecular import (
     us_standard,
 )
 from lidarops.retrieve.raman.scattering import MASS_RATIO, NITROGEN_SHARE
-from lidarops.simulate import _checks
-from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.signal import SimulationInputError, check_between
 
 Array = NDArray[np.float64]
 
@@ -319,8 +318,8 @@ def solar_elevation(moment: datetime, latitude: float, longitude: float) -> floa
         raise SimulationInputError(
             f"of {moment} has no time zone", field="moment", remedy="add tzinfo=UTC"
         )
-    _checks.between("latitude", latitude, -90.0, 90.0, "degree")
-    _checks.between("longitude", longitude, -360.0, 360.0, "degree")
+    check_between("latitude", latitude, -90.0, 90.0, "degree")
+    check_between("longitude", longitude, -360.0, 360.0, "degree")
     utc = moment.astimezone(UTC)
     hours = utc.hour + utc.minute / 60.0 + utc.second / 3600.0
     days = utc.timetuple().tm_yday - 1 + (hours - 12.0) / 24.0

@@ -11,8 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
-from lidarops.simulate import _checks
-from lidarops.simulate._checks import SimulationInputError
+from lidarops.simulate.signal import (
+    SimulationInputError,
+    check_not_negative,
+    check_positive,
+    check_profile,
+)
 
 Counts = NDArray[np.signedinteger[Any]]
 Array = NDArray[np.float64]
@@ -53,7 +57,7 @@ def limited_rate(rate: Array) -> Array:
         If a rate is negative or NaN.
     """
     rate = np.minimum(rate, BRIGHTEST)
-    _checks.profile("rate", rate, rate.shape, "MHz")
+    check_profile("rate", rate, rate.shape, "MHz")
     return rate
 
 
@@ -79,8 +83,8 @@ def release(
     SimulationInputError
         If a rate is negative or NaN, or the number of shots is negative.
     """
-    _checks.not_negative("shots", shots)
-    _checks.positive("bin_width", bin_width, "m")
+    check_not_negative("shots", shots)
+    check_positive("bin_width", bin_width, "m")
     bin_time = bin_width / LICEL_RANGE_PER_MICROSECOND * 1e-6
     rate = limited_rate(rate)
     number = None if random is None else random.poisson(rate * (shots * bin_time * 1e6))
@@ -214,7 +218,7 @@ def count_photons(
     ----------
     `cox1962`.
     """
-    _checks.not_negative("dead_time", dead_time, "s")
+    check_not_negative("dead_time", dead_time, "s")
     in_previous = _share_in_previous(dead_time, released.bin_time)
     counted: Counts
     if released.number is None:
@@ -260,8 +264,8 @@ def counter_moments(
     ----------
     `cox1962`.
     """
-    _checks.positive("bin_time", bin_time, "s")
-    _checks.not_negative("dead_time", dead_time, "s")
+    check_positive("bin_time", bin_time, "s")
+    check_not_negative("dead_time", dead_time, "s")
     rate = limited_rate(rate)
     in_previous = 2.0 * _share_in_previous(dead_time, bin_time)
     mean, variance = _moments(rate, dead_time * 1e6, in_previous, paralyzable=paralyzable)

@@ -27,10 +27,16 @@ from scipy.special import ndtr
 
 from lidarops.campaign import simulated_instrument as settings
 from lidarops.constants import SPEED_OF_LIGHT
-from lidarops.simulate import _checks
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.atmosphere import BeamPath
-from lidarops.simulate.signal import bin_centres
+from lidarops.simulate.signal import (
+    SimulationInputError,
+    bin_centres,
+    check_ascending,
+    check_between,
+    check_not_negative,
+    check_positive,
+    check_profile,
+)
 
 Array = NDArray[np.float64]
 
@@ -54,7 +60,7 @@ class Pulse(ABC):
     """Where the pulse is cut, in units of time."""
 
     def __post_init__(self) -> None:
-        _checks.between("width", self.width, 1e-15, 1e-3, "s")
+        check_between("width", self.width, 1e-15, 1e-3, "s")
 
     @property
     def unit(self) -> float:
@@ -168,17 +174,17 @@ def response(
     start, stop = (0.0, 0.0) if pulse is None else (pulse.start, pulse.stop)
     start, stop = 0.5 * SPEED_OF_LIGHT * start, 0.5 * SPEED_OF_LIGHT * stop
     if bin_width is not None:
-        _checks.positive("bin_width", bin_width, "m")
+        check_positive("bin_width", bin_width, "m")
     elif pulse is None:
         raise SimulationInputError("needs a pulse, a bin width or both", field="pulse")
     half = 0.5 * (bin_width or 0.0)
     if resolution is None:
         resolution = bin_width / _CELLS_OF_BIN if bin_width else (stop - start) / _CELLS_OF_PULSE
-    _checks.positive("resolution", resolution, "m")
+    check_positive("resolution", resolution, "m")
     span = stop - start + 2.0 * half
     # Rounding must not add a cell to a pulse of a whole number of cells.
     cells = max(math.ceil(span / resolution * (1.0 - 1e-12)), 1)
-    _checks.between("resolution", cells, 1, _MOST_CELLS, "cells")
+    check_between("resolution", cells, 1, _MOST_CELLS, "cells")
     edges = np.linspace(start - half, stop + half, cells + 1)
     return edges, np.diff(_passed(pulse, edges, half)) / (span / cells)
 
@@ -246,8 +252,8 @@ def pulsed_signal(
     ----------
     `vasylkivskyi2009`, equations 10, 14 and 20.
     """
-    _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
-    _checks.not_negative("full_overlap_range", full_overlap_range, "m")
+    check_not_negative("system_constant", system_constant, "MHz m3 sr")
+    check_not_negative("full_overlap_range", full_overlap_range, "m")
     edges, density = response(pulse, bin_width=bin_width, resolution=resolution)
     _refuse_near(distance, edges, full_overlap_range)
     grid = distance if path is None else path
@@ -311,7 +317,7 @@ _SHAPES: Final[Mapping[str, Callable[[float], tuple[Pulse, float]]]] = {
 
 
 def _refuse_near(distance: Array, edges: Array, full_overlap_range: float) -> None:
-    _checks.ascending("distance", distance)
+    check_ascending("distance", distance)
     if edges[-1] >= distance[-1]:
         raise SimulationInputError(
             f"is as long as the range: {edges[-1]:g} m of {distance[-1]:g} m",
@@ -331,11 +337,11 @@ def _points(
     path: Array, extinction: Array, backscatter: Array, returning: Array | None
 ) -> tuple[Array, Array, Array, Array]:
     """Return range, two-way extinction, two-way optical depth and backscatter from R = 0 on."""
-    _checks.ascending("path", path)
-    _checks.profile("extinction", extinction, path.shape, "m-1")
-    _checks.profile("backscatter", backscatter, path.shape, "m-1 sr-1")
+    check_ascending("path", path)
+    check_profile("extinction", extinction, path.shape, "m-1")
+    check_profile("backscatter", backscatter, path.shape, "m-1 sr-1")
     if returning is not None:
-        _checks.profile("returning_extinction", returning, path.shape, "m-1")
+        check_profile("returning_extinction", returning, path.shape, "m-1")
     ahead = path > 0.0
     if not ahead.any():
         raise SimulationInputError("has no range in front of the lidar", field="path")

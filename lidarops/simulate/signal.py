@@ -5,18 +5,63 @@
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarops.simulate import _checks
-from lidarops.simulate._checks import SimulationInputError
+from lidarops.errors import LidarOpsError
 
 Array = NDArray[np.float64]
 
 _FARTHEST: Final = 1.0e9
 """m: the Moon is nearer, and no lidar reaches farther."""
+
+
+class SimulationInputError(LidarOpsError, ValueError):
+    """A lidar, a pulse or an atmosphere that cannot be simulated."""
+
+
+def check_positive(field: str, value: float, unit: str = "") -> None:
+    """Raise unless `value` is positive and finite."""
+    if not (math.isfinite(value) and value > 0.0):
+        raise _refusal(field, value, unit, "be positive and finite")
+
+
+def check_not_negative(field: str, value: float, unit: str = "") -> None:
+    """Raise unless `value` is finite and not negative."""
+    if not (math.isfinite(value) and value >= 0.0):
+        raise _refusal(field, value, unit, "be finite and not negative")
+
+
+def check_between(field: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Raise unless `value` lies between `low` and `high`, ends included."""
+    if not low <= value <= high:
+        raise _refusal(field, value, unit, f"lie between {low:g} and {high:g}")
+
+
+def check_profile(
+    field: str, values: NDArray[np.float64], shape: tuple[int, ...], unit: str
+) -> None:
+    """Raise unless a profile has this shape and its values are finite and not negative."""
+    if values.shape != shape:
+        raise SimulationInputError(f"has shape {values.shape}, not {shape}", field=field)
+    # NaN passes neither comparison.
+    if not (values.min(initial=0.0) >= 0.0 and values.max(initial=0.0) < np.inf):
+        where = int(np.argmin(np.isfinite(values) & (values >= 0.0)))
+        raise _refusal(f"{field}[{where}]", float(values[where]), unit, "not be negative or NaN")
+
+
+def check_ascending(field: str, values: NDArray[np.float64]) -> None:
+    """Raise unless a grid has one axis and at least two ascending values."""
+    if values.ndim != 1 or values.size < 2 or not np.all(np.diff(values) > 0.0):
+        raise SimulationInputError("must be one axis of at least 2 ascending values", field=field)
+
+
+def _refusal(field: str, value: Any, unit: str, rule: str) -> SimulationInputError:
+    text = f"{value:g} {unit}".rstrip()
+    return SimulationInputError(f"must {rule}, not {text}", field=field)
 
 
 def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
@@ -25,9 +70,9 @@ def bin_centres(bins: int, bin_width: float, offset: float = 0.0) -> Array:
     A bin holds the light that returns while it is open, so its signal belongs to its centre. At
     the start of the bin the lidar equation would be off by bin_width / R.
     """
-    _checks.not_negative("bins", bins)
-    _checks.positive("bin_width", bin_width, "m")
-    _checks.between("offset", offset, -_FARTHEST, _FARTHEST, "m")
+    check_not_negative("bins", bins)
+    check_positive("bin_width", bin_width, "m")
+    check_between("offset", offset, -_FARTHEST, _FARTHEST, "m")
     return (np.arange(bins, dtype=np.float64) + 0.5) * bin_width + offset
 
 
@@ -45,7 +90,7 @@ def sine_overlap(distance: Array, full_overlap_range: float) -> Array:
     :math:`O(R) = \sin^2(\pi R / 2 R_f)` up to the range of full overlap :math:`R_f`, exactly 1
     beyond: smooth at both ends, and of second order at R = 0, where :math:`R^{-2}` diverges.
     """
-    _checks.not_negative("full_overlap_range", full_overlap_range, "m")
+    check_not_negative("full_overlap_range", full_overlap_range, "m")
     if full_overlap_range == 0.0:
         return np.where(distance > 0.0, 1.0, 0.0)
     fraction = np.clip(distance / full_overlap_range, 0.0, 1.0)
@@ -122,14 +167,14 @@ def backscatter_signal(
     bin centre.
     """
     if distance.ndim != 1 or distance.size > 1:
-        _checks.ascending("distance", distance)
+        check_ascending("distance", distance)
     if not np.all(np.abs(distance[-1:]) <= _FARTHEST):
         raise SimulationInputError(f"ends at {distance[-1]:g} m", field="distance")
-    _checks.not_negative("system_constant", system_constant, "MHz m3 sr")
-    _checks.profile("extinction", extinction, distance.shape, "m-1")
-    _checks.profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
+    check_not_negative("system_constant", system_constant, "MHz m3 sr")
+    check_profile("extinction", extinction, distance.shape, "m-1")
+    check_profile("backscatter", backscatter, distance.shape, "m-1 sr-1")
     if returning_extinction is not None:
-        _checks.profile("returning_extinction", returning_extinction, distance.shape, "m-1")
+        check_profile("returning_extinction", returning_extinction, distance.shape, "m-1")
     two_way = extinction + (extinction if returning_extinction is None else returning_extinction)
     positive = distance > 0.0
     safe = np.where(positive, distance, 1.0)

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles.counter import registered
 
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.counting import (
     BRIGHTEST,
     count_photons,
     counter_moments,
     release,
 )
+from lidarops.simulate.signal import SimulationInputError
 
 BIN_WIDTH = 7.5
 BIN_TIME = 50e-9

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from lidarops.campaign.simulated_instrument import AnalogRecorder, LaserDrift
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.analog import digitise
 from lidarops.simulate.counting import count_photons, delay_recorder, release
-from lidarops.simulate.signal import backscatter_signal, bin_centres
+from lidarops.simulate.signal import SimulationInputError, backscatter_signal, bin_centres
 
 BIN_WIDTH = 7.5
 DEAD_TIME = 4e-9

@@ -14,11 +14,10 @@ from lidarops.campaign.simulated_instrument import AnalogRecorder
 from lidarops.campaign.simulation import SimulationSettings
 from lidarops.retrieve.air.molecular import us_standard
 from lidarops.simulate import analog
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.atmosphere import Air, solar_elevation
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.counting import count_photons, counter_moments, release
-from lidarops.simulate.signal import backscatter_signal, bin_centres
+from lidarops.simulate.signal import SimulationInputError, backscatter_signal, bin_centres
 
 BIN_WIDTH = 7.5
 BIN_TIME = 50e-9

@@ -13,9 +13,14 @@ from hypothesis import strategies as st
 
 from lidarops.campaign.simulated_air import AtmosphereSettings
 from lidarops.campaign.simulated_instrument import Optics
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.atmosphere import Air, Beam, sky_brightness, solar_elevation
-from lidarops.simulate.signal import backscatter_signal, bin_centres, optical_depth, sine_overlap
+from lidarops.simulate.signal import (
+    SimulationInputError,
+    backscatter_signal,
+    bin_centres,
+    optical_depth,
+    sine_overlap,
+)
 
 
 @pytest.mark.parametrize("extinction", [1e-5, 2e-4, 2e-3])

@@ -13,7 +13,6 @@ from scipy.integrate import quad
 
 from lidarops.constants import SPEED_OF_LIGHT
 from lidarops.errors import LidarOpsError
-from lidarops.simulate._checks import SimulationInputError
 from lidarops.simulate.pulse import (
     ExponentialPulse,
     GaussianPulse,
@@ -21,7 +20,7 @@ from lidarops.simulate.pulse import (
     pulsed_signal,
     response,
 )
-from lidarops.simulate.signal import backscatter_signal, bin_centres
+from lidarops.simulate.signal import SimulationInputError, backscatter_signal, bin_centres
 
 HALF_C = SPEED_OF_LIGHT / 2
 
