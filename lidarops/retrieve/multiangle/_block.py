@@ -189,8 +189,16 @@ def regress(beams: BeamBlock, inhomogeneity: float | None) -> Regression:
     return refit(beams, variance, freedom)
 
 
-def refit(beams: BeamBlock, inhomogeneity: Array, freedom: Array) -> Regression:
-    """Fit with a given variance of the inhomogeneity and its degrees of freedom."""
+def refit(
+    beams: BeamBlock,
+    inhomogeneity: Array,
+    freedom: Array,
+    most_added: float = THRESHOLDS.gradient_variance,
+) -> Regression:
+    """Fit with a given variance of the inhomogeneity and its degrees of freedom.
+
+    A gradient is fitted where that adds at most a multiple of the variance of the optical depth.
+    """
     centre = beams.columns.mean(axis=1)
     centre[0] = 0.0
     design = (beams.columns - centre[:, np.newaxis]).swapaxes(0, 1).copy()
@@ -198,8 +206,9 @@ def refit(beams: BeamBlock, inhomogeneity: Array, freedom: Array) -> Regression:
     residual, leverage = np.empty(noise.shape), np.empty(noise.shape)
     table = np.empty((len(noise), kh.COLUMNS, noise.shape[2]))
     kh.fit_levels(
-        logarithm, noise, inhomogeneity, design, centre, beams.sides, table, residual, leverage
-    )
+        logarithm, noise, inhomogeneity, design, centre, most_added if beams.sides else -1.0,
+        table, residual, leverage,
+    )  # fmt: skip
     return Regression(table, inhomogeneity, freedom, residual, leverage)
 
 

@@ -82,7 +82,7 @@ def _beam_means(beams: BeamBlock, inhomogeneity: Array, *thirds: Indices) -> tup
     scatter = np.full(inhomogeneity.size, inhomogeneity[thirds[0]].mean())
     some = beams.typical()
     clear = replace(some, noise=np.where(some.noise < scatter, some.noise, np.inf), sides=True)
-    fit = refit(clear, scatter, np.zeros_like(scatter))
+    fit = refit(clear, scatter, np.zeros_like(scatter), np.inf)
     size = np.nan_to_num(fit.residual) / np.sqrt(clear.noise + scatter)
     size = np.clip(size, -_CLIPPED, _CLIPPED)
     value, freedom = [], []

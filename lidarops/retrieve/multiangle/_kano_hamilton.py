@@ -79,8 +79,8 @@ def _add_sums(
 
 
 @compiled
-def _factor(a: Array, f: Array, spare: Array, gradients: bool) -> None:  # noqa: FBT001
-    """Factor the normal equations as L D L', leaving out what depends on others.
+def _factor(a: Array, f: Array, spare: Array, most_added: float) -> None:
+    """Factor the normal equations as L D L', leaving out what depends on others, and fill `_SHARE`.
 
     Parameters
     ----------
@@ -90,8 +90,8 @@ def _factor(a: Array, f: Array, spare: Array, gradients: bool) -> None:  # noqa:
         Right sides; becomes their solution.
     spare : (altitude,) float
         Number of beams; becomes the residual degrees of freedom.
-    gradients : bool
-        Whether they are fitted.
+    most_added : float
+        See `fit_levels`.
     """
     for c in range(a.shape[0]):
         for k in range(a.shape[2]):
@@ -104,18 +104,24 @@ def _factor(a: Array, f: Array, spare: Array, gradients: bool) -> None:  # noqa:
                 a[c, e, k] = link
                 f[_RIGHT, c, k] -= link * f[_RIGHT, e, k]
                 length -= link * link * a[e, e, k]
-            # A gradient must leave a residual to check the optical depth.
+            share = 1.0 if c == _PATH else 0.0
+            for e in range(_PATH, c):
+                share -= a[c, e, k] * f[_SHARE, e, k]
             used = length > _DEPENDENT * a[c, c, k]
-            used &= c <= _PATH or (gradients and spare[k] > 1.0)
+            if c > _PATH:
+                # A gradient must leave a residual to check the optical depth.
+                used &= spare[k] > 1.0 and (c == _PATH + 1 or f[_INVERSE, c - 1, k] > 0.0)
+                used &= share * share <= most_added * f[_INVERSE, _PATH, k] * length
             a[c, c, k] = length if used else 0.0
             f[_INVERSE, c, k] = 1.0 / length if used else 0.0
+            f[_SHARE, c, k] = share
             spare[k] -= 1.0 if used else 0.0
     f[_RIGHT] *= f[_INVERSE]
 
 
 @compiled
 def _solve(a: Array, f: Array, centre: Array, out: Array) -> None:
-    """Fill optical depth and intercept with their variances, and `_SHARE`."""
+    """Fill optical depth and intercept with their variances, and finish `_SHARE`."""
     origin = np.empty(a.shape[1:])
     for c in range(a.shape[0]):
         for k in range(a.shape[2]):
@@ -123,13 +129,10 @@ def _solve(a: Array, f: Array, centre: Array, out: Array) -> None:
             for e in range(c):
                 value -= a[c, e, k] * origin[e, k]
             origin[c, k] = value
-            share = 1.0 if c == _PATH else 0.0
-            if c > _PATH:
-                for e in range(_PATH, c):
-                    share -= a[c, e, k] * f[_SHARE, e, k]
-                if not f[_INVERSE, c, k] > 0.0:
-                    out[SLOPES + c - _PATH - 1, k] = 0.5 * share
-                    value = share = 0.0
+            share = f[_SHARE, c, k]
+            if c > _PATH and not f[_INVERSE, c, k] > 0.0:
+                out[SLOPES + c - _PATH - 1, k] = 0.5 * share
+                value = share = 0.0
             f[_SHARE, c, k] = share
             out[TAU, k] -= 0.5 * share * f[_RIGHT, c, k]
             out[INFORMATION, k] += 0.25 * share * share * f[_INVERSE, c, k]
@@ -186,7 +189,7 @@ def _add_squares(weights: Array, residual: Array, hat: Array, lever: Array, out:
 @compiled
 def fit_levels(
     y: Array, noise: Array, scatter: Array, design: Array, centre: Array,
-    gradients: bool,  # noqa: FBT001
+    most_added: float,
     out: Array, residuals: Array, leverages: Array,
 ) -> None:  # fmt: skip
     """Fit every altitude of every profile.
@@ -201,8 +204,9 @@ def fit_levels(
         Ones, slant path, and horizontal distances over altitude, minus their means over beams.
     centre : (column, altitude) float
         Those means.
-    gradients : bool
-        Whether gradients along the distances are fitted together with the optical depth.
+    most_added : float
+        Largest variance of the optical depth that the fit of a gradient along a distance may add,
+        over that without gradients; negative if none is fitted.
     out : (profile, COLUMNS, altitude) float
         Output.
     residuals, leverages : (profile, angle, altitude) float
@@ -211,14 +215,14 @@ def fit_levels(
     """
     angles, altitudes = y.shape[1:]
     columns = design.shape[1]
-    used = columns if gradients else _PATH + 1
+    used = columns if most_added >= 0.0 else _PATH + 1
     weights, lever = np.empty((angles, altitudes)), np.empty((angles, altitudes))
     spare = np.empty(altitudes)
     a, f = np.empty((columns, columns, altitudes)), np.empty((3, columns, altitudes))
     for t in range(y.shape[0]):
         out[t], spare[:], a[:], f[:] = 0.0, 0.0, 0.0, 0.0
         _add_sums(y[t], noise[t], scatter, design, used, weights, spare, a, f)
-        _factor(a, f, spare, gradients)
+        _factor(a, f, spare, most_added)
         _solve(a, f, centre, out[t])
         own, hat = residuals[t], leverages[t]
         _fill_residuals(y[t], weights, design, a, f[:, :used], own, hat, lever)

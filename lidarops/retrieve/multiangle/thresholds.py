@@ -96,7 +96,11 @@ class Thresholds(NamedTuple):
     """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
     alone in 2.3 percent of the altitudes where the air is clear."""
 
-    # Horizontal gradient (`_horizontal_variation`, `optical_depth`).
+    # Horizontal gradient (`_block`, `_horizontal_variation`, `optical_depth`).
+    gradient_variance: float = 9.0
+    """Variance of an optical depth that the fit of a gradient may add, over that without it: the
+    usual limit of collinearity, 10 in all (`marquardt1970`). Beams to one side, as of a cycle that
+    is cut short, have 12 to 800."""
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_noise: float = 0.04
