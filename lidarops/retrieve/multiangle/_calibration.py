@@ -58,12 +58,12 @@ class Sandwich(NamedTuple):
         every = np.eye(len(information))
         repeated = np.repeat(bands, len(every), axis=2)
         factors, rough = (
-            _smoothing.factor(repeated, stiffness, np.full(len(every), times * weight))
+            _smoothing.factor_bands(repeated, stiffness, np.full(len(every), times * weight))
             for times in (1.0, THRESHOLDS.pilot)
         )
-        inverse = _smoothing.solve(factors, every)
+        inverse = _smoothing.solve_bands(factors, every)
         data = _smoothing.multiply(bands, inverse)
-        pilot = _smoothing.multiply(bands, _smoothing.solve(rough, every - data))
+        pilot = _smoothing.multiply(bands, _smoothing.solve_bands(rough, every - data))
         known = information[:, 0] > 0.0
         variance = np.where(known, 1.0 / np.where(known, information[:, 0], 1.0), 0.0)
         # Neighbours of the ends are as those of the altitudes beside them.

@@ -70,7 +70,7 @@ def multiply(bands: Array, columns: Array) -> Array:
 
 
 @compiled
-def factor(bands: Array, stiffness: Array, weight: Array) -> Array:
+def factor_bands(bands: Array, stiffness: Array, weight: Array) -> Array:
     """Return the factors L D L' of the precision plus a multiple of the penalty.
 
     Parameters
@@ -107,7 +107,7 @@ def factor(bands: Array, stiffness: Array, weight: Array) -> Array:
 
 
 @compiled
-def solve(f: Array, right: Array) -> Array:
+def solve_bands(f: Array, right: Array) -> Array:
     """Return the solution of factored systems, (altitude, system)."""
     altitudes, systems = right.shape
     out = np.zeros((altitudes + _PAD, systems))
@@ -123,7 +123,7 @@ def solve(f: Array, right: Array) -> Array:
 
 
 @compiled
-def invert(f: Array) -> Array:
+def invert_bands(f: Array) -> Array:
     """Return diagonal and first off-diagonal of the inverse (Takahashi's recursion).
 
     (2, altitude, system), of factored systems (`takahashi1973`).
@@ -154,11 +154,11 @@ class Smoother(NamedTuple):
     def of(cls, bands: Array, stiffness: Array, weight: Array, share: Array) -> Self:
         """Return the systems with weights (candidate,) of their shares."""
         repeated = np.repeat(bands, share.size, axis=2)
-        return cls(bands, share, factor(repeated, stiffness, np.tile(weight, bands.shape[2])))
+        return cls(bands, share, factor_bands(repeated, stiffness, np.tile(weight, bands.shape[2])))
 
     def solve(self, right: Array) -> Array:
         """Return the solutions of all systems for (altitude, profile) right-hand sides."""
-        return np.asarray(solve(self.factors, np.repeat(right, self.share.size, axis=1)))
+        return np.asarray(solve_bands(self.factors, np.repeat(right, self.share.size, axis=1)))
 
     def respond(self, columns: Array) -> Array:
         """Return the smoothed form of (altitude, profile) estimates."""
@@ -189,8 +189,8 @@ def _misfits(
     altitudes, profiles = estimates.shape
     out = np.zeros((2, weight.size))
     for i in range(weight.size):
-        f = factor(bands, stiffness, np.full(profiles, weight[i]))
-        away = estimates - solve(f, right)
+        f = factor_bands(bands, stiffness, np.full(profiles, weight[i]))
+        away = estimates - solve_bands(f, right)
         product = np.ones(profiles)
         for k in range(altitudes):
             product *= f[0, k]
@@ -251,7 +251,7 @@ def freedom(bands: Array, stiffness: Array, weight: Array) -> Array:
     weight : (smoothing,) float64
     """
     repeated = np.repeat(bands, weight.size, axis=2)
-    diagonal, beside = invert(factor(repeated, stiffness, weight))
+    diagonal, beside = invert_bands(factor_bands(repeated, stiffness, weight))
     return np.asarray((bands[0] * diagonal + 2.0 * bands[1] * beside).sum(axis=0))
 
 

@@ -201,7 +201,7 @@ def _result(
     """Return the solution with calibrated errors."""
     bands, step = smoother.bands, np.diff(altitude, prepend=0.0)
     solved = smoother.solve(_smoothing.multiply(bands, estimates))
-    diagonal, beside = _smoothing.invert(smoother.factors)
+    diagonal, beside = _smoothing.invert_bands(smoother.factors)
     gained = np.diff(solved, axis=0, prepend=0.0)
     uncertain = diagonal.copy()
     uncertain[1:] += diagonal[:-1] - 2.0 * beside[:-1]

@@ -32,9 +32,9 @@ def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
 
 def solved(bands, estimates, stiffness, lam):
     """Return solution, diagonal and first off-diagonal of the inverse, (3, altitude, profile)."""
-    factors = _smoothing.factor(bands, stiffness, lam)
+    factors = _smoothing.factor_bands(bands, stiffness, lam)
     right = _smoothing.multiply(bands, estimates)
-    return np.stack([_smoothing.solve(factors, right), *_smoothing.invert(factors)])
+    return np.stack([_smoothing.solve_bands(factors, right), *_smoothing.invert_bands(factors)])
 
 
 @each("heights", [1, 2, 3, 7, 60])
