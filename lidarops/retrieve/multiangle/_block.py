@@ -72,13 +72,9 @@ class BeamBlock:
 
     def typical(self) -> BeamBlock:
         """Return the profiles from which what a block has in common is estimated."""
-        every, change = every_nth(len(self.noise)), self.dead_time_change
+        every = every_nth(len(self.noise))
         return replace(
-            self,
-            logarithm=self.logarithm[every],
-            noise=self.noise[every],
-            alive=self.alive[every],
-            dead_time_change=None if change is None else change[every],
+            self, logarithm=self.logarithm[every], noise=self.noise[every], alive=self.alive[every]
         )
 
 

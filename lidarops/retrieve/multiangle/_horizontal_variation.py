@@ -140,8 +140,8 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
 
     It is the largest that is shown in any window of 1000 m of the block, or of 500 m at its ends,
-    by the typical profiles, beyond what an error of the dead time explains; 0 if none is shown. It
-    holds at all altitudes: an optical depth is that of the air below, too.
+    by all profiles, beyond what an error of the dead time explains; 0 if none is shown. It holds at
+    all altitudes: an optical depth is that of the air below, too.
 
     Parameters
     ----------
@@ -150,7 +150,6 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     altitude : (altitude,) float
         m.
     """
-    beams, fit = beams.typical(), fit.typical()
     # Where none is fitted.
     tested = (fit.table[:, kh.SLOPES :] != 0.0).any(axis=1) & (fit.column(kh.FREEDOM) > 0.0)
     clear = tested[:, np.newaxis] & (beams.noise < THRESHOLDS.gradient_noise)
