@@ -19,12 +19,12 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 70_614,
-    "lines of code alone": 46_126,
-    "modules": 279,
-    "dataclasses": 239,
-    "lines of dataclasses": 6_464,
-    "tuning numbers": 215,
+    "lines": 71_100,
+    "lines of code alone": 46_490,
+    "modules": 280,
+    "dataclasses": 245,
+    "lines of dataclasses": 6_567,
+    "tuning numbers": 216,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,

@@ -99,7 +99,9 @@ def test_standard_errors_hold_in_weak_light():
     assert 60 < within_1 < 82
     assert within_2 > 92
     assert np.isfinite(joint.inhomogeneity).any()
-    assert np.nanmedian(joint.inhomogeneity) < 0.045
+    # Where fewer of the 12 beams are bright, it includes what the series of the noise leaves out.
+    bright = np.count_nonzero(signal.mean(axis=0) > 3.0 * np.sqrt(variance[0]), axis=0) > 7
+    assert np.nanpercentile(joint.inhomogeneity[:, bright], 90) < 0.045
     assert not joint.raised(MultiAngleQuality.POOR_STRATIFICATION).any()
 
 
