@@ -98,9 +98,9 @@ class Thresholds(NamedTuple):
 
     # Horizontal gradient (`_block`, `_horizontal_variation`, `optical_depth`).
     gradient_variance: float = 9.0
-    """Variance of an optical depth that the fit of a gradient may add, over that without it: the
-    usual limit of collinearity, 10 in all (`marquardt1970`). Beams to one side, as of a cycle that
-    is cut short, have 12 to 800."""
+    """Variance of an optical depth that the fit of a gradient may add, over that without it: beams
+    to one side, as of a cycle that is cut short, add 11 to 800, those to both sides less than 9; by
+    geometry (`test_a_cycle_cut_short_fits_no_gradient_that_its_beams_cannot_tell`)."""
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_noise: float = 0.04
