@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from scipy.special import polygamma, stdtrit
 
-from lidarops.retrieve.common.arrays import Array, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression, refit
 from lidarops.retrieve.multiangle.altitude_correlation import windowed
@@ -22,6 +23,8 @@ _LEAST_REST: Final = 1e-3
 _DEPENDENT: Final = 1e-8
 """Squared length of a column outside those before it, over its own, up to which it depends on
 them."""
+_SUMS: Final = 5
+"""Number of the sums of `_gradient_sums`."""
 _CLIPPED: Final = 3.0
 """Standard errors to which residuals are clipped in the test of growth."""
 _FEWEST_PROFILES: Final = 4
@@ -136,6 +139,57 @@ def gradient_scale(optical_depth: Array, standard_error: Array, gradient_error: 
     return np.where(shown, np.sqrt(square), 1.0)
 
 
+@compiled
+def _levers(
+    noise: Array, tested: Booleans, inhomogeneity: Array, limit: float, design: Array,
+    altitude: Array, lever: Array, arm: Array,
+) -> None:  # fmt: skip
+    """Fill what a residual adds to a gradient, and what a gradient adds to a residual.
+
+    Parameters
+    ----------
+    noise : (angle, altitude) float
+    tested : (altitude,) bool
+    inhomogeneity, altitude : (altitude,) float
+    limit : float
+        Noise from which a sample is left out.
+    design : (2, angle, altitude) float
+        Distance and path.
+    lever, arm : (angle, altitude) float
+        Outputs; 0 where the sample is too noisy, or constant and path explain the distance.
+    """
+    angles, altitudes = noise.shape
+    sums, least = np.zeros((6, altitudes)), np.zeros(altitudes)
+    for a in range(angles):
+        for k in range(altitudes):
+            clear = tested[k] and noise[a, k] < limit
+            w = 1.0 / (noise[a, k] + inhomogeneity[k]) if clear else 0.0
+            lever[a, k] = w
+            sums[0, k] += w
+            sums[1, k] += w * design[0, a, k]
+            sums[2, k] += w * design[1, a, k]
+            least[k] += w * design[0, a, k] * design[0, a, k]
+    for k in range(altitudes):
+        sums[1, k] /= sums[0, k]
+        sums[2, k] /= sums[0, k]
+    for a in range(angles):
+        for k in range(altitudes):
+            distance, path = design[0, a, k] - sums[1, k], design[1, a, k] - sums[2, k]
+            sums[3, k] += lever[a, k] * path * path
+            sums[4, k] += lever[a, k] * path * distance
+            sums[5, k] += lever[a, k] * distance * distance
+    for k in range(altitudes):
+        slope = sums[4, k] / sums[3, k]
+        left = sums[5, k] - slope * sums[4, k]
+        sums[4, k], sums[5, k] = slope, 1.0 if left > _DEPENDENT * least[k] else 0.0
+    for a in range(angles):
+        for k in range(altitudes):
+            distance, path = design[0, a, k] - sums[1, k], design[1, a, k] - sums[2, k]
+            own = altitude[k] * (distance - sums[4, k] * path)
+            arm[a, k] = own if sums[5, k] > 0.0 else 0.0
+            lever[a, k] *= arm[a, k]
+
+
 def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> float:
     """Return the largest horizontal gradient of ln backscatter that residuals of a block show, m-1.
 
@@ -150,60 +204,71 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     altitude : (altitude,) float
         m.
     """
+    if not beams.noise.size:
+        return 0.0
+    # Empty blocks at both ends make windows of half the length there: near ranges are distorted.
+    block = 1 + (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
     # Where none is fitted.
     tested = (fit.table[:, kh.SLOPES :] != 0.0).any(axis=1) & (fit.column(kh.FREEDOM) > 0.0)
-    clear = tested[:, np.newaxis] & (beams.noise < THRESHOLDS.gradient_noise)
-    if not clear.any():
-        return 0.0
-    weight = np.where(clear, 1.0 / (beams.noise + fit.inhomogeneity), 0.0)
-    residual = np.nan_to_num(fit.residual)
-    change = np.zeros(1)
+    change = np.empty((0, *beams.noise.shape[1:]))
     if beams.dead_time_change is not None:
-        change = beams.dead_time_change / np.exp(beams.logarithm - residual)
-    # Beams of large leverage keep less of an error.
-    whole = 1.0 / np.sqrt(np.maximum(1.0 - fit.leverage, _LEAST_REST))
-    # Windows of two blocks each, every half a window; near ranges, at one end, are distorted.
-    block = (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
-    first = np.arange(-1, block[-1] + 1)
-    inside = (block[:, np.newaxis] == first) | (block[:, np.newaxis] == first + 1)
+        expected = np.exp(beams.logarithm - np.nan_to_num(fit.residual))
+        change = beams.dead_time_change / expected
     square = 0.0
     for distance in beams.axes:
-        arm = altitude * _beside_path(weight, distance, beams.path)
-        lever = weight * arm
-        of_beams = [
-            np.einsum("tak,kw->wta", lever * part, 1.0 * inside).reshape(first.size, -1)
-            for part in (residual, arm, whole * residual, whole * arm, change)
-        ]
-        square += _gradient_beyond_chance(*of_beams) ** 2
+        sums = np.zeros((_SUMS, *beams.noise.shape[:2], int(block[-1]) + 2))
+        _gradient_sums(
+            fit.residual, fit.leverage, beams.noise, tested, fit.inhomogeneity,
+            np.stack([distance, beams.path]), altitude, block, change, sums,
+        )  # fmt: skip
+        # Windows of two blocks each, every half a window.
+        windows = sums[..., :-1] + sums[..., 1:]
+        windows = np.moveaxis(windows, -1, 1).reshape(_SUMS, block[-1] + 1, -1)
+        square += _gradient_beyond_chance(windows) ** 2
     return float(np.sqrt(square))
 
 
-def _beside_path(weight: Array, distance: Array, path: Array) -> Array:
-    """Return the part of distances that no constant and path explain, 0 where they explain all.
+@compiled
+def _gradient_sums(
+    residual: Array, leverage: Array, noise: Array, tested: Booleans, inhomogeneity: Array,
+    design: Array, altitude: Array, block: Integers, change: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Add what the beams of each profile show of a gradient along an axis, in blocks of altitudes.
 
     Parameters
     ----------
-    weight : (profile, angle, altitude) float
-    distance, path : (angle, altitude) float
-
-    Returns
-    -------
-    (profile, angle, altitude) float
+    residual, leverage, noise : (profile, angle, altitude) float
+    tested : (profile, altitude) bool
+    inhomogeneity, altitude : (altitude,) float
+    design : (2, angle, altitude) float
+        Horizontal distance along the axis over altitude, and slant path.
+    block : (altitude,) int
+    change : (profile or 0, angle, altitude) float
+        Of the logarithm, with one standard error of the dead time.
+    sums : (5, profile, angle, block) float
+        Output: of lever times residual and arm; of both with the lever over what a fit leaves of an
+        error, because beams of large leverage keep less; and of lever times change.
     """
-    total = np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    aside, along = (
-        values - (weight * values).sum(axis=1, keepdims=True) / total for values in (distance, path)
-    )
-    squares = (weight * along**2).sum(axis=1, keepdims=True)
-    slope = (weight * along * aside).sum(axis=1, keepdims=True)
-    left = aside - slope / np.where(squares > 0.0, squares, np.inf) * along
-    least = _DEPENDENT * (weight * distance**2).sum(axis=1, keepdims=True)
-    return np.where((weight * left**2).sum(axis=1, keepdims=True) > least, left, 0.0)
+    lever, arm = np.empty(noise.shape[1:]), np.empty(noise.shape[1:])
+    for t in range(noise.shape[0]):
+        _levers(
+            noise[t], tested[t], inhomogeneity, THRESHOLDS.gradient_noise, design, altitude,
+            lever, arm,
+        )  # fmt: skip
+        for a in range(noise.shape[1]):
+            for k in range(altitude.size):
+                if lever[a, k] != 0.0:
+                    b, own, r = block[k], lever[a, k], residual[t, a, k]
+                    whole = own / math.sqrt(max(1.0 - leverage[t, a, k], _LEAST_REST))
+                    sums[0, t, a, b] += own * r
+                    sums[1, t, a, b] += own * arm[a, k]
+                    sums[2, t, a, b] += whole * r
+                    sums[3, t, a, b] += whole * arm[a, k]
+                    if change.shape[0] > 0:
+                        sums[4, t, a, b] += own * change[t, a, k]
 
 
-def _gradient_beyond_chance(
-    total: Array, weight: Array, product: Array, part: Array, shift: Array
-) -> float:
+def _gradient_beyond_chance(sums: Array) -> float:
     """Return the largest gradient along an axis that is beyond chance and the dead time, m-1.
 
     The error by chance follows from the scatter of the beams of all profiles about the gradient,
@@ -211,10 +276,10 @@ def _gradient_beyond_chance(
 
     Parameters
     ----------
-    total, weight, product, part, shift : (window, profile times angle) float
-        Sums over altitudes of the lever of a sample times its residual, and times its arm; of both
-        over what the fit leaves of an error; and of the lever times the change by the dead time.
+    sums : (5, window, profile times angle) float
+        From `_gradient_sums`.
     """
+    total, weight, product, part, shift = sums
     information = weight.sum(axis=1)
     known = np.where(information > 0.0, information, np.inf)
     gradient = total.sum(axis=1) / known
