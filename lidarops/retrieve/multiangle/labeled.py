@@ -87,11 +87,6 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
     depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
     quality = _quality(retrieval)
-    texts = [
-        f"{step.step if step.ran else f'left out {step.step}'}: {step.reason}"
-        for step in retrieval.steps
-    ]
-    methods = set(optical_depth.MultiAngleMethod)
     product = xr.Dataset(
         {
             **values,
@@ -104,10 +99,7 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
             "shots": beams["shots"],
         },
         coords={name: beams[name] for name in beams.coords},
-        attrs={
-            "steps": "; ".join(texts),
-            "method": next(s.step for s in retrieval.steps if s.ran and s.step in methods),
-        },
+        attrs={"steps": "; ".join(retrieval.steps), "method": retrieval.method},
     )
     product = product.assign(_plane_variables(signals, scan))
     product = product.assign(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import partial
@@ -54,15 +54,6 @@ LARGEST_GRADIENT: Final = 5e-5
 
 
 @dataclass(frozen=True, slots=True)
-class StepRecord:
-    """One step of the retrieval: whether it ran, and why or why not."""
-
-    step: str
-    ran: bool
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
 class MultiAngleResult:
     """Profiles of a multi-angle retrieval, (profile, altitude) unless stated; NaN if withheld."""
 
@@ -110,8 +101,10 @@ class MultiAngleResult:
     quality: Flags
     """Bits of `lidarops.flags.Quality` and `MultiAngleQuality`; each missing optical depth has one
     that rejects it."""
-    steps: tuple[StepRecord, ...]
-    """Steps that ran or were left out."""
+    method: str
+    """One of `MultiAngleMethod`, which ran."""
+    steps: tuple[str, ...]
+    """Steps that ran or were left out, with the reason; the last one is the method."""
 
     def raised(self, bits: int) -> Booleans:
         """Return where any of the bits is raised."""
@@ -228,8 +221,8 @@ def retrieve_optical_depth(
     values = _METHODS[name](beams, fit, block)
     _mark_variation(values, beams, fit)
     _mark_missing(values, rows, noise, signal_quality)
-    steps = [*_steps(beams, block, name), StepRecord(name, ran=True, reason=reason)]
-    return MultiAngleResult(**values, steps=tuple(steps))
+    steps = *_steps(beams, block, name), f"{name}: {reason}"
+    return MultiAngleResult(**values, method=name, steps=steps)
 
 
 def layer_levels(
@@ -346,23 +339,19 @@ def _withhold_extinction(values: Values, where: Booleans) -> None:
         values[f"extinction{error}"][where] = np.nan
 
 
-def _steps(beams: BeamBlock, settings: BlockSettings, method: str) -> Iterator[StepRecord]:
-    """Yield what the data decided before the method."""
+def _steps(beams: BeamBlock, settings: BlockSettings, method: str) -> tuple[str, str]:
+    """Return what the data decided before the method."""
     number = int(np.count_nonzero(~settings.scan.usable))
-    count = number or "no"
-    are = "are" if number else "is"
-    beam = "beams" if number else "beam"
-    yield StepRecord(
-        "drop_longest_paths",
-        number > 0,
-        f"{count} {beam} {are} less than 3 degrees above the horizon",
-    )
-    around = "beams point to all sides"
-    free = "a half turn around the zenith has no beam"
+    low = f"{number or 'no'} {'beams are' if number else 'beam is'} less than 3 degrees"
     if method in WITHOUT_GRADIENT:
-        yield StepRecord("horizontal_gradient", ran=False, reason=f"{method} fits none")
+        fitted, reason = False, f"{method} fits none"
     else:
-        yield StepRecord("horizontal_gradient", beams.sides, around if beams.sides else free)
+        around, free = "beams point to all sides", "a half turn around the zenith has no beam"
+        fitted, reason = beams.sides, around if beams.sides else free
+    return (
+        f"{'' if number else 'left out '}drop_longest_paths: {low} above the horizon",
+        f"{'' if fitted else 'left out '}horizontal_gradient: {reason}",
+    )
 
 
 def _choose_method(beams: BeamBlock, settings: BlockSettings) -> tuple[str, str]:
