@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from benchmarks.harness.figure import Array
 from benchmarks.stability import random_scans
 from benchmarks.studies.ablation import (
     PAGES,
@@ -19,9 +20,8 @@ from benchmarks.studies.ablation import (
 )
 from lidarops.retrieve.multiangle import (
     _calibration,
-    _horizontal_variation,
-    _methods,
     _smoothing,
+    optical_depth,
     smooth_profile,
 )
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
@@ -40,23 +40,33 @@ def _nothing(*_: Any) -> None:
     return None
 
 
+def _zero(*_: Any) -> float:
+    return 0.0
+
+
+def _uncalibrated(
+    sandwich: _calibration.Sandwich, inflation: Array, _: Any, scale: Array
+) -> _calibration.Calibration:
+    return _calibration.Calibration(sandwich, inflation, None, scale)
+
+
 GUARDS: Final = (
     Guard("NO_RESIDUAL", int(MultiAngleQuality.NO_RESIDUAL)),
     Guard("INTERPOLATED", int(MultiAngleQuality.INTERPOLATED)),
-    Guard("path variation", off=without((_horizontal_variation, "path_variation_from", _nothing))),
-    Guard("gradients that residuals show", off=_at(_horizontal_variation, gradient_noise=0.0)),
+    Guard("gradients that residuals show", off=without((optical_depth, "visible_gradient", _zero))),
+    Guard("path variation", off=without((optical_depth, "path_variation_from", _nothing))),
     Guard(
         "few residuals: inflation",
-        off=without((smooth_profile, "_inflation", lambda noise: np.ones(noise.freedom.size))),
+        off=without((smooth_profile, "inflation", lambda noise: np.ones(noise.freedom.size))),
     ),
     Guard("Cp beside the likelihood", off=_at(_smoothing, rougher=np.inf)),
-    Guard("calibration", off=without((smooth_profile, "_calibrate", _nothing))),
+    Guard("calibration", off=without((smooth_profile, "Calibration", _uncalibrated))),
     Guard(
         "calibration: scale of profiles",
-        off=without((_calibration, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
+        off=without((smooth_profile, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
     ),
     Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
-    Guard("correlation", off=without((_methods, "correlation_of_air", lambda *_: 0.0))),
+    Guard("correlation", off=without((optical_depth, "correlation_of_air", lambda *_: 0.0))),
 )
 
 if __name__ == "__main__":

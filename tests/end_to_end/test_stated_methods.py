@@ -36,10 +36,10 @@ RETRIEVAL = {
         "known_extinction": "homogeneous/path_fit:solve_with_known_extinction",
     },
     "multiangle": {
-        "two_angle": "multiangle/_methods:_two_angle",
-        "kano_hamilton": "multiangle/_methods:_kano_hamilton",
-        "joint": "multiangle/_methods:_joint",
-        "mld": "multiangle/_methods:_mld",
+        "two_angle": "multiangle/optical_depth:_two_angle",
+        "kano_hamilton": "multiangle/optical_depth:_kano_hamilton",
+        "joint": "multiangle/optical_depth:_joint",
+        "mld": "multiangle/optical_depth:_mld",
     },
     "visibility": {
         "beams_with_prior": "network/_block_solution:solve_block",

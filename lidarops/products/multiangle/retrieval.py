@@ -34,7 +34,11 @@ from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
 from lidarops.retrieve.multiangle.labeled_altitudes import BATCH, AltitudeCycles, BeamAir
-from lidarops.retrieve.multiangle.optical_depth import OpticalDepthSettings
+from lidarops.retrieve.multiangle.optical_depth import (
+    REGULARISED,
+    WITHOUT_GRADIENT,
+    OpticalDepthSettings,
+)
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettings
 from lidarops.scene.choices import BackgroundSettings, background, no_scan, with_low_signal_to_noise
@@ -46,17 +50,10 @@ Array = npt.NDArray[np.float64]
 Case = ChannelCase[MultiAngleSettings]
 Numbers = tuple[tuple[float, ...], ...]
 """Angles, or bounds of time, of each granule."""
-_HALF_TURN: Final = 180.0
 _FEWEST_DIRECTIONS: Final = 2
 """Two paths define a slope."""
 LOWEST_ELEVATION: Final = math.degrees(math.asin(1.0 / THRESHOLDS.longest_path))
 """degree; lower beams are longer than the longest path, but for the curvature of the Earth."""
-_SIMPLE: Final = frozenset({"kano_hamilton", "two_angle", "mld", "mld_prior"})
-"""Methods that treat each altitude independently."""
-_BLIND: Final = frozenset({"two_angle", "mld", "mld_prior"})
-"""Methods that cannot fit a horizontal gradient."""
-_DIFFERENTIATING: Final = frozenset({"mld", "mld_prior"})
-"""Methods of Gobrusenko and Ivanenko."""
 
 
 def altitude_steps(step: float, highest: float) -> Array:
@@ -68,15 +65,15 @@ def altitude_steps(step: float, highest: float) -> Array:
 class Beams:
     """The beam directions of a scan that the retrieval uses."""
 
-    count: int
-    low: int
-    """Number of directions that are left out, because their path is too long or they do not rise.
-    """
     sides_known: bool
     """Whether any azimuth is known."""
-    free: float
+    low: int = 0
+    """Number of directions that are left out, because their path is too long or they do not rise.
+    """
+    count: int = 0
+    free: float = 360.0
     """degree, the largest azimuth sector without beams."""
-    surround: bool
+    surround: bool = False
     """Whether no half turn is free of beams, so that a horizontal gradient can be estimated."""
     span: float = 0.0
     """Largest minus smallest slant path over the vertical one."""
@@ -122,25 +119,24 @@ def _beams(pointings: Numbers, bounds: Numbers, step: float, highest: float) -> 
         cycle = scan_cycles.cycles(zenith_angle, azimuth, bounds)
     except RetrievalInputError:
         # The retrieval raises the same error with its message.
-        return Beams(0, 0, sides_known, 2 * _HALF_TURN, surround=False)
+        return Beams(sides_known)
     altitude = altitude_steps(step, highest)
     up = slant_paths.rising_beams(directions.zenith_angle, altitude)
     low = directions.zenith_angle.size - up.size
     if up.size == 0:
-        return Beams(0, low, sides_known, 2 * _HALF_TURN, surround=False)
+        return Beams(sides_known, low)
     scan = slant_paths.make_scan(directions.zenith_angle[up], altitude, directions.azimuth[up])
     tilted = scan.tilted_azimuths
-    free = math.degrees(widest_azimuth_gap(tilted))
     angles = directions.zenith_angle[up]
     profiles = np.flatnonzero(np.isin(directions.index, up))
     seen = np.unique(np.stack([cycle[profiles], directions.index[profiles]]), axis=1)[0]
     numbers, counts = np.unique(seen, return_counts=True)
     single = numbers[counts < _FEWEST_DIRECTIONS]
     return Beams(
-        up.size,
-        low,
         sides_known,
-        free,
+        low,
+        up.size,
+        math.degrees(widest_azimuth_gap(tilted)),
         slant_paths.surrounds_zenith(tilted),
         float(np.ptp(scan.path[:, 0])),
         _pattern(angles, directions.azimuth[up]) if sides_known else f"{up.size} zenith angles",
@@ -206,7 +202,7 @@ def _gradient(case: Case, directions: Beams) -> Entry:
     if largest <= 0:
         reason = "largest_gradient of the campaign is 0: only what the residuals show is included"
         return case.leave("gradient", reason, number=0.0)
-    blind = case.request.method in _BLIND
+    blind = case.request.method in WITHOUT_GRADIENT
     use = "part of the error" if blind else "retrieved, or part of the error"
     reason = f"backscatter may vary horizontally: {use}"
     if directions.surround and directions.pattern.startswith("a volume"):
@@ -220,7 +216,7 @@ def _gradient(case: Case, directions: Beams) -> Entry:
 def _gradient_regressor(case: Case, directions: Beams) -> Entry:
     """Fit a horizontal gradient where beams point to all sides."""
     name, method = "gradient_regressor", case.request.method
-    if method in _BLIND:
+    if method in WITHOUT_GRADIENT:
         return case.leave(name, f"method {method} fits no horizontal gradient")
     if not directions.sides_known:
         reason = "headers give no azimuths: all beams are assumed to point to one side"
@@ -239,7 +235,7 @@ def _gradient_regressor(case: Case, directions: Beams) -> Entry:
 def _vertical(case: Case, directions: Beams) -> Entry:
     """Regularise the profile along altitude where the method treats altitudes together."""
     settings, count = case.request, directions.count
-    if settings.method in _SIMPLE:
+    if settings.method not in ("auto", "joint"):
         reason = f"method {settings.method} treats each altitude independently"
         return case.leave("vertical", reason)
     if settings.method == "auto" and count <= 2:
@@ -252,7 +248,7 @@ def _vertical(case: Case, directions: Beams) -> Entry:
 def _correlation(case: Case, directions: Beams) -> Entry:
     """Include the correlation of errors along altitude where redundant beams can show it."""
     spare, method = float(directions.count - 2), case.request.method
-    if method in _DIFFERENTIATING:
+    if method in REGULARISED:
         reason = f"method {method} assumes independent errors at different altitudes"
         return case.leave("correlation", reason)
     if spare <= 0:
@@ -416,8 +412,7 @@ class _Scans(ProductStream):
             background_method=BACKGROUND_METHOD.code(self._background.method),
         )
         # Beside those of all methods.
-        differentiates = self._settings.method in _DIFFERENTIATING
-        papers = [MULTIANGLE_PAPER] if differentiates else []
+        papers = [MULTIANGLE_PAPER] if settings.method in REGULARISED else []
         papers += [KNOWN_SHAPE_PAPERS] if self._known_shape else []
         if papers:
             optical_depth = optical_depth.assign_attrs(references="\n".join(papers))

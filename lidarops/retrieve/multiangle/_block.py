@@ -7,35 +7,37 @@ keeping high ones would be the largest error of all.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Indices
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
+from lidarops.retrieve.multiangle.altitude_correlation import windowed
 from lidarops.retrieve.multiangle.slant_paths import Scan, surrounds_zenith
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _FIRST_GUESS: Final = 0.03**2
 """Variance of the inhomogeneity with which the first fit is weighted; the estimate does not depend
 on it, but for its noise."""
-_FEW: Final = 16
-"""Profiles of a long block from which the first of two estimates is made."""
-_AROUND: Final = 3
-"""Windows ahead that make the window around an altitude."""
-_LARGEST_RATIO: Final = 1.0 / THRESHOLDS.lowest_snr**2
+_STEPS: Final = 2
+"""Fits from which the inhomogeneity is estimated."""
+_TYPICAL: Final = 32
+"""Most profiles from which what a block has in common is estimated: every n-th."""
+_LARGEST_RATIO: Final = 1.0 / THRESHOLDS.unweighted_snr**2
 """Largest variance over squared signal for which the moments of the logarithm are corrected: their
 series diverges for larger ones."""
-_LEAST_NOISE: Final = 1e-6
-"""Noise over signal where the stated variance is smaller, such as 0."""
+_LEAST_NOISE: Final = 1e-12
+"""Variance over squared signal where the stated variance is smaller, such as 0."""
 _FARTHEST: Final = 3.0
 """Standard deviations by which the expected signal may differ from the sample."""
 _PAD: Final = 2
 """Altitudes without data at either end of a row."""
+_DEPENDENT: Final = 1e-8
+"""Squared length of the shorter axis of horizontal distances, over that of the longer one, up to
+which beams lie in one vertical plane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +48,13 @@ class BeamBlock:
     """(profile, angle, altitude); 0 where there is no sample."""
     noise: Array
     """Their variances; inf where there is no sample."""
-    design: Array
-    """(3, angle, altitude), finite: horizontal distance over altitude, eastward and northward, and
-    slant path."""
+    columns: Array
+    """(column, angle, altitude), finite: ones, slant path, and horizontal distance over altitude
+    along the axes of the scan, the longer one first; one if beams lie in one vertical plane."""
     alive: Indices
     """(profile, altitude): number of beams not yet lost in noise."""
     sides: bool
-    """Whether beams point to all sides."""
+    """Whether beams point to all sides, so that horizontal gradients are fitted."""
     needed: int
     """Beams that an altitude needs to be within the reach."""
     dead_time_change: Array | None = None
@@ -61,7 +63,19 @@ class BeamBlock:
     @property
     def path(self) -> Array:
         """Slant path, (angle, altitude)."""
-        return np.asarray(self.design[2])
+        return np.asarray(self.columns[1])
+
+    @property
+    def axes(self) -> Array:
+        """Distances along the axes, (axis, angle, altitude)."""
+        return np.asarray(self.columns[2:])
+
+    def typical(self) -> BeamBlock:
+        """Return the profiles from which what a block has in common is estimated."""
+        every = every_nth(len(self.noise))
+        return replace(
+            self, logarithm=self.logarithm[every], noise=self.noise[every], alive=self.alive[every]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +97,14 @@ class Regression:
         """Return one column as (profile, altitude)."""
         return self.table[:, number]
 
+    def typical(self) -> Regression:
+        """Return the fit of `BeamBlock.typical`."""
+        every = every_nth(len(self.table))
+        return replace(
+            self, table=self.table[every], residual=self.residual[every],
+            leverage=self.leverage[every],
+        )  # fmt: skip
+
     def within(self, beams: BeamBlock) -> Booleans:
         """Return where the beams that are needed are alive and give an optical depth."""
         return np.asarray((beams.alive >= beams.needed) & np.isfinite(self.column(kh.TAU)))
@@ -98,6 +120,11 @@ class Regression:
         return np.asarray(np.clip(both, -1.0, 1.0))
 
 
+def every_nth(profiles: int) -> slice:
+    """Return every n-th profile, so that at most 32 are left."""
+    return slice(None, None, max(-(-profiles // _TYPICAL), 1))
+
+
 def make_beam_block(
     signal: Array, variance: Array, scan: Scan, dead_time_change: Array | None = None
 ) -> BeamBlock:
@@ -109,20 +136,36 @@ def make_beam_block(
     scan : Scan
     dead_time_change : (profile, angle, altitude) float, optional
     """
-    logarithm = np.empty(signal.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithm = np.log(signal)
     noise = np.empty(signal.shape)
-    alive = np.empty((len(signal), signal.shape[-1]), dtype=np.int64)
+    alive = np.zeros((len(signal), signal.shape[-1]), dtype=np.int64)
     take_logarithms(signal, variance, scan.usable, logarithm, noise, alive)
+    distances = np.stack([np.nan_to_num(scan.east), np.nan_to_num(scan.north)])
     return BeamBlock(
         logarithm,
         noise,
-        np.stack(
-            [np.nan_to_num(scan.east), np.nan_to_num(scan.north), np.nan_to_num(scan.path, nan=1.0)]
-        ),
+        fit_columns(np.nan_to_num(scan.path, nan=1.0), distances),
         alive,
         surrounds_zenith(scan.tilted_azimuths),
         min(3, max(int(scan.usable.sum()), 2)),
         dead_time_change,
+    )
+
+
+def fit_columns(path: Array, distances: Array) -> Array:
+    """Return the columns of a fit, see `BeamBlock`.
+
+    Parameters
+    ----------
+    path : (angle, altitude) float
+    distances : (2, angle, altitude) float
+        To the east and north.
+    """
+    lengths, axes = np.linalg.eigh(np.einsum("iak,jak->ij", distances, distances))
+    longest = axes.T[::-1][: 1 + int(lengths[0] > _DEPENDENT * lengths[1])]
+    return np.concatenate(
+        [[np.ones_like(path), path], np.einsum("ij,jak->iak", longest, distances)]
     )
 
 
@@ -134,47 +177,49 @@ def regress(beams: BeamBlock, inhomogeneity: float | None) -> Regression:
     beams : BeamBlock
     inhomogeneity : float, optional
         Standard deviation of the logarithms on top of the noise; estimated from the residuals
-        of a first fit if not given.
+        of the typical profiles if not given.
     """
     altitudes = beams.noise.shape[2]
     if inhomogeneity is not None:
         return refit(beams, np.full(altitudes, inhomogeneity**2), np.zeros(altitudes))
     variance, freedom = np.full(altitudes, _FIRST_GUESS), np.zeros(altitudes)
-    nothing = np.empty((0, *beams.noise.shape[1:]))
-    # The first step, which only gives the weights of the second, needs few profiles.
-    for every in (max(len(beams.noise) // _FEW, 1), 1):
-        table = _table(beams, variance, nothing, nothing, every)
-        variance, freedom = _dersimonian_laird(table, variance)
+    some = beams.typical()
+    for _ in range(_STEPS):
+        variance, freedom = _dersimonian_laird(refit(some, variance, freedom))
     return refit(beams, variance, freedom)
 
 
-def refit(beams: BeamBlock, inhomogeneity: Array, freedom: Array) -> Regression:
-    """Fit with a given variance of the inhomogeneity and its degrees of freedom."""
-    residual, leverage = np.empty(beams.noise.shape), np.empty(beams.noise.shape)
-    table = _table(beams, inhomogeneity, residual, leverage)
+def refit(
+    beams: BeamBlock,
+    inhomogeneity: Array,
+    freedom: Array,
+    most_added: float = THRESHOLDS.gradient_variance,
+) -> Regression:
+    """Fit with a given variance of the inhomogeneity and its degrees of freedom.
+
+    A gradient is fitted where that adds at most a multiple of the variance of the optical depth.
+    """
+    centre = beams.columns.mean(axis=1)
+    centre[0] = 0.0
+    design = (beams.columns - centre[:, np.newaxis]).swapaxes(0, 1).copy()
+    logarithm, noise = (np.ascontiguousarray(part) for part in (beams.logarithm, beams.noise))
+    residual, leverage = np.empty(noise.shape), np.empty(noise.shape)
+    table = np.empty((len(noise), kh.COLUMNS, noise.shape[2]))
+    kh.fit_levels(
+        logarithm, noise, inhomogeneity, design, centre, most_added if beams.sides else -1.0,
+        table, residual, leverage,
+    )  # fmt: skip
     return Regression(table, inhomogeneity, freedom, residual, leverage)
 
 
-def _table(
-    beams: BeamBlock, variance: Array, residual: Array, leverage: Array, every: int = 1
-) -> Array:
-    """Return the fit of every n-th profile, and fill residuals and leverages if they have rows."""
-    logarithm, noise = (
-        np.ascontiguousarray(values[::every]) for values in (beams.logarithm, beams.noise)
-    )
-    table = np.empty((len(noise), kh.COLUMNS, noise.shape[2]))
-    kh.fit_levels(logarithm, noise, variance, beams.design, beams.sides, table, residual, leverage)
-    return table
-
-
-def _dersimonian_laird(table: Array, before: Array) -> tuple[Array, Array]:
+def _dersimonian_laird(fit: Regression) -> tuple[Array, Array]:
     """Return the variance of the inhomogeneity, formula 4 of the page, and its degrees of freedom.
 
     Pooled over the block and a window of altitudes (`dersimonian1986`).
     """
-    freedom = windowed(table[:, kh.FREEDOM].sum(axis=0))
-    trace = table[:, kh.TRACE].sum(axis=0)
-    excess = (table[:, kh.CHI2] - table[:, kh.FREEDOM]).sum(axis=0)
+    before, freedom = fit.inhomogeneity, pooled_freedom(fit)
+    trace = fit.column(kh.TRACE).sum(axis=0)
+    excess = (fit.column(kh.CHI2) - fit.column(kh.FREEDOM)).sum(axis=0)
     whole, total = windowed(trace), windowed(before * trace + excess)
     known = whole > 0.0
     if not np.any(known):
@@ -182,13 +227,6 @@ def _dersimonian_laird(table: Array, before: Array) -> tuple[Array, Array]:
     variance = np.maximum(total[known] / whole[known], 0.0)
     altitudes = np.arange(before.size)
     return np.interp(altitudes, altitudes[known], variance), freedom
-
-
-def windowed(values: Array) -> Array:
-    """Return sums over the window around each altitude, cut at the ends of the grid."""
-    half = THRESHOLDS.pooled // 2
-    padded = np.pad(values, half)
-    return np.asarray(sliding_window_view(padded, 2 * half + 1).sum(axis=1))
 
 
 def pooled_freedom(fit: Regression) -> Array:
@@ -202,8 +240,15 @@ def student_factor(freedom: Array) -> Array:
     return np.where(freedom > 0, np.sqrt(nu / (nu - 2.0)), 1.0)
 
 
+def strong_samples(beams: BeamBlock) -> BeamBlock:
+    """Return only the samples that methods without weights can use."""
+    strong = beams.noise < _LARGEST_RATIO
+    return replace(beams, noise=np.where(strong, beams.noise, np.inf))
+
+
 def end_beams(beams: BeamBlock) -> BeamBlock:
     """Return only the beams with the shortest and the longest path at every altitude."""
+    beams = strong_samples(beams)
     on = beams.noise < np.inf
     shortest = np.where(on, beams.path, np.inf)
     longest = np.where(on, beams.path, -np.inf)
@@ -227,107 +272,65 @@ def _clean(signal: Array, variance: Array, row: Array) -> None:
 
 
 @compiled
-def _window_sums(row: Array, size: int, step: int, sums: Array) -> int:
-    """Fill the sums of every `step`-th value of windows, and return the number of windows."""
-    starts = row.shape[1] - (size - 1) * step
+def _fill_sums(row: Array, sums: Array) -> None:
+    """Fill the sums over the altitudes from two below to two above each."""
     for i in range(row.shape[0]):
-        total = sums[i, :starts]
-        total[:] = 0.0
-        for shift in range(0, size * step, step):
-            values = row[i, shift : shift + starts]
-            for k in range(starts):
-                total[k] += values[k]
-    return int(starts)
+        total, values = sums[i], row[i]
+        for k in range(total.size):
+            total[k] = values[k] + values[k + 1] + values[k + 2] + values[k + 3] + values[k + 4]
 
 
 @compiled
-def _first_loss(sums: Array, windows: int, before: int, altitudes: int, lowest: float) -> int:
-    """Return the first altitude where the mean signal of the window is below `lowest` times noise.
-
-    The window begins `before` altitudes below, and is moved inside the grid.
-    """
+def _end(sums: Array) -> int:
+    """Return the first altitude of a beam from which the signal is lost in noise."""
+    altitudes = sums.shape[1]
     for k in range(altitudes):
-        j = max(min(k - before, windows - 1), 0)
-        lost = not sums[0, j] > lowest * math.sqrt(sums[1, j] * sums[2, j])
-        if lost and sums[2, j] > 0.0:
+        # The window begins at the altitude, and is moved inside the grid.
+        j = min(k + _PAD, max(altitudes - 1 - _PAD, (altitudes - 1) // 2))
+        least = THRESHOLDS.lowest_snr**2 * sums[1, j] * sums[2, j]
+        if sums[2, j] > 0.0 and not (sums[0, j] > 0.0 and sums[0, j] * sums[0, j] > least):
             return k
     return int(altitudes)
-
-
-@compiled
-def _end(row: Array, ahead: Array, around: Array) -> int:
-    """Return the first altitude of a beam that is lost in noise."""
-    altitudes, size = row.shape[1], THRESHOLDS.ahead
-    windows = _window_sums(row, min(size, altitudes), 1, ahead)
-    end = _first_loss(ahead, windows, 0, altitudes, THRESHOLDS.swallowed_snr)
-    if altitudes < _AROUND * size:
-        windows = _window_sums(row, altitudes, 1, around)
-    else:
-        windows = _window_sums(ahead[:, :windows], _AROUND, size, around)
-    before = _AROUND * size // 2
-    return min(end, _first_loss(around, windows, before, altitudes, THRESHOLDS.lowest_snr))
-
-
-@compiled
-def _neighbours(row: Array, levels: Array, roots: Array) -> None:
-    """Fill the means of pairs of neighbours that have data, 0 where not positive, and the roots."""
-    for j in range(levels.size):
-        total = row[0, j] + row[0, j + 1]
-        levels[j] = total / (row[2, j] + row[2, j + 1]) if total > 0.0 else 0.0
-        roots[j] = math.sqrt(levels[j])
-
-
-@compiled
-def _ratios(row: Array, levels: Array, roots: Array, ratio: Array) -> None:
-    """Fill the variances over the squares of the signals expected from the neighbours.
-
-    The geometric mean of both sides is exact for an exponential decay.
-    """
-    for k in range(ratio.size):
-        own, spread = row[0, k + _PAD], math.sqrt(row[1, k + _PAD])
-        guess = roots[k] * roots[k + 3]
-        guess = guess if guess > 0.0 else max(levels[k], levels[k + 3])
-        slack = _FARTHEST * spread
-        guess = own if guess == 0.0 else min(max(guess, own - slack), own + slack)
-        relative = max(spread / guess, _LEAST_NOISE)
-        ratio[k] = relative * relative
 
 
 @compiled
 def take_logarithms(
     signal: Array, variance: Array, usable: Booleans, logarithm: Array, noise: Array, alive: Indices
 ) -> None:
-    """Take the logarithms of range-corrected signals without the bias caused by noise.
+    """Correct the logarithms of range-corrected signals for the bias caused by noise.
 
-    Formula 3 of ``docs/algorithms/multiangle.md``; the expectation of the signal is estimated from
-    neighbouring altitudes.
+    Formula 3 of ``docs/algorithms/multiangle.md``; the expectation of the signal is the mean of
+    two altitudes on either side.
 
     Parameters
     ----------
     signal, variance : (profile, angle, altitude) float
     usable : (angle,) bool
-    logarithm, noise : (profile, angle, altitude) float64
-        Outputs: the logarithms and their variances; 0 and inf where there is no sample.
+    logarithm : (profile, angle, altitude) float64
+        Corrected; 0 where there is no sample.
+    noise : (profile, angle, altitude) float64
+        Output: variances of the logarithms; inf where there is no sample.
     alive : (profile, altitude) int
-        Output: number of beams that are not yet lost in noise.
+        Increased by the number of beams that are not yet lost in noise.
     """
     count, angles, altitudes = signal.shape
-    row, ratio = np.zeros((3, altitudes + 2 * _PAD)), np.empty(altitudes)
-    ahead, around = np.empty((3, altitudes)), np.empty((3, altitudes))
-    levels, roots = np.empty(altitudes + 3), np.empty(altitudes + 3)
-    inside = row[:, _PAD : altitudes + _PAD]
-    alive[:] = 0
+    row, sums = np.zeros((3, altitudes + 2 * _PAD)), np.empty((3, altitudes))
     for t in range(count):
         for a in range(angles):
             _clean(signal[t, a], variance[t, a], row)
-            end = _end(inside, ahead, around) if usable[a] else 0
+            _fill_sums(row, sums)
+            end = _end(sums) if usable[a] else 0
             alive[t, :end] += 1
-            _neighbours(row, levels, roots)
-            _ratios(row, levels, roots, ratio)
+            y, v = logarithm[t, a], noise[t, a]
             for k in range(altitudes):
-                logarithm[t, a, k] = 0.0
-                noise[t, a, k] = np.inf
-                if k < end and inside[0, k] > 0.0:
-                    known = min(ratio[k], _LARGEST_RATIO)
-                    noise[t, a, k] = ratio[k] * (1.0 + 2.5 * known)
-                    logarithm[t, a, k] = math.log(inside[0, k]) + known * (0.5 + 0.75 * known)
+                own, spread = row[0, k + _PAD], row[1, k + _PAD]
+                around, others = sums[0, k] - own, sums[2, k] - row[2, k + _PAD]
+                spread = (sums[1, k] - spread) / others if others > 0.0 else spread
+                slack = _FARTHEST * np.sqrt(spread)
+                guess = around / others if around > 0.0 else own
+                guess = min(max(guess, own - slack), own + slack)
+                ratio = max(spread / (guess * guess), _LEAST_NOISE)
+                known = min(ratio, _LARGEST_RATIO)
+                on = k < end and own > 0.0
+                v[k] = ratio * (1.0 + 2.5 * known) if on else np.inf
+                y[k] = y[k] + known * (0.5 + 0.75 * known) if on else 0.0

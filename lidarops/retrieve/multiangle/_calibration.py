@@ -5,109 +5,123 @@ Formula numbers are those of ``docs/algorithms/vertical.md``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
 from lidarops.retrieve.multiangle import _smoothing
+from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, decayed_sums
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
-_COMPUTED: Final = 48
-"""Most differences that are computed, not interpolated: factors on errors become up to 2 percent
-smaller, beside a gap up to 14."""
 
+class Sandwich(NamedTuple):
+    """A profile that represents all of a block in quantities that depend on weights only.
 
-@dataclass(frozen=True, slots=True)
-class Typical:
-    """A profile that represents all of a block in quantities that depend on weights only."""
-
-    bands: Array
-    """(2, altitude): its precision."""
-    information: Array
-    """(altitude,): 0 where there is no estimate."""
-    shared: Array
-    """(altitude - 1,): correlation of its noise at neighbouring altitudes in equal air."""
-    correlation: float
-    """Correlation of the correlated noise at neighbouring altitudes."""
-    stiffness: Array
-    """(3, altitude): bands of the penalty on roughness."""
-    smoothing: float
-    """Weight of the penalty, in the unit of the system."""
-
-
-def sandwich(typical: Typical, upper: Integers, lower: Integers) -> Array:
-    """Return posterior variances of differences of optical depths, and their components.
-
-    Formula 3 of ``docs/algorithms/vertical.md``. Of many differences, some are computed, more at
-    low altitudes, and those between them interpolated.
-
-    Parameters
-    ----------
-    typical : Typical
-    upper, lower : (difference,) int64
-        Altitudes in ascending order; -1 for the lidar.
-
-    Returns
-    -------
-    (5, difference) float64
-        Posterior variance, variance from noise and air, expected square of the smoothing error,
-        variance of the smoothing error estimated from the pilot, and variance from air alone.
+    Matrices over altitudes, of which a column is that of one optical depth.
     """
-    every = np.arange(upper.size)
-    some = every
-    if every.size > _COMPUTED:
-        places = every[-1] * np.linspace(0.0, 1.0, _COMPUTED) ** 2
-        some = np.unique(np.rint(places).astype(np.int64))
-    bands, each = typical.bands[:, np.newaxis], np.arange(some.size)
-    a = np.zeros((some.size, bands.shape[2]))
-    a[each, upper[some]] = 1.0
-    below = lower[some]
-    a[each[below >= 0], below[below >= 0]] = -1.0
-    solved = _inverse(typical, 1.0, a)
-    x = _smoothing.multiply_rows(bands, solved)
-    y = _smoothing.multiply_rows(bands, _inverse(typical, THRESHOLDS.pilot, a - x))
-    posterior = (a * solved).sum(axis=1)
-    model = np.maximum(posterior - (solved * x).sum(axis=1), 0.0)
-    (noise, air), of_pilot = _noise_and_air(typical, x), _noise_and_air(typical, y)
-    parts = posterior, noise + air, model, sum(of_pilot), air
-    return np.stack([np.interp(every, some, part) for part in parts])
 
+    inverse: Array
+    """Posterior covariance."""
+    data: Array
+    """Response of the optical depths to the estimates, transposed."""
+    pilot: Array
+    """The same of the change of the pilot solution by smoothing."""
+    noise: Array
+    """(3, altitude): variance of the errors of estimates that is their own, root of that which
+    they share with others, and its correlation at neighbouring altitudes."""
 
-def _inverse(typical: Typical, factor: float, rows: Array) -> Array:
-    """Return rows times the inverse of the system, with a multiple of its smoothing."""
-    count = len(rows)
-    out = np.empty((1, *rows.shape))
-    _smoothing.solve_banded(
-        np.broadcast_to(typical.bands[:, np.newaxis], (2, *rows.shape)).copy(),
-        rows, typical.stiffness, np.arange(count),
-        np.full(count, factor * typical.smoothing), out,
-    )  # fmt: skip
-    return np.asarray(out[0])
+    @classmethod
+    def of(
+        cls,
+        typical: tuple[Array, Array],
+        bands: Array,
+        correlation: float,
+        stiffness: Array,
+        weight: float,
+    ) -> Self:
+        """Return the matrices.
 
+        Parameters
+        ----------
+        typical : (altitude, 1) float, (altitude - 1, 1) float
+            Information, and correlation of errors at neighbouring altitudes in equal air.
+        bands : (2, altitude, 1) float
+            Precision of the same.
+        correlation : float
+            Of the air at neighbouring altitudes.
+        stiffness : (3, altitude) float
+        weight : float
+            Of the penalty.
+        """
+        information, shared = typical
+        every = np.eye(len(information))
+        repeated = np.repeat(bands, len(every), axis=2)
+        factors, rough = (
+            _smoothing.factor_bands(repeated, stiffness, np.full(len(every), times * weight))
+            for times in (1.0, THRESHOLDS.pilot)
+        )
+        inverse = _smoothing.solve_bands(factors, every)
+        data = _smoothing.multiply(bands, inverse)
+        pilot = _smoothing.multiply(bands, _smoothing.solve_bands(rough, every - data))
+        known = information[:, 0] > 0.0
+        variance = np.where(known, 1.0 / np.where(known, information[:, 0], 1.0), 0.0)
+        # Neighbours of the ends are as those of the altitudes beside them.
+        beside = shared[:, 0] if len(shared) else np.zeros(1)
+        share = np.convolve(np.pad(beside, 1, mode="edge"), [0.5, 0.5], mode="valid")
+        share = share[: variance.size]
+        noise = np.stack(
+            [variance * (1.0 - share), np.sqrt(variance * share), np.full(share.size, correlation)]
+        )
+        return cls(inverse, data, pilot, noise)
 
-def _noise_and_air(typical: Typical, y: Array) -> tuple[Array, Array]:
-    """Return the parts of y'Vy of each row: the share of the air decays with the distance."""
-    known = typical.information > 0.0
-    error = np.where(known, 1.0 / np.sqrt(np.where(known, typical.information, 1.0)), 0.0)
-    from scipy.signal import lfilter  # noqa: PLC0415 - loads a third of a second of other modules
+    def parts(self, upper: Integers, lower: Integers) -> Array:
+        """Return posterior variances of differences of optical depths, and their components.
 
-    # Neighbours of the ends are as those of the altitudes beside them.
-    shared = typical.shared if typical.shared.size else np.zeros(1)
-    share = np.convolve(np.pad(shared, 1, mode="edge"), [0.5, 0.5], mode="valid")[: y.shape[1]]
-    own, common = (y * error) ** 2 * (1.0 - share), y * error * np.sqrt(share)
-    decay = typical.correlation
-    tail = lfilter([0.0, decay], [1.0, -decay], common, axis=1)
-    return own.sum(axis=1), (common * (common + 2.0 * tail)).sum(axis=1)
+        Formula 3 of ``docs/algorithms/vertical.md``.
+
+        Parameters
+        ----------
+        upper, lower : (difference,) int64
+            Altitudes in ascending order; -1 for the lidar.
+
+        Returns
+        -------
+        (5, difference) float64
+            Posterior variance, variance from noise and air, expected square of the smoothing error,
+            variance of the smoothing error estimated from the pilot, and variance from air alone.
+        """
+        each = np.arange(upper.size)
+
+        def between(matrix: Array) -> Array:
+            return matrix[:, upper] - np.where(lower >= 0, matrix[:, np.maximum(lower, 0)], 0.0)
+
+        solved, x, y = (between(matrix) for matrix in (self.inverse, self.data, self.pilot))
+        posterior = solved[upper, each] - np.where(lower >= 0, solved[lower, each], 0.0)
+        model = np.maximum(posterior - (solved * x).sum(axis=0), 0.0)
+        (noise, air), of_pilot = self._noise_and_air(x), self._noise_and_air(y)
+        return np.stack([posterior, noise + air, model, sum(of_pilot), air])
+
+    def _noise_and_air(self, y: Array) -> tuple[Array, Array]:
+        """Return the parts of y'Vy of each column: the share of the air decays with distance."""
+        own, root, decay = self.noise[:, :, np.newaxis]
+        common = root * y
+        linked = np.ones((len(y) - 1, y.shape[1]), dtype=np.bool_)
+        tail = decayed_sums(common, linked, float(decay[0, 0]))
+        return (own * y**2).sum(axis=0), (common * (common + 2.0 * tail)).sum(axis=0)
 
 
 def typical_profile(information: Array, shared: Array) -> tuple[Array, Array]:
-    """Return means over the profiles of a block, of information and of what neighbours share."""
+    """Return means over the profiles of a block, of information and of what neighbours share.
+
+    Parameters and results are (altitude, profile).
+    """
     used = information > 0.0
-    linked = used[:, 1:] & used[:, :-1]
-    mean = np.where(linked, shared, 0.0).sum(axis=0) / np.maximum(linked.sum(axis=0), 1)
-    return information.sum(axis=0) / np.maximum(used.sum(axis=0), 1), np.maximum(mean, 0.0)
+    linked = used[1:] & used[:-1]
+    count = np.maximum(linked.sum(axis=1, keepdims=True), 1)
+    mean = np.where(linked, shared, 0.0).sum(axis=1, keepdims=True) / count
+    whole = information.sum(axis=1, keepdims=True)
+    return whole / np.maximum(used.sum(axis=1, keepdims=True), 1), np.maximum(mean, 0.0)
 
 
 def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
@@ -132,7 +146,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     square = np.where(reached, depth[:, tops] ** 2, np.nan)
     noise = np.where(reached, variance[:, tops], np.nan)
     # The median, because the square of a single noisy profile may exceed all others.
-    usual = np.maximum(np.nanmedian(square, axis=0), np.finfo(np.float64).tiny)
+    usual = np.maximum(_median(square, reached.sum(axis=0)), np.finfo(np.float64).tiny)
     weight = (usual / (usual + noise)) ** 2
     total = np.nansum(weight, axis=0)
     # Zero if no profile is known, or most have no optical depth at all.
@@ -143,6 +157,12 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     known = np.isfinite(own_square) & np.isfinite(usual_square) & (usual_square > 0.0)
     relative = np.where(known, own_square, 1.0) / np.where(known, usual_square, 1.0)
     return np.asarray(np.maximum(relative, THRESHOLDS.least_scale))
+
+
+def _median(values: Array, count: Integers) -> Array:
+    """Return the median of the first axis, of which `count` values are no NaN."""
+    ordered, each = np.sort(values, axis=0), np.arange(count.size)
+    return np.asarray(0.5 * (ordered[(count - 1) // 2, each] + ordered[count // 2, each]))
 
 
 def _smoothing_square(bias: Array, known: Array) -> Array:
@@ -175,21 +195,42 @@ def _trust(signal: Array, variance: Array) -> Array:
     return np.asarray(signal**2 / np.maximum(signal**2 + variance, np.finfo(np.float64).tiny))
 
 
-def variance_ratio(known: Array, bias: Array, scale: Array) -> Array:
-    """Return calibrated over posterior variance of differences of optical depths.
+class Calibration(NamedTuple):
+    """Variances of differences of optical depths over posterior ones."""
 
-    Parameters
-    ----------
-    known : (5, difference) float64
-        From `sandwich`.
-    bias : (profile, difference) float64
-        Pilot solution minus its smoothed form; NaN beyond the reach.
-    scale : (profile,) float64
-        From `relative_squares`.
+    sandwich: Sandwich
+    inflation: Array
+    """(altitude,): factor because noise is estimated from a window of residuals."""
+    change: Array | None
+    """(profile, altitude): pilot solution minus its smoothed form; NaN beyond the reach. None if
+    the block is too small for a calibration."""
+    scale: Array
+    """(profile,): from `relative_squares`."""
 
-    Returns
-    -------
-    (profile, difference) float64
-    """
-    square = scale[:, np.newaxis] * _smoothing_square(bias, known)
-    return np.asarray((known[1] + square) / known[0])
+    def factors(self, upper: Integers, lower: Integers) -> tuple[Array, Array]:
+        """Return the factors on variances, (profile or 1, difference), and those of the air alone.
+
+        Parameters
+        ----------
+        upper, lower : (difference,) int64
+            Altitudes in ascending order; -1 for the lidar.
+        """
+        known = self.sandwich.parts(upper, lower)
+        below = lower >= 0
+        few = np.maximum(
+            self.inflation[upper], np.where(below, self.inflation[np.maximum(lower, 0)], 1.0)
+        )
+        square = known[2]
+        if self.change is not None:
+            beside = np.where(below, self.change[:, np.maximum(lower, 0)], 0.0)
+            bias = self.change[:, upper] - beside
+            square = self.scale[:, np.newaxis] * _smoothing_square(bias, known)
+        return few * (known[1] + np.atleast_2d(square)) / known[0], few * known[4] / known[0]
+
+
+def inflation(noise: AltitudeNoise) -> Array:
+    """Return the factor on variances because noise is estimated from a window of residuals."""
+    square = noise.correlation**2
+    known = noise.freedom * (1.0 - square) / (1.0 + square)
+    known = np.maximum(known, THRESHOLDS.fewest_freedom)
+    return np.asarray(known / (known - 2.0))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -29,81 +28,8 @@ class AltitudeNoise:
         return AltitudeNoise(self.correlation, self.shared[profiles], self.freedom)
 
 
-@compiled
-def _traces(sums: Array, joint: Array, sides: Array, k: int) -> float:
-    """Return the trace of the product of what the fits of an altitude and the next leave.
-
-    For beams of equal weight, of which some may be missing at one of both.
-
-    Parameters
-    ----------
-    sums : (3, altitude) float
-        Number of beams, and sums of their paths and squared paths.
-    joint : (4, altitude) float
-        The same of the beams at both, and the sum of 1 minus both leverages.
-    sides : (altitude,) float
-        Number of gradients that are fitted.
-    k : int
-    """
-    n, after, both = sums[0, k], sums[0, k + 1], joint[0, k]
-    mean, mean_after = sums[1, k] / n, sums[1, k + 1] / after
-    square = sums[2, k] - n * mean * mean
-    square_after = sums[2, k + 1] - after * mean_after * mean_after
-    line = joint[1, k] - both * mean
-    line_after = joint[1, k] - both * mean_after
-    slope = joint[2, k] - (mean + mean_after) * joint[1, k] + both * mean * mean_after
-    lost = both**2 / (n * after) + line_after**2 / (n * square_after)
-    lost += line**2 / (after * square) + slope**2 / (square * square_after)
-    return float(joint[3, k] + lost + min(sides[k], sides[k + 1]))
-
-
-@compiled
-def _neighbour_products(
-    residual: Array, noise: Array, leverage: Array, variance: Array, path: Array, sides: Array
-) -> tuple[float, float]:
-    """Return the weighted sum of products of neighbours, and its expectation for equal air."""
-    profiles, beams, altitudes = residual.shape
-    value, free, weight = np.empty(altitudes), np.empty(altitudes), np.empty(altitudes)
-    sums, joint, pairs = (
-        np.empty((3, altitudes)),
-        np.empty((4, altitudes)),
-        np.empty((3, altitudes)),
-    )
-    scatter = np.sqrt(variance)
-    product = norm = 0.0
-    for t in range(profiles):
-        sums[:], joint[:], pairs[:] = 0.0, 0.0, 0.0
-        for beam in range(beams):
-            x = path[beam]
-            for k in range(altitudes):
-                used = noise[t, beam, k] < np.inf and leverage[t, beam, k] < 1.0
-                free[k] = math.sqrt(1.0 - leverage[t, beam, k]) if used else 0.0
-                weight[k] = scatter[k] * free[k] / (noise[t, beam, k] + variance[k])
-                value[k] = residual[t, beam, k] * weight[k] if weight[k] > 0.0 else 0.0
-                on = 1.0 if used else 0.0
-                sums[0, k] += on
-                sums[1, k] += on * x[k]
-                sums[2, k] += on * x[k] * x[k]
-            for k in range(altitudes - 1):
-                on = 1.0 if free[k] * free[k + 1] > 0.0 else 0.0
-                joint[0, k] += on
-                joint[1, k] += on * x[k]
-                joint[2, k] += on * x[k] * x[k]
-                joint[3, k] += on * (free[k] * free[k] + free[k + 1] * free[k + 1] - 1.0)
-                pairs[0, k] += free[k] * free[k + 1]
-                pairs[1, k] += value[k] * value[k + 1]
-                expected = weight[k] * weight[k + 1] * free[k] * free[k + 1]
-                pairs[2, k] += scatter[k] * scatter[k + 1] * expected
-        for k in range(altitudes - 1):
-            if pairs[2, k] > 0.0 and min(sums[0, k], sums[0, k + 1]) > 2.0:
-                share = _traces(sums, joint, sides[t], k) / pairs[0, k]
-                product += pairs[1, k]
-                norm += pairs[2, k] * min(max(share, 0.0), 1.0)
-    return product, norm
-
-
 def correlation_of_air(
-    residual: Array, noise: Array, leverage: Array, variance: Array, path: Array, sides: Array
+    residual: Array, noise: Array, leverage: Array, variance: Array, columns: Array
 ) -> float:
     r"""Return the correlation of the air at neighbouring altitudes, 0 to 0.98.
 
@@ -118,60 +44,89 @@ def correlation_of_air(
         Logarithm of the signal minus its fit, and the variance of its noise; NaN and infinite where
         a beam was not used.
     leverage : (profile, beam, altitude) float64
-        Diagonal of the hat matrix, :math:`h = w (1 / \sum w + (x - \bar x)^2 / S_{xx})`.
+        Diagonal of the hat matrix, 1 where a beam was not used.
     variance : (altitude,) float64
         Of the air, :math:`s^2`.
-    path : (beam, altitude) float64
-        Slant over vertical path.
-    sides : (profile, altitude) float64
-        Number of gradients that are fitted.
+    columns : (column, beam, altitude) float64
+        Of the fit: ones, slant path, and horizontal distances.
     """
-    product, norm = _neighbour_products(residual, noise, leverage, variance, path, sides)
-    return min(max(product / norm, 0.0), THRESHOLDS.most_correlated) if norm > 0.0 else 0.0
+    scatter, free = np.sqrt(variance), np.sqrt(np.maximum(1.0 - leverage, 0.0))
+    weight = scatter * free / (noise + variance)
+    value, expected = np.nan_to_num(residual) * weight, scatter * free * weight
+    products = (value[..., 1:] * value[..., :-1]).sum(axis=1)
+    norms = (expected[..., 1:] * expected[..., :-1]).sum(axis=1)
+    on = leverage < 1.0
+    beams = on.sum(axis=1)
+    pairs = (on[..., 1:] != on[..., :-1]).any(axis=1) & (norms > 0.0)
+    pairs &= np.minimum(beams[:, 1:], beams[:, :-1]) > len(columns)
+    if pairs.any():
+        norms[pairs] *= _common_share(on, leverage, columns, *np.nonzero(pairs))
+    norm = float(norms.sum())
+    return min(max(float(products.sum()) / norm, 0.0), THRESHOLDS.most_correlated) if norm else 0.0
 
 
-@compiled
-def _mean_covariances(information: Array, shared: Array, joint: Array) -> Booleans:
-    """Fill the covariances of neighbours in equal air, and return where both are known.
+def _common_share(on: Booleans, leverage: Array, columns: Array, t: Indices, k: Indices) -> Array:
+    """Return the trace of the product of what the fits of altitudes k and k + 1 leave.
 
-    They are means over 15 altitudes, weighted by information: where samples are missing, neighbours
-    see the air along different beams, but altitudes a few steps apart do not see less of it in
-    common. The first and the last place are those of neighbours outside the grid.
+    Over the sum of the roots of what they leave of each beam: 1 if they use the same beams. For
+    beams of equal weight.
     """
-    links, half = np.zeros(joint.size, np.bool_), THRESHOLDS.pooled // 2
-    both = np.zeros(joint.size)
-    for k in range(1, joint.size - 1):
-        both[k] = information[k - 1] * information[k]
-        links[k] = both[k] > 0.0
-    for k in range(joint.size):
-        total = weight = 0.0
-        for j in range(max(k - half, 1), min(k + half + 1, joint.size - 1)):
-            total += shared[j - 1] * math.sqrt(both[j])
-            weight += both[j]
-        joint[k] = max(total / weight, 0.0) if links[k] else 0.0
-    return links
+    bases = []
+    for j in (k, k + 1):
+        basis: list[Array] = []
+        for column in columns:
+            own = np.where(on[t, :, j], column[:, j].T, 0.0)
+            for other in basis:
+                own = own - (own * other).sum(axis=1, keepdims=True) * other
+            basis.append(own / np.sqrt((own**2).sum(axis=1, keepdims=True)))
+        bases.append(np.stack(basis))
+    left = 1.0 - leverage[t, :, k], 1.0 - leverage[t, :, k + 1]
+    both = on[t, :, k] & on[t, :, k + 1]
+    trace = np.where(both, left[0] + left[1] - 1.0, 0.0).sum(axis=1)
+    trace += np.square(np.einsum("ipb,jpb->pij", *bases)).sum(axis=(1, 2))
+    free = np.sqrt(np.maximum(left[0] * left[1], 0.0)).sum(axis=1)
+    return np.asarray(np.clip(trace / free, 0.0, 1.0))
 
 
 @compiled
-def _covariance_sums(
-    information: Array, joint: Array, links: Booleans, correlation: float, sums: Array
-) -> None:
-    """Fill the sums over the covariances of each error with itself and all that it is linked to."""
-    air, along = np.zeros(sums.size), 0.0
-    for k in range(sums.size):
-        n = (1.0 if links[k] else 0.0) + (1.0 if links[k + 1] else 0.0)
-        sums[k] = 1.0 / information[k] if information[k] > 0.0 else 0.0
-        air[k] = math.sqrt(min((joint[k] + joint[k + 1]) / max(n, 1.0), sums[k]))
-    for k in range(1, sums.size):
-        along = correlation * (along + air[k - 1]) if links[k] else 0.0
-        sums[k] += air[k] * along
-    along = 0.0
-    for k in range(sums.size - 2, -1, -1):
-        along = correlation * (along + air[k + 1]) if links[k + 1] else 0.0
-        sums[k] += air[k] * along
+def decayed_sums(values: Array, linked: Booleans, decay: float) -> Array:
+    """Return the sums of the values before, less by a factor for each step; 0 across a gap.
+
+    Parameters
+    ----------
+    values : (altitude, profile) float
+    linked : (altitude - 1, profile) bool
+        Whether an altitude is linked with the next.
+    decay : float
+    """
+    out = np.zeros_like(values)
+    for k in range(1, len(values)):
+        for t in range(values.shape[1]):
+            along = decay * (out[k - 1, t] + values[k - 1, t])
+            out[k, t] = along if linked[k - 1, t] else 0.0
+    return out
 
 
-@compiled
+def _mean_covariances(information: Array, shared: Array) -> Array:
+    """Return the covariances of neighbours in equal air, means over 15 altitudes.
+
+    Weighted by information: where samples are missing, neighbours see the air along different
+    beams, but altitudes a few steps apart do not see less of it in common.
+    """
+    both = information[1:] * information[:-1]
+    total, weight = (windowed(values) for values in (np.maximum(shared, 0.0) * np.sqrt(both), both))
+    return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.0))
+
+
+def windowed(values: Array) -> Array:
+    """Return sums over the window around each altitude, the first axis, cut at the ends."""
+    half, out = THRESHOLDS.pooled // 2, values.copy()
+    for step in range(1, half + 1):
+        out[step:] += values[:-step]
+        out[:-step] += values[step:]
+    return out
+
+
 def correlated_precision(information: Array, shared: Array, correlation: float) -> Array:
     """Return the precision of the estimates as a chain along altitude.
 
@@ -179,38 +134,38 @@ def correlated_precision(information: Array, shared: Array, correlation: float) 
 
     Parameters
     ----------
-    information : (profile, altitude) float64
+    information : (altitude, profile) float64
         0 where there is no estimate.
-    shared : (profile, altitude - 1) float64
+    shared : (altitude - 1, profile) float64
         See `AltitudeNoise`.
     correlation : float
         Of the air at neighbouring altitudes.
 
     Returns
     -------
-    (2, profile, altitude) float64
+    (2, altitude, profile) float64
         Diagonal, and the off-diagonal (of an altitude with the one above it).
     """
-    profiles, altitudes = information.shape
-    bands, joint = np.zeros((2, profiles, altitudes)), np.empty(altitudes + 1)
-    sums, far = np.empty(altitudes), 2.0 * correlation / (1.0 - correlation)
-    for t in range(profiles):
-        own = information[t]
-        links = _mean_covariances(own, shared[t], joint)
-        _covariance_sums(own, joint, links, correlation, sums)
-        for k in range(altitudes):
-            bands[0, t, k] = 1.0 if own[k] > 0.0 else 0.0
-        for k in range(altitudes - 1):
-            if links[k + 1]:
-                variance = 0.5 / own[k] + 0.5 / own[k + 1]
-                both = min(joint[k + 1], variance)
-                slow = 1.0 / (variance + both * far)
-                product = 2.0 * (variance - both * correlation) * slow
-                u = 0.125 * (product + math.sqrt(product * (product + 16.0)))
-                link = 0.25 * slow * (1.0 - u * u) / (u * u)
-                bands[0, t, k] += link * sums[k + 1]
-                bands[0, t, k + 1] += link * sums[k]
-                bands[1, t, k] = -link
-        for k in range(altitudes):
-            bands[0, t, k] /= sums[k] if own[k] > 0.0 else 1.0
+    known = information > 0.0
+    own = np.where(known, 1.0 / np.where(known, information, 1.0), 0.0)
+    links = known[1:] & known[:-1]
+    joint = np.where(links, _mean_covariances(information, shared), 0.0)
+    around = np.pad(np.stack([links, joint]), ((0, 0), (1, 1), (0, 0)))
+    count, both = around[:, 1:] + around[:, :-1]
+    air = np.sqrt(np.minimum(both / np.maximum(count, 1.0), own))
+    along = decayed_sums(air, links, correlation)
+    along += decayed_sums(air[::-1].copy(), links[::-1].copy(), correlation)[::-1]
+    sums = own + air * along
+    variance = np.where(links, 0.5 * (own[1:] + own[:-1]), 1.0)
+    both = np.minimum(joint, variance)
+    slow = 1.0 / (variance + both * 2.0 * correlation / (1.0 - correlation))
+    product = 2.0 * (variance - both * correlation) * slow
+    u = 0.125 * (product + np.sqrt(product * (product + 16.0)))
+    link = np.where(links, 0.25 * slow * (1.0 / (u * u) - 1.0), 0.0)
+    bands = np.zeros((2, *own.shape))
+    bands[0] = known
+    bands[0, :-1] += link * sums[1:]
+    bands[0, 1:] += link * sums[:-1]
+    bands[0] /= np.where(known, sums, 1.0)
+    bands[1, :-1] = -link
     return bands

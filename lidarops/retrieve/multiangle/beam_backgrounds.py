@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
-from lidarops.retrieve.multiangle._methods import MultiAngleResult
+from lidarops.retrieve.multiangle.optical_depth import MultiAngleResult
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 
@@ -100,16 +100,17 @@ class ScanSignals:
         retrieval : MultiAngleResult
             Of these signals.
         """
-        weight, change, residual = self._samples(retrieval)
-        fit = _Regression(weight, self.path)
+        lines = self._lines(retrieval)
+        weight, change = lines.weight, lines.change
         pull = weight * change
-        level = pull / np.sqrt(fit.total)[:, np.newaxis]
-        slope = pull * fit.arm / np.sqrt(fit.squares)[:, np.newaxis]
-        information = _diagonal(pull * change) - _outer(level) - _outer(slope)
-        misfit = (pull * fit.residual(residual)).sum(axis=-1)
+        level = pull / np.sqrt(lines.total)[:, np.newaxis]
+        slope = pull * lines.arm / np.sqrt(lines.squares)[:, np.newaxis]
+        whole = (pull * change).sum(axis=-1)[:, np.newaxis] * np.eye(pull.shape[1])
+        information = whole - sum(part @ np.swapaxes(part, 1, 2) for part in (level, slope))
+        misfit = (pull * lines.rest(lines.residual)).sum(axis=-1)
         # Without the backgrounds, which are common to all altitudes.
         background, _ = self._posterior(information, misfit)
-        rest = fit.residual(residual - change * background[..., np.newaxis])
+        rest = lines.rest(lines.residual - change * background[..., np.newaxis])
         together = _altitudes_together(rest * np.sqrt(weight))
         background, covariance = self._posterior(information / together, misfit / together)
         return replace(
@@ -130,9 +131,8 @@ class ScanSignals:
 
         It is carried by half the weighted regression of :math:`g_l \delta_l` on the slant path.
         """
-        weight, change, _ = self._samples(retrieval)
-        fit = _Regression(weight, self.path)
-        pull = 0.5 * weight * fit.arm * change / fit.squares[:, np.newaxis]
+        lines = self._lines(retrieval)
+        pull = 0.5 * lines.weight * lines.arm * lines.change / lines.squares[:, np.newaxis]
         square = np.einsum("tbz,tbc,tcz->tz", pull, self.covariance, pull)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
@@ -145,14 +145,13 @@ class ScanSignals:
             Of these signals.
         change : (time, beam, altitude) float
         """
-        weight, per_background, _ = self._samples(retrieval)
-        fit = _Regression(weight, self.path)
-        relative = per_background / self.response * np.nan_to_num(change)
-        slope = (weight * fit.arm * np.nan_to_num(relative)).sum(axis=1) / fit.squares
+        lines = self._lines(retrieval)
+        relative = lines.change / self.response * np.nan_to_num(change)
+        slope = (lines.weight * lines.arm * np.nan_to_num(relative)).sum(axis=1) / lines.squares
         return np.asarray(-0.5 * slope)
 
-    def _samples(self, retrieval: MultiAngleResult) -> tuple[Array, Array, Array]:
-        """Return weight, relative change per background, and residual; 0 where there is none."""
+    def _lines(self, retrieval: MultiAngleResult) -> _Lines:
+        """Return the samples of a retrieval, and the lines through them."""
         seen = np.isfinite(retrieval.residual)
         scatter = np.nan_to_num(retrieval.inhomogeneity)[:, np.newaxis] ** 2
         expected = self._expected(seen, retrieval.optical_depth, scatter)
@@ -164,7 +163,10 @@ class ScanSignals:
         weight, change, residual = (
             np.where(used, values, 0.0) for values in (weight, change, residual)
         )
-        return weight, change, residual
+        total = _infinite_where_zero(weight.sum(axis=1))
+        arm = self.path - ((weight * self.path).sum(axis=1) / total)[:, np.newaxis]
+        squares = _infinite_where_zero((weight * arm**2).sum(axis=1))
+        return _Lines(weight, change, residual, arm, total, squares)
 
     def _expected(self, seen: Booleans, optical_depth: Array, scatter: Array) -> Array:
         """Return the signals that fit best to the optical depths; NaN where there are none.
@@ -184,26 +186,29 @@ class ScanSignals:
             return np.where(expected > 0.0, expected, np.nan)
 
 
-class _Regression:
+class _Lines(NamedTuple):
     """Weighted straight lines over the slant path at each altitude of each cycle."""
 
-    def __init__(self, weight: Array, path: Array) -> None:
-        """Regress with weights (time, beam, altitude) on paths (beam, altitude)."""
-        self._weight = weight
-        self.total = _infinite_where_zero(weight.sum(axis=1))
-        """(time, altitude): sum of the weights; infinite where there is none."""
-        self.arm = path - ((weight * path).sum(axis=1) / self.total)[:, np.newaxis]
-        """(time, beam, altitude): path about its mean."""
-        self.squares = _infinite_where_zero((weight * self.arm**2).sum(axis=1))
-        """(time, altitude): weighted squares of the arms; infinite where there is none."""
+    weight: Array
+    """(time, beam, altitude): 0 where there is no sample."""
+    change: Array
+    """Of the logarithm, per background."""
+    residual: Array
+    """Of the signal, relative to the expected one."""
+    arm: Array
+    """Path about its mean."""
+    total: Array
+    """(time, altitude): sum of the weights; infinite where there is none."""
+    squares: Array
+    """(time, altitude): weighted squares of the arms; infinite where there is none."""
 
-    def residual(self, values: Array) -> Array:
+    def rest(self, values: Array) -> Array:
         """Return values minus their line."""
-        weighted = self._weight * values
+        weighted = self.weight * values
         level = weighted.sum(axis=1) / self.total
         slope = (weighted * self.arm).sum(axis=1) / self.squares
         line = level[:, np.newaxis] + slope[:, np.newaxis] * self.arm
-        return np.asarray(np.where(self._weight > 0.0, values - line, 0.0))
+        return np.asarray(np.where(self.weight > 0.0, values - line, 0.0))
 
 
 def _infinite_where_zero(values: Array) -> Array:
@@ -219,13 +224,3 @@ def _altitudes_together(scaled: Array) -> float:
         2.0 * products / squares if squares else 0.0, 0.0, THRESHOLDS.most_correlated
     )
     return float((1.0 + correlation) / (1.0 - correlation))
-
-
-def _diagonal(values: Array) -> Array:
-    """Return the sums over altitudes as diagonal matrices, (time, beam, beam)."""
-    return np.asarray(values.sum(axis=-1)[:, np.newaxis] * np.eye(values.shape[1]))
-
-
-def _outer(values: Array) -> Array:
-    """Return the sums over altitudes of outer products, (time, beam, beam)."""
-    return np.asarray(values @ np.swapaxes(values, 1, 2))

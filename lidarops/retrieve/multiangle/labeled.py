@@ -87,11 +87,6 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
     depth = nearest_rising(retrieval.optical_depth)
     values["monotone_vertical_optical_depth"] = (("time", "altitude"), depth)
     quality = _quality(retrieval)
-    texts = [
-        f"{step.step if step.ran else f'left out {step.step}'}: {step.reason}"
-        for step in retrieval.steps
-    ]
-    methods = set(optical_depth.MultiAngleMethod)
     product = xr.Dataset(
         {
             **values,
@@ -104,10 +99,7 @@ def retrieve_optical_depth(beams: xr.Dataset, settings: OpticalDepthSettings) ->
             "shots": beams["shots"],
         },
         coords={name: beams[name] for name in beams.coords},
-        attrs={
-            "steps": "; ".join(texts),
-            "method": next(s.step for s in retrieval.steps if s.ran and s.step in methods),
-        },
+        attrs={"steps": "; ".join(retrieval.steps), "method": retrieval.method},
     )
     product = product.assign(_plane_variables(signals, scan))
     product = product.assign(
@@ -161,10 +153,24 @@ class _Scan(NamedTuple):
         )
 
     def solve_with_errors(self, signals: ScanSignals, levels: Indices) -> MultiAngleResult:
-        """Return the result of the method, with errors by what the backgrounds may hold."""
+        """Return the result of the method, with errors by what the backgrounds may hold.
+
+        `levels` are the bottom and top of requested layers, 0 for the station and k + 1 for the
+        altitude k.
+        """
         retrieval = self.solve(signals)
         thickness = np.diff(self.altitude, prepend=self.settings.station_altitude)
-        return _with_background_errors(retrieval, signals, thickness, levels)
+        shift = np.pad(signals.shift(retrieval), ((0, 0), (1, 0)))
+        parts = {
+            "optical_depth": shift[:, 1:],
+            "extinction": np.diff(shift, axis=1) / thickness,
+            "layer_optical_depth": np.diff(shift[:, levels], axis=2)[..., 0],
+        }
+        errors = {f"{name}_standard_error": part for name, part in parts.items()}
+        return replace(
+            retrieval,
+            **{name: np.hypot(getattr(retrieval, name), part) for name, part in errors.items()},
+        )
 
 
 def _variable(field: str) -> str:
@@ -317,28 +323,3 @@ def _below_others(depth: Array, error: Array, good: Booleans) -> Booleans:
         most = THRESHOLDS.negative * np.hypot(error[:, k:], error[:, [k]])
         below[:, k:] |= known & (depth[:, [k]] - depth[:, k:] > most)
     return below
-
-
-def _with_background_errors(
-    retrieval: MultiAngleResult,
-    beams: ScanSignals,
-    thickness: Array,
-    levels: Indices,
-) -> MultiAngleResult:
-    """Return the result with standard errors that include signal in the background of all beams.
-
-    `thickness` is that of the layers between altitudes in m; `levels` are the bottom and top of
-    requested layers, 0 for the station and k + 1 for altitude k.
-    """
-    shift = np.pad(beams.shift(retrieval), ((0, 0), (1, 0)))
-    of_layers = np.diff(shift[:, levels], axis=2)[..., 0]
-    return replace(
-        retrieval,
-        optical_depth_standard_error=np.hypot(retrieval.optical_depth_standard_error, shift[:, 1:]),
-        extinction_standard_error=np.hypot(
-            retrieval.extinction_standard_error, np.diff(shift, axis=1) / thickness
-        ),
-        layer_optical_depth_standard_error=np.hypot(
-            retrieval.layer_optical_depth_standard_error, of_layers
-        ),
-    )

@@ -20,7 +20,7 @@ STRENGTHS: Final[Array] = 10.0 ** np.linspace(-6.0, 6.0, 97)
 """Strengths of the penalty to choose from; dimensionless, for paths scaled to a span of 1."""
 _SAME_NODE: Final = 1e-4
 """Distance of scaled slant paths up to which beams share a node."""
-_ESTIMATES: Final = 8
+_ESTIMATES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class MldEstimates:
     prior: Array
     """Optical depth to which the penalty pulls."""
     slopes: Array
-    """(2, profile, altitude): change of optical depth per unit of a gradient over altitude, to the
-    east and north."""
+    """(axis, profile, altitude): change of optical depth per unit of a gradient over altitude along
+    the axes of the scan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def solve_mld(
     """
     strengths = STRENGTHS if strength is None else np.array([strength])
     profiles, _, altitudes = beams.noise.shape
-    out = np.full((profiles, altitudes, _ESTIMATES), np.nan)
+    out = np.full((profiles, altitudes, _ESTIMATES + len(beams.axes)), np.nan)
     prior = np.zeros((profiles, 2))
     operators: dict[bytes, Operator] = {}
     for k in range(altitudes):
@@ -112,7 +112,7 @@ def solve_mld(
                 beams.logarithm[:, :, k][rows],
                 beams.noise[:, :, k][rows] + inhomogeneity[k],
                 path,
-                beams.design[:2, pattern, k],
+                beams.axes[:, pattern, k],
                 operators[key],
                 prior[members],
                 strengths,
@@ -141,7 +141,7 @@ def _solve_altitude(
     ----------
     y, variance : (profile, beam) float
     path : (beam,) float
-    distance : (2, beam) float
+    distance : (axis, beam) float
     operator : Operator
     prior : (profile, 2) float
         Optical depth and its variance.
@@ -150,7 +150,7 @@ def _solve_altitude(
 
     Returns
     -------
-    (profile, 8) float
+    (profile, 6 + axis) float
         Optical depth, variance, data share, degrees of freedom, strength, prior and slopes.
     """
     left = y + 2.0 * path * prior[:, :1]

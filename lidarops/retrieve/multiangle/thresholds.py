@@ -69,16 +69,16 @@ class Thresholds(NamedTuple):
     assumed."""
 
     # Samples (`_block`).
-    lowest_snr: float = 3.0
-    """Mean signal over noise of the altitudes around, below which a beam ends; by the bias in weak
-    light (`test_kano_hamilton`)."""
-    swallowed_snr: float = 2.0
-    """The same of the altitudes from one upwards: the wide window would accept samples behind a
-    cloud that swallows the beam; by the stiff case of optical depth 20."""
-    ahead: int = 5
-    """Altitudes of that mean, a third of those around; by the same case."""
+    lowest_snr: float = 1.5
+    """Signal over noise, means of an altitude and the next four, below which a beam ends; with 3,
+    optical depths in weak light are 15 percent less exact (`benchmarks.accuracy`, SNR 300), and
+    fewer have a value."""
 
-    # Fit at single altitudes (`_block`, `_methods`).
+    unweighted_snr: float = 3.0
+    """The same of a sample, below which methods without weights leave it out; with 1.5, optical
+    depths of "two_angle" and "mld_prior" are a fifth less exact (`benchmarks.accuracy`)."""
+
+    # Fit at single altitudes (`_block`, `optical_depth`).
     pooled: int = 15
     """Altitudes over which the inhomogeneity is pooled; assumed."""
     fewest_freedom: float = 4.1
@@ -96,7 +96,11 @@ class Thresholds(NamedTuple):
     """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
     alone in 2.3 percent of the altitudes where the air is clear."""
 
-    # Horizontal gradient (`_horizontal_variation`, `_methods`).
+    # Horizontal gradient (`_block`, `_horizontal_variation`, `optical_depth`).
+    gradient_variance: float = 9.0
+    """Variance of an optical depth that the fit of a gradient may add, over that without it: beams
+    to one side, as of a cycle that is cut short, add 11 to 800, those to both sides less than 9; by
+    geometry (`test_a_cycle_cut_short_fits_no_gradient_that_its_beams_cannot_tell`)."""
     gradient_window: float = 1000.0
     """m, window in which the residuals are tested for a gradient; assumed."""
     gradient_noise: float = 0.04

@@ -18,12 +18,12 @@ STATION = 35.0
 
 def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
     """Return precision bands, estimates, penalty and weights of random profiles."""
-    information = rng.uniform(1.0, 100.0, (profiles, heights))
-    information[rng.random((profiles, heights)) < missing] = 0.0
-    information[:, heights // 2] = 5.0
-    estimates = np.where(information > 0.0, rng.normal(size=(profiles, heights)), 0.0)
+    information = rng.uniform(1.0, 100.0, (heights, profiles))
+    information[rng.random((heights, profiles)) < missing] = 0.0
+    information[heights // 2] = 5.0
+    estimates = np.where(information > 0.0, rng.normal(size=(heights, profiles)), 0.0)
     bands = correlated_precision(
-        information, rng.uniform(0.3, 1.0, (profiles, heights - 1)), correlation
+        information, rng.uniform(0.3, 1.0, (heights - 1, profiles)), correlation
     )
     altitude = STATION + 120.0 + 30.0 * np.arange(heights)
     stiffness = _smoothing.penalty(altitude - STATION)
@@ -31,11 +31,10 @@ def systems(rng, profiles, heights, correlation=0.7, missing=0.2):
 
 
 def solved(bands, estimates, stiffness, lam):
-    profiles, heights = estimates.shape
-    out = np.empty((3, profiles, heights))
-    right = _smoothing.multiply_rows(bands, estimates)
-    _smoothing.solve_banded(bands, right, stiffness, np.arange(profiles), lam, out)
-    return out
+    """Return solution, diagonal and first off-diagonal of the inverse, (3, altitude, profile)."""
+    factors = _smoothing.factor_bands(bands, stiffness, lam)
+    right = _smoothing.multiply(bands, estimates)
+    return np.stack([_smoothing.solve_bands(factors, right), *_smoothing.invert_bands(factors)])
 
 
 @each("heights", [1, 2, 3, 7, 60])
@@ -45,32 +44,22 @@ def test_solution_and_inverse_equal_dense_algebra(heights, correlation):
     bands, estimates, stiffness, lam = systems(rng, 19, heights, correlation)
     out = solved(bands, estimates, stiffness, lam)
     for t in range(19):
-        weight = dense(bands[:, t])
+        weight = dense(bands[..., t])
         inverse = np.linalg.inv(weight + lam[t] * dense(stiffness))
         scale = np.abs(inverse).max()
-        np.testing.assert_allclose(out[0, t], inverse @ weight @ estimates[t], rtol=1e-8, atol=1e-9)
+        expected = inverse @ weight @ estimates[:, t]
+        np.testing.assert_allclose(out[0, :, t], expected, rtol=1e-8, atol=1e-9)
         for step in range(min(2, heights)):
             off = np.diag(inverse, step)
-            np.testing.assert_allclose(out[1 + step, t, : off.size], off, atol=1e-9 * scale)
+            np.testing.assert_allclose(out[1 + step, : off.size, t], off, atol=1e-9 * scale)
 
 
-def test_scores_equal_dense_algebra():
-    bands, estimates, stiffness, lam = systems(np.random.default_rng(1), 21, 33)
-    right = _smoothing.multiply_rows(bands, estimates)
-    which = np.array([20, 3, 3, 7, *range(15)])
-    scores = _smoothing.banded_scores(bands, right, estimates, stiffness, which, lam[which])
-    for i, t in enumerate(which):
-        weight = dense(bands[:, t])
-        system = weight + lam[t] * dense(stiffness)
-        inverse = np.linalg.inv(system)
-        left = estimates[t] - inverse @ weight @ estimates[t]
-        expected = (
-            estimates[t] @ weight @ left,
-            left @ weight @ left,
-            np.trace(inverse @ weight),
-            np.linalg.slogdet(system)[1],
-        )
-        np.testing.assert_allclose(scores[:, i], expected, rtol=1e-8)
+def test_freedom_equals_dense_algebra():
+    bands, _, stiffness, lam = systems(np.random.default_rng(1), 21, 33)
+    freedom = _smoothing.freedom(bands[..., 3:4].copy(), stiffness, lam)
+    weight = dense(bands[..., 3])
+    expected = [np.trace(np.linalg.inv(weight + of * dense(stiffness)) @ weight) for of in lam]
+    np.testing.assert_allclose(freedom, expected, rtol=1e-8)
 
 
 @each("smoothing", [1e-10, 1e-3, 1.0])
@@ -78,22 +67,20 @@ def test_scores_equal_dense_algebra():
 def test_solution_keeps_8_digits_of_60(smoothing, correlation):
     heights = 200
     rng = np.random.default_rng(4)
-    information = 10.0 ** rng.uniform(-4.0, 4.0, (1, heights))
+    information = 10.0 ** rng.uniform(-4.0, 4.0, (heights, 1))
     # The same air everywhere, beside noise that differs.
-    shared = 0.9 * np.sqrt(information[:, 1:] * information[:, :-1]) / information.max()
+    shared = 0.9 * np.sqrt(information[1:] * information[:-1]) / information.max()
     altitude = 150.0 + 30.0 * np.arange(heights)
     truth = 1e-4 * altitude
-    estimates = (truth + rng.normal(size=heights) / np.sqrt(information[0]))[np.newaxis]
+    estimates = (truth + rng.normal(size=heights) / np.sqrt(information[:, 0]))[:, np.newaxis]
     bands = correlated_precision(information, shared, correlation)
     stiffness = _smoothing.penalty(altitude)
     lam = np.array([smoothing * information.mean() * altitude[-1] ** 3])
-    right = _smoothing.multiply_rows(bands, estimates)
-    out = np.empty((3, 1, heights))
-    _smoothing.solve_banded(bands, right, stiffness, np.zeros(1, dtype=np.int64), lam, out)
+    out = solved(bands, estimates, stiffness, lam)
     with mp.workdps(60):
-        exact, inverse_last = _exact(bands[:, 0], stiffness, float(lam[0]), estimates[0])
-    assert np.abs(out[0, 0] - exact).max() <= 1e-8 * np.abs(exact).max()
-    assert abs(out[1, 0, -1] / inverse_last - 1.0) <= 1e-8
+        exact, inverse_last = _exact(bands[..., 0], stiffness, float(lam[0]), estimates[:, 0])
+    assert np.abs(out[0, :, 0] - exact).max() <= 1e-8 * np.abs(exact).max()
+    assert abs(out[1, -1, 0] / inverse_last - 1.0) <= 1e-8
 
 
 def _exact(bands, stiffness, lam, estimates):
@@ -147,32 +134,32 @@ def test_penalty_is_the_integral_of_the_squared_slope_of_extinction():
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
 @settings(max_examples=25, deadline=None)
-def test_lanes_are_independent_of_each_other(seed, count):
+def test_systems_are_independent_of_each_other(seed, count):
     rng = np.random.default_rng(seed)
     bands, estimates, stiffness, lam = systems(rng, count, 12)
     together = solved(bands, estimates, stiffness, lam)
     chosen = int(rng.integers(count))
     alone = solved(
-        np.ascontiguousarray(bands[:, chosen : chosen + 1]),
-        estimates[chosen : chosen + 1],
+        np.ascontiguousarray(bands[..., chosen : chosen + 1]),
+        np.ascontiguousarray(estimates[:, chosen : chosen + 1]),
         stiffness,
         lam[chosen : chosen + 1],
     )
-    np.testing.assert_array_equal(alone[:, 0], together[:, chosen])
+    np.testing.assert_array_equal(alone[..., 0], together[..., chosen])
 
 
 @pytest.mark.parametrize("missing", [(), (3,), (3, 4), (0, 9)])
 def test_precision_is_the_inverse_of_the_covariance_of_an_autoregressive_process(missing):
-    information = np.full((1, 10), 5.0)
-    information[0, list(missing)] = 0.0
-    bands = correlated_precision(information, np.ones((1, 9)), 0.6)
-    known = np.flatnonzero(information[0])
+    information = np.full((10, 1), 5.0)
+    information[list(missing)] = 0.0
+    bands = correlated_precision(information, np.ones((9, 1)), 0.6)
+    known = np.flatnonzero(information)
     apart = np.abs(np.subtract.outer(known, known))
     # A gap separates the altitudes below it from those above.
     if 3 in missing:
         apart = np.where((known[:, None] < 3) == (known < 3), apart, 99)
     decay = np.where(apart < 99, 0.6**apart, 0.0)
-    error = 1.0 / np.sqrt(information[0, known])
+    error = 1.0 / np.sqrt(information[known, 0])
     covariance = decay * np.outer(error, error)
-    precision = dense(bands[:, 0])[np.ix_(known, known)]
+    precision = dense(bands[..., 0])[np.ix_(known, known)]
     np.testing.assert_allclose(precision @ covariance, np.eye(known.size), atol=1e-12)

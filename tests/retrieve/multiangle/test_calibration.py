@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from support.cases import each
@@ -15,14 +17,30 @@ HEIGHTS = 30
 ROWS = np.arange(HEIGHTS)
 
 
-def typical(correlation=0.6, heights=HEIGHTS):
+@dataclass
+class Typical:
+    """A profile and its systems."""
+
+    information: np.ndarray
+    shared: np.ndarray
+    correlation: float
+    smoothing: float = 1e7
+
+    def __post_init__(self):
+        both = self.information[:, np.newaxis], self.shared[:, np.newaxis]
+        self.stiffness = _smoothing.penalty(30.0 * np.arange(1, HEIGHTS + 1))
+        bands = correlated_precision(*both, self.correlation)
+        self.bands = bands[..., 0]
+        self.sandwich = _calibration.Sandwich.of(
+            both, bands, self.correlation, self.stiffness, self.smoothing
+        )
+
+
+def typical(correlation=0.6):
     rng = np.random.default_rng(3)
-    information = rng.uniform(20.0, 80.0, heights)
+    information = rng.uniform(20.0, 80.0, HEIGHTS)
     information[7] = 0.0
-    shared = rng.uniform(0.2, 1.0, heights - 1)
-    bands = correlated_precision(information[np.newaxis], shared[np.newaxis], correlation)
-    stiffness = _smoothing.penalty(30.0 * np.arange(1, heights + 1))
-    return _calibration.Typical(bands[:, 0], information, shared, correlation, stiffness, 1e7)
+    return Typical(information, rng.uniform(0.2, 1.0, HEIGHTS - 1), correlation)
 
 
 def air_and_noise_covariances(c):
@@ -39,7 +57,7 @@ def air_and_noise_covariances(c):
 @each("lower", [np.full(HEIGHTS, -1), ROWS - 1, np.maximum(ROWS - 5, -1)])
 def test_sandwich_equals_dense_algebra(correlation, lower):
     c = typical(correlation)
-    components = _calibration.sandwich(c, ROWS, lower)
+    components = c.sandwich.parts(ROWS, lower)
     air, noise = air_and_noise_covariances(c)
     weight, covariance = dense(c.bands), air + noise
     inverse = np.linalg.inv(weight + c.smoothing * dense(c.stiffness))
@@ -62,7 +80,7 @@ def test_pilot_variance_is_that_of_simulated_noise():
     smoother = np.linalg.solve(weight + c.smoothing * dense(c.stiffness), weight)
     rough = np.linalg.solve(weight + THRESHOLDS.pilot * c.smoothing * dense(c.stiffness), weight)
     bias = noise @ (rough - smoother @ rough).T
-    components = _calibration.sandwich(c, ROWS, np.full(HEIGHTS, -1))
+    components = c.sandwich.parts(ROWS, np.full(HEIGHTS, -1))
     np.testing.assert_allclose(bias.var(axis=0), components[3], rtol=0.1)
     spread = (noise @ smoother.T).var(axis=0)
     np.testing.assert_allclose(spread, components[1], rtol=0.1)
@@ -114,9 +132,11 @@ def test_small_optical_depth_does_not_make_the_smoothing_error_small():
 
 
 def test_smoothing_error_is_scaled_and_noise_is_not():
-    known = _calibration.sandwich(typical(), ROWS, np.full(HEIGHTS, -1))
-    bias, scale = np.full((2, HEIGHTS), 5.0), np.array([1.0, 4.0])
-    unscaled, fourfold = _calibration.variance_ratio(known, bias, scale)
+    sandwich, ones, ground = typical().sandwich, np.ones(HEIGHTS), np.full(HEIGHTS, -1)
+    change, scale = np.full((2, HEIGHTS), 5.0), np.array([1.0, 4.0])
+    calibration = _calibration.Calibration(sandwich, ones, change, scale)
+    unscaled, fourfold = calibration.factors(ROWS, ground)[0]
+    known = sandwich.parts(ROWS, ground)
     noise = known[1] / known[0]
     np.testing.assert_allclose(fourfold - noise, 4.0 * (unscaled - noise), rtol=1e-9)
 

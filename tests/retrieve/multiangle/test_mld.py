@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.oracles.multiangle import PER_KM, rms
+from support.oracles.multiangle import ANGLES, PER_KM, clear, rms, signals
 from support.scan_arguments import retrieve_optical_depth
 
 from lidarops.errors import RetrievalInputError
@@ -195,3 +195,22 @@ def test_a_result_states_the_chosen_strength_and_the_prior(method):
         np.testing.assert_array_equal(again.optical_depth[same], result.optical_depth[same])
     plain = retrieve(signal, angles, "kano_hamilton")
     assert np.isnan(plain.regularisation).all()
+
+
+def test_methods_without_weights_leave_out_weak_samples():
+    """With samples of 1.5 times their noise, ratios are 3.0 and 2.1."""
+    atmosphere = clear()
+    signal, variance, tau = signals(
+        np.random.default_rng(9), 60, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.03
+    )
+    error = {
+        method: rms(
+            retrieve_optical_depth(
+                signal, ANGLES, atmosphere[0], variance=variance, method=method
+            ).optical_depth
+            - tau
+        )
+        for method in ("kano_hamilton", "two_angle", "mld_prior")
+    }
+    assert error["two_angle"] < 2.6 * error["kano_hamilton"]
+    assert error["mld_prior"] < 1.8 * error["kano_hamilton"]

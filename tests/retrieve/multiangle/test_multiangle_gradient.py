@@ -40,6 +40,21 @@ def test_a_gradient_cancels_or_is_within_the_stated_error(method, cancels):
     assert (error.max() < 0.01) == cancels
 
 
+@pytest.mark.parametrize("method", ["kano_hamilton", "joint"])
+def test_a_cycle_cut_short_fits_no_gradient_that_its_beams_cannot_tell(method):
+    """The beams to one side would determine the optical depth seven times worse with a gradient."""
+    signal, variance = level_sky(0.0)
+    drawn = np.random.default_rng(5).normal(size=(2, *variance.shape))
+    cycles = signal[:2] + np.sqrt(variance) * drawn
+    cycles[1, ZENITH < 0.0] = np.nan
+    result = retrieve_optical_depth(cycles, ZENITH, ALTITUDE, variance=variance, method=method)
+    whole, cut = result.optical_depth_standard_error
+    assert np.nanmedian(cut / whole) < 2.0
+    assert np.nanmax(np.abs(result.optical_depth[1] - 1e-4 * ALTITUDE) / cut) < 4.0
+    assert np.all(result.optical_depth_gradient_error[0] < 1e-9)
+    assert np.all(result.optical_depth_gradient_error[1] > 0.0)
+
+
 LOW = np.arange(65.0, 85.1, 0.4)
 CELLS = np.arange(60.0, 3001.0, 60.0)
 

@@ -155,9 +155,10 @@ def kano_hamilton(scene, logarithm, variance):
     shared = np.clip(shared * np.sqrt(between[1:] * between[:-1]), 0.0, 1.0)
     used = w > 0.0
     residual, noise = np.where(used, residual, np.nan), np.where(used, variance, np.inf)
+    leverage = np.where(used, np.nan_to_num(leverage, nan=1.0), 1.0)
     path = np.repeat(scene.secant[:, np.newaxis], between.size, axis=1)
-    leverage, sides = np.nan_to_num(leverage, nan=1.0), np.zeros((len(w), between.size))
-    correlation = correlation_of_air(residual, noise, leverage, between, path, sides)
+    columns = np.stack([np.ones_like(path), path])
+    correlation = correlation_of_air(residual, noise, leverage, between, columns)
     freedom = _pooled(np.maximum(used.sum(axis=1, keepdims=True) - 2.0, 0.0))
     noise_of_depth = AltitudeNoise(correlation, shared, freedom)
     return Estimates(-0.5 * slope[:, 0], 4.0 * square[:, 0], noise_of_depth, slant)
