@@ -151,6 +151,21 @@ class Lock(AbstractContextManager["Lock"]):
 
     __exit__ = release
 
+    def held_by(self) -> str:
+        """Return in words who holds the lock, and when it last gave a sign of life; empty if none.
+
+        A clock ahead of that of the database gives no age.
+        """
+        current = self.holder()
+        if current is None:
+            return ""
+        since = datetime.fromtimestamp(current.acquired, UTC)
+        age = max(current.silent, 0.0)
+        return (
+            f"held by {current.holder} since {since:%Y-%m-%d %H:%M:%S} UTC, with a sign of life"
+            f" {age:.0f} s ago"
+        )
+
     def holder(self) -> Holder | None:
         """Return the present holder of the lock."""
         return next(iter(self._holders()), None)
@@ -211,13 +226,8 @@ class Lock(AbstractContextManager["Lock"]):
 
     def _refusal(self) -> CatalogError:
         """Return the error of a process that does not get the lock; it names the holder."""
-        current = self.holder()
-        problem = "another run holds the catalog"
-        if current is not None:
-            since = datetime.fromtimestamp(current.acquired, UTC)
-            problem = f"held by {current.holder} since {since:%Y-%m-%d %H:%M:%S} UTC"
         return UnavailableError(
-            problem,
+            self.held_by() or "another run holds the catalog",
             file=self._database.place,
             remedy=f"stop it, or wait for it with --wait SECONDS: after {SILENCE:.0f} s without a"
             " sign of life it is overtaken",

@@ -172,22 +172,28 @@ def runs(
     ] = 20,
     as_json: options.Json = False,
 ) -> None:
-    """Show the runs of a campaign, the newest first: status, numbers and time per stage.
+    """Show the runs of a campaign, the newest first, and who holds its catalog now.
+
+    Of a run its status, numbers and time per stage. A holder that is dead is overtaken by the next
+    command; one that only may be, because it ran elsewhere, by a command with --wait 60.
 
     Example: lidarops runs catalogs/demo.yaml
     """
     from lidarops.campaign.model import load_campaign
+    from lidarops.catalog.lock import Lock
     from lidarops.catalog.store import Store
 
     settings = load_campaign(campaign, output=out, catalog=catalog)
     with Store(settings.catalog_url, settings.name, create=False) as store:
-        listed = store.runs(limit=limit)
+        listed, holder = store.runs(limit=limit), Lock(store).held_by()
     if as_json:
         plain = [asdict(run) for run in listed]
         typer.echo(json.dumps(plain, indent=2, default=datetime.isoformat))
         return
     columns = ("run", "status", "took", "scenes", "products", "failed", "refused", "stages", "by")
     show_rows(f"Runs of {settings.name}", columns, map(_row, listed))
+    if holder:
+        say(f"The catalog is {holder}.")
 
 
 def _row(run: Run) -> tuple[object, ...]:

@@ -83,7 +83,15 @@ def test_the_command_line_shows_runs_and_mismatches(archive: Archive) -> None:
     (run,) = json.loads(summary.stdout)
     assert (run["status"], run["scenes"], run["products"]) == ("finished", 4, 12)
     assert {"digest", "retrieve", "write"} <= set(run["seconds"])
-    assert run["id"] in runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
+    shown = runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
+    assert run["id"] in shown
+    assert "held by" not in shown
+    campaign = archive.write()
+    with Store(campaign.catalog_url, campaign.name) as store, Lock(store) as lock:
+        lock.acquire()
+        shown = runner.invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
+    assert f"held by {Lock.holder_name()} since " in shown
+    assert "with a sign of life 0 s ago" in shown
     assert runner.invoke(app, ["verify", file]).exit_code == 0
     archive.flip("raw/rich/h00")
     wrong = runner.invoke(app, ["verify", file, "--json"])
