@@ -13,7 +13,6 @@ import xarray as xr
 from jinja2 import Environment
 from markupsafe import Markup
 
-from lidarops.figures import browser
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment
@@ -26,7 +25,6 @@ from lidarops.site.paths import day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import citation, contact, variables
 from lidarops.site.product_entry import Entry, Problem, ShareGrade, mean_availability
 from lidarops.site.quality import Quality
-from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import Values
 
 INDEX: Final = "index.html"
@@ -228,11 +226,6 @@ def index(
     by_station = stations(entries)
     newest = sorted(entries, key=lambda entry: (entry.start, entry.path), reverse=True)
     retrieved = [e for e in newest if is_retrieved(e.kind) and not e.lacking] or newest
-    places = [
-        Place(first.place, first.latitude, first.longitude)
-        for first, *_ in by_station.values()
-        if first.latitude is not None and first.longitude is not None
-    ]
     lead = "No product could be read."
     if entries:
         first, last = (end(entry.day for entry in entries) for end in (min, max))
@@ -247,7 +240,6 @@ def index(
         lead=lead,
         trail=[],
         below=f"{below / 1e3:g} km",
-        map=browser.inline(station_map(places)) if places else "",
         stac=links.catalog(INDEX),
         report=links.report(INDEX),
         licenses=sorted({entry.license for entry in entries if entry.license}),

@@ -429,7 +429,6 @@ def test_go_to_another_channel_or_kind_of_the_same_time(visitor: Visitor) -> Non
 
 def test_find_where_the_station_is_and_its_data(visitor: Visitor) -> None:
     assert visitor.reads("46.44\u00b0 N, 30.76\u00b0 E")
-    assert "Одеса, hill at 46.44° north" in drawn(visitor.page).get_attribute("aria-label")
 
 
 def test_see_one_kind_only(visitor: Visitor) -> None:

@@ -1,4 +1,4 @@
-"""What pages show: values as numbers, neighbours, downloads, filters, citation, map."""
+"""What pages show: values as numbers, neighbours, downloads, filters, citation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ from lidarops.flags import Quality
 from lidarops.site import build, values
 from lidarops.site.build import build_site
 from lidarops.site.product_contents import campaign, citation
-from lidarops.site.station_map import Place, station_map
 from lidarops.site.values import read_values
 
 
@@ -343,9 +342,8 @@ def test_a_published_site_links_catalog_and_report_where_they_are(
     assert places["Report of the last run"] == "../../reports/run-1/index.html"
 
 
-def test_stations_are_on_a_map(output: Path) -> None:
+def test_stations_have_their_position(output: Path) -> None:
     text = (output / "site/index.html").read_text("utf-8")
-    assert "Map of the stations, without coastlines. Одеса, hill at 46.44° north" in text
     assert 'id="s-odesa"' in text
     assert "46.44° N, 30.76° E, 53.5 m" in text
 
@@ -356,21 +354,6 @@ def test_a_network_is_in_the_middle_of_its_crossings(output: Path) -> None:
     with xr.open_dataset(output / "products" / entry["path"], decode_timedelta=False) as product:
         assert entry["latitude"] == pytest.approx(float(product["latitude"].mean()))
         assert entry["longitude"] == pytest.approx(float(product["longitude"].mean()))
-
-
-def test_the_map_holds_the_stations() -> None:
-    places = [Place("one", 60.0, -20.0), Place("south", -10.0, 30.0)]
-    (panel,) = station_map(places).panels
-    marks, words = panel.layers
-    assert words.texts == ("one", "south")
-    np.testing.assert_allclose([marks.x, marks.y], [[-20.0, 30.0], [60.0, -10.0]])
-    assert panel.x.low < -20.0 < 30.0 < panel.x.high
-    assert station_map([Place("alone", 90.0, 180.0)]).panels[0].y.high > 90.0
-
-
-def test_the_map_crosses_the_date_line() -> None:
-    (panel,) = station_map([Place("east", 10.0, 179.0), Place("west", 12.0, -179.0)]).panels
-    np.testing.assert_allclose(panel.layers[0].x, [179.0, 181.0])
 
 
 def test_the_first_page_is_titled_by_the_campaign() -> None:
