@@ -393,9 +393,8 @@ def _write_calendar(
     for station, station_entries in pages.stations(entries).items():
         by_year = pages.years(station_entries)
         for year, year_entries in by_year.items():
-            for kind in pages.tabs(year_entries):
-                name = year_page(station, int(year), kind)
-                write(name, pages.year(station, int(year), year_entries, list(by_year), kind))
+            name = year_page(station, int(year))
+            write(name, pages.year(station, int(year), year_entries, list(by_year)))
         for month, month_entries in pages.months(station_entries).items():
             name = month_list(station, month)
             lines = [f"{links.product(entry, name)}\n" for entry in month_entries]

@@ -35,8 +35,6 @@ _PROBLEMS: Final = 200
 _LATEST: Final = 6
 _NAVIGATION: Final = (b"<!-- navigation -->", b"<!-- /navigation -->")
 """Ends of the part of a product page that does not follow from the product."""
-_FILTERED: Final = 16
-"""Most kinds that can be chosen on a page of a day."""
 
 ByDay = Mapping[str, Sequence[Entry]]
 
@@ -204,12 +202,6 @@ def months(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
     return _by(entries, lambda entry: entry.day[:7])
 
 
-def tabs(entries: Iterable[Entry]) -> list[str]:
-    """Return the kinds of products in the order of their rank, after an empty one for all."""
-    kinds_ = sorted({entry.kind for entry in entries}, key=lambda kind: (rank_of(kind), kind))
-    return ["", *kinds_]
-
-
 def days(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
     """Return the entries by day."""
     return _by(entries, lambda entry: entry.day)
@@ -251,23 +243,16 @@ def index(
     )
 
 
-def year(
-    key: str, number: int, entries: Sequence[Entry], all_years: Sequence[str], kind: str = ""
-) -> bytes:
-    """Return the page of a year of a station, of all kinds of product or of one.
-
-    `all_years` are those with data; `entries` are of all kinds.
-    """
-    page = year_page(key, number, kind)
+def year(key: str, number: int, entries: Sequence[Entry], all_years: Sequence[str]) -> bytes:
+    """Return the page of a year of a station. `all_years` are those with data."""
+    page = year_page(key, number)
     return _render(
         "year.html",
         page,
         key=key,
         place=entries[0].place,
         year=number,
-        kind=kind,
-        entries=[entry for entry in entries if kind in ("", entry.kind)],
-        tabs=tabs(entries),
+        entries=entries,
         trail=[("Archive", href(INDEX, page))],
         others=[int(other) for other in all_years],
     )
@@ -285,7 +270,6 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
     entries = sorted(by_day[day_], key=_order)
     share = mean_availability(entries)
     mean = "" if share is None else f"; {percent(share)} of profiles usable"
-    shown_kinds = tabs(entries)[1:]
     return _render(
         "day.html",
         page,
@@ -297,9 +281,6 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
         before=before,
         after=after,
         days=by_day,
-        own_grades=[grade for grade in ShareGrade if any(e.grade is grade for e in entries)],
-        kinds=shown_kinds[:_FILTERED],
-        number_of=shown_kinds.index,
         instruments=_by(entries, lambda entry: entry.instrument),
         named=_named,
     )

@@ -53,10 +53,9 @@ def product_page(path: str) -> str:
     return "/".join(("product", *parts)) + ".html"
 
 
-def year_page(station: str, year: int, kind: str = "") -> str:
-    """Return the page of a station's year, of all kinds or of one, relative to the site."""
-    of_kind = f"-{slug(kind)}" if kind else ""
-    return f"station/{slug(station)}/{year:04d}{of_kind}.html"
+def year_page(station: str, year: int) -> str:
+    """Return the page of a station's year, relative to the site."""
+    return f"station/{slug(station)}/{year:04d}.html"
 
 
 def month_list(station: str, month: str) -> str:

@@ -101,7 +101,6 @@ def _pages(site: Path) -> dict[str, Path]:
         "first": site / "index.html",
         "year": next(site.glob("station/*/2026.html")),
         "day": next(site.glob("station/*/*/2026-03-01.html")),
-        "kind": site / "station/odesa/2026-elastic.html",
         "unknown": site / "product/odesa/wind.html",
         "report": site.parent / "report/20260304T000000-1/index.html",
         **of_kind,
@@ -429,33 +428,6 @@ def test_go_to_another_channel_or_kind_of_the_same_time(visitor: Visitor) -> Non
 
 def test_find_where_the_station_is_and_its_data(visitor: Visitor) -> None:
     assert visitor.reads("46.44\u00b0 N, 30.76\u00b0 E")
-
-
-def test_see_one_kind_only(visitor: Visitor) -> None:
-    visitor.click("March 2026").click("usable, 6 products").click("Choose kinds", "summary")
-    signals = visitor.page.get_by_role("heading", name="Range-corrected signals").first
-    assert signals.is_visible()
-    visitor.click("Range-corrected signals", "checkbox")
-    assert not signals.is_visible()
-    visitor.click("most", "checkbox")
-    assert not visitor.page.locator(".g-most-card").first.is_visible()
-
-
-def test_quality_is_chosen_of_days_in_a_year_and_of_products_in_a_day(visitor: Visitor) -> None:
-    states = "links => links.map(link => getComputedStyle(link).visibility)"
-    visitor.click("March 2026")
-    (grade,) = visitor.page.locator("table.days a small").first.evaluate(
-        "e => [...e.parentElement.classList].filter(name => name.startsWith('g-'))"
-    )
-    days = visitor.page.locator(f"table.days a.{grade}")
-    for page, state in (("year", "hidden"), ("day", "visible")):
-        if page == "day":
-            visitor.page.locator(f"#f-{grade}").check()
-            days.first.click()
-            visitor.click("Choose kinds", "summary")
-        assert set(days.evaluate_all(states)) == {"visible"}, page
-        visitor.page.locator(f"#f-{grade}").uncheck()
-        assert set(days.evaluate_all(states)) == {state}, page
 
 
 def test_choose_another_date(visitor: Visitor) -> None:

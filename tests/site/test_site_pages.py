@@ -1,4 +1,4 @@
-"""What pages show: values as numbers, neighbours, downloads, filters, citation."""
+"""What pages show: values as numbers, neighbours, downloads, citation."""
 
 from __future__ import annotations
 
@@ -277,23 +277,8 @@ def test_a_month_can_be_downloaded_from_its_list(output: Path) -> None:
     assert "2026-03.txt" in links(site / "station/odesa/2026.html")
 
 
-def test_a_year_can_be_seen_by_kind(output: Path) -> None:
-    year = output / "site/station/odesa/2026.html"
-    assert "Backscatter of elastic profiles" in links(year)["2026-elastic.html"]
-    text = (output / "site/station/odesa/2026-elastic.html").read_text("utf-8")
-    assert "3 products of 3 days" in text
-    assert 'aria-current="page">Backscatter of elastic profiles' in text
-
-
-def test_days_have_a_calendar_and_filters(output: Path) -> None:
-    day = output / "site/station/odesa/2026/2026-03-01.html"
-    assert "2026-03-02.html" in links(day)
-    text = day.read_text("utf-8")
-    style = (output / "site/site.css").read_text("utf-8")
-    boxes = re.findall(r'<input type="checkbox" id="([^"]+)" checked>', text)
-    assert len(boxes) > 6
-    for box in boxes:
-        assert f"body:has(#{box}:not(:checked))" in style
+def test_days_lead_to_the_others_of_their_month(output: Path) -> None:
+    assert "2026-03-02.html" in links(output / "site/station/odesa/2026/2026-03-01.html")
 
 
 def test_human_names_stand_beside_identifiers(output: Path) -> None:
