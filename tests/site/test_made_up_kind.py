@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -99,9 +97,7 @@ def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Regist
         }.items():
             (package / f"{name}.py").write_text(text)
         monkeypatch.syspath_prepend(package.parent)
-        point = SimpleNamespace(
-            name="smooth", value="", load=lambda: import_module("madeup_smooth").KIND
-        )
+        point = EntryPoint("smooth", "madeup_smooth:KIND", kinds.GROUP)
 
         def points(group: str) -> list[Any]:
             return [*entry_points(group=group), *([point] if group == kinds.GROUP else [])]
