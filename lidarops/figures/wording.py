@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
+from lidarops.flags import Severity
 from lidarops.records import Grade, Measure
 
 if TYPE_CHECKING:
@@ -14,6 +15,12 @@ if TYPE_CHECKING:
 
     from lidarops.records import Change, Verdicts
 
+SEVERITIES: Final[Mapping[Severity | None, str]] = {
+    Severity.REJECT: "do not use",
+    Severity.CARE: "use with care",
+    None: "unknown",
+}
+"""What the severity of a quality bit means; None where it is not known."""
 _NAMED: Final = 2
 """Most descriptions that `named_shares` names."""
 _REORDERING: Final = frozenset(

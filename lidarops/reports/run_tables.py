@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import Any, Final, TypeVar
 
 from lidarops.figures.wording import (
+    SEVERITIES,
     change_in_words,
     counted,
     decided_on,
@@ -18,7 +19,7 @@ from lidarops.figures.wording import (
     size,
     verdicts_in_words,
 )
-from lidarops.flags import PLACES, Severity
+from lidarops.flags import PLACES
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import (
@@ -280,12 +281,11 @@ def flags(record: RunRecord) -> list[Row]:
                 counts[name.lower()].append(count)
         for name in sorted(counts, key=lambda name: (bits.get(name, _LAST), name)):
             bit = bits.get(name)
-            words = {Severity.REJECT: "do not use", Severity.CARE: "use with care"}
             rows.append(
                 {
                     "kind": kind,
                     "bit": name,
-                    "severity": words[bit.severity] if bit else "unknown",
+                    "severity": SEVERITIES[bit.severity if bit else None],
                     "description": bit.description if bit else _UNKNOWN,
                     "count": sum(counts[name]),
                     "share": percent(sum(counts[name]) / values) if values else "no value",

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment
-from lidarops.figures.wording import counted, percent, size
+from lidarops.figures.wording import SEVERITIES, counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.links import Links
@@ -105,7 +105,10 @@ def product(
             ("sha256", entry.sha256),
         ],
         figures=[(markup, figure.text) for figure, markup in figures],
-        quality=quality,
+        bits=[
+            (bit.word, SEVERITIES[bit.severity], bit.description, n, percent(n / entry.values))
+            for bit, n in quality.bits
+        ],
         origin=origin,
         values=values,
         citation=citation(opened),
