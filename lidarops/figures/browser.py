@@ -106,8 +106,7 @@ def _described(figure: Figure) -> dict[str, Any]:
     packed = _Packed()
     panels = [_panel(panel, packed) for panel in figure.panels]
     data = base64.b64encode(zlib.compress(b"".join(packed.parts), 6)).decode("ascii")
-    name = visible(figure.caption)
-    return {"name": name, "beside": figure.beside, "panels": panels, "data": data}
+    return {"beside": figure.beside, "panels": panels, "data": data}
 
 
 def _panel(panel: Panel, packed: _Packed) -> dict[str, Any]:

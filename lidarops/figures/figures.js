@@ -236,15 +236,11 @@ class Picture {
     // The first figure of a page says how to use all.
     this.hint = place === document.querySelector("div.fig") ? HINT : "";
     this.words = Object.assign(document.createElement("output"), { textContent: this.hint });
-    this.all = this.button("Show all", () => this.zoom(null));
-    this.all.hidden = true;
+    const all = { type: "button", textContent: "Show all", hidden: true, onclick: () => this.zoom(null) };
+    this.all = Object.assign(document.createElement("button"), all);
     const tools = Object.assign(document.createElement("p"), { className: "figtools" });
-    tools.append(this.words, this.all, this.button("Save values as CSV", () => this.save()));
+    tools.append(this.words, this.all);
     place.append(this.canvas, tools);
-  }
-
-  button(text, onclick) {
-    return Object.assign(document.createElement("button"), { type: "button", textContent: text, onclick });
   }
 
   async begin() {
@@ -292,7 +288,6 @@ class Picture {
       box.fromX = (pixel) => x[0] + ((pixel - box.left) / box.width) * (x[1] - x[0]);
       box.fromY = (pixel) => y[0] + ((box.top + box.height - pixel) / box.height) * (y[1] - y[0]);
       bottom = box.top + box.height + (box.labelled ? (panel.x.time ? 36 : 20) + 24 : 6);
-      box.bottom = bottom;
       return box;
     });
     if (beside) for (const box of this.boxes) box.top = Math.max(...this.boxes.map((other) => other.top));
@@ -541,37 +536,6 @@ class Picture {
     } else if (event.key === "Escape") this.zoom(null);
     else return;
     event.preventDefault();
-  }
-
-  // Saves the values that are drawn, one table for each image and curve.
-  save() {
-    const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
-    const cell = (axis, place) =>
-      axis.time ? new Date(place * DAY).toISOString() : isFinite(place) ? String(Number(value(axis, place).toPrecision(6))) : "";
-    const rows = [];
-    for (const panel of this.spec.panels) {
-      const heads = [panel.x.label, panel.y.label];
-      panel.layers.forEach((layer, k) => {
-        if (layer.is === "curve") {
-          rows.push([...heads, "error", layer.label]);
-          layer.x.forEach((x, i) => rows.push([cell(panel.x, x), cell(panel.y, layer.y[i]), String(this.error(panel, k, i) || "")]));
-        } else if (layer.is === "image" && panel.bar) {
-          rows.push([...heads, panel.bar.label]);
-          const low = along(panel.bar, panel.bar.low), high = along(panel.bar, panel.bar.high);
-          layer.codes.forEach((code, at) => {
-            const column = Math.floor(at / layer.rows), row = at % layer.rows;
-            const x = (layer.left[column] + layer.right[column]) / 2, y = (layer.edges[row] + layer.edges[row + 1]) / 2;
-            const beyond = code === FIRST ? "<=" : code === 255 ? ">=" : "";
-            const number = code < FIRST ? "" : beyond + value(panel.bar, low + ((code - FIRST) / (255 - FIRST)) * (high - low)).toPrecision(3);
-            rows.push([cell(panel.x, x), cell(panel.y, y), number]);
-          });
-        }
-      });
-    }
-    const text = rows.map((row) => row.map(quoted).join(",")).join("\n") + "\n";
-    const href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
-    Object.assign(document.createElement("a"), { href, download: `${this.spec.name.slice(0, 60)}.csv` }).click();
-    URL.revokeObjectURL(href);
   }
 }
 
