@@ -25,7 +25,7 @@ Content = tuple[str, Quantity, tuple[TimeSeries, ...]]
 """Title, the variable, and its series."""
 
 
-def main_name(product: xr.Dataset) -> str | None:
+def _main_name(product: xr.Dataset) -> str | None:
     """Return the name of the main variable of a product; None without a variable over time.
 
     The first of: the preferred variables of all kinds, variables with a standard error,
@@ -63,7 +63,7 @@ def views_of(kind: str) -> Sequence[View[Any]]:
 
 def _read(name: str | None, product: xr.Dataset, _: int) -> Content | None:
     """Return the series with the most values; of a large variable, only of some profiles."""
-    name = name or main_name(product)
+    name = name or _main_name(product)
     if name is None:
         return None
     step = max(1, -(-product[name].nbytes // _BULK))

@@ -17,7 +17,6 @@ import xarray as xr
 from lidarops.figures.image_panels import ImageQuantity, image_figure
 from lidarops.figures.panels import Figure
 from lidarops.figures.raster import Raster, raster_variables, read_raster
-from lidarops.figures.series_panels import Quantity
 from lidarops.kinds import kinds
 
 Content = TypeVar("Content")
@@ -51,9 +50,6 @@ class KindFigures:
     """The first figure of the first view is the thumbnail of a product."""
     preferred: str
     """Variable for an overview of any product that has it."""
-    values: tuple[Quantity, ...] = ()
-    """Quantities of tables of values, in the units of the figures, the main one first; the main
-    variable where there are none."""
 
 
 def image_view(

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import xarray as xr
 from markupsafe import Markup
@@ -41,7 +42,6 @@ from lidarops.site.paths import (
 )
 from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.quality import Quality, read_quality
-from lidarops.site.values import Values, read_values
 from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
     COPIES,
@@ -62,7 +62,6 @@ _ALWAYS: Final = "time", TIME_BOUNDS, QUALITY_FLAG, USABLE
 _EMPTY: Final = "No figure of the product"
 _OURS: Final = ("product", "station", COPIES)
 """Folders that only the site writes to."""
-Part = TypeVar("Part")
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,18 +210,12 @@ def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry
     with opened_product(file, decode_cf=False) as stored:
         kind = attribute(stored, "lidarops_kind")
         opened = _decoded(stored, kind)
-        quality, no_quality = _guarded(
-            lambda: read_quality(opened, below), "its quality over time cannot be drawn"
-        )
-        quality = quality or Quality()
-        values, no_values = _guarded(
-            lambda: read_values(opened, kind), "its values cannot be shown"
-        )
+        quality, no_quality = _quality(opened, below)
         figures, not_drawn = _draw(stored, opened, kind, quality.figure)
         origin = product_contents.origin(opened)
         start, stop = product_contents.span(opened)
         no_flags = "" if QUALITY_FLAG in opened else "the product has no quality flags"
-        problems = (not_drawn, no_values, no_quality, origin["problem"], no_flags)
+        problems = (not_drawn, no_quality, origin["problem"], no_flags)
         station = attribute(opened, "lidarops_station")
         instrument = attribute(opened, "lidarops_instrument")
         entry = Entry(
@@ -254,7 +247,7 @@ def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry
             problem="; ".join(filter(None, problems)),
         )
         contents = (
-            pages.product(entry, stored, quality, origin, figures, values or Values()),
+            pages.product(entry, stored, quality, origin, figures),
             browser.thumbnail(figures[0][0] if figures else None),
         )
     for name, content in zip(entry.files, contents, strict=True):
@@ -268,31 +261,28 @@ def _decoded(stored: xr.Dataset, kind: str) -> xr.Dataset:
     Of an unknown kind, any variable may be shown. What several parts of the page need is read once,
     unless it is large.
     """
-    shown = {*_ALWAYS, *product_contents.USED, *flags_names(stored)}
     figures = figures_of(kind)
-    often = {quantity.name for quantity in figures.values} if figures is not None else set()
-    often |= {f"{name}_standard_error" for name in often} | {QUALITY_FLAG}
-    if figures is not None:
-        shown.update(*(view.variables for view in figures.views), often)
+    uses = Counter(name for view in (figures.views if figures else ()) for name in view.variables)
+    uses.update((*_ALWAYS, *product_contents.USED, *flags_names(stored)))
     used = {
         name: variable
         for name, variable in stored.variables.items()
-        if figures is None or name in shown
+        if figures is None or name in uses
     }
     whole = xr.Dataset(used, attrs=stored.attrs)
     opened = xr.decode_cf(whole, decode_coords=False, decode_timedelta=False)
     for name, variable in opened.variables.items():
-        if name in often and variable.nbytes <= _READ_BYTES:
+        if uses[str(name)] > 1 and variable.nbytes <= _READ_BYTES:
             variable.load()
     return opened
 
 
-def _guarded(make: Callable[[], Part], failure: str) -> tuple[Part | None, str]:
-    """Return a part of a page, or why there is none."""
+def _quality(product: xr.Dataset, below: float) -> tuple[Quality, str]:
+    """Return the quality of a product, or why it is not known."""
     try:
-        return make(), ""
+        return read_quality(product, below), ""
     except UNREADABLE as error:
-        return None, f"{failure}: {error}"
+        return Quality(), f"its quality over time cannot be drawn: {error}"
 
 
 def _with_quality(figures: list[Figure], shown: Figure | None) -> list[Figure]:

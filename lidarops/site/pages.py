@@ -25,7 +25,6 @@ from lidarops.site.paths import day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import citation, contact, variables
 from lidarops.site.product_entry import Entry, Problem, ShareGrade, mean_availability
 from lidarops.site.quality import Quality
-from lidarops.site.values import Values
 
 INDEX: Final = "index.html"
 SHEET: Final = "site.css"
@@ -81,7 +80,6 @@ def product(
     quality: Quality,
     origin: Mapping[str, Any],
     figures: Sequence[tuple[Figure, Markup]],
-    values: Values,
 ) -> bytes:
     """Return the page of a product; it depends only on the product and its path."""
     page = entry.page
@@ -110,7 +108,6 @@ def product(
             for bit, n in quality.bits
         ],
         origin=origin,
-        values=values,
         citation=citation(opened),
         contact=contact(opened),
         references=str(opened.attrs.get("references", "")).splitlines(),

@@ -389,7 +389,7 @@ def test_find_the_list_of_a_month(visitor: Visitor) -> None:
 
 
 def test_find_how_to_open_all_values(visitor: Visitor) -> None:
-    visitor.product("Backscatter of elastic profiles").click("Values")
+    visitor.product("Backscatter of elastic profiles").click("File")
     assert visitor.reads('xarray.open_dataset("odesa_lidar-1_elastic_photon_532o_')
 
 

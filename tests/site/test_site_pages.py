@@ -1,11 +1,10 @@
-"""What pages show: values as numbers, neighbours, downloads, citation."""
+"""What pages show: neighbours, downloads, citation."""
 
 from __future__ import annotations
 
 import json
 import re
 import shutil
-import tracemalloc
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -14,21 +13,16 @@ import numpy as np
 import pytest
 import xarray as xr
 from netCDF4 import Dataset
-from support.archives.site_archive import add, add_unknown, contents, small_archive
-from support.products.fabricated import START as FIRST
-from support.products.fabricated import signal, times
+from support.archives.site_archive import add, contents, small_archive
 from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CatalogError
 from lidarops.figures import image_panels
-from lidarops.figures.panels import Axis, number
-from lidarops.figures.wording import percent
-from lidarops.flags import Quality
-from lidarops.site import build, values
+from lidarops.figures.panels import Axis
+from lidarops.site import build
 from lidarops.site.build import build_site
 from lidarops.site.product_contents import campaign, citation
-from lidarops.site.values import read_values
 
 
 class _Links(HTMLParser):
@@ -70,63 +64,13 @@ def page_of(output: Path, kind: str, day: str = "20260301") -> Path:
     return next((output / "site").glob(f"product/odesa/lidar-1/{kind}/**/*{day}T*.html"))
 
 
-@pytest.mark.parametrize("kind", ["elastic", "homogeneous", "multiangle", "signal"])
-def test_values_are_summarised_as_in_the_file(output: Path, kind: str) -> None:
-    page = page_of(output, kind)
-    file = output / "products" / page.relative_to(output / "site/product").with_suffix(".nc")
-    factor = {"elastic": 1e6, "homogeneous": 1e3, "multiangle": 1e3, "signal": 1.0}[kind]
-    with xr.open_dataset(file, decode_timedelta=False) as product:
-        row = read_values(product, kind).rows[0]
-        name = row["quantity"].partition(" (")[0].lower().replace(" ", "_")
-        usable = (product["usable"] < 2) & np.isfinite(product[name])
-        values = factor * product[name].astype(float).values[usable]
-        errors = factor * product[f"{name}_standard_error"].astype(float).values[usable]
-    assert row["usable"] == percent(float(usable.mean()))
-    stated = (row["5 %"], row["median"], row["95 %"], row["median error"])
-    expected = (*np.percentile(values, (5, 50, 95)), np.median(errors))
-    assert stated == tuple(number(float(f"{value:.3g}")) for value in expected)
-    assert all(words in page.read_text("utf-8") for words in stated)
-
-
-def test_a_summary_of_some_profiles_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    product = fields(600, 40)
-    monkeypatch.setattr(values, "READ_BYTES", product["signal"].nbytes // 3)
-    assert read_values(product, "signal").every == 3
-    monkeypatch.undo()
-    assert read_values(product, "signal").every == 1
-
-
-def test_values_without_flags_are_usable_where_they_are_known(tmp_path: Path) -> None:
-    product = xr.load_dataset(add_unknown(tmp_path)).drop_vars("quality_flag")
-    product["quality_flag"] = "time", np.ones(product.sizes["time"], np.int32)
-    (row,) = read_values(product, "wind").rows
-    assert (row["usable"], row["median error"]) == ("100 %", "0.2")
-    product["speed"][:] = np.nan
-    (row,) = read_values(product, "wind").rows
-    assert (row["usable"], row["median"]) == ("0 %", "\u2013")
-
-
-def test_only_values_that_are_shown_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(values, "READ_BYTES", 1_000_000)
-    fields(600, 4000).astype(np.float32).to_netcdf(tmp_path / "long.nc")
-    with xr.open_dataset(tmp_path / "long.nc") as product:
-        tracemalloc.start()
-        read_values(product, "signal")
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 8 * 600 * 4000, "less than one variable"
-
-
-@pytest.mark.parametrize("part", ["read_values", "read_quality"])
 def test_what_cannot_be_shown_does_not_cost_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise MemoryError("no memory")
 
-    monkeypatch.setattr(build, part, fail)
+    monkeypatch.setattr(build, "read_quality", fail)
     output = tmp_path / "out"
     add(output, "signal")
     made = build_site(output)
@@ -145,15 +89,6 @@ def test_an_axis_that_is_not_finite_is_a_problem_of_the_product(
     assert made.products == 1
     assert "it cannot be drawn as signal" in made.problems[0].reason
     assert "NaN" not in page_of(output, "signal").read_text("utf-8")
-
-
-def fields(profiles: int, bins: int) -> xr.Dataset:
-    """Return a product with values in all bins, that differ."""
-    product = signal(times(FIRST, profiles, 60.0), bins=bins)
-    product["signal"][:] = 1.0 + np.arange(profiles * bins).reshape(profiles, bins)
-    product["signal_standard_error"][:] = 0.5
-    product["quality_flag"][:] = np.arange(bins) % 2 * int(Quality.PILE_UP)
-    return product
 
 
 def test_a_product_leads_to_the_previous_the_next_and_its_siblings(output: Path) -> None:

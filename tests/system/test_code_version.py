@@ -67,7 +67,7 @@ def test_line_ends_change_nothing(copy: Copy):
         ("figures/raster.py", True),
         ("products/raman/figures.py", True),
         ("retrieve/elastic/flags.py", True),
-        ("site/values.py", True),
+        ("site/quality.py", True),
         ("site/templates/site.css", True),
         ("figures/figures.js", True),
         ("figures/templates/page.css", True),

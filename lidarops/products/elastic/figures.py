@@ -7,7 +7,6 @@ from typing import Final
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, image_view
 from lidarops.figures.profile_panels import ProfileQuantity, profile_view
-from lidarops.figures.series_panels import Quantity
 
 _MEGA: Final = 1e6
 _UNIT: Final = "Mm⁻¹ sr⁻¹"
@@ -31,8 +30,4 @@ FIGURES: Final = KindFigures(
         profile_view("profile", (_PROFILE,), "range"),
     ),
     preferred="aerosol_backscatter",
-    values=(
-        Quantity("aerosol_backscatter", _MEGA, _UNIT),
-        Quantity("aerosol_extinction", _MEGA, "Mm⁻¹"),
-    ),
 )

@@ -84,5 +84,4 @@ def _draw(contents: Sequence[_Content]) -> Iterator[Figure]:
 FIGURES: Final = KindFigures(
     (View("homogeneous", SECTION_VARIABLES, _read, _draw),),
     preferred="total_extinction",
-    values=(Quantity("total_extinction", 1e3, "km⁻¹"),),
 )

@@ -7,7 +7,6 @@ from typing import Final
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, View, image_view
 from lidarops.figures.profile_panels import ProfileQuantity, profile_view
-from lidarops.figures.series_panels import Quantity
 from lidarops.products.multiangle.scan_images import VARIABLES, draw_scan, read_scan
 
 _EXTINCTION: Final = ImageQuantity("total extinction", 1e3, "km⁻¹", limits=(0.01, 10.0))
@@ -36,5 +35,4 @@ FIGURES: Final = KindFigures(
         View("scan", VARIABLES, read_scan, draw_scan, first=True),
     ),
     preferred="vertical_optical_depth",
-    values=(Quantity("total_extinction", 1e3, "km⁻¹"), Quantity("vertical_optical_depth", 1.0, "")),
 )

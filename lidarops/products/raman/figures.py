@@ -7,7 +7,6 @@ from typing import Final
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, image_view
 from lidarops.figures.profile_panels import ProfileQuantity, profile_view
-from lidarops.figures.series_panels import Quantity
 
 _MEGA: Final = 1e6
 _IMAGE: Final = ImageQuantity("aerosol extinction", _MEGA, "Mm⁻¹", (1.0, 1000.0))
@@ -24,9 +23,4 @@ FIGURES: Final = KindFigures(
         profile_view("profile", _PROFILE, "range"),
     ),
     preferred="aerosol_extinction",
-    values=(
-        Quantity("aerosol_extinction", _MEGA, "Mm⁻¹"),
-        Quantity("aerosol_backscatter", _MEGA, "Mm⁻¹ sr⁻¹"),
-        Quantity("lidar_ratio", 1.0, "sr"),
-    ),
 )

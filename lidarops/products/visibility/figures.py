@@ -257,5 +257,4 @@ FIGURES: Final = KindFigures(
         View("network", MAP_VARIABLES, read_map, _draw_map, first=True),
     ),
     preferred="visibility_in_air",
-    values=(Quantity("visibility_in_air", 1e-3, "km"), Quantity("total_extinction", 1e3, "km⁻¹")),
 )
