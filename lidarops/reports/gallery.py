@@ -87,8 +87,6 @@ class Group:
 class Picture:
     """A figure of the report, equal to itself only, because arrays have no single equality."""
 
-    view: str
-    """Name of the view that drew it."""
     figure: Figure
     instrument: str
     caption: str
@@ -136,8 +134,7 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
                 contents = list(_read(processes, group, view, gallery.problems))
                 if contents:
                     title = _title(group, gallery.problems)
-                    drawn = (_picture(view.name, one, group, title) for one in view.draw(contents))
-                    gallery.pictures += drawn
+                    gallery.pictures += [_picture(one, group, title) for one in view.draw(contents)]
     return gallery
 
 
@@ -194,11 +191,11 @@ def _reason(path: Path, error: BaseException) -> str:
     return words or type(error).__name__
 
 
-def _picture(view: str, drawn: Figure, group: Group, title: str) -> Picture:
+def _picture(drawn: Figure, group: Group, title: str) -> Picture:
     scenes = counted(len(group.products), "scene")
     words = f"{scenes}. {drawn.words}."
     caption = f"{drawn.caption}: {title}"
-    return Picture(view, drawn, group.instrument, caption, group.lacking, words)
+    return Picture(drawn, group.instrument, caption, group.lacking, words)
 
 
 def _title(group: Group, unreadable: Collection[str]) -> str:

@@ -61,8 +61,6 @@ def _typed(expected: object, value: object, place: str) -> object:
         return {key: _typed(arguments[1], item, f"{place}.{key}") for key, item in pairs.items()}
     if isinstance(expected, type) and is_dataclass(expected):
         return from_plain(expected, value, place)
-    if isinstance(expected, type) and issubclass(expected, StrEnum):
-        return _enum(expected, value, place)
     return _scalar(expected, value, place)
 
 
@@ -84,17 +82,8 @@ def from_plain(kind: type[_T], value: object, place: str) -> _T:
     return kind(**{name: _typed(hints[name], items[name], f"{place}.{name}") for name in hints})
 
 
-def _enum(kind: type[StrEnum], value: object, place: str) -> StrEnum:
-    for member in kind:
-        if member.value == value:
-            return member
-    choices = ", ".join(member.value for member in kind)
-    raise MismatchError(place, f"one of {choices}, not {value!r:.80}")
-
-
 def _checked(value: object, kind: type[_T], words: str, place: str) -> _T:
-    # In Python, booleans are integers.
-    if not isinstance(value, kind) or isinstance(value, bool):
+    if not isinstance(value, kind):
         raise MismatchError(place, f"{words}, not {value!r:.80}")
     return value
 
@@ -114,7 +103,11 @@ def _scalar(kind: object, value: object, place: str) -> object:
         return value
     if kind is float and isinstance(value, str):
         value = _NOT_FINITE.get(value, value)
-    written, read, words = _SCALARS[kind]
+    read: Callable[[Any], object]
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        written, read, words = str, kind, f"one of {', '.join(kind)}"
+    else:
+        written, read, words = _SCALARS[kind]
     # In Python, booleans are integers.
     if isinstance(value, written) and isinstance(value, bool) == (kind is bool):
         with suppress(OverflowError, ValueError):

@@ -380,16 +380,15 @@ def _write_calendar(
         expected.add(name)
         _write(site, name, content)
 
-    for station, station_entries in pages.stations(entries).items():
-        by_year = pages.years(station_entries)
-        for year, year_entries in by_year.items():
-            name = year_page(station, int(year))
-            write(name, pages.year(station, int(year), year_entries, list(by_year)))
-        for month, month_entries in pages.months(station_entries).items():
+    for station, station_entries in pages.grouped(entries, "station").items():
+        by_year = pages.grouped(station_entries, "year")
+        for year in by_year:
+            write(year_page(station, year), pages.year(station, year, by_year))
+        for month, month_entries in pages.grouped(station_entries, "month").items():
             name = month_list(station, month)
             lines = [f"{links.product(entry, name)}\n" for entry in month_entries]
             write(name, "".join(lines).encode())
-        by_day = pages.days(station_entries)
+        by_day = pages.grouped(station_entries, "day")
         ends = [None, *by_day, None]
         for (before, _), (day, after) in zip(pairwise(ends), pairwise(ends[1:]), strict=False):
             if day is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import calendar
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from functools import cache, partial
 from typing import Any, Final
@@ -51,9 +51,7 @@ def _templates() -> Environment:
         "clock": _clock,
         "shown_span": _span,
         "cell": _cell,
-        "by_month": months,
-        "by_day": days,
-        "by_year": years,
+        "grouped": grouped,
         "weeks_of": _weeks,
         "day_page": day_page,
         "year_page": year_page,
@@ -159,10 +157,9 @@ def _clock(moment: str) -> str:
 
 
 def _trail(entry: Entry, page: str) -> list[tuple[str, str]]:
-    year_ = int(entry.day[:4])
     return [
         ("Archive", href(INDEX, page)),
-        (f"{entry.place} {year_}", href(year_page(entry.station, year_), page)),
+        (f"{entry.place} {entry.year}", href(year_page(entry.station, entry.year), page)),
     ]
 
 
@@ -180,31 +177,12 @@ def _cell(entries: Iterable[Entry]) -> dict[str, Any]:
     return {"share": percent(share), "of": " of profiles usable", "grade": ShareGrade.of(share)}
 
 
-def _by(entries: Iterable[Entry], key: Callable[[Entry], str]) -> dict[str, list[Entry]]:
+def grouped(entries: Iterable[Entry], by: str) -> dict[str, list[Entry]]:
+    """Return the entries by one of their texts, such as ``station`` or ``month``, in its order."""
     groups: dict[str, list[Entry]] = defaultdict(list)
     for entry in entries:
-        groups[key(entry)].append(entry)
+        groups[getattr(entry, by)].append(entry)
     return dict(sorted(groups.items()))
-
-
-def stations(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
-    """Return the entries by station."""
-    return _by(entries, lambda entry: entry.station)
-
-
-def years(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
-    """Return the entries by year."""
-    return _by(entries, lambda entry: entry.day[:4])
-
-
-def months(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
-    """Return the entries by month, such as ``2024-09``."""
-    return _by(entries, lambda entry: entry.day[:7])
-
-
-def days(entries: Iterable[Entry]) -> dict[str, list[Entry]]:
-    """Return the entries by day."""
-    return _by(entries, lambda entry: entry.day)
 
 
 def index(
@@ -215,7 +193,7 @@ def index(
     below: float,
 ) -> bytes:
     """Return the first page. `below` is the height of the calendar above the station, m."""
-    by_station = stations(entries)
+    by_station = grouped(entries, "station")
     newest = sorted(entries, key=lambda entry: (entry.start, entry.path), reverse=True)
     retrieved = [e for e in newest if is_retrieved(e.kind) and not e.lacking] or newest
     lead = "No product could be read."
@@ -243,18 +221,18 @@ def index(
     )
 
 
-def year(key: str, number: int, entries: Sequence[Entry], all_years: Sequence[str]) -> bytes:
-    """Return the page of a year of a station. `all_years` are those with data."""
-    page = year_page(key, number)
+def year(key: str, own: str, by_year: Mapping[str, Sequence[Entry]]) -> bytes:
+    """Return the page of a year of a station, with links to its other years with data."""
+    page, entries = year_page(key, own), by_year[own]
     return _render(
         "year.html",
         page,
         key=key,
         place=entries[0].place,
-        year=number,
+        year=own,
         entries=entries,
         trail=[("Archive", href(INDEX, page))],
-        others=[int(other) for other in all_years],
+        years=list(by_year),
     )
 
 
@@ -281,6 +259,6 @@ def day(key: str, day_: str, by_day: ByDay, before: str | None, after: str | Non
         before=before,
         after=after,
         days=by_day,
-        instruments=_by(entries, lambda entry: entry.instrument),
+        instruments=grouped(entries, "instrument"),
         named=_named,
     )

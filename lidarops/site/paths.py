@@ -53,9 +53,9 @@ def product_page(path: str) -> str:
     return "/".join(("product", *parts)) + ".html"
 
 
-def year_page(station: str, year: int) -> str:
+def year_page(station: str, year: str) -> str:
     """Return the page of a station's year, relative to the site."""
-    return f"station/{slug(station)}/{year:04d}.html"
+    return f"station/{slug(station)}/{year}.html"
 
 
 def month_list(station: str, month: str) -> str:

@@ -127,6 +127,16 @@ class Entry:
         return self.start[:10]
 
     @property
+    def month(self) -> str:
+        """UTC month of that day, such as ``2024-09``."""
+        return self.start[:7]
+
+    @property
+    def year(self) -> str:
+        """UTC year of that day."""
+        return self.start[:4]
+
+    @property
     def verdicts(self) -> Verdicts:
         """Numbers of good values, of those to be used with care, and of rejected ones."""
         return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
