@@ -22,7 +22,7 @@ from lidarops.catalog.raw_files import Source
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import Role
-from lidarops.system.files import COPIES, MANIFEST, SITE, product_paths, sha256_of
+from lidarops.system.files import MANIFEST, SITE, product_paths, sha256_of
 from lidarops.system.stores import Published, RemoteStore
 
 FOLDER: Final = "superseded"
@@ -326,12 +326,12 @@ def _check_links(site: Path) -> None:
         raise CatalogError(
             "there is no complete site", file=manifest, remedy="run lidarops site OUT first"
         ) from error
-    if place.rstrip("/") not in (_PUBLISHED, COPIES) and not place.startswith(_ADDRESSES):
+    if place.rstrip("/") != _PUBLISHED and not place.startswith(_ADDRESSES):
         raise CatalogError(
             f"downloads lead to {place}, but published products are beside the site",
             file=manifest,
             field="products_at",
-            remedy=f"run lidarops site OUT --products-at {_PUBLISHED}, or --copies",
+            remedy=f"run lidarops site OUT --products-at {_PUBLISHED}",
         )
 
 

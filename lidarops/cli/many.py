@@ -150,15 +150,11 @@ def site(
             " a site that is published beside the products."
         ),
     ] = "../products",
-    copies: Annotated[
-        bool,
-        typer.Option("--copies", help="Copy the products into the site, to serve it alone."),
-    ] = False,
     stac_at: Annotated[
         str,
         typer.Option(
-            help="Where links to the STAC catalog lead, for a site that is published or holds"
-            " copies: an address, or a place relative to the site. Default: no link there."
+            help="Where links to the STAC catalog lead, for a site that is published: an"
+            " address, or a place relative to the site. Default: no link there."
         ),
     ] = "",
     reports_at: Annotated[
@@ -191,7 +187,6 @@ def site(
             out,
             workers=workers,
             products_at=products_at,
-            copies=copies,
             stac_at=stac_at,
             reports_at=reports_at,
             below=below,

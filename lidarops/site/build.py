@@ -44,10 +44,8 @@ from lidarops.site.product_entry import Entry, Problem
 from lidarops.site.quality import Quality, read_quality
 from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
-    COPIES,
     MANIFEST,
     SITE,
-    copy_atomically,
     product_paths,
     sha256_of,
     within,
@@ -60,7 +58,7 @@ _READ_BYTES: Final = 16_000_000
 """Most bytes of a variable that is read as a whole."""
 _ALWAYS: Final = "time", TIME_BOUNDS, QUALITY_FLAG, USABLE
 _EMPTY: Final = "No figure of the product"
-_OURS: Final = ("product", "station", COPIES)
+_OURS: Final = ("product", "station")
 """Folders that only the site writes to."""
 
 
@@ -92,7 +90,6 @@ def build_site(
     *,
     workers: int = 1,
     products_at: str = BESIDE,
-    copies: bool = False,
     stac_at: str = "",
     reports_at: str = "",
     below: float = CALENDAR_HEIGHT,
@@ -113,8 +110,6 @@ def build_site(
         Number of processes.
     products_at : str, optional
         Where the downloads lead: an address, or a place relative to the site.
-    copies : bool, optional
-        Whether the site holds copies of the products, so that it can be served alone.
     stac_at, reports_at : str, optional
         Where the links to the STAC catalog and to the report of the last run lead, where the site
         is not used in the output: an address, or a place relative to the site.
@@ -138,7 +133,7 @@ def build_site(
         If the site cannot be written, or the folder ``site`` has other content.
     """
     output = Path(output).resolve()
-    links = Links(output, COPIES if copies else products_at, stac_at, reports_at)
+    links = Links(output, products_at, stac_at, reports_at)
     products, site = product_folder(output), output / SITE
     before = _manifest(site, links, below)
     tasks = [(path, before.get(path)) for path in product_paths(products)]
@@ -147,12 +142,10 @@ def build_site(
         entries, problems, made = _collected(done, progress)
     built = Site(site / pages.INDEX, len(entries), made, tuple(problems))
     stated = _stated(entries, problems, links, below)
-    if built.index.is_file() and not copies and (site / MANIFEST).read_bytes() == stated:
+    if built.index.is_file() and (site / MANIFEST).read_bytes() == stated:
         return built
     entries = list(_linked(site, entries, links))
     expected = _write_calendar(site, entries, problems, links, below)
-    if copies:
-        expected |= _copy(products, site, entries)
     _write(site, MANIFEST, _stated(entries, problems, links, below))
     _sweep(site, expected)
     return built
@@ -329,17 +322,15 @@ def _figures(
     return [(figure, browser.inline(figure)) for figure in _with_quality(figures, quality)]
 
 
-def _write(site: Path, name: str, content: bytes | Path) -> None:
-    """Write a file of the site, or copy it, atomically; one that holds the same stays as it is.
+def _write(site: Path, name: str, content: bytes) -> None:
+    """Write a file of the site atomically; one that holds the same stays as it is.
 
     All files are written here.
     """
     target = within(site, name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if isinstance(content, Path):
-            copy_atomically(content, target)
-        elif not target.is_file() or target.read_bytes() != content:
+        if not target.is_file() or target.read_bytes() != content:
             write_atomically(target, content)
     except OSError as error:
         raise UnavailableError(
@@ -356,18 +347,6 @@ def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entr
         linked = pages.with_navigation(page, pages.navigation(entry, neighbours, links))
         _write(site, entry.page, linked)
         yield replace(entry, digests=(hashlib.sha256(linked).hexdigest(), *entry.digests[1:]))
-
-
-def _copy(products: Path, site: Path, entries: Sequence[Entry]) -> set[str]:
-    """Copy the products that the site lacks or has in another version; return their names."""
-    names = set()
-    for entry in entries:
-        name = f"{COPIES}/{entry.path}"
-        names.add(name)
-        copy = within(site, name)
-        if not copy.is_file() or sha256_of(copy) != entry.sha256:
-            _write(site, name, within(products, entry.path))
-    return names
 
 
 def _write_calendar(
@@ -410,8 +389,6 @@ def _sweep(site: Path, expected: set[str]) -> None:
                     file.rmdir()
             elif file.relative_to(site).as_posix() not in expected:
                 file.unlink(missing_ok=True)
-    if (site / COPIES).is_dir() and not any((site / COPIES).iterdir()):
-        (site / COPIES).rmdir()
 
 
 @cache

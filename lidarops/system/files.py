@@ -5,14 +5,13 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
-from typing import IO, Final
+from typing import Final
 
 from lidarops.errors import ProductError
 
@@ -20,8 +19,6 @@ SITE: Final = "site"
 """Folder of the site beside the products, also where it is published."""
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
-COPIES: Final = "files"
-"""Folder of the site with copies of the products."""
 
 
 @contextmanager
@@ -126,35 +123,11 @@ def write_atomically(target: Path, content: bytes) -> None:
     OSError
         If the file system refuses; `target` is then unchanged.
     """
-    with _replacing(target) as stream:
-        stream.write(content)
-
-
-def copy_atomically(source: Path, target: Path) -> None:
-    """Copy a file as `write_atomically` writes one, without holding it in memory.
-
-    Parameters
-    ----------
-    source : Path
-    target : Path
-        File to create or replace; its folder must exist.
-
-    Raises
-    ------
-    OSError
-        If a file system refuses; `target` is then unchanged.
-    """
-    with source.open("rb") as content, _replacing(target) as stream:
-        shutil.copyfileobj(content, stream)
-
-
-@contextmanager
-def _replacing(target: Path) -> Iterator[IO[bytes]]:
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            yield stream
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         # mkstemp makes files that only their owner can read, but reports are shared.

@@ -156,24 +156,6 @@ def test_a_citation_without_an_author_begins_with_the_title() -> None:
     assert citation(xr.Dataset(attrs={"title": "Mini"})) == "Mini."
 
 
-def test_a_site_with_copies_can_be_served_alone(tmp_path: Path) -> None:
-    output = tmp_path / "out"
-    files = [add(output, kind) for kind in ("signal", "elastic")]
-    result = CliRunner().invoke(app, ["site", str(output), "--copies"])
-    assert result.exit_code == 0, result.output
-    site = shutil.copytree(output / "site", tmp_path / "alone")
-    for page in site.rglob("*.html"):
-        for href in links(page):
-            path = (page.parent / unquote(href.partition("#")[0])).resolve()
-            assert path.is_relative_to(site), href
-            assert path.exists(), href
-    for file in files:
-        copy = site / "files" / file.relative_to(output / "products")
-        assert copy.read_bytes() == file.read_bytes()
-    build_site(output)
-    assert not (output / "site/files").exists()
-
-
 @pytest.mark.parametrize(
     ("place", "expected"),
     [
@@ -240,10 +222,7 @@ def test_the_stac_item_is_linked_where_it_exists(tmp_path: Path) -> None:
     assert (index.parent / catalog).is_file()
 
 
-@pytest.mark.parametrize("serving", [["--products-at", ".."], ["--copies"]])
-def test_a_published_site_links_catalog_and_report_where_they_are(
-    tmp_path: Path, serving: list[str]
-) -> None:
+def test_a_published_site_links_catalog_and_report_where_they_are(tmp_path: Path) -> None:
     output = tmp_path / "out"
     add(output, "signal")
     catalog, report = output / "aggregates/stac/catalog.json", output / "report/run-1/index.html"
@@ -252,7 +231,7 @@ def test_a_published_site_links_catalog_and_report_where_they_are(
         file.write_text("{}")
 
     def shown(*options: str) -> dict[str, str]:
-        result = CliRunner().invoke(app, ["site", str(output), *serving, *options])
+        result = CliRunner().invoke(app, ["site", str(output), "--products-at", "..", *options])
         assert result.exit_code == 0, result.output
         return {words: href for href, words in links(output / "site/index.html").items()}
 

@@ -1,34 +1,34 @@
-"""Files are written and copied as a whole or not at all."""
+"""Files are written as a whole or not at all."""
 
 from __future__ import annotations
 
-import tracemalloc
+import os
 from pathlib import Path
 
 import pytest
 
-from lidarops.system.files import copy_atomically
-
-SIZE = 20_000_000
+from lidarops.system.files import write_atomically
 
 
-def test_a_copy_is_equal_and_not_held_in_memory(tmp_path: Path) -> None:
-    source, target = tmp_path / "source", tmp_path / "target"
-    source.write_bytes(bytes(range(250)) * (SIZE // 250))
+def test_a_file_is_replaced_and_can_be_read_by_others(tmp_path: Path) -> None:
+    target = tmp_path / "target"
     target.write_bytes(b"old")
-    tracemalloc.start()
-    copy_atomically(source, target)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < SIZE / 10
-    assert target.read_bytes() == source.read_bytes()
+    write_atomically(target, b"new")
+    assert target.read_bytes() == b"new"
     assert target.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_source_that_is_missing_leaves_the_target(tmp_path: Path) -> None:
+def test_a_disk_that_refuses_leaves_the_target(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     target = tmp_path / "target"
     target.write_bytes(b"old")
-    with pytest.raises(FileNotFoundError):
-        copy_atomically(tmp_path / "missing", target)
+
+    def refuse(_: int) -> None:
+        raise OSError(28, "no space left")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(OSError, match="no space"):
+        write_atomically(target, b"new")
     assert target.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["target"]
