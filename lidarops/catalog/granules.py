@@ -34,8 +34,6 @@ Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?(e[-+]?\d+)?")
 _MOST_VALUES: Final = 3
 """Notes that differ by a number only, as of the angles of a scan, of which each is reported."""
-MOST_NOTES: Final = 100
-"""Different notes on files that are reported; others are counted."""
 
 
 class Fingerprint(NamedTuple):
@@ -333,8 +331,8 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
 def joined_notes(notes: Iterable[FileNote]) -> tuple[FileNote, ...]:
     """Return notes, contradictions first, then by frequency; equal ones are one.
 
-    So are many that differ by numbers only, and those beyond the most that are reported: notes that
-    state a value of each file would fill the report.
+    So are many that differ by numbers only: notes that state a value of each file would fill the
+    report.
     """
     wordings: dict[tuple[str, bool, str], Counter[str]] = defaultdict(Counter)
     for note in notes:
@@ -348,13 +346,7 @@ def joined_notes(notes: Iterable[FileNote]) -> tuple[FileNote, ...]:
             found = {f"{text}; {len(texts) - 1} other values in other files": texts.total()}
         joined += [FileNote(instrument, text, contradicts, files) for text, files in found.items()]
     joined.sort(key=lambda note: (not note.contradicts, -note.files, note.instrument, note.text))
-    more: Counter[tuple[str, bool]] = Counter()
-    for note in joined[MOST_NOTES:]:
-        more[note.instrument, note.contradicts] += note.files
-    rest = (
-        FileNote(name, "other notes", contradicts, n) for (name, contradicts), n in more.items()
-    )
-    return (*joined[:MOST_NOTES], *rest)
+    return tuple(joined)
 
 
 def _sentences(stored: str) -> tuple[str, ...]:
