@@ -172,14 +172,20 @@ class Granules(Database):
                 if "/" not in path[len(begin) :]
             ]
 
-    def days_below(self, folder: str, instrument: str) -> list[datetime]:
-        """Return when the first good signal file of each day starts, of those below a folder."""
+    def nearest_days(self, folder: str, instrument: str) -> list[datetime]:
+        """Return when the first good signal file of each day starts, of those below a folder.
+
+        Of the first folder above it that holds some, where it holds none.
+        """
         query = (
             sa.select(sa.func.min(_C.start))
             .where(*self._good_below(folder, Role.SIGNAL), _C.instrument == instrument)
             .group_by(_C.day)
         )
-        return sorted(start for (start,) in self.read(query, tuple))
+        days = sorted(start for (start,) in self.read(query, tuple))
+        if days or not folder:
+            return days
+        return self.nearest_days(folder.rpartition("/")[0], instrument)
 
     def _good(self, role: Role | None = None) -> list[sa.ColumnElement[bool]]:
         conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
