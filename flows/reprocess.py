@@ -69,7 +69,6 @@ from lidarops.run.archive import (
 from lidarops.run.options import (
     NO_USABLE_VALUE,
     check_selection,
-    missing_report,
     selected,
     selects_no_scene,
 )
@@ -302,8 +301,6 @@ def reprocess(
     made = "" if result.record is None else result.record.id
     for page in report_earlier_runs(settings, without=made, workers=local):
         get_run_logger().info("campaign %s: report of an earlier run, %s", settings.name, page)
-    if report_note := missing_report(settings):
-        get_run_logger().warning("campaign %s: %s", settings.name, report_note)
     if not result.has_failures:
         return result, built
     # Prefect uses a returned state as that of the flow, and gives its data to callers.

@@ -645,8 +645,6 @@ class IdlePattern:
     key: str
     """``files`` or ``dark_files``."""
     pattern: str
-    near: tuple[str, ...]
-    """Files of the archive with similar names that no instrument claims."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,6 @@ from lidarops.catalog.folder import (
     InstrumentHeaders,
     Purpose,
     instruments_of,
-    lone_beams,
 )
 from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
@@ -31,7 +30,6 @@ from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.formats import time_in_path
 from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
 from lidarops.records import ChannelLayout, DetectionMode, file_channels, is_glued
-from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _NEAR: Final = 0.2
 """degree, 22 km of latitude: twice the rounding of headers, and the reach of horizontal beams."""
@@ -115,7 +113,7 @@ def draft_campaign(
     CatalogError
         If the folder holds no raw file that can be used.
     """
-    known, lone = drafted_instruments(contents)
+    known = drafted_instruments(contents)
     if not known:
         reasons = [reason for _, reason in contents.refused[:1]]
         packed = "".join(f"unpack {path}, or " for path in _packed(contents)[:1])
@@ -148,31 +146,17 @@ def draft_campaign(
         lines += [*_instrument(key, seen, sites[key], estimates=estimates), ""]
     lines += _networks({key: (headers, sites[key]) for key, headers in known.items()})
     lines.append("scenes: {window: day}  # products of one file each: day, 6h, 30min")
-    return "\n".join([*lines, *_left_out(contents, archive, lone), ""])
+    return "\n".join([*lines, *_left_out(contents, archive), ""])
 
 
-def drafted_instruments(
-    contents: FolderContents,
-) -> tuple[dict[str, InstrumentHeaders], list[FileGroup]]:
-    """Return the instruments of a draft by their keys, and groups of beams that are left out.
-
-    None where no raw file can be used.
-    """
+def drafted_instruments(contents: FolderContents) -> dict[str, InstrumentHeaders]:
+    """Return the instruments of a draft by their keys; none where no raw file can be used."""
     tests = [group for group in contents.groups if group.purpose not in _USED]
     if not any(group.purpose is Purpose.MEASUREMENT for group in contents.groups):
         tests = []
     instruments = [one for one in instruments_of(contents.groups, tests) if one.files]
-    lone = [
-        group
-        for instrument in filter(_scans, instruments)
-        for group in lone_beams(instrument)
-        if _is_free(group)
-    ]
-    if lone:
-        left_out = [*tests, *lone]
-        instruments = [one for one in instruments_of(contents.groups, left_out) if one.files]
     keys = _keys(f"{site.key}-lidar" for site in _sites(instruments))
-    return dict(zip(keys, instruments, strict=True)), lone
+    return dict(zip(keys, instruments, strict=True))
 
 
 def _sites(instruments: Sequence[InstrumentHeaders]) -> list[_Site]:
@@ -207,14 +191,6 @@ def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
 
 def _scans(headers: InstrumentHeaders) -> bool:
     return headers.zenith_span >= LEAST_SPREAD
-
-
-def _is_free(group: FileGroup) -> bool:
-    """Return whether no beam is so low that it may be blocked, which shows the analog baseline.
-
-    Without the blocked beam of SAVANT, all analog values of its scans are rejected.
-    """
-    return max(map(abs, group.zenith_angles)) <= 90.0 - THRESHOLDS.lowest_free
 
 
 def _instrument(
@@ -392,7 +368,7 @@ def _networks(known: Mapping[str, tuple[InstrumentHeaders, _Site]]) -> Iterator[
             yield ""
 
 
-def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup]) -> Iterator[str]:
+def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
     """Yield comments on the files that no instrument has."""
     tables = [path for path in contents.other if path.lower().endswith(_PROFILES)]
     packed = _packed(contents)
@@ -405,10 +381,6 @@ def _left_out(contents: FolderContents, archive: str, lone: Sequence[FileGroup])
         named += "; copy them below the folder of this file first"
     for title, paths in (
         ("copies of the last record of the acquisition, left out", contents.copies),
-        (
-            "of cycles of one beam, whose values a scan rejects, left out of `files`",
-            [path for group in lone for path in group.files],
-        ),
         *(
             (
                 f"? {purpose} by path or counts, left out of `files`",

@@ -12,8 +12,6 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Final
 
-import numpy as np
-
 from lidarops.catalog.raw_files import (
     HEADER_BYTES,
     Source,
@@ -22,11 +20,10 @@ from lidarops.catalog.raw_files import (
     printable,
 )
 from lidarops.constants import FIXED, STEEPEST
-from lidarops.errors import RawFormatError, RetrievalInputError
+from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, time_in_path
 from lidarops.raw.header import HeaderPointing, RawHeader, named_layout, recorder_names
 from lidarops.records import FEWEST_ALIKE, UNKNOWN_FORMAT, ChannelLayout, DetectionMode
-from lidarops.retrieve.multiangle import scan_cycles
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 from lidarops.system.stores import Stored
 
@@ -442,39 +439,6 @@ def _purpose(folder: str, stem: str) -> Purpose:
         if re.search(rf"(?<![a-z])({known})(?![a-z])", f"{words} {name}"):
             return purpose
     return Purpose.MEASUREMENT
-
-
-def lone_beams(headers: InstrumentHeaders) -> tuple[FileGroup, ...]:
-    """Return the groups of a scanning instrument whose cycles have one beam each; none if all do.
-
-    Of cycles of one beam, a scan has no value.
-    """
-    rows = sorted(
-        (header.start.timestamp(), header.stop.timestamp(), *_beam(header), number)
-        for number, group in enumerate(headers.signal)
-        for header in group.headers
-    )
-    beams = np.array(rows)
-    zenith_angle, azimuth, group = beams.T[2:]
-    try:
-        cycle = scan_cycles.cycles(zenith_angle, azimuth, beams[:, :2])
-        direction = scan_cycles.directions(zenith_angle, azimuth).index
-    except RetrievalInputError:
-        # Without times that rise, nothing is known of cycles; the plan says it.
-        return ()
-    known = direction >= 0
-    counts = np.bincount(np.unique([cycle[known], direction[known]], axis=1)[0])
-    group = group[known].astype(int)
-    scanned = set(group[counts[cycle[known]] > 1].tolist())
-    lone = set(group.tolist()) - scanned
-    return tuple(headers.signal[number] for number in sorted(lone)) if scanned else ()
-
-
-def _beam(header: RawHeader) -> tuple[float, ...]:
-    """Return zenith angle and azimuth in degree; NaN where none, or a doubtful one, is stated."""
-    zenith_angle = None if header.doubt else header.zenith_angle
-    stated = (zenith_angle, header.azimuth)
-    return tuple(math.nan if angle is None else angle for angle in stated)
 
 
 def instruments_of(

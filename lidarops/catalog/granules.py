@@ -34,8 +34,6 @@ Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?(e[-+]?\d+)?")
 _MOST_VALUES: Final = 3
 """Notes that differ by a number only, as of the angles of a scan, of which each is reported."""
-MOST_NOTES: Final = 100
-"""Different notes on files that are reported; others are counted."""
 
 
 class Fingerprint(NamedTuple):
@@ -174,14 +172,20 @@ class Granules(Database):
                 if "/" not in path[len(begin) :]
             ]
 
-    def days_below(self, folder: str, instrument: str) -> list[datetime]:
-        """Return when the first good signal file of each day starts, of those below a folder."""
+    def nearest_days(self, folder: str, instrument: str) -> list[datetime]:
+        """Return when the first good signal file of each day starts, of those below a folder.
+
+        Of the first folder above it that holds some, where it holds none.
+        """
         query = (
             sa.select(sa.func.min(_C.start))
             .where(*self._good_below(folder, Role.SIGNAL), _C.instrument == instrument)
             .group_by(_C.day)
         )
-        return sorted(start for (start,) in self.read(query, tuple))
+        days = sorted(start for (start,) in self.read(query, tuple))
+        if days or not folder:
+            return days
+        return self.nearest_days(folder.rpartition("/")[0], instrument)
 
     def _good(self, role: Role | None = None) -> list[sa.ColumnElement[bool]]:
         conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
@@ -333,8 +337,8 @@ def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
 def joined_notes(notes: Iterable[FileNote]) -> tuple[FileNote, ...]:
     """Return notes, contradictions first, then by frequency; equal ones are one.
 
-    So are many that differ by numbers only, and those beyond the most that are reported: notes that
-    state a value of each file would fill the report.
+    So are many that differ by numbers only: notes that state a value of each file would fill the
+    report.
     """
     wordings: dict[tuple[str, bool, str], Counter[str]] = defaultdict(Counter)
     for note in notes:
@@ -348,13 +352,7 @@ def joined_notes(notes: Iterable[FileNote]) -> tuple[FileNote, ...]:
             found = {f"{text}; {len(texts) - 1} other values in other files": texts.total()}
         joined += [FileNote(instrument, text, contradicts, files) for text, files in found.items()]
     joined.sort(key=lambda note: (not note.contradicts, -note.files, note.instrument, note.text))
-    more: Counter[tuple[str, bool]] = Counter()
-    for note in joined[MOST_NOTES:]:
-        more[note.instrument, note.contradicts] += note.files
-    rest = (
-        FileNote(name, "other notes", contradicts, n) for (name, contradicts), n in more.items()
-    )
-    return (*joined[:MOST_NOTES], *rest)
+    return tuple(joined)
 
 
 def _sentences(stored: str) -> tuple[str, ...]:

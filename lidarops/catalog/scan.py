@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -45,11 +44,6 @@ _FACTS_OF_HEADERS: Final = {
     "valid_from", "valid_to", "invalid", "zenith_angle", "azimuth", "clock_offset"
 }  # fmt: skip
 """Facts on which the granule of a file depends."""
-_NAMES_OF_FOLDER: Final = 3
-"""Files of a folder that are compared with patterns that match nothing."""
-_LEAST_LIKENESS: Final = 0.5
-"""Share of equal characters in names that count as similar; assumed."""
-_NAMES_SHOWN: Final = 3
 
 Progress = Callable[[int], None]
 
@@ -175,10 +169,6 @@ class _Scan:
         self._folder: str | None = None
         self._near: list[_Claim] = []
         self._idle = set(self._claims)
-        self._alike: dict[str, list[tuple[float, str]]] = defaultdict(list)
-        """Likeness, negative, and names of files without claim that resemble a pattern."""
-        self._first: tuple[str, int] = "", 0
-        """Folder of the last of them, and how many it held."""
         self._files = self._changed = 0
         self._judged: deque[Fingerprint | None] = deque()
         self._pending: list[GranuleRow] = []
@@ -195,10 +185,8 @@ class _Scan:
         """Compare each file with the catalog, and yield those whose header must be read."""
         for file, before in pairs:
             owners = [] if file is None else self.owners(file.path)
-            if self._idle and file is not None:
+            if self._idle:
                 self._idle.difference_update(owners)
-                if not owners:
-                    self._compare(file.path, {claim.pattern for claim in self._idle})
             if file is None or not owners:
                 if before is not None:
                     self._gone.append(before)
@@ -216,17 +204,6 @@ class _Scan:
                 yield UnreadFile(file, first, owners[0].role, tuple(rivals), key)
             else:
                 self._readable = True
-
-    def _compare(self, path: str, patterns: Iterable[str]) -> None:
-        """Compare a file without claim with patterns, if it is among the first of its folder."""
-        folder = path.rpartition("/")[0]
-        last, number = self._first
-        self._first = folder, number + 1 if folder == last else 1
-        for pattern in patterns if self._first[1] <= _NAMES_OF_FOLDER else ():
-            likeness = _likeness(pattern.lower(), path.lower())
-            if likeness >= _LEAST_LIKENESS:
-                alike = sorted({*self._alike[pattern], (-likeness, path)})
-                self._alike[pattern] = alike[:_NAMES_SHOWN]
 
     def _is_known(self, before: Fingerprint, file: Stored, key: str) -> bool:
         """Return whether the catalog holds what a file is; a damaged one may have been repaired."""
@@ -330,7 +307,6 @@ class _Scan:
                     claim.instrument,
                     "dark_files" if claim.role is Role.DARK else "files",
                     claim.pattern,
-                    tuple(path for _, path in self._alike[claim.pattern]),
                 )
                 for claim in self._claims
                 if claim in self._idle
@@ -366,17 +342,6 @@ class _Scan:
                     candidates[digest] -= 1
                     moved[path] = digest
         return moved
-
-
-def _likeness(pattern: str, path: str) -> float:
-    """Return the share of equal characters of a pattern and the begin of a path.
-
-    Folders and names are compared apart: a name is often longer than its pattern.
-    """
-    folder, _, name = re.sub(r"[*?]|\[.*?\]", "", pattern).rpartition("/")
-    of_file, _, file = path.rpartition("/")
-    begin = f"{of_file}/{file[: len(name)]}"
-    return difflib.SequenceMatcher(None, f"{folder}/{name}", begin).ratio()
 
 
 def _claims(campaign: Campaign) -> list[_Claim]:

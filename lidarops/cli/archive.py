@@ -220,7 +220,7 @@ def reprocess(
     """
     from lidarops.catalog.store import RunStatus
     from lidarops.run import archive as pipeline
-    from lidarops.run.options import missing_report, selects_no_scene
+    from lidarops.run.options import selects_no_scene
 
     set_up_log(log_level, as_json=log_json, file=log_file)
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
@@ -245,14 +245,13 @@ def reprocess(
         _print_result(
             settings, result, no_scene=no_scene, removing=remove_orphans, everything=everything
         )
-    page, removed, report_note = None, None, ""
+    page, removed = None, None
     earlier: list[Path] = []
     try:
         if result.record is not None:
             page = _page(settings, result.record, chosen.workers)
         own = "" if result.record is None else result.record.id
         earlier = pipeline.report_earlier_runs(settings, without=own, workers=chosen.workers)
-        report_note = missing_report(settings) if result.record is None else ""
         if remove_orphans:
             removed = pipeline.remove_orphans(settings, result, wait=wait)
     finally:
@@ -261,13 +260,11 @@ def reprocess(
             summary = _run_summary(settings, result, page)
             summary |= {"no_scene_selected": no_scene, "removed": removed or 0}
             summary |= {"earlier_reports": [str(made) for made in earlier]}
-            typer.echo(json.dumps({**summary, "unreported": report_note}, indent=2))
+            typer.echo(json.dumps(summary, indent=2))
         else:
             _print_places(result, page)
             for made in earlier:
                 say(f"report of an earlier run: {made}")
-            if report_note:
-                typer.echo(report_note)
     if removed is not None and not as_json:
         most = None if everything else _FEW_ROWS
         show_tables([_orphan_table(result, f"{removed} removed")], most)

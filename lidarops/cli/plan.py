@@ -262,7 +262,7 @@ def _needs(plan: Plan) -> Iterator[str]:
 
 def _effect(step: PlannedStep, plan: Plan) -> str:
     from lidarops.reports.rejections import settings_in_words
-    from lidarops.scene.choices import idle_window
+    from lidarops.scene.retrieval import idle_window
 
     idle = idle_window(step, plan.steps)
     return f"no effect: {idle}" if idle else ", ".join(settings_in_words(step))
@@ -283,7 +283,7 @@ def _kept(judged: Judgement) -> tuple[tuple[str, Sequence[Stale]], ...]:
 
 def _plain(judged: Judgement) -> dict[str, Any]:
     from lidarops.records import entry_as_dict
-    from lidarops.scene.choices import idle_window
+    from lidarops.scene.retrieval import idle_window
 
     stale, frozen, kept = (
         [{"kind": each.kind, "channel": each.channel, "reason": each.reason} for each in products]

@@ -83,9 +83,8 @@ def _rows(findings: Findings) -> Iterator[FindingRow]:
         subject = f"{lost.files:,} of {counted(lost.of, 'raw file')}: {names}"
         yield FindingRow(lost.instrument, subject, problem, fails=bool(lost.kept))
     for idle in findings.idle_patterns:
-        near = f"; unclaimed files with similar names: {', '.join(idle.near)}" if idle.near else ""
-        problem = f"matches no file of the archive{near}"
-        yield FindingRow(idle.instrument, f"{idle.key}: {idle.pattern}", problem, fails=True)
+        subject = f"{idle.key}: {idle.pattern}"
+        yield FindingRow(idle.instrument, subject, "matches no file of the archive", fails=True)
     for facts in (*findings.idle_facts, *findings.incomplete_facts):
         yield FindingRow(facts.instrument, facts.subject, facts.reason, fails=False)
     for note in findings.file_notes:

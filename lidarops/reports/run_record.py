@@ -25,7 +25,7 @@ JOURNAL: Final = "scenes.jsonl"
 INDEX: Final = "index.html"
 """Name of the page beside it."""
 _FORMAT: Final = "lidarops run record"
-_VERSION: Final = 8
+_VERSION: Final = 9
 _REMEDY: Final = "give a run's report folder or its run.json, or run the campaign again"
 
 _LOG = logging.getLogger(__name__)

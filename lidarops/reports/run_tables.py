@@ -32,13 +32,8 @@ from lidarops.records import (
     SceneOutcome,
     Verdicts,
 )
-from lidarops.reports.findings import (
-    disagreement_rows,
-    finding_rows,
-    scene_note_rows,
-    unmade_words,
-)
-from lidarops.scene.choices import idle_window
+from lidarops.reports.findings import disagreement_rows, finding_rows, scene_note_rows, unmade_words
+from lidarops.scene.retrieval import idle_window
 
 _T = TypeVar("_T")
 _MOST_NAMES: Final = 8

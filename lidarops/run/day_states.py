@@ -168,8 +168,7 @@ class DayStates:
     @cached_property
     def refused(self) -> tuple[RefusedFile, ...]:
         """Files that the catalog refuses, with times to which they belong."""
-        store = self.store
-        return tuple(dated(self.campaign, store.refused(), store.files_in, store.days_below))
+        return tuple(dated(self.campaign, self.store))
 
     def ancillary(self, name: str) -> str:
         """Return the SHA-256 of an ancillary file when it was first needed."""

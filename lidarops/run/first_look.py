@@ -91,7 +91,7 @@ def look_at_data(
     drafted = with_plain_numbers(yaml.safe_load(text), campaign_schema)
     looks: dict[str, FirstLook] = {}
     failed: dict[str, str] = {}
-    for key, headers in drafted_instruments(contents)[0].items():
+    for key, headers in drafted_instruments(contents).items():
         if "elastic" in drafted["instruments"][key]["products"]:
             with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
                 try:

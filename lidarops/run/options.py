@@ -14,7 +14,6 @@ from lidarops.catalog.store import RecordedProduct, RunStatus, Store, Verdict
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
 from lidarops.records import Findings, RunRecord, SceneOutcome, day_of
-from lidarops.reports import run_record
 from lidarops.run.scenes import parse_scene_id, scene_stop
 
 if TYPE_CHECKING:
@@ -200,23 +199,6 @@ def unused(
             empty_scenes |= verdict.empty_scenes
             set_aside |= verdict.set_aside
     return empty_scenes, set_aside
-
-
-def missing_report(campaign: Campaign) -> str:
-    """Return how to get the missing report page of the last run; empty if it is not missing.
-
-    The page is missing if the disk was full or the run was stopped while it drew.
-    """
-    with Store(campaign.catalog_url, campaign.name, create=False) as store:
-        for last in store.runs(limit=1):
-            folder = campaign.report_root / last.id
-            if not folder.is_dir() or (folder / run_record.INDEX).exists():
-                return ""
-            problem = "the report page of the last run is missing"
-            if run_record.exists(folder):
-                return f"{problem}; make it with: lidarops report {folder}"
-            return f"{problem}, and so is its record; lidarops reprocess --force makes new ones"
-    return ""
 
 
 def check_selection(campaign: Campaign, selection: Selection) -> None:

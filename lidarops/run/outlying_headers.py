@@ -42,6 +42,8 @@ ReadHeader = Callable[[Granule], RawHeader | None]
 Ahead = Callable[[Granule], float | None]
 """Clock of the instrument minus UTC at a file, s, which its start has not; None where names tell no
 time."""
+Statements = Iterator[tuple[int, str, bool]]
+"""Place of a file, what its header states, and whether the file cannot be used for that."""
 
 
 class Outlying(NamedTuple):
@@ -102,7 +104,7 @@ def outlying_headers(
     for granule in sorted(granules, key=lambda g: (g.start, g.path)):
         if granule.start:
             by_day[granule.instrument, granule.role, day_of(granule.start)].append(granule)
-    found: dict[str, Outlying] = {}
+    found: dict[str, dict[bool, list[str]]] = {}
     for instrument, role, day in [key for key in by_day if key[2] in days]:
         near = range(day - NEAR_DAYS, day + NEAR_DAYS + 1)
         around = [g for other in near for g in by_day.get((instrument, role, other), ())]
@@ -112,11 +114,13 @@ def outlying_headers(
         statements += _times(around, day, ahead)
         if role is Role.SIGNAL:
             statements += _pointings(around, day)
-        for place, stated in statements:
-            path = around[place].path
-            both = zip(found.get(path, ("", "")), stated, strict=True)
-            found[path] = Outlying(*("; ".join(filter(None, pair)) for pair in both))
-    return found
+        for place, text, refused in statements:
+            texts = found.setdefault(around[place].path, {True: [], False: []})
+            texts[refused].append(text)
+    return {
+        path: Outlying("; ".join(texts[True]), "; ".join(texts[False]))
+        for path, texts in found.items()
+    }
 
 
 def _places_of_lone_values(
@@ -133,19 +137,14 @@ def _places_of_lone_values(
             yield place, usual
 
 
-def _setups(
-    around: Sequence[Granule], day: int, read: ReadHeader
-) -> Iterator[tuple[int, Outlying]]:
-    """Yield places of files whose site or channels are recorded as in no other file."""
+def _setups(around: Sequence[Granule], day: int, read: ReadHeader) -> Statements:
+    """Yield what files alone state of their site or channels."""
     lone = dict(_places_of_lone_values(around, day, [granule.layout for granule in around]))
     lone |= _places_of_lone_values(around, day, [granule.setup for granule in around])
     for place, usual in lone.items():
         own, other = read(around[place]), read(around[usual])
         if own and other:
-            texts: dict[bool, list[str]] = {True: [], False: []}
-            for text, of_values in _differences(own, other):
-                texts[of_values].append(text)
-            yield place, Outlying("; ".join(texts[True]), "; ".join(texts[False]))
+            yield from ((place, *stated) for stated in _differences(own, other))
 
 
 def _differences(own: RawHeader, usual: RawHeader) -> Iterator[tuple[str, bool]]:
@@ -164,10 +163,8 @@ def _differences(own: RawHeader, usual: RawHeader) -> Iterator[tuple[str, bool]]
             yield f"{subject} {one}, the files around it {other}", of_values
 
 
-def _intervals(
-    around: Sequence[Granule], day: int, read: ReadHeader
-) -> Iterator[tuple[int, Outlying]]:
-    """Yield places of files that lasted longer or shorter than the others for the same shots.
+def _intervals(around: Sequence[Granule], day: int, read: ReadHeader) -> Statements:
+    """Yield which files lasted longer or shorter than the others for the same shots.
 
     One that lasted while another one was recorded cannot be used: its start or stop is wrong.
     """
@@ -184,15 +181,13 @@ def _intervals(
         text += f" the files around it {other} s for {others}"
         start, stop = ends[place]
         beside = ends[max(place - 1, 0) : place] + ends[place + 1 : place + 2]
-        if any(min(stop, past) - max(start, first) > _JITTER for first, past in beside):
-            text += ", and one of them was recorded at the same time"
-            yield place, Outlying(text, "")
-        else:
-            yield place, Outlying("", text)
+        overlaps = any(min(stop, past) - max(start, first) > _JITTER for first, past in beside)
+        text += ", and one of them was recorded at the same time" if overlaps else ""
+        yield place, text, overlaps
 
 
-def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[int, Outlying]]:
-    """Yield places of files that start away from the time in their name as no other file does.
+def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Statements:
+    """Yield which files start away from the time in their name as no other file does.
 
     Names tell start or stop, in any time zone: the other files show how far they are from it. A
     clock that is set moves both, and summer time may move one of both by an hour.
@@ -221,15 +216,15 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Iterator[tuple[
             text += " where its name and the files around it have it"
             # Such a file may be the only one of its day before or after a change of time.
             summer = abs(abs(own - usual) - _SUMMER_TIME) <= room
-            yield place, Outlying("", text) if summer else Outlying(text, "")
+            yield place, text, not summer
 
 
 def _shots(header: RawHeader | None) -> int:
     return max((channel.shots for channel in header.channels), default=0) if header else 0
 
 
-def _pointings(around: Sequence[Granule], day: int) -> Iterator[tuple[int, Outlying]]:
-    """Yield the place of the file that alone has its pointing, if each other pointing has several.
+def _pointings(around: Sequence[Granule], day: int) -> Statements:
+    """Yield the pointing that one file alone has, if each other pointing has several files.
 
     Of a beam that is fixed otherwise it cannot be used: the whole scene would seem to move. In a
     scan it is one of many pointings.
@@ -240,5 +235,4 @@ def _pointings(around: Sequence[Granule], day: int) -> Iterator[tuple[int, Outly
         for place, _ in _places_of_lone_values(around, day, stated):
             named = zip(("zenith angle", "azimuth"), stated[place], strict=True)
             words = " and ".join(f"{name} {angle:g}" for name, angle in named if angle is not None)
-            text = f"the pointing {words} alone of all files around it"
-            yield place, Outlying("", text) if len(others) > 1 else Outlying(text, "")
+            yield place, f"the pointing {words} alone of all files around it", len(others) == 1

@@ -24,7 +24,7 @@ import itertools
 import math
 from bisect import bisect
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
@@ -32,7 +32,7 @@ from operator import attrgetter
 from typing import Any, Final, NamedTuple, Self
 
 from lidarops.campaign.model import Campaign, InstrumentFacts
-from lidarops.catalog.granules import DatedFile
+from lidarops.catalog.granules import DatedFile, Granules
 from lidarops.constants import DARK_REACH, LEAST_SPREAD
 from lidarops.errors import RetrievalInputError, SceneError
 from lidarops.kinds import Scope, kinds_of
@@ -393,12 +393,7 @@ class RefusedFile(NamedTuple):
     """Whether it belongs only to scenes without dark files, of which it may be the one."""
 
 
-def dated(
-    campaign: Campaign,
-    refused: Iterable[Granule],
-    files_in: Callable[[str], Iterable[DatedFile]],
-    days_below: Callable[[str, str], Sequence[datetime]],
-) -> Iterator[RefusedFile]:
+def dated(campaign: Campaign, catalog: Granules) -> Iterator[RefusedFile]:
     """Yield refused files with the times of the good files beside which they belong.
 
     These are the ones before and after in the order of names, of the same folder, instrument and
@@ -407,22 +402,13 @@ def dated(
     neither is not yielded: the files of a whole day may be unreadable. But a dark file may be the
     only one of its time, so it is yielded, in doubt, with all days of the nearest signal files from
     the dark file before to the one after.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    refused : iterable of Granule
-    files_in : callable
-        Returns the good files of a folder.
-    days_below : callable
-        Returns times of the good signal files of an instrument below a folder, one for each day.
     """
     folders: dict[str, list[Granule]] = defaultdict(list)
-    for granule in refused:
+    for granule in catalog.refused():
         folders[granule.path.rpartition("/")[0]].append(granule)
     for folder, granules in sorted(folders.items()):
         rows: dict[tuple[str, Role], list[DatedFile]] = defaultdict(list)
-        for file in sorted(files_in(folder)):
+        for file in sorted(catalog.files_in(folder)):
             if file.instrument in campaign.instruments:
                 rows[file.instrument, file.role].append(file)
         series = {key: _Series.of(campaign, files) for key, files in rows.items()}
@@ -441,21 +427,10 @@ def dated(
                 since, until = beside.times_around(granule.path) if beside else _ALWAYS
                 undated[granule.instrument, since, until].append(granule)
         for (instrument, since, until), dark in undated.items():
-            days = _nearest(folder, instrument, days_below)
+            days = catalog.nearest_days(folder, instrument)
             within = [day for day in days if since <= day <= until]
             for granule in dark[:MOST_IN_DOUBT]:
                 yield from (RefusedFile(granule, day, in_doubt=True) for day in within)
-
-
-def _nearest(
-    folder: str, instrument: str, days_below: Callable[[str, str], Sequence[datetime]]
-) -> Sequence[datetime]:
-    """Return the days of an instrument in a folder, or in the first above it that holds some."""
-    days = days_below(folder, instrument)
-    while folder and not days:
-        folder = folder.rpartition("/")[0]
-        days = days_below(folder, instrument)
-    return days
 
 
 @dataclass(frozen=True, slots=True)

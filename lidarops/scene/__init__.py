@@ -2,7 +2,7 @@
 
 `pipe` holds the stages from raw counts to profiles in order, `case` what is known when they are
 decided, `profiles` what they fill in. `retrieval` states what a kind of product adds: a decision,
-and products in the making; `choices` what several kinds decide alike. `plan` asks all of them,
+and products in the making, and what several kinds decide alike. `plan` asks all of them,
 `processing` carries the plan out. What one product depends on is what stands before it in the pipe,
 or the products that it reads (`dependence`).
 """

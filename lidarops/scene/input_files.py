@@ -19,9 +19,9 @@ from lidarops.raw.archive import open_counts
 from lidarops.raw.formats import RawFile, parse_raw_header, read_all_counts
 from lidarops.raw.header import Stretches
 from lidarops.records import UNREADABLE, Granule, InputRecord, Scene, Status
-from lidarops.scene.choices import bins_before
 from lidarops.scene.dependence import scene_facts
 from lidarops.scene.profiles import BEFORE
+from lidarops.scene.retrieval import bins_before
 from lidarops.system.stores import RemoteStore
 
 # A file that a scan does not find either counts as lost, like one that cannot be read.

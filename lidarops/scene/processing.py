@@ -49,21 +49,9 @@ from lidarops.scene.case import (
     member_channel,
     product_channel,
 )
-from lidarops.scene.choices import read_windows
-from lidarops.scene.dependence import (
-    ancillary_files,
-    read_products,
-    scene_facts,
-)
+from lidarops.scene.dependence import ancillary_files, read_products, scene_facts
 from lidarops.scene.input_files import check_files, local_files, open_granules
-from lidarops.scene.job import (
-    NO_PLACE,
-    Failure,
-    Job,
-    guarded,
-    nothing_to_do,
-    product_context,
-)
+from lidarops.scene.job import NO_PLACE, Failure, Job, guarded, nothing_to_do, product_context
 from lidarops.scene.pipe import channel_signal
 from lidarops.scene.profiles import (
     LIGHTLESS,
@@ -81,6 +69,7 @@ from lidarops.scene.retrieval import (
     NetworkRetrieval,
     making,
     product_settings,
+    read_windows,
     streams_of,
 )
 from lidarops.system.files import sha256_of

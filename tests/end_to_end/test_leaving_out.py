@@ -25,10 +25,10 @@ from lidarops.retrieve.multiangle import _block, slant_paths
 from lidarops.run.archive import Options, bring_up_to_date, reprocess
 from lidarops.run.scenes import cut_scenes
 from lidarops.scene import dependence
-from lidarops.scene.choices import idle_window, read_windows
 from lidarops.scene.job import Job
 from lidarops.scene.plan import plan_scene
 from lidarops.scene.processing import process_scene
+from lidarops.scene.retrieval import idle_window, read_windows
 from lidarops.simulate.campaign import simulate_campaign
 
 SECTIONS = {"channels": ["photon_532o"], "sections": [[750, 4500], [1500, 7500]]}

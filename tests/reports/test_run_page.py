@@ -511,7 +511,7 @@ def nasty_run(nasty: str, archive):
         findings=Findings(
             unmet=(Unmet(nasty, nasty, nasty, nasty, 3, 4, 1),),
             file_notes=(FileNote(nasty, nasty, True, 3),),
-            idle_patterns=(IdlePattern(nasty, nasty, nasty, (nasty,)),),
+            idle_patterns=(IdlePattern(nasty, nasty, nasty),),
             unusable_files=(UnusableFile(nasty, nasty, nasty, nasty),),
             unmade=(Unmade(nasty, nasty, nasty, nasty),),
             lost_files=(LostFiles(nasty, 5, 9, (nasty, nasty), 2),),

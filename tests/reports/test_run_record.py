@@ -123,7 +123,7 @@ findings = st.builds(
     Findings,
     unmet=some(st.builds(Unmet, text, text, text, text, whole, whole, whole)),
     file_notes=some(st.builds(FileNote, text, text, st.booleans(), whole)),
-    idle_patterns=some(st.builds(IdlePattern, text, text, text, some(text))),
+    idle_patterns=some(st.builds(IdlePattern, text, text, text)),
     unusable_files=some(st.builds(UnusableFile, text, text, text, text)),
     unmade=some(st.builds(Unmade, text, text, text, text)),
     lost_files=some(st.builds(LostFiles, text, whole, whole, some(text), whole)),

@@ -96,10 +96,7 @@ def test_a_tolerance_acknowledges_a_distance(archive: Archive) -> None:
 
 
 @pytest.mark.parametrize(("key", "pattern"), [("files", "poor/x*"), ("dark_files", "poor/dark/d*")])
-def test_a_pattern_without_file_is_named_with_similar_names(
-    archive: Archive, key: str, pattern: str
-) -> None:
-    raw_archives.write(archive.folder / "raw/Poor/dark/D0", b"")
+def test_a_pattern_without_file_is_named(archive: Archive, key: str, pattern: str) -> None:
     if key == "files":
         archive.tree["instruments"]["poor"]["files"] = pattern
     else:
@@ -108,17 +105,8 @@ def test_a_pattern_without_file_is_named_with_similar_names(
         shown = invoke(archive, command)
         assert shown.exit_code == 1
         assert f"{key}: {pattern}" in shown.output
-        near = "poor/h00" if key == "files" else "Poor/dark/D0"
-        assert near in shown.output
+        assert "matches no file of the archive" in shown.output
     assert invoke(archive, "reprocess", "--instrument", "rich").exit_code == 0
-
-
-@pytest.mark.parametrize("pattern", ["pillar/h*", "pilar/k*", "pilar/h25*", "Pilar/H24A0*"])
-def test_patterns_are_compared_with_the_begin_of_long_names(archive: Archive, pattern: str) -> None:
-    for name in ("h24A0217.364914", "h24A0217.365919"):
-        raw_archives.write(archive.folder / "raw/pilar" / name, b"")
-    archive.tree["instruments"]["poor"]["files"] = pattern
-    assert "pilar/h24A0217.364914" in invoke(archive, "catalog").output
 
 
 def test_facts_without_an_overlap_are_noted(archive: Archive) -> None:

@@ -9,13 +9,14 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import create_autospec
 
 import pytest
 import xarray as xr
 from support.archives.small_archive import Archive
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.granules import DatedFile
+from lidarops.catalog.granules import DatedFile, Granules
 from lidarops.netcdf.comparison import compare_products
 from lidarops.netcdf.context import MOST_UNUSED, UNUSED_INPUTS
 from lidarops.records import Grade, Granule, Role, Status
@@ -284,8 +285,10 @@ def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
     ]
     start = datetime(2026, 3, 1, tzinfo=UTC)
     days = [start + timedelta(days=day) for day in range(3650)]
-    named = dated(archive.write(), refused, lambda _: [], lambda folder, _: [] if folder else days)
-    assert sum(1 for _ in named) == MOST_IN_DOUBT * len(days)
+    catalog = create_autospec(Granules, instance=True)
+    catalog.refused.return_value, catalog.files_in.return_value = refused, []
+    catalog.nearest_days.return_value = days
+    assert sum(1 for _ in dated(archive.write(), catalog)) == MOST_IN_DOUBT * len(days)
 
 
 @pytest.mark.parametrize(
@@ -371,7 +374,7 @@ def test_a_refused_file_belongs_beside_the_files_of_like_names(
         "other": [DatedFile("other/a01", "other", Role.SIGNAL, start)],
     }
     refused = Granule(path, 0, 0, "poor", Role.SIGNAL, Status.REFUSED, "cannot be read: Stale")
-    beside = dated(
-        archive.write(), [refused], lambda folder: files.get(folder, []), lambda *_: [start]
-    )
-    assert [file.time.day for file in beside] == days
+    catalog = create_autospec(Granules, instance=True)
+    catalog.refused.return_value = [refused]
+    catalog.files_in.side_effect = lambda folder: files.get(folder, [])
+    assert [file.time.day for file in dated(archive.write(), catalog)] == days

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from lidarops.flags import Quality
-from lidarops.scene.choices import with_low_signal_to_noise
+from lidarops.scene.retrieval import with_low_signal_to_noise
 
 CARE = int(Quality.LOW_SIGNAL_TO_NOISE)
 

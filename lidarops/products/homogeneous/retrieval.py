@@ -19,23 +19,20 @@ from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
-from lidarops.retrieve.signal.labeled import (
-    CORRELATION_LENGTH,
-    baseline_error,
-    counts_per_power,
-)
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error, counts_per_power
 from lidarops.scene.case import ALL_STEPS, REQUESTED, ChannelCase, Entries, Entry, NoSettings
-from lidarops.scene.choices import (
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, in_one_batch
+from lidarops.scene.retrieval import (
     ANALOG_NOISE,
     FEWEST_BINS,
     WINDOW,
+    Retrieval,
     WindowSettings,
+    Workload,
     bins_within,
     moves,
     tail,
 )
-from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, in_one_batch
-from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
 
 Case = ChannelCase[HomogeneousSettings]

@@ -41,9 +41,15 @@ from lidarops.retrieve.multiangle.optical_depth import (
 )
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettings
-from lidarops.scene.choices import BackgroundSettings, background, no_scan, with_low_signal_to_noise
 from lidarops.scene.profiles import ChannelSignal, Chunk, Indices, ProductStream, in_one_batch
-from lidarops.scene.retrieval import Retrieval, Workload
+from lidarops.scene.retrieval import (
+    BackgroundSettings,
+    Retrieval,
+    Workload,
+    background,
+    no_scan,
+    with_low_signal_to_noise,
+)
 from lidarops.settings import SettingsModel
 
 Array = npt.NDArray[np.float64]

@@ -24,16 +24,17 @@ from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled_averaging import MEANS_TOGETHER, Screening
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, member_channel
-from lidarops.scene.choices import (
+from lidarops.scene.profiles import Averages, ChannelSignal, Chunk, ProductStream
+from lidarops.scene.retrieval import (
     AverageSettings,
+    Retrieval,
+    Workload,
     average,
     before_pulse,
     fixed_zenith,
     with_low_signal_to_noise,
     with_methods,
 )
-from lidarops.scene.profiles import Averages, ChannelSignal, Chunk, ProductStream
-from lidarops.scene.retrieval import Retrieval, Workload
 from lidarops.settings import SettingsModel, quantity
 
 Case = ChannelCase[RamanProduct]

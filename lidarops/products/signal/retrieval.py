@@ -16,16 +16,16 @@ from lidarops.products.signal import SignalSettings
 from lidarops.products.signal.variables import LAYOUT
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries
-from lidarops.scene.choices import (
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
+from lidarops.scene.retrieval import (
     FEWEST_BINS,
     BackgroundSettings,
+    Retrieval,
     background,
     before_pulse,
     tail,
     with_low_signal_to_noise,
 )
-from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
-from lidarops.scene.retrieval import Retrieval
 from lidarops.settings import SettingsModel
 
 

@@ -11,20 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.campaign.model import (
-    Campaign,
-    ChannelFacts,
-    InstrumentFacts,
-    Station,
-    channel_facts,
-)
+from lidarops.campaign.model import Campaign, ChannelFacts, InstrumentFacts, Station, channel_facts
 from lidarops.flags import Quality
-from lidarops.products.visibility import (
-    NAME,
-    MultiplierValue,
-    PriorName,
-    VisibilityProductSettings,
-)
+from lidarops.products.visibility import NAME, MultiplierValue, PriorName, VisibilityProductSettings
 from lidarops.products.visibility.variables import LAYOUT
 from lidarops.records import (
     ChannelLayout,
@@ -54,22 +43,26 @@ from lidarops.scene.case import (
     member_channel,
     product_channel,
 )
-from lidarops.scene.choices import (
+from lidarops.scene.dependence import scene_facts
+from lidarops.scene.pipe import NO_WAVELENGTH, plan_stages
+from lidarops.scene.profiles import Averages, Chunk, Indices
+from lidarops.scene.retrieval import (
     ANALOG_NOISE,
     WINDOW,
     AverageSettings,
     BackgroundSettings,
+    Member,
+    NetworkCase,
+    NetworkRetrieval,
+    NetworkStream,
     WindowSettings,
+    Workload,
     average,
     background,
     bins_within,
     merged,
     tail,
 )
-from lidarops.scene.dependence import scene_facts
-from lidarops.scene.pipe import NO_WAVELENGTH, plan_stages
-from lidarops.scene.profiles import Averages, Chunk, Indices
-from lidarops.scene.retrieval import Member, NetworkCase, NetworkRetrieval, NetworkStream, Workload
 from lidarops.settings import SettingsModel, VisibilitySettings
 
 Case = ChannelCase[VisibilityProductSettings]

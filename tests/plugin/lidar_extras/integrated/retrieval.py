@@ -12,9 +12,8 @@ from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, channel_ranges
-from lidarops.scene.choices import FEWEST_BINS, BackgroundSettings, background, tail
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
-from lidarops.scene.retrieval import Retrieval
+from lidarops.scene.retrieval import FEWEST_BINS, BackgroundSettings, Retrieval, background, tail
 from lidarops.settings import SettingsModel
 
 
