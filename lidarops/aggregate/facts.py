@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
-from enum import StrEnum
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -94,25 +93,6 @@ def _parse_time(text: datetime | str | None, name: str) -> datetime | None:
             f"is {text!r}", field=name, remedy="give a time such as 2026-03-01T12:00"
         ) from error
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
-
-
-_Choice = TypeVar("_Choice", bound=StrEnum)
-
-
-def parse_choice(choices: type[_Choice], word: str, field: str) -> _Choice:
-    """Return the member of an enumeration with this value.
-
-    Raises
-    ------
-    RetrievalInputError
-        If there is none; the message lists the choices.
-    """
-    try:
-        return choices(word)
-    except ValueError as error:
-        raise RetrievalInputError(
-            f"is {word!r}", field=field, remedy=f"choose one of {', '.join(choices)}"
-        ) from error
 
 
 FOLDER: Final = "aggregates"

@@ -77,12 +77,7 @@ class Changes:
 
 
 class UnreadableProductError(Exception):
-    """A product that cannot be read or has changed, though its facts could be read."""
-
-    def __init__(self, facts: Facts, reason: str) -> None:
-        super().__init__(reason)
-        self.facts = facts
-        self.reason = reason
+    """Facts of a product that cannot be read or has changed, and why."""
 
 
 def store_path(root: Path, kind: str) -> Path:
@@ -143,8 +138,9 @@ def update_store(
                 changes = _write_groups(session.store, root, wanted, replace(selection, kind=kind))
                 break
             except UnreadableProductError as error:
-                wanted.remove(error.facts)
-                refused.append(Refused(error.facts.path, error.reason))
+                facts, reason = error.args
+                wanted.remove(facts)
+                refused.append(Refused(facts.path, reason))
         if session.has_uncommitted_changes:
             session.commit(_message(kind, changes, runs))
         return StoreUpdate(

@@ -383,17 +383,11 @@ def _place(form: str, place: Place) -> str:
         values["pressure"] = place.pressure / 100.0
     for name, value in values.items():
         if (value is not None) != (f"{{{name}:" in _PLACES[form]):
-            if value is None:
-                raise RawFormatError(
-                    f"is needed in a {form} header",
-                    field=name,
-                    remedy="give it, or write another dialect",
-                )
-            other = next(other for other, places in _PLACES.items() if f"{{{name}:" in places)
+            has_none = f"a {form} header has no place for it"
             raise RawFormatError(
-                f"a {form} header has no place for it",
+                f"is needed in a {form} header" if value is None else has_none,
                 field=name,
-                remedy=f"omit it, or write the {other} dialect",
+                remedy="give what the dialect holds, or write another one",
             )
     return _PLACES[form].format_map(values)
 

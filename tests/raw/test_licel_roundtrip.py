@@ -155,14 +155,14 @@ def test_other_time_zones_are_written_in_utc():
         ({"zenith_angle": 72.55, "azimuth": 0.0}, "zenith angle"),
         (
             {"azimuth": 10.0, "dialect": "classic"},
-            r"azimuth: a classic header has no place for it \(omit it, or write the extended",
+            "azimuth: a classic header has no place for it",
         ),
         ({"custom": "x"}, "azimuth"),
         ({"custom": "two\nlines", "azimuth": 1.0}, "does not print"),
         ({"temperature": 300.0}, "pressure: is needed in a raymetrics header"),
         (
             {"temperature": 300.0, "pressure": 1e5, "dialect": "classic"},
-            r"temperature: a classic header has no place for it \(omit it, or write the raymetrics",
+            "temperature: a classic header has no place for it",
         ),
         ({"start": datetime(2024, 10, 2, 17, 30)}, "aware"),  # noqa: DTZ001
         ({"start": datetime(2024, 10, 2, 17, 30, 0, 1, tzinfo=UTC)}, "whole seconds"),
