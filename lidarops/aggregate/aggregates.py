@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,15 +128,11 @@ def _products(
 ) -> list[Facts]:
     products, known = [], KnownFacts(root)
     for path in list_products(root):
-        former = known.of(path)
-        found: Iterable[Facts | Refused] = (
-            read_product_facts(root, [path], selection) if former is None else [former]
-        )
-        for facts in found:
-            if isinstance(facts, Refused):
-                made.refused.append(facts)
-            elif former is None or selection.admits(facts.names, facts.start, facts.stop):
-                products.append(facts)
+        facts = known.of(path) or read_product_facts(root, path, selection)
+        if isinstance(facts, Refused):
+            made.refused.append(facts)
+        elif facts and selection.admits(facts.names, facts.start, facts.stop):
+            products.append(facts)
         progress(1)
     return products
 

@@ -245,34 +245,19 @@ def list_products(root: Path) -> list[str]:
 
 
 def read_product_facts(
-    root: Path, paths: Iterable[str], selection: ProductSelection = EVERYTHING
-) -> Iterator[Facts | Refused]:
-    """Read the facts of selected products; unreadable files do not stop the reading.
+    root: Path, path: str, selection: ProductSelection = EVERYTHING
+) -> Facts | Refused | None:
+    """Read the facts of a product, a path from `list_products`; None where it is not selected.
 
-    Parameters
-    ----------
-    root : path
-    paths : iterable of str
-        From `list_products`.
-    selection : ProductSelection
-
-    Yields
-    ------
-    Facts or Refused
-        Unreadable files are refused whatever the selection, because their kind is unknown.
+    An unreadable file is refused whatever the selection, because its kind is unknown.
     """
-    for path in paths:
-        try:
-            file = within(root, path)
-            with opened_stored(file) as product:
-                header = read_header(product, path, selection)
-                if header is None:
-                    continue
-                facts = _facts(product, file, header)
-        except ProductError as error:
-            yield Refused(path, error.problem)
-        else:
-            yield facts
+    try:
+        file = within(root, path)
+        with opened_stored(file) as product:
+            header = read_header(product, path, selection)
+            return header and _facts(product, file, header)
+    except ProductError as error:
+        return Refused(path, error.problem)
 
 
 def read_header(product: Any, path: str, selection: ProductSelection) -> Header | None:
