@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -37,22 +37,11 @@ def shared_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     }
 
 
-class Source(NamedTuple):
-    """Where the values of a product are."""
-
-    file: Path
-    id: str
-
-    def read(self, name: str, rows: slice = slice(None)) -> NDArray[Any]:
-        """Return values as stored; see `lidarops.netcdf.read.stored_values`."""
-        return stored_values(self.file, self.id, name, rows)
-
-
 class Part(NamedTuple):
     """One of the products that are joined."""
 
     header: Header
-    source: Source
+    file: Path
     attributes: Mapping[str, Any]
     times: NDArray[np.float64]
     """s since 1970, of each profile."""
@@ -118,7 +107,7 @@ def join(parts: Sequence[Part], pattern: xr.Dataset) -> xr.Dataset:
         PRODUCT_INDEX.name: np.repeat(np.arange(len(parts), dtype=np.int32), lengths),
     }
     rows = {"time": tuple(lengths), PRODUCT.name: (1,) * len(parts)}
-    sources = tuple(part.source for part in parts)
+    sources = tuple((part.file, part.header.id) for part in parts)
     variables = {
         name: xr.Variable(variable.dims, known[name], variable.attrs, variable.encoding)
         if name in known
@@ -142,15 +131,15 @@ def _on_dask(
     name: str,
     variable: xr.Variable,
     rows: Mapping[Any, tuple[int, ...]],
-    sources: tuple[Source, ...],
+    sources: tuple[tuple[Path, str], ...],
 ) -> xr.Variable:
     """Return a variable of all products, of which one is read at a time."""
     along = next((dim for dim in variable.dims if dim in rows), None)
     if along is None:
         return variable
-    blocks = _Blocks(name, variable.dims.index(along), along == PRODUCT.name, sources)
+    axis, whole = variable.dims.index(along), along == PRODUCT.name
     data = map_blocks(  # type: ignore[no-untyped-call]
-        blocks,
+        partial(_read_block, name, axis, whole, sources),
         name=f"{name}-{tokenize(sources, name)}",
         chunks=tuple(
             rows.get(dim, (size,)) for dim, size in zip(variable.dims, variable.shape, strict=True)
@@ -161,17 +150,13 @@ def _on_dask(
     return xr.Variable(variable.dims, data, variable.attrs, variable.encoding)
 
 
-@dataclass(frozen=True, slots=True)
-class _Blocks:
-    """Reads a variable of one product after the other."""
-
-    name: str
-    axis: int
-    whole: bool
-    """Whether it is of the whole product, so that it has the further dimension `axis`."""
-    sources: tuple[Source, ...]
-
-    def __call__(self, block_id: tuple[int, ...]) -> NDArray[Any]:
-        """Return the values of a block."""
-        values = self.sources[block_id[self.axis]].read(self.name)
-        return np.expand_dims(values, self.axis) if self.whole else values
+def _read_block(
+    name: str,
+    axis: int,
+    whole: bool,  # noqa: FBT001 - of a partial
+    sources: tuple[tuple[Path, str], ...],
+    block_id: tuple[int, ...],
+) -> NDArray[Any]:
+    """Return a variable of one product; one of the `whole` product gets the dimension `axis`."""
+    values = stored_values(*sources[block_id[axis]], name)
+    return np.expand_dims(values, axis) if whole else values

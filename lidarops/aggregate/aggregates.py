@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 from lidarops.aggregate.facts import (
     EVERYTHING,
@@ -27,22 +28,6 @@ from lidarops.errors import ProductError
 Progress = Callable[[int], None]
 
 
-@dataclass(frozen=True, slots=True)
-class AggregateOptions:
-    """Which aggregates to make besides the index, which is always made."""
-
-    selection: ProductSelection = EVERYTHING
-    period: Period | None = None
-    """Period of means; None for no means."""
-    weights: Weights = Weights.SHOTS
-    stac: bool = False
-    store: bool = False
-    runs: Mapping[str, str] = field(default_factory=dict)
-    """Product path -> run that made it, for the snapshots of stores."""
-    products_at: str = ""
-    """Address to which the STAC catalog links products; empty: in the output."""
-
-
 @dataclass(slots=True)
 class AggregateResult:
     """Aggregates that were made, and what failed and why."""
@@ -62,7 +47,16 @@ class AggregateResult:
 
 
 def make_aggregates(
-    root: Path, options: AggregateOptions, *, progress: Progress = lambda _done: None
+    root: Path,
+    selection: ProductSelection = EVERYTHING,
+    *,
+    period: Period | None = None,
+    weights: Weights = Weights.SHOTS,
+    stac: bool = False,
+    products_at: str = "",
+    store: bool = False,
+    runs: Mapping[str, str] = MappingProxyType({}),
+    progress: Progress = lambda _done: None,
 ) -> AggregateResult:
     """Make the aggregates of an output; a failure is reported and the others are made.
 
@@ -71,7 +65,16 @@ def make_aggregates(
     root : path
         Output of a campaign, or a folder of products; aggregates go to its ``aggregates``, stores
         to its ``stores``.
-    options : AggregateOptions
+    selection : ProductSelection
+    period : Period or None
+        Of means; None for no means.
+    weights : Weights
+    stac, store : bool
+        Whether to make a STAC catalog, and to update the stores.
+    products_at : str
+        Address to which the STAC catalog links products; empty: in the output.
+    runs : mapping of str to str
+        Product path -> run that made it, for the snapshots of stores.
     progress : callable
         Called with 1 for each product that was examined.
 
@@ -90,33 +93,33 @@ def make_aggregates(
         If a file cannot be written.
     """
     made = AggregateResult(root)
-    products = _products(root, options.selection, made, progress)
+    products = _products(root, selection, made, progress)
     if not products:
-        _refuse_unknown(root, options.selection)
+        _refuse_unknown(root, selection)
         raise ProductError("no product found", file=root, remedy=_remedy(made))
     made.products = len(products)
     by_group = groups(products)
     made.notes += grid_notes(by_group)
-    if options.selection == EVERYTHING:
+    if selection == EVERYTHING:
         made.index = write_index(root, products)
     else:
         made.notes.append("the index lists all products; run without a selection to update it")
-    if options.period is not None:
+    if period is not None:
         for alike in by_group.values():
             with _failures(made):
-                done = write_means(root, alike, options.period, weights=options.weights)
+                done = write_means(root, alike, period, weights=weights)
                 made.means += done.files
                 made.refused += done.refused
                 made.notes += [done.note] if done.note else []
-    if options.store:
+    if store:
         with _failures(made):
-            _update_stores(made, products, options)
-    if options.stac:
+            _update_stores(made, products, selection, runs)
+    if stac:
         with _failures(made):
-            if options.selection != EVERYTHING:
+            if selection != EVERYTHING:
                 remedy = "run without a selection"
                 raise ProductError("the STAC catalog lists all products", remedy=remedy)
-            made.stac = write_stac(root, products, options.products_at)
+            made.stac = write_stac(root, products, products_at)
     return made
 
 
@@ -125,15 +128,11 @@ def _products(
 ) -> list[Facts]:
     products, known = [], KnownFacts(root)
     for path in list_products(root):
-        former = known.of(path)
-        found: Iterable[Facts | Refused] = (
-            read_product_facts(root, [path], selection) if former is None else [former]
-        )
-        for facts in found:
-            if isinstance(facts, Refused):
-                made.refused.append(facts)
-            elif former is None or selection.admits(facts.names, facts.start, facts.stop):
-                products.append(facts)
+        facts = known.of(path) or read_product_facts(root, path, selection)
+        if isinstance(facts, Refused):
+            made.refused.append(facts)
+        elif facts and selection.admits(facts.names, facts.start, facts.stop):
+            products.append(facts)
         progress(1)
     return products
 
@@ -173,9 +172,11 @@ def _failures(made: AggregateResult) -> Iterator[None]:
 
 
 def _update_stores(
-    made: AggregateResult, products: Sequence[Facts], options: AggregateOptions
+    made: AggregateResult,
+    products: Sequence[Facts],
+    selection: ProductSelection,
+    runs: Mapping[str, str],
 ) -> None:
-    selection = options.selection
     if selection.since is not None or selection.until is not None:
         raise ProductError("a store holds all times", remedy="run without --since and --until")
     for kind in sorted({product.kind for product in products} | set(stored_kinds(made.root))):
@@ -183,7 +184,7 @@ def _update_stores(
             continue
         with _failures(made):
             alike = [product for product in products if product.kind == kind]
-            done = update_store(made.root, kind, alike, selection, options.runs)
+            done = update_store(made.root, kind, alike, selection, runs)
             made.stores.append(done)
             made.refused += done.refused
             made.failed += done.failed

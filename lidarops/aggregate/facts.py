@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
-from enum import StrEnum
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -94,25 +93,6 @@ def _parse_time(text: datetime | str | None, name: str) -> datetime | None:
             f"is {text!r}", field=name, remedy="give a time such as 2026-03-01T12:00"
         ) from error
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
-
-
-_Choice = TypeVar("_Choice", bound=StrEnum)
-
-
-def parse_choice(choices: type[_Choice], word: str, field: str) -> _Choice:
-    """Return the member of an enumeration with this value.
-
-    Raises
-    ------
-    RetrievalInputError
-        If there is none; the message lists the choices.
-    """
-    try:
-        return choices(word)
-    except ValueError as error:
-        raise RetrievalInputError(
-            f"is {word!r}", field=field, remedy=f"choose one of {', '.join(choices)}"
-        ) from error
 
 
 FOLDER: Final = "aggregates"
@@ -265,34 +245,19 @@ def list_products(root: Path) -> list[str]:
 
 
 def read_product_facts(
-    root: Path, paths: Iterable[str], selection: ProductSelection = EVERYTHING
-) -> Iterator[Facts | Refused]:
-    """Read the facts of selected products; unreadable files do not stop the reading.
+    root: Path, path: str, selection: ProductSelection = EVERYTHING
+) -> Facts | Refused | None:
+    """Read the facts of a product, a path from `list_products`; None where it is not selected.
 
-    Parameters
-    ----------
-    root : path
-    paths : iterable of str
-        From `list_products`.
-    selection : ProductSelection
-
-    Yields
-    ------
-    Facts or Refused
-        Unreadable files are refused whatever the selection, because their kind is unknown.
+    An unreadable file is refused whatever the selection, because its kind is unknown.
     """
-    for path in paths:
-        try:
-            file = within(root, path)
-            with opened_stored(file) as product:
-                header = read_header(product, path, selection)
-                if header is None:
-                    continue
-                facts = _facts(product, file, header)
-        except ProductError as error:
-            yield Refused(path, error.problem)
-        else:
-            yield facts
+    try:
+        file = within(root, path)
+        with opened_stored(file) as product:
+            header = read_header(product, path, selection)
+            return header and _facts(product, file, header)
+    except ProductError as error:
+        return Refused(path, error.problem)
 
 
 def read_header(product: Any, path: str, selection: ProductSelection) -> Header | None:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from lidarops.aggregate._join import Part, Source, join, pattern_of
+from lidarops.aggregate._join import Part, join, pattern_of
 from lidarops.aggregate.facts import (
     Header,
     ProductSelection,
@@ -152,8 +152,7 @@ def _read(root: Path, paths: Iterable[str], selection: ProductSelection) -> dict
             with opened_stored(file) as product:
                 header = read_header(product, path, selection)
                 if header is not None:
-                    source = Source(file, header.id)
-                    parts[header] = Part(header, source, vars(product), product["time"][...])
+                    parts[header] = Part(header, file, vars(product), product["time"][...])
         except ProductError as error:
             raise ProductError(error.problem, file=path, remedy="leave the file out") from error
     return parts

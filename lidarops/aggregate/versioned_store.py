@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.aggregate import need
-from lidarops.aggregate._join import Source, pattern_of, shared_attributes, sorted_by_time
+from lidarops.aggregate._join import pattern_of, shared_attributes, sorted_by_time
 from lidarops.aggregate.facts import (
     Facts,
     ProductSelection,
@@ -32,6 +32,7 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
+from lidarops.netcdf.read import stored_values
 from lidarops.system.files import only_one, within
 
 FOLDER: Final = "stores"
@@ -76,12 +77,7 @@ class Changes:
 
 
 class UnreadableProductError(Exception):
-    """A product that cannot be read or has changed, though its facts could be read."""
-
-    def __init__(self, facts: Facts, reason: str) -> None:
-        super().__init__(reason)
-        self.facts = facts
-        self.reason = reason
+    """Facts of a product that cannot be read or has changed, and why."""
 
 
 def store_path(root: Path, kind: str) -> Path:
@@ -142,8 +138,9 @@ def update_store(
                 changes = _write_groups(session.store, root, wanted, replace(selection, kind=kind))
                 break
             except UnreadableProductError as error:
-                wanted.remove(error.facts)
-                refused.append(Refused(error.facts.path, error.reason))
+                facts, reason = error.args
+                wanted.remove(facts)
+                refused.append(Refused(facts.path, reason))
         if session.has_uncommitted_changes:
             session.commit(_message(kind, changes, runs))
         return StoreUpdate(
@@ -310,8 +307,8 @@ def _rows(root: Path, facts: Facts, number: int, name: str, rows: slice | None) 
     if name == PRODUCT_INDEX.name:
         return np.full(facts.profiles, number, np.int32)[rows]
     try:
-        source = Source(within(root, facts.path), facts.id)
-        return source.read(name)[None] if rows is None else source.read(name, rows)
+        values = stored_values(within(root, facts.path), facts.id, name, rows or slice(None))
+        return values[None] if rows is None else values
     except ProductError as error:
         raise UnreadableProductError(facts, error.problem) from error
 

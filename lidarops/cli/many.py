@@ -79,22 +79,29 @@ def aggregate(
 
     Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
     """
-    from lidarops.aggregate.aggregates import AggregateOptions, make_aggregates
-    from lidarops.aggregate.facts import parse_choice, parse_selection
+    from lidarops.aggregate.aggregates import make_aggregates
+    from lidarops.aggregate.facts import parse_selection
     from lidarops.aggregate.means_variables import Period, Weights
 
+    try:
+        period, weighting = means if means is None else Period(means), Weights(weights)
+    except ValueError as error:
+        choices = f"means of {', '.join(Period)}; weights {', '.join(Weights)}"
+        raise typer.BadParameter(f"{error}; there are {choices}") from error
+    selection = parse_selection(kind, channel, station, instrument, utc(since), utc(until))
     root, runs = _root(out, with_runs=store)
-    chosen = AggregateOptions(
-        parse_selection(kind, channel, station, instrument, utc(since), utc(until)),
-        None if means is None else parse_choice(Period, means, "means"),
-        parse_choice(Weights, weights, "weights"),
-        stac,
-        store,
-        runs,
-        products_at,
-    )
     with progress_bar("aggregate", None) as bar:
-        made = make_aggregates(root, chosen, progress=bar.advance)
+        made = make_aggregates(
+            root,
+            selection,
+            period=period,
+            weights=weighting,
+            stac=stac,
+            products_at=products_at,
+            store=store,
+            runs=runs,
+            progress=bar.advance,
+        )
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
     else:

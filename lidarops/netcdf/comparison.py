@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import Severity
 from lidarops.netcdf.read import opened_product, read_provenance
-from lidarops.netcdf.stored_flags import flags_names
+from lidarops.netcdf.stored_flags import flags_names, parts
 from lidarops.netcdf.variables import PROVENANCE, judging, summary_of
 from lidarops.records import Change, Grade, Measure, Plan
 
@@ -36,8 +36,8 @@ _MAKING: Final = frozenset(
     }
 )  # fmt: skip
 """Global attributes that state how and when a product was made, not what it holds."""
-_BLOCK: Final = 1 << 26
-"""Bytes of a variable that are compared at a time."""
+_BLOCK: Final = 1 << 24
+"""Values of a variable that are compared at a time."""
 _MOST_CAUSES: Final = 20
 _MOST_REASONS: Final = 3
 """Changes that name why a product is to be made again; the rest is counted."""
@@ -105,7 +105,7 @@ def compare_products(old: Path, new: Path) -> Change:
         # It names the new one, also where values of the old one cannot be read.
         with _opened(old) as before:
             for variable in before.variables.values():
-                for part in _parts(variable):
+                for part in parts(variable, _BLOCK):
                     _ = variable[part].values
         raise
     most = max(differences, key=lambda d: d.largest, default=_Difference("", 0))
@@ -181,7 +181,7 @@ def _differences(old: xr.Dataset, new: xr.Dataset) -> Iterator[_Difference]:
             size = max(before.size, after.size)
             yield _Difference(name, size, lost=size)
             continue
-        count = sum(int(_differs(before, after, part).sum()) for part in _parts(before))
+        count = sum(int(_differs(before, after, part).sum()) for part in parts(before, _BLOCK))
         is_summary = name in summaries
         good = int((before.to_numpy() == 0).sum()) if is_summary else 0
         allowed = max(MOST_STATES * (good or before.size), 1)
@@ -231,10 +231,10 @@ def _difference(
     usual = 0.0
     if count:
         # The root mean square.
-        total = sum(float(np.sum(_numbers(before, part) ** 2)) for part in _parts(before))
+        total = sum(float(np.sum(_numbers(before, part) ** 2)) for part in parts(before, _BLOCK))
         usual = math.sqrt(total / max(before.size, 1))
     lost, largest = 0, 0.0
-    for part in _parts(before):
+    for part in parts(before, _BLOCK):
         stated, now_stated = (_stated(product, quantity, part) for product in (old, new))
         if name == quantity:
             lost += int(np.count_nonzero(stated != now_stated))
@@ -248,16 +248,6 @@ def _difference(
         moved = np.abs(now - then)
         largest = max(largest, float(np.max(moved[moved > 0.0] / scale[moved > 0.0], initial=0.0)))
     return _Difference(name, count, lost=lost, largest=largest, measure=measure)
-
-
-def _parts(variable: xr.Variable) -> Iterator[Any]:
-    """Yield indices of parts of a variable that fit in memory."""
-    if not variable.ndim or not variable.size:
-        yield ...
-        return
-    rows = max(1, _BLOCK * variable.shape[0] // max(variable.nbytes, 1))
-    for first in range(0, variable.shape[0], rows):
-        yield slice(first, first + rows)
 
 
 def _differs(before: xr.Variable, after: xr.Variable, part: Any) -> NDArray[np.bool_]:

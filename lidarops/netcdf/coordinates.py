@@ -97,7 +97,8 @@ def locate_product(source: xr.Dataset, layout: Layout, context: Context) -> Loca
         bins[f"bin_{name}"].values if bins else by_name[name].values
         for name in ("latitude", "longitude")
     ]
-    spread = _SPREADS.get(layout.sampled, "along the beam")
+    of_network = layout.sampled == "crossing"
+    spread = "irregular: crossings of beams" if of_network else "along the beam"
     extents = _extents(horizontal, spread, vertical, moments, bounds)
     return Located(variables, moving, extents, vertical.profiles)
 
@@ -331,9 +332,6 @@ def _common_step(altitude: Values, rise: Values) -> float | None:
     if largest <= _LEVEL:
         return 0.0
     return None if largest - smallest > _SAME_STEP * largest else float(scales.flat[0] * steps[0])
-
-
-_SPREADS: Final = {"crossing": "irregular: crossings of beams"}
 
 
 def _extents(

@@ -139,13 +139,17 @@ def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
 
 def blocks(variable: xr.DataArray, most: int) -> Iterator[xr.DataArray]:
     """Yield a variable some rows at a time, at most `most` values but at least a row."""
-    if not variable.dims or variable.size == 0:
-        yield variable
+    return (variable[part] for part in parts(variable, most))
+
+
+def parts(variable: xr.DataArray | xr.Variable, most: int) -> Iterator[Any]:
+    """Yield indices of some rows of a variable at a time, of `most` values but at least a row."""
+    if not variable.ndim or not variable.size:
+        yield ...
         return
-    first, rows = next(iter(variable.sizes.items()))
-    step = max(1, most * rows // variable.size)
-    for start in range(0, rows, step):
-        yield variable.isel({first: slice(start, start + step)})
+    step = max(1, most * variable.shape[0] // variable.size)
+    for first in range(0, variable.shape[0], step):
+        yield slice(first, first + step)
 
 
 def rejecting_mask(bits: Iterable[StoredBit]) -> int:

@@ -24,7 +24,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, cast
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import h5py
 import netCDF4
@@ -35,7 +36,7 @@ from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.system.files import sha256_of
+from lidarops.system.files import copy_atomically, sha256_of
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -47,11 +48,9 @@ CONTIGUOUS_BYTES: Final = 2048
 """Up to this size, a variable without rows is stored as it is: the index of a chunk takes 2.1 kB.
 """
 
-_TYPES: Final = {"S1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"}
 _OTHER_DIMENSION: Final = "_nc4_non_coord_"
 """Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 _Array = NDArray[Any]
-_Format = Literal["NETCDF4", "NETCDF4_CLASSIC"]
 
 _LEVEL: Final = 1
 """Compression level of libdeflate, 1 to 12; level 2 takes a sixth longer for 5 % smaller files."""
@@ -82,52 +81,46 @@ def write_product(dataset: xr.Dataset, path: str | Path) -> Written:
     Raises
     ------
     ProductError
-        If the dataset is not in memory, or the file cannot be written.
+        If the file cannot be written.
     """
     unlimited = next((str(name) for name in dataset.encoding.get("unlimited_dims", ())), None)
-    return _write(dataset, unlimited, Path(path), "NETCDF4_CLASSIC")
+    variables = {str(name): variable for name, variable in dataset.variables.items()}
+    skeleton = Skeleton(variables, dataset.attrs, unlimited)
+    with create_file(skeleton, Path(path)) as file:
+        rows = {name: variable.values for name, variable in skeleton.with_rows.items()}
+        if rows:
+            file.add(rows)
+    return cast("Written", file.written)
 
 
-def write_plain(dataset: xr.Dataset, path: str | Path) -> Written:
-    """Write any dataset as xarray would encode it, atomically and with reproducible bytes.
+def write_plain(dataset: xr.Dataset, path: Path) -> None:
+    """Write any dataset as xarray encodes it, atomically and with reproducible bytes.
 
     Parameters
     ----------
     dataset : xr.Dataset
-        In memory; may hold times and text.
-    path : path or str
-        Path of the file; missing folders are created.
+        May hold times and text.
+    path : Path
+        Missing folders are created.
 
     Raises
     ------
     ProductError
-        If the dataset is not in memory, cannot be encoded, or the file cannot be written.
+        If the dataset cannot be encoded, or the file cannot be written.
     """
-    variables, attributes = xr.conventions.encode_dataset_coordinates(dataset)
-    try:
-        encoded, attributes = xr.conventions.cf_encoder(variables, attributes)
-    except (TypeError, ValueError) as error:
-        raise ProductError(f"cannot be encoded: {error}", file=path) from error
-    # All as data variables: xarray would encode coordinates a second time.
-    plain = {str(name): _as_chars(path, str(name), var) for name, var in encoded.items()}
-    return _write(xr.Dataset(plain, attrs=dict(attributes)), None, Path(path), "NETCDF4")
-
-
-def _as_chars(path: str | Path, name: str, variable: xr.Variable) -> xr.Variable:
-    values = np.asarray(variable.values)
-    if values.dtype.kind not in "OU":
-        return variable
-    if not all(isinstance(value, str) for value in values.flat):
-        raise ProductError("holds objects that are not text", file=path, field=name)
     # Text of variable length lies on HDF5's heap, whose byte order is not reproducible.
-    packed = np.char.encode(values.astype(str), "utf-8")
-    length = max(packed.dtype.itemsize, 1)
-    chars = np.ascontiguousarray(packed.astype(f"S{length}"))
-    return xr.Variable(
-        (*variable.dims, f"{name}_strlen"),
-        chars.reshape(*packed.shape, 1).view("S1"),
-        {**variable.attrs, "_Encoding": "utf-8"},
-    )
+    encoding: dict[Any, dict[str, Any]] = {
+        name: {"dtype": "S1"} if variable.dtype.kind == "U" else {"zlib": True}
+        for name, variable in dataset.variables.items()
+    }
+    with _disk_errors(path), TemporaryDirectory() as folder:
+        whole = Path(folder, path.name)
+        try:
+            dataset.to_netcdf(whole, engine="netcdf4", encoding=encoding)
+        except (TypeError, ValueError) as error:
+            raise ProductError(f"cannot be encoded: {error}", file=path) from error
+        path.parent.mkdir(parents=True, exist_ok=True)
+        copy_atomically(whole, path)
 
 
 def chunk_sizes(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
@@ -146,24 +139,6 @@ def chunk_sizes(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
         if rest <= CHUNK_BYTES:
             break
     return tuple(chunk)
-
-
-def _write(dataset: xr.Dataset, unlimited: str | None, path: Path, model: _Format) -> Written:
-    variables = {str(name): variable for name, variable in dataset.variables.items()}
-    for name, variable in variables.items():
-        if variable.chunks is not None:
-            raise ProductError(
-                "is a dask array, whose bytes in a file depend on the order of its tasks",
-                file=path,
-                field=name,
-                remedy="load the dataset before it is written",
-            )
-    skeleton = Skeleton(variables, dataset.attrs, unlimited)
-    with create_file(skeleton, path, model) as file:
-        rows = {name: variable.values for name, variable in skeleton.with_rows.items()}
-        if rows:
-            file.add(rows)
-    return cast("Written", file.written)
 
 
 class Skeleton:
@@ -248,7 +223,6 @@ class QuietFile(io.FileIO):
 def create_file(
     skeleton: Skeleton,
     path: Path,
-    model: _Format = "NETCDF4_CLASSIC",
     replaces: Callable[[Path], bool] = lambda _new: True,
 ) -> Iterator[RowFile]:
     """Yield a file to which rows are added; at the end it is complete, on disk and has its name.
@@ -261,8 +235,6 @@ def create_file(
     path : Path
         Missing folders are created. A former file is replaced at the end, and stays if anything
         fails.
-    model : str
-        Data model of netCDF.
     replaces : callable
         Returns of the complete file, under its temporary name, whether it replaces the former one.
 
@@ -271,13 +243,12 @@ def create_file(
     ProductError
         If the file cannot be written, or lacks rows at the end.
     """
-    _refuse_unstorable(skeleton, path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with NETCDF4_PYTHON_LOCK:
-                _store(skeleton, temporary, model)
+                _store(skeleton, temporary)
             stream = QuietFile(temporary)
         with stream:
             file = RowFile(skeleton, path, stream)
@@ -401,19 +372,6 @@ class RowFile:
             self._file.close()
 
 
-def _refuse_unstorable(skeleton: Skeleton, path: Path) -> None:
-    for name, variable in skeleton.variables.items():
-        if variable.dtype.str[1:] not in _TYPES:
-            raise ProductError(
-                f"has data of type {variable.dtype}, which NetCDF cannot hold",
-                file=path,
-                field=name,
-                remedy="encode it first",
-            )
-        if variable.size == 0:
-            raise ProductError("is empty", file=path, field=name)
-
-
 @contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
     """Raise errors of disks and libraries as `ProductError`."""
@@ -450,11 +408,11 @@ class _DefinedAtOnce(netCDF4.Dataset):
         super()._enddef()  # type: ignore[misc]  # not in its stubs
 
 
-def _store(skeleton: Skeleton, path: Path, model: _Format) -> None:
+def _store(skeleton: Skeleton, path: Path) -> None:
     """Write all definitions and the variables without chunks."""
     # In memory until the end, because HDF5 may crash on a full disk.
     with _DefinedAtOnce(
-        path, "w", format=model, clobber=False, diskless=True, persist=True
+        path, "w", format="NETCDF4_CLASSIC", clobber=False, diskless=True, persist=True
     ) as file:
         file.setncatts(skeleton.attributes)
         for name, size in skeleton.sizes.items():

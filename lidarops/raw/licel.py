@@ -5,20 +5,17 @@ Reading
     Physical values of many files: `lidarops.open_archive`.
 Writing
     `new_dataset` and `new_header` build a `Dataset` and a `Header` from numbers,
-    ``encode(header, counts)`` returns the bytes of a file, ``write(path, header, counts)`` writes
-    it. As from Licel instruments, every header line starts with a blank, has its values separated
-    by single blanks, is padded to 78 characters and ends in CRLF. A `Header` always agrees with its
-    text: it is built or parsed, never edited.
+    ``encode(header, counts)`` returns the bytes of a file. As from Licel instruments, every header
+    line starts with a blank, has its values separated by single blanks, is padded to 78 characters
+    and ends in CRLF. A `Header` always agrees with its text: it is built or parsed, never edited.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -55,8 +52,6 @@ __all__ = [
     "parse_header",
     "read_counts",
     "read_header",
-    "select",
-    "write",
 ]
 
 PathLike = str | os.PathLike[str]
@@ -94,39 +89,17 @@ def read_header(path: PathLike) -> Header:
         return _header(file)
 
 
-def select(header: Header, channels: Iterable[str] | None = None) -> tuple[Dataset, ...]:
-    """Return the stored datasets of these names, in the order of `channels`.
-
-    Parameters
-    ----------
-    header : Header
-    channels : str or iterable of str, optional
-        By default the signal channels in file order. Datasets that are not signals can be named
-        too.
-
-    Raises
-    ------
-    RawFormatError
-        If a channel is not stored, or there is no channel; the error names the stored ones.
-    """
-    stored = {d.name: d for d in header.datasets if d.places}
-    if channels is None:
-        channels = [d.name for d in stored.values() if d.mode is not None]
-    return chosen(stored, channels, header.path)
-
-
 def read_counts(
-    path: PathLike, channels: Iterable[str] | None = None, *, bins: int | None = None
+    path: PathLike, channels: Iterable[str] | None = None
 ) -> tuple[Header, dict[str, Counts]]:
     """Read the raw counts of one file.
 
     Parameters
     ----------
     path : path or str
-    channels : iterable of str, optional
-        As in `select`.
-    bins : int, optional
-        Return only this many of the nearest bins; by default all.
+    channels : str or iterable of str, optional
+        By default the signal channels in file order. Datasets that are not signals can be named
+        too.
 
     Returns
     -------
@@ -136,18 +109,18 @@ def read_counts(
     Raises
     ------
     RawFormatError
-        If the file cannot be read, or has no such channel.
+        If the file cannot be read, or has no such channel; the error names the stored ones.
     """
     counts = {}
     with RawFile(path) as file:
         header = _header(file)
-        datasets = select(header, channels)
-        if bins is not None and bins < 1:
-            raise RawFormatError(f"{bins} bins cannot be read", file=file.path, field="bins")
-        for dataset in datasets:
+        stored = {d.name: d for d in header.datasets if d.places}
+        if channels is None:
+            channels = [d.name for d in stored.values() if d.mode is not None]
+        for dataset in chosen(stored, channels, header.path):
             row = np.empty(dataset.bins, COUNTS)
             read_dataset(file, dataset.places[0], None, row)
-            counts[dataset.name] = row[:bins].astype(np.int32, copy=False)
+            counts[dataset.name] = row.astype(np.int32, copy=False)
     return header, counts
 
 
@@ -368,27 +341,6 @@ def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
     return b"".join(parts)[: header.size]
 
 
-def write(path: str | os.PathLike[str], header: Header, counts: Mapping[str, NDArray[Any]]) -> None:
-    """Write a file as a whole, or not at all.
-
-    Raises
-    ------
-    RawFormatError
-        As `encode`.
-    """
-    target = Path(path)
-    content = encode(header, counts)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _counts(dataset: Dataset, counts: Mapping[str, NDArray[Any]]) -> NDArray[np.int32]:
     if dataset.name not in counts:
         raise RawFormatError("no counts are given", field=dataset.name)
@@ -431,17 +383,11 @@ def _place(form: str, place: Place) -> str:
         values["pressure"] = place.pressure / 100.0
     for name, value in values.items():
         if (value is not None) != (f"{{{name}:" in _PLACES[form]):
-            if value is None:
-                raise RawFormatError(
-                    f"is needed in a {form} header",
-                    field=name,
-                    remedy="give it, or write another dialect",
-                )
-            other = next(other for other, places in _PLACES.items() if f"{{{name}:" in places)
+            has_none = f"a {form} header has no place for it"
             raise RawFormatError(
-                f"a {form} header has no place for it",
+                f"is needed in a {form} header" if value is None else has_none,
                 field=name,
-                remedy=f"omit it, or write the {other} dialect",
+                remedy="give what the dialect holds, or write another one",
             )
     return _PLACES[form].format_map(values)
 

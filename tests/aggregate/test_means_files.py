@@ -470,7 +470,7 @@ def test_a_beam_that_moves_has_no_mean(tmp_path: Path):
 def test_means_are_no_products(tmp_path: Path):
     add_day(tmp_path, 0)
     (file,) = means_of(tmp_path).files
-    (refused,) = read_product_facts(tmp_path, [file.path])
+    refused = read_product_facts(tmp_path, file.path)
     assert isinstance(refused, Refused)
     assert refused.reason.startswith("holds means of products")
     assert not any(isinstance(product, Refused) for product in facts_of(tmp_path))

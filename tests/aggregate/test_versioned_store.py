@@ -192,14 +192,14 @@ def test_a_killed_update_leaves_the_snapshot_before_and_the_next_one_completes(t
 import os, signal
 from pathlib import Path
 import zarr
-from lidarops.aggregate.aggregates import AggregateOptions, make_aggregates
+from lidarops.aggregate.aggregates import make_aggregates
 write = zarr.Array.__setitem__
 def write_and_die(array, rows, values):
     write(array, rows, values)
     if array.basename == "signal" and rows == slice(0, 10):
         os.kill(os.getpid(), signal.SIGKILL)
 zarr.Array.__setitem__ = write_and_die
-make_aggregates(Path({str(tmp_path)!r}), AggregateOptions(store=True))
+make_aggregates(Path({str(tmp_path)!r}), store=True)
 """
     process = subprocess.run([sys.executable, "-c", killed], check=False)
     assert process.returncode == -signal.SIGKILL

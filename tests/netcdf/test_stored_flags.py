@@ -67,7 +67,7 @@ def test_who_goes_by_the_places_of_now_refuses_others(tmp_path: Path):
 
 
 def facts_of(file: Path) -> Facts:
-    (facts,) = read_product_facts(file.parent, [file.name])
+    facts = read_product_facts(file.parent, file.name)
     assert isinstance(facts, Facts)
     return facts
 
@@ -76,7 +76,7 @@ def test_facts_and_inspection_go_by_the_meanings_of_the_file(tmp_path: Path):
     now = older(tmp_path / "older.nc")
     facts = facts_of(tmp_path / "older.nc")
     flags = flags_of("homogeneous")
-    assert facts.usable == np.count_nonzero((now & flags.rejecting) == 0)
+    assert facts.verdicts.usable == np.count_nonzero((now & flags.rejecting) == 0)
     counts = {bit.word: int(np.count_nonzero(now & int(bit))) for bit in flags}
     assert facts.flagged == {word.upper(): count for word, count in counts.items() if count}
     rows = {row["name"]: row for row in describe(tmp_path / "older.nc")["quality"]}

@@ -294,15 +294,18 @@ def run(script: str, *arguments: str, **environment: str) -> subprocess.Complete
 
 SHA = """
 import sys
+from pathlib import Path
 from support.products.made_products import MAKERS, context
 from test_write import of_noise, truth
 from support.products.encoded_products import build_product
 from lidarops.netcdf.write import write_product, write_plain
+from lidarops.system.files import sha256_of
 for kind, maker in MAKERS.items():
     product = build_product(maker(zenith=[0, 1, 2, 3, 4]), context(kind))
     print(write_product(product, sys.argv[1]).sha256)
 print(write_product(of_noise(), sys.argv[1]).sha256)
-print(write_plain(truth(), sys.argv[1]).sha256)
+write_plain(truth(), Path(sys.argv[1]))
+print(sha256_of(Path(sys.argv[1])))
 """
 
 
@@ -455,36 +458,9 @@ def test_products_follow_the_umask_of_the_user(product: xr.Dataset, tmp_path: Pa
     assert stat.S_IMODE((tmp_path / "product.nc").stat().st_mode) == 0o644
 
 
-@pytest.mark.parametrize("function", [write_product, write_plain])
-def test_dask_arrays_are_refused(function, product: xr.Dataset, tmp_path: Path):
-    lazy = product.assign(total_extinction=product["total_extinction"].chunk())
-    with pytest.raises(ProductError, match="load the dataset") as caught:
-        function(lazy, tmp_path / "product.nc")
-    assert caught.value.field == "total_extinction"
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("values", "problem"),
-    [
-        (np.array(["text"]), "NetCDF cannot hold"),
-        (np.array(["2026-01-01"], "datetime64[ns]"), "NetCDF cannot hold"),
-        (np.ones(9999, np.float16), "NetCDF cannot hold"),
-        (np.array([b"text"]), "NetCDF cannot hold"),
-        (np.array([1j]), "NetCDF cannot hold"),
-        (np.zeros(0), "empty"),
-    ],
-)
-def test_data_that_netcdf_cannot_hold_are_refused(values, problem, tmp_path: Path):
-    with pytest.raises(ProductError, match=problem):
-        write_product(xr.Dataset({"x": ("n", values)}), tmp_path / "product.nc")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_plain_datasets_are_read_as_written(tmp_path: Path):
     path = tmp_path / "truth.nc"
-    written = write_plain(truth(), path)
-    assert written.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    write_plain(truth(), path)
     with xr.open_dataset(path) as stored:
         xr.testing.assert_identical(stored.load().drop_encoding(), truth())
         assert stored["label"].values.tolist() == ["hazy", "чисто"]

@@ -109,13 +109,6 @@ def test_headers_are_what_instruments_write(files):
         assert rebuilt.source == expected, path
 
 
-def test_counts_of_the_nearest_bins(files):
-    _, whole = licel.read_counts(files[-1])
-    _, nearest = licel.read_counts(files[-1], bins=7)
-    for name, values in nearest.items():
-        np.testing.assert_array_equal(values, whole[name][:7])
-
-
 def test_manaus(data_root):
     header = licel.read_header(data_root / "manaus" / "RM10C1315.162")
     assert (header.name, header.site) == ("RM10C1315.162", "Manaus")

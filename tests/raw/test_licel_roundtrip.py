@@ -59,7 +59,7 @@ def test_the_naive_reader_agrees_on_what_is_written(file):
 def test_files_are_read_back_in_every_way(tmp_path, file):
     header, counts = file
     path = tmp_path / "file"
-    licel.write(path, header, counts)
+    path.write_bytes(licel.encode(header, counts))
     again, read = licel.read_counts(path)
     assert again == header
     with (
@@ -85,7 +85,7 @@ def test_memories_are_added_before_their_sum_is_limited(tmp_path):
     values = (2**31 - 1, 2, -3)
     rows = [np.full(4, value, dtype=np.int32) for value in values]
     counts = {one.name: row for one, row in zip(header.datasets, rows, strict=True)}
-    licel.write(path, header, counts)
+    path.write_bytes(licel.encode(header, counts))
     with xr.open_dataset(path, engine="licel", mask_and_scale=False) as raw:
         assert np.all(raw[memories(header.datasets)[0][0].name].values == sum(values))
 
@@ -155,14 +155,14 @@ def test_other_time_zones_are_written_in_utc():
         ({"zenith_angle": 72.55, "azimuth": 0.0}, "zenith angle"),
         (
             {"azimuth": 10.0, "dialect": "classic"},
-            r"azimuth: a classic header has no place for it \(omit it, or write the extended",
+            "azimuth: a classic header has no place for it",
         ),
         ({"custom": "x"}, "azimuth"),
         ({"custom": "two\nlines", "azimuth": 1.0}, "does not print"),
         ({"temperature": 300.0}, "pressure: is needed in a raymetrics header"),
         (
             {"temperature": 300.0, "pressure": 1e5, "dialect": "classic"},
-            r"temperature: a classic header has no place for it \(omit it, or write the raymetrics",
+            "temperature: a classic header has no place for it",
         ),
         ({"start": datetime(2024, 10, 2, 17, 30)}, "aware"),  # noqa: DTZ001
         ({"start": datetime(2024, 10, 2, 17, 30, 0, 1, tzinfo=UTC)}, "whole seconds"),
@@ -226,28 +226,9 @@ def test_an_edited_header_is_not_written():
         ({"analog_532o": np.zeros(4, int), "photon_532o": np.zeros(4, int)}, "not stored"),
     ],
 )
-def test_counts_that_cannot_be_written(tmp_path, counts, match):
+def test_counts_that_cannot_be_written(counts, match):
     with pytest.raises(RawFormatError, match=match):
-        licel.write(tmp_path / "x", new(), counts)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_write_replaces_whole_files_only(tmp_path, monkeypatch):
-    path = tmp_path / "x"
-    path.write_bytes(b"old")
-    counts = {"analog_532o": np.arange(4)}
-
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        licel.write(path, new(), counts)
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
-    monkeypatch.undo()
-    licel.write(path, new(), counts)
-    assert path.read_bytes() == licel.encode(new(), counts)
+        licel.encode(new(), counts)
 
 
 @given(st.integers(0, 437), st.integers(1, 255))

@@ -56,6 +56,6 @@ def add_day(
 
 def facts_of(root: Path) -> list[Facts]:
     """Return the facts of all products of an archive; none may be refused."""
-    results = list(read_product_facts(root, list_products(root)))
+    results = [read_product_facts(root, path) for path in list_products(root)]
     assert all(isinstance(facts, Facts) for facts in results), results
     return [facts for facts in results if isinstance(facts, Facts)]
