@@ -6,7 +6,7 @@ Messages state the line, the key, the value, and what is expected there.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import yaml
@@ -142,9 +142,7 @@ class _Problem:
             below = self.expected.below(key)
             # A location key that the schema lacks names the member of a union that was tried.
             self.of_union = below is None
-            if below is None:
-                self.expected = self.expected.member(key)
-            else:
+            if below is not None:
                 self.mapping, self.expected = self.expected, below
                 self.keys.append(key)
         self.unknown = unknown
@@ -166,7 +164,7 @@ class _Problem:
             return f"must be {self.mapping.words_of_keys()}, not {self.name!r}"
         if kind == "missing":
             return f"is required: {self.expected.words()}"
-        if kind in _OWN_WORDS or kind.startswith("union_tag"):
+        if kind in _OWN_WORDS:
             return self.details["msg"].removeprefix("Value error, ")
         return f"must be {self.expected.words()}, not {self._value()}{self._hint()}"
 
@@ -239,11 +237,6 @@ class Expected:
         inner = [schema for outer in self.schemas for schema in _below(outer, key)]
         return self._resolved(inner, self.unit) if inner else None
 
-    def member(self, tag: str) -> Expected:
-        """Return what is expected of the member of a union that has a tag or title."""
-        chosen = tuple(schema for schema in self.schemas if _has_tag(schema, tag))
-        return replace(self, schemas=chosen or self.schemas)
-
     def keys(self) -> list[str]:
         """Return the valid keys of mappings, sorted."""
         return sorted({key for schema in self.schemas for key in schema.get("properties", ())})
@@ -310,11 +303,6 @@ def _below(schema: Schema, key: str) -> Iterator[Schema]:
     elif schema.get("type") == "array" and key.isdecimal():
         fixed = schema.get("prefixItems", [])
         yield fixed[int(key)] if int(key) < len(fixed) else schema.get("items") or {}
-
-
-def _has_tag(schema: Schema, tag: str) -> bool:
-    tags = [inner.get("const") for inner in schema.get("properties", {}).values()]
-    return tag == schema.get("title") or tag in tags
 
 
 def _choices(schema: Schema) -> Iterator[str]:

@@ -248,7 +248,7 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Simulat
         settings=settings,
         instrument=instrument,
         station=station,
-        origin=station if settings.own_air(key) else _origin(campaign, settings),
+        origin=station if simulated.atmosphere else _origin(campaign, settings),
         folder={role: folder for role, (folder, _) in places.items()},
         prefix={role: prefix for role, (_, prefix) in places.items()},
         damage={damage.index: damage.kind for damage in simulated.damage},

@@ -24,12 +24,7 @@ from lidarops.campaign.simulated_instrument import (
     DialectName,
     Pointing,
 )
-from lidarops.campaign.simulation import (
-    HorizontalPath,
-    InstrumentSimulation,
-    Lidar,
-    SimulationSettings,
-)
+from lidarops.campaign.simulation import InstrumentSimulation, SimulationSettings
 from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.raw.licel import Dataset, Laser, ScanGrid
@@ -212,7 +207,7 @@ class SimulatedInstrument:
     @property
     def scan(self) -> Pointing | None:
         """Sequence of zenith angles; None where the facts of the campaign give the pointing."""
-        return self.simulated.scan if isinstance(self.simulated, Lidar) else None
+        return self.simulated.scan
 
     @property
     def dialect(self) -> Dialect:
@@ -294,10 +289,7 @@ class SimulatedInstrument:
         if self.scan is not None:
             cycle = self.scan.cycle()
             return cycle[planned.index % len(cycle)]
-        if facts.zenith_angle is not None:
-            return facts.zenith_angle, facts.azimuth
-        level = isinstance(self.simulated, HorizontalPath)
-        return (90.0 if level else 0.0), facts.azimuth
+        return facts.zenith_angle or 0.0, facts.azimuth
 
 
 def channel_name(mode: DetectionMode, detector: Detector) -> str:
