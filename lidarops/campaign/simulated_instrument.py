@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period, ordered
 from lidarops.constants import PLANCK, SPEED_OF_LIGHT
+from lidarops.records import DetectionMode
 from lidarops.settings import SettingsModel, quantity
 
 if TYPE_CHECKING:
@@ -184,6 +185,12 @@ class Detector(SettingsModel):
     def label(self) -> str:
         """Wavelength and polarisation as in channel names, such as ``532o``."""
         return f"{self.wavelength}{self.polarisation}"
+
+    @property
+    def recorders(self) -> dict[str, AnalogRecorder | PhotonCounter]:
+        """Its recorders by the names of their channels, in the order of the datasets in a file."""
+        outputs = {DetectionMode.ANALOG: self.analog, DetectionMode.PHOTON: self.photon}
+        return {f"{mode}_{self.label}": output for mode, output in outputs.items() if output}
 
     @property
     def strength(self) -> float:

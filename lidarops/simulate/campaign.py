@@ -15,17 +15,12 @@ from typing import TYPE_CHECKING, Final
 import xarray as xr
 
 from lidarops.campaign.model import Campaign, Station
-from lidarops.campaign.simulated_instrument import DamageKind
+from lidarops.campaign.simulated_instrument import DamageKind, PhotonCounter
 from lidarops.campaign.simulation import SimulationSettings
 from lidarops.errors import CampaignError
-from lidarops.records import DetectionMode, Role
+from lidarops.records import Role
 from lidarops.simulate.files import Simulator
-from lidarops.simulate.planned_files import (
-    PlannedFile,
-    SimulatedInstrument,
-    channel_name,
-    photon_dead_time,
-)
+from lidarops.simulate.planned_files import PlannedFile, SimulatedInstrument, photon_dead_time
 from lidarops.simulate.truth import FileTruth, TruthTable
 
 if TYPE_CHECKING:
@@ -303,9 +298,10 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
             remedy="give the zenith angles of a scan, or use another dialect",
         )
     counted = [
-        channel_name(DetectionMode.PHOTON, detector)
+        name
         for detector in site.simulated.detectors
-        if detector.photon is not None
+        for name, recorder in detector.recorders.items()
+        if isinstance(recorder, PhotonCounter)
     ]
     for planned in files:
         for name in counted:

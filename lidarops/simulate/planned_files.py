@@ -20,7 +20,6 @@ from lidarops.campaign.model import Instrument, InstrumentFacts, Station, channe
 from lidarops.campaign.simulated_instrument import (
     Acquisition,
     DamageKind,
-    Detector,
     DialectName,
     Pointing,
 )
@@ -29,7 +28,7 @@ from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.raw.licel import Dataset, Laser, ScanGrid
 from lidarops.raw.licel_header import parse_dataset
-from lidarops.records import DetectionMode, Role
+from lidarops.records import Role
 from lidarops.simulate.damage import FOREIGN_NAME
 
 _MASK: Final = (1 << 64) - 1
@@ -290,18 +289,6 @@ class SimulatedInstrument:
             cycle = self.scan.cycle()
             return cycle[planned.index % len(cycle)]
         return facts.zenith_angle or 0.0, facts.azimuth
-
-
-def channel_name(mode: DetectionMode, detector: Detector) -> str:
-    """Return the name of a channel, as the reader of raw files derives it from the header."""
-    return f"{mode.value}_{detector.label}"
-
-
-def modes(detector: Detector) -> tuple[DetectionMode, ...]:
-    """Return the detection modes of a detector, in the order of the datasets in a file."""
-    analog = () if detector.analog is None else (DetectionMode.ANALOG,)
-    photon = () if detector.photon is None else (DetectionMode.PHOTON,)
-    return analog + photon
 
 
 def photon_dead_time(site: SimulatedInstrument, start: datetime, channel: str) -> float:
