@@ -137,13 +137,6 @@ class BoundaryLayer(SettingsModel):
         unit="m",
         description="above the ground",
     )
-    entrainment_depth: float = quantity(
-        100.0,
-        unit="m",
-        gt=0,
-        le=2000,
-        description="scale of the gradual decrease at the top",
-    )
 
 
 class Layer(Period):

@@ -59,7 +59,6 @@ def _spread(most: float, description: str) -> Any:
 class PhotonCounter(SettingsModel):
     """Photon-counting output of a detector; its dead time is a fact of the campaign."""
 
-    discriminator_level: int = quantity(8, unit="1", ge=1, le=63, description="Licel level")
     paralyzable: bool = Field(
         default=False, description="whether a lost photon prolongs the dead time"
     )
@@ -146,9 +145,6 @@ class RamanLines(SettingsModel):
     laser: int = _wavelength("wavelength of the laser")
     surface_mixing_ratio: float = quantity(
         0.01, unit="kg kg-1", gt=0, le=0.05, description="of water vapour at the origin"
-    )
-    scale_height: float = quantity(
-        2000.0, unit="m", ge=100, le=20_000, description="of the mixing ratio"
     )
 
 

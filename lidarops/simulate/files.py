@@ -19,7 +19,6 @@ from lidarops.campaign.simulated_instrument import (
     Detector,
     PhotonCounter,
 )
-from lidarops.constants import LICEL_DISCRIMINATOR_STEP
 from lidarops.raw.licel import (
     Dataset,
     DatasetKind,
@@ -274,12 +273,7 @@ class Simulator:
                 input_range=recorder.adc_range * 1e-3,
             )
         else:
-            written = Recorder(
-                DatasetKind.PHOTON,
-                f"BC{number}",
-                detector.high_voltage,
-                discriminator=recorder.discriminator_level * LICEL_DISCRIMINATOR_STEP,
-            )
+            written = Recorder(DatasetKind.PHOTON, f"BC{number}", detector.high_voltage)
         dataset = new_dataset(
             written,
             wavelength=detector.wavelength * 1e-9,

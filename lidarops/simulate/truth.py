@@ -161,17 +161,9 @@ class TruthTable:
             "handling": np.array(handled, dtype=str),
             "refused": np.array([act == Handling.REFUSE for act in handled], dtype=np.int8),
         }
-        # What no file states is left out.
-        known = [
-            name
-            for name in _VARIABLES
-            if name == "total_extinction"
-            or values[name].dtype != np.float64
-            or np.isfinite(values[name]).any()
-        ]
         of_channels = {name: name.rsplit("_", 2) for name in columns.keys() - _VARIABLES.keys()}
         truth = xr.Dataset(
-            {name: _row(values[name], *_VARIABLES[name]) for name in known},
+            {name: _row(values[name], *about) for name, about in _VARIABLES.items()},
             attrs={
                 "title": f"Truth of the simulated campaign {campaign}",
                 "comment": "P = P* + B R^-2 exp(-2 sigma R) beyond full overlap, with sigma in"
