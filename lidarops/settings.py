@@ -234,6 +234,18 @@ class SettingsModel(BaseModel):
         return cls(**given, **{name: getattr(other, name) for name in names})
 
 
+def ordered(low: str, high: str, problem: str, *, may_be_equal: bool = False) -> Any:
+    """Return a validator of a model: the value of field `high` exceeds that of `low`."""
+
+    def check(model: SettingsModel) -> SettingsModel:
+        first, last = getattr(model, low), getattr(model, high)
+        if last < first or (last == first and not may_be_equal):
+            raise ValueError(problem)
+        return model
+
+    return model_validator(mode="after")(check)
+
+
 def _divides_day(interval: timedelta) -> timedelta:
     seconds = interval.total_seconds()
     if seconds < 1 or 86400 % seconds:

@@ -47,6 +47,7 @@ from lidarops.settings import (
     SettingsModel,
     located_error,
     nearest,
+    ordered,
     quantity,
 )
 from lidarops.system.stores import refuse_keys
@@ -260,11 +261,7 @@ class InstrumentFacts(SettingsModel):
         default={}, description="facts about channels, by their names such as photon_532o"
     )
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.valid_to <= self.valid_from:
-            raise ValueError("valid_to must be later than valid_from")
-        return self
+    _ordered = ordered("valid_from", "valid_to", "valid_to must be later than valid_from")
 
     @model_validator(mode="after")
     def _one_role_of_each_file(self) -> Self:
@@ -510,11 +507,7 @@ class CampaignPeriod(SettingsModel):
         description="products of scenes that begin in the period are not replaced without --thaw",
     )
 
-    @model_validator(mode="after")
-    def _ends_after_its_start(self) -> Self:
-        if self.until <= self.since:
-            raise ValueError("until must be later than since")
-        return self
+    _ordered = ordered("since", "until", "until must be later than since")
 
 
 class Acknowledged(SettingsModel):

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period, ordered
+from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period
 from lidarops.constants import PLANCK, SPEED_OF_LIGHT
 from lidarops.records import DetectionMode
-from lidarops.settings import SettingsModel, quantity
+from lidarops.settings import SettingsModel, ordered, quantity
 
 if TYPE_CHECKING:
     import numpy as np

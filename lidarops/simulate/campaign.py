@@ -8,9 +8,9 @@ import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count, islice
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import xarray as xr
 
@@ -22,9 +22,7 @@ from lidarops.records import Role
 from lidarops.simulate.files import Simulator
 from lidarops.simulate.planned_files import PlannedFile, SimulatedInstrument, photon_dead_time
 from lidarops.simulate.truth import FileTruth, TruthTable
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
+from lidarops.system.processes import Processes
 
 Progress = Callable[[int], None]
 _Work = Sequence[tuple[PlannedFile, int | None]]
@@ -38,9 +36,6 @@ _Truths = list[tuple[int | None, FileTruth]]
 
 _BATCH: Final = 64
 """Files that one worker writes at a time."""
-
-_QUEUE: Final = 4
-"""Batches submitted ahead per worker; the others are created when needed."""
 
 _FLAT_EARTH_LIMIT: Final = 300e3
 """m, largest distance of a station from the origin in horizontally varying air."""
@@ -62,7 +57,7 @@ class SimulatedCampaign:
 def simulate_campaign(
     campaign: Campaign,
     *,
-    client: Client | None = None,
+    workers: int = 1,
     progress: Progress | None = None,
     expect: Progress | None = None,
 ) -> SimulatedCampaign:
@@ -73,8 +68,8 @@ def simulate_campaign(
     campaign : Campaign
         With a `simulation`. Each simulated instrument needs ``files: <folder>/<prefix>*`` (and
         such `dark_files`, where it has any): folder and prefix name the files to be written.
-    client : distributed.Client, optional
-        Its workers write the files into the same folder; by default this process does.
+    workers : int, optional
+        Number of local processes that write the files; by default this process does.
     progress : callable, optional
         Called with the number of files written since the last call.
     expect : callable, optional
@@ -124,18 +119,13 @@ def simulate_campaign(
         expect(len(paths))
     rows = sum(planned.role is Role.SIGNAL for _, files in plan for planned in files)
     table = TruthTable(rows, {site.key: Simulator(site).grid for site, _ in plan})
-    work = _batches(plan)
-    results = (
-        (_write_batch(batch, archive) for batch in work)
-        if client is None
-        else _distributed(work, archive, client)
-    )
-    for truths in results:
-        for row, file_truth in truths:
-            if row is not None:
-                table.add(row, file_truth)
-        if progress:
-            progress(len(truths))
+    with Processes(workers, archive) as processes:
+        for _, truths in processes.map_items(_write_batch, _batches(plan), at_a_time=1):
+            for row, file_truth in truths:
+                if row is not None:
+                    table.add(row, file_truth)
+            if progress:
+                progress(len(truths))
     return SimulatedCampaign(archive, tuple(paths), table.dataset(campaign.name))
 
 
@@ -164,26 +154,7 @@ def _batches(plan: _Plan) -> Iterator[_Batch]:
             yield site, work[first : first + _BATCH]
 
 
-def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_Truths]:
-    from distributed import as_completed  # noqa: PLC0415 - takes a second to import
-
-    def submit(batch: _Batch) -> Future[_Truths]:
-        return client.submit(_write_batch, batch, archive, pure=False)
-
-    workers = max(1, len(client.scheduler_info()["workers"]))
-    waiting = iter(work)
-    stream = as_completed([submit(batch) for batch in islice(waiting, _QUEUE * workers)])
-    try:
-        for future in stream:
-            yield future.result()
-            future.release()
-            for batch in islice(waiting, 1):
-                stream.add(submit(batch))
-    finally:
-        client.cancel(list(stream.futures))
-
-
-def _write_batch(batch: _Batch, archive: Path) -> _Truths:
+def _write_batch(archive: Path, batch: _Batch) -> _Truths:
     site, work = batch
     simulator = Simulator(site)
     truths: _Truths = []
