@@ -93,7 +93,7 @@ def aggregate(
         runs,
         products_at,
     )
-    with progress_bar("aggregate", None) as bar:
+    with progress_bar("aggregate") as bar:
         made = make_aggregates(root, chosen, progress=bar.advance)
     if as_json:
         typer.echo(json.dumps(asdict(made), indent=2, default=str))
@@ -186,7 +186,7 @@ def site(
     from lidarops.figures.wording import counted
     from lidarops.site.build import build_site
 
-    with progress_bar("site", None) as bar:
+    with progress_bar("site") as bar:
         made = build_site(
             out,
             workers=workers,

@@ -84,7 +84,7 @@ def init(
     if not headers_only:
         from lidarops.run.first_look import look_at_data
 
-        with progress_bar("look at data", None, "instruments") as bar:
+        with progress_bar("look at data") as bar:
             looks, failed = look_at_data(text, contents, str(root), bar.advance)
         for key, reason in failed.items():
             say(f"{key}: no look at data, drafted from headers alone: {reason}")
@@ -122,7 +122,7 @@ def simulate(
     from lidarops.simulate.campaign import simulate_campaign
 
     settings = load_campaign(campaign, archive=archive, output=out)
-    with progress_bar("simulate", None) as bar:
+    with progress_bar("simulate") as bar:
         simulated = simulate_campaign(
             settings, workers=workers, progress=bar.advance, expect=bar.grow
         )
