@@ -8,7 +8,6 @@ import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Final
 
@@ -25,14 +24,10 @@ from lidarops.simulate.truth import FileTruth, TruthTable
 from lidarops.system.processes import Processes
 
 Progress = Callable[[int], None]
-_Work = Sequence[tuple[PlannedFile, int | None]]
-"""Files of one instrument that are written together, and their rows in the truth, None for dark
-files."""
-_Batch = tuple[SimulatedInstrument, _Work]
+_Batch = tuple[SimulatedInstrument, Sequence[PlannedFile]]
+"""Files of one instrument that are written together."""
 _Plan = Sequence[tuple[SimulatedInstrument, Sequence[PlannedFile]]]
 """Every instrument with its files: dark ones first, then signal files in time."""
-_Truths = list[tuple[int | None, FileTruth]]
-"""Of the files of a batch."""
 
 _BATCH: Final = 64
 """Files that one worker writes at a time."""
@@ -120,12 +115,11 @@ def simulate_campaign(
     rows = sum(planned.role is Role.SIGNAL for _, files in plan for planned in files)
     table = TruthTable(rows, {site.key: Simulator(site).grid for site, _ in plan})
     with Processes(workers, archive) as processes:
-        for _, truths in processes.map_items(_write_batch, _batches(plan), at_a_time=1):
-            for row, file_truth in truths:
-                if row is not None:
-                    table.add(row, file_truth)
+        for (_, files), truths in processes.map_items(_write_batch, _batches(plan), at_a_time=1):
+            for file_truth in truths:
+                table.add(file_truth)
             if progress:
-                progress(len(truths))
+                progress(len(files))
     return SimulatedCampaign(archive, tuple(paths), table.dataset(campaign.name))
 
 
@@ -147,21 +141,21 @@ def _plan(campaign: Campaign) -> _Plan:
 
 
 def _batches(plan: _Plan) -> Iterator[_Batch]:
-    rows = count()
     for site, files in plan:
-        work = [(file, next(rows) if file.role is Role.SIGNAL else None) for file in files]
-        for first in range(0, len(work), _BATCH):
-            yield site, work[first : first + _BATCH]
+        for first in range(0, len(files), _BATCH):
+            yield site, files[first : first + _BATCH]
 
 
-def _write_batch(archive: Path, batch: _Batch) -> _Truths:
-    site, work = batch
+def _write_batch(archive: Path, batch: _Batch) -> list[FileTruth]:
+    """Write some files, and return the truth of the signal files."""
+    site, files = batch
     simulator = Simulator(site)
-    truths: _Truths = []
-    for planned, row in work:
+    truths = []
+    for planned in files:
         content, truth = simulator.simulate(planned)
         _write_whole(archive / planned.path, content)
-        truths.append((row, truth))
+        if planned.role is Role.SIGNAL:
+            truths.append(truth)
     return truths
 
 

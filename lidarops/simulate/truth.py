@@ -118,7 +118,7 @@ def _evenly(start: int, stop: int, cells: int) -> NDArray[np.intp]:
 
 
 class TruthTable:
-    """Truth of a campaign: one row per granule, filled in any order.
+    """Truth of a campaign: one row per granule.
 
     Parameters
     ----------
@@ -130,6 +130,7 @@ class TruthTable:
 
     def __init__(self, rows: int, grids: Mapping[str, TruthGrid]) -> None:
         self._rows = rows
+        self._filled = 0
         self._grids = grids
         texts = ("path", "instrument", "damage")
         numbers = ("total_extinction", "zenith_angle", "azimuth", "clock_error", "energy")
@@ -142,8 +143,9 @@ class TruthTable:
             key: {} for key in grids
         }
 
-    def add(self, row: int, truth: FileTruth) -> None:
-        """Fill one row."""
+    def add(self, truth: FileTruth) -> None:
+        """Fill the next row."""
+        row, self._filled = self._filled, self._filled + 1
         for name, value in truth.values.items():
             if name not in self._columns:
                 self._columns[name] = np.full(self._rows, np.nan)
