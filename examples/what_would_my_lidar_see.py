@@ -29,7 +29,6 @@ DEAD_TIME = 4e-9  # s
 
 # %% The lidar: a laser of 20 mJ at 50 Hz, a telescope of 20 cm, files of one minute.
 LIDAR = {
-    "kind": "lidar",
     "acquisition": {"interval": 43_200, "shots": 3000, "repetition_rate": 50, "bins": 4000},
     "pulse": {"shape": "gaussian", "width": 8e-9},
     "detectors": [

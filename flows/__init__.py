@@ -2,7 +2,7 @@
 
 - `reprocess`: bring the products of a campaign up to date.
 - `catalog`: update the catalog only.
-- `maintenance`: end runs whose process is dead.
+- `maintenance`: end runs whose process is dead, without a flow.
 - `start`: what a flow does before its work.
 - `notifications`: set up automations that report failed or missing runs.
 

@@ -1,4 +1,4 @@
-"""Flow: end runs whose process is dead.
+"""End runs whose process is dead.
 
 If a worker loses power, Prefect keeps its run in the state Running for ever. The run occupies the
 one slot of its deployment, so that nothing is scheduled any more. Such a run sends no heartbeats.
@@ -18,7 +18,7 @@ from uuid import UUID
 
 import typer
 from httpx import HTTPError
-from prefect import flow, get_client, get_run_logger
+from prefect import get_client
 from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas.filters import (
     FlowRunFilter,
@@ -36,16 +36,14 @@ from prefect.events.filters import (
 )
 from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
-from pydantic import Field
+
+from lidarops.errors import UNAVAILABLE
 
 HEARTBEAT = "prefect.flow-run.heartbeat"
 TAG = "lidarops"
 """Tag of every deployment in ``deploy/prefect.yaml``."""
 
 _PAGE = 200
-
-Silence = Annotated[float, Field(ge=60, le=86_400)]
-"""s; at least two heartbeats, because one may be late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,34 +125,12 @@ def _last_heartbeat(client: SyncPrefectClient, run: FlowRun) -> datetime:
     return page.events[0].occurred if page.events else _changed(run)
 
 
-@flow(name="lidarops-maintenance", retries=2, retry_delay_seconds=10)
-def maintenance(silence: Silence = 90.0, start: Silence = 600.0) -> int:
-    """End runs whose process is dead.
-
-    Parameters
-    ----------
-    silence : float
-        s without a heartbeat after which a run counts as dead.
-    start : float
-        s that a claimed run may take to start.
-
-    Returns
-    -------
-    int
-        Number of ended runs.
-    """
-    with get_client(sync_client=True) as client:
-        reaped = reap_runs(client, silence=silence, start=start)
-    for run in reaped:
-        get_run_logger().warning("run %s ended: silent for %.0f s", run.name, run.silent)
-    return len(reaped)
-
-
 def main(
     every: Annotated[
         float | None, typer.Option(min=5, help="Keep running and check every so many seconds.")
     ] = None,
     silence: Annotated[
+        # At least two heartbeats, because one may be late.
         float, typer.Option(min=60, help="Seconds without heartbeat until a run is dead.")
     ] = 90.0,
     start: Annotated[
@@ -162,17 +138,18 @@ def main(
     ] = 600.0,
 ) -> None:
     """End runs whose process is dead, once or repeatedly."""
-    if every is None:
-        maintenance(silence, start)
-        return
     while True:
         try:
             with get_client(sync_client=True) as client:
                 for run in reap_runs(client, silence=silence, start=start):
                     typer.echo(f"run {run.name} ended: silent for {run.silent:.0f} s")
         except HTTPError as error:
-            # The server may be restarting; maintenance must survive that.
             typer.echo(f"the server does not answer: {error!r}", err=True)
+            # It may be restarting; repeated maintenance must survive that.
+            if every is None:
+                raise typer.Exit(UNAVAILABLE) from error
+        if every is None:
+            return
         time.sleep(every)
 
 

@@ -22,9 +22,6 @@ EFFECTIVE_RADIUS: Final = EARTH_RADIUS / (1.0 - BEAM_CURVATURE)
 LICEL_RANGE_PER_MICROSECOND: Final = 150.0
 """m. Licel converts counts to MHz with this nominal value, not with c / 2 (`licel2023`)."""
 
-LICEL_DISCRIMINATOR_STEP: Final = 25.0e-3 / 63.0
-"""V per discriminator level of a Licel photon-counting channel (`licel2023`)."""
-
 DEFAULT_DEAD_TIME: Final = 4.0e-9
 """s. Assumed for noise and flags where the campaign gives no dead time; never used to correct."""
 DEAD_TIME_UNCERTAINTY: Final = 0.2

@@ -29,7 +29,6 @@ from lidarops.campaign.yaml_errors import (
     Loader,
     duplicate_keys,
     explain_yaml_error,
-    with_plain_numbers,
     with_quantities,
 )
 from lidarops.errors import CampaignError
@@ -48,6 +47,7 @@ from lidarops.settings import (
     SettingsModel,
     located_error,
     nearest,
+    ordered,
     quantity,
 )
 from lidarops.system.stores import refuse_keys
@@ -261,11 +261,7 @@ class InstrumentFacts(SettingsModel):
         default={}, description="facts about channels, by their names such as photon_532o"
     )
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.valid_to <= self.valid_from:
-            raise ValueError("valid_to must be later than valid_from")
-        return self
+    _ordered = ordered("valid_from", "valid_to", "valid_to must be later than valid_from")
 
     @model_validator(mode="after")
     def _one_role_of_each_file(self) -> Self:
@@ -511,11 +507,7 @@ class CampaignPeriod(SettingsModel):
         description="products of scenes that begin in the period are not replaced without --thaw",
     )
 
-    @model_validator(mode="after")
-    def _ends_after_its_start(self) -> Self:
-        if self.until <= self.since:
-            raise ValueError("until must be later than since")
-        return self
+    _ordered = ordered("since", "until", "until must be later than since")
 
 
 class Acknowledged(SettingsModel):
@@ -720,11 +712,13 @@ def load_campaign(
             remedy="see catalogs/demo.yaml for an example",
         )
     try:
-        campaign = Campaign.model_validate(with_plain_numbers(raw, campaign_schema))
+        campaign = Campaign.model_validate(raw)
     except ValidationError as error:
         nodes = yaml.compose(text, Loader=yaml.SafeLoader)
         lines = explain_yaml_error(error, nodes, campaign_schema())
         raise CampaignError(_listed("is not a valid campaign:", lines), file=path) from error
+    except RecursionError as error:
+        raise CampaignError("holds a list that contains itself", file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):
         raise CampaignError(

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticUndefined
 
 from lidarops import settings
-from lidarops.settings import SettingsModel, quantity
+from lidarops.settings import SettingsModel, ordered, quantity
 
 
 def _fits_headers(value: datetime) -> datetime:
@@ -29,18 +29,6 @@ def _fits_headers(value: datetime) -> datetime:
 Instant = Annotated[settings.Instant, AfterValidator(_fits_headers)]
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Azimuth = Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
-
-
-def ordered(low: str, high: str, problem: str, *, may_be_equal: bool = False) -> Any:
-    """Return a validator of a model: the value of field `high` exceeds that of `low`."""
-
-    def check(model: SettingsModel) -> SettingsModel:
-        first, last = getattr(model, low), getattr(model, high)
-        if last < first or (last == first and not may_be_equal):
-            raise ValueError(problem)
-        return model
-
-    return model_validator(mode="after")(check)
 
 
 def lidar_ratio(default: float, description: str) -> Any:
@@ -136,13 +124,6 @@ class BoundaryLayer(SettingsModel):
         DiurnalCourse(minimum=500.0, maximum=1600.0, hour_of_maximum=14.0),
         unit="m",
         description="above the ground",
-    )
-    entrainment_depth: float = quantity(
-        100.0,
-        unit="m",
-        gt=0,
-        le=2000,
-        description="scale of the gradual decrease at the top",
     )
 
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period, ordered
+from lidarops.campaign.simulated_air import Azimuth, Instant, NotNegative, Period
 from lidarops.constants import PLANCK, SPEED_OF_LIGHT
-from lidarops.settings import SettingsModel, quantity
+from lidarops.records import DetectionMode
+from lidarops.settings import SettingsModel, ordered, quantity
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,7 +59,6 @@ def _spread(most: float, description: str) -> Any:
 class PhotonCounter(SettingsModel):
     """Photon-counting output of a detector; its dead time is a fact of the campaign."""
 
-    discriminator_level: int = quantity(8, unit="1", ge=1, le=63, description="Licel level")
     paralyzable: bool = Field(
         default=False, description="whether a lost photon prolongs the dead time"
     )
@@ -146,9 +146,6 @@ class RamanLines(SettingsModel):
     surface_mixing_ratio: float = quantity(
         0.01, unit="kg kg-1", gt=0, le=0.05, description="of water vapour at the origin"
     )
-    scale_height: float = quantity(
-        2000.0, unit="m", ge=100, le=20_000, description="of the mixing ratio"
-    )
 
 
 class Detector(SettingsModel):
@@ -184,6 +181,12 @@ class Detector(SettingsModel):
     def label(self) -> str:
         """Wavelength and polarisation as in channel names, such as ``532o``."""
         return f"{self.wavelength}{self.polarisation}"
+
+    @property
+    def recorders(self) -> dict[str, AnalogRecorder | PhotonCounter]:
+        """Its recorders by the names of their channels, in the order of the datasets in a file."""
+        outputs = {DetectionMode.ANALOG: self.analog, DetectionMode.PHOTON: self.photon}
+        return {f"{mode}_{self.label}": output for mode, output in outputs.items() if output}
 
     @property
     def strength(self) -> float:

@@ -10,19 +10,11 @@ from __future__ import annotations
 
 import math
 from datetime import datetime, timedelta
-from typing import Annotated, Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
-from lidarops.campaign.simulated_air import (
-    Aerosol,
-    AtmosphereSettings,
-    BoundaryLayer,
-    DiurnalExtinction,
-    Homogeneous,
-    Instant,
-    Layer,
-)
+from lidarops.campaign.simulated_air import AtmosphereSettings, Instant
 from lidarops.campaign.simulated_instrument import (
     Acquisition,
     Damage,
@@ -42,7 +34,15 @@ _DAMAGE_OF_OUTPUT = {
 }
 
 
-class _Instrument(SettingsModel):
+class InstrumentSimulation(SettingsModel):
+    """Simulation of one lidar."""
+
+    atmosphere: AtmosphereSettings | None = Field(
+        default=None, description="its own atmosphere; by default that of the simulation"
+    )
+    scan: Pointing | None = Field(
+        default=None, description="sequence of zenith angles; by default the pointing of the facts"
+    )
     acquisition: Acquisition = Acquisition()
     detectors: list[Detector] = Field(
         min_length=1, description="one for each wavelength and polarisation"
@@ -103,65 +103,6 @@ class _Instrument(SettingsModel):
         return self
 
 
-class HorizontalPath(_Instrument):
-    """Lidar on a homogeneous path."""
-
-    kind: Literal["horizontal"] = Field(description="a homogeneous path")
-    aerosol: Aerosol = Aerosol()
-    aerosol_extinction: DiurnalExtinction = quantity(
-        unit="m-1", description="of aerosol, at 532 nm"
-    )
-
-    @property
-    def air(self) -> AtmosphereSettings:
-        """The homogeneous path."""
-        path = Homogeneous(
-            aerosol=self.aerosol, extinction=self.aerosol_extinction, molecules_constant=True
-        )
-        return AtmosphereSettings(homogeneous=path)
-
-    @model_validator(mode="after")
-    def _one_extinction(self) -> Self:
-        wavelengths = {detector.wavelength for detector in self.detectors}
-        if len(wavelengths) > 1:
-            raise ValueError(
-                f"detectors at {sorted(wavelengths)} nm: a homogeneous path has one extinction per"
-                " file, so its detectors need one wavelength; give other wavelengths their own"
-                " instrument"
-            )
-        return self
-
-
-class VerticalColumn(_Instrument):
-    """Vertical lidar below a layered atmosphere."""
-
-    kind: Literal["vertical"] = Field(description="a vertical beam in layered air")
-    boundary_layer: BoundaryLayer = BoundaryLayer()
-    layers: tuple[Layer, ...] = Field(default=(), description="elevated layers")
-
-    @property
-    def air(self) -> AtmosphereSettings:
-        """The layered atmosphere."""
-        return AtmosphereSettings(boundary_layer=self.boundary_layer, layers=self.layers)
-
-
-class Lidar(_Instrument):
-    """Lidar with any pointing, in its own atmosphere or in the shared one."""
-
-    kind: Literal["lidar"] = Field(description="any pointing, in any air")
-    atmosphere: AtmosphereSettings | None = Field(
-        default=None, description="its own atmosphere; by default that of the simulation"
-    )
-    scan: Pointing | None = Field(
-        default=None, description="sequence of zenith angles; by default the pointing of the facts"
-    )
-
-
-InstrumentSimulation = Annotated[
-    HorizontalPath | VerticalColumn | Lidar, Field(discriminator="kind")
-]
-
-
 class TruthSettings(SettingsModel):
     """Resolution of the true profiles along the beams."""
 
@@ -191,7 +132,7 @@ class SimulationSettings(SettingsModel):
         unit="s", gt=0, le=366 * 86400.0 * 30, description="within which all files end"
     )
     atmosphere: AtmosphereSettings | None = Field(
-        default=None, description="shared by instruments of kind 'lidar'"
+        default=None, description="shared by the instruments that have none of their own"
     )
     origin: str | None = Field(
         default=None,
@@ -224,19 +165,14 @@ class SimulationSettings(SettingsModel):
                         f" {files - 1}"
                     )
                     raise located_error(problem, *place, "damage")
-            if self.own_air(key) is None and self.atmosphere is None:
+            if instrument.atmosphere is None and self.atmosphere is None:
                 problem = "has no atmosphere: give it one, or give simulation.atmosphere for all"
                 raise located_error(problem, *place)
         return self
 
     def air_of(self, key: str) -> AtmosphereSettings:
         """Return the atmosphere of an instrument."""
-        return self.own_air(key) or self.atmosphere or AtmosphereSettings()
-
-    def own_air(self, key: str) -> AtmosphereSettings | None:
-        """Return the atmosphere of an instrument alone; None where it is in the shared one."""
-        instrument = self.instruments[key]
-        return instrument.atmosphere if isinstance(instrument, Lidar) else instrument.air
+        return self.instruments[key].atmosphere or self.atmosphere or AtmosphereSettings()
 
     def files(self, key: str) -> int:
         """Return the number of signal files of an instrument; all end within the campaign."""

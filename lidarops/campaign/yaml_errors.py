@@ -1,12 +1,12 @@
-"""Read quantities of a YAML file by its schema, and explain its errors.
+"""Read a YAML file of settings, and explain its errors by its schema.
 
 Messages state the line, the key, the value, and what is expected there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import yaml
@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from lidarops.settings import NO_UNIT, nearest
-from lidarops.units import PATTERN, is_quantity, is_small, parse_quantity, written
+from lidarops.units import PATTERN, is_small, written
 
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
@@ -83,48 +83,6 @@ def duplicate_keys(tree: yaml.Node | None) -> list[str]:
     return [message for _, message in sorted(messages)]
 
 
-def with_plain_numbers(content: Any, schema: Callable[[], dict[str, Any]]) -> Any:
-    """Return the content of a file with quantities, such as ``4 ns``, as numbers in the unit there.
-
-    What is none, or has a unit of another dimension, is left for the validation to name.
-
-    Parameters
-    ----------
-    content : object
-        Of YAML.
-    schema : callable
-        Returns the JSON schema of the file, with units; called where a text may be a quantity.
-    """
-    texts = _texts(content)
-    return _plain(content, Expected.root(schema())) if any(map(is_quantity, texts)) else content
-
-
-def _texts(content: Any) -> Iterator[str]:
-    """Yield all texts that are values."""
-    stack, seen = [content], set[int]()
-    while stack:
-        value = stack.pop()
-        if isinstance(value, str):
-            yield value
-        # An anchor may contain itself.
-        elif isinstance(value, dict | list) and id(value) not in seen:
-            seen.add(id(value))
-            stack += value.values() if isinstance(value, dict) else value
-
-
-def _plain(content: Any, expected: Expected | None) -> Any:
-    if expected is None:
-        return content
-    if isinstance(content, dict):
-        return {key: _plain(value, expected.below(str(key))) for key, value in content.items()}
-    if isinstance(content, list):
-        return [_plain(value, expected.below(str(k))) for k, value in enumerate(content)]
-    if isinstance(content, str) and expected.unit and not expected.takes_any_text():
-        number = parse_quantity(content, expected.unit)
-        return content if number is None else number
-    return content
-
-
 def with_quantities(schema: Any, unit: str | None = None) -> Any:
     """Return a JSON schema for editors, in which numbers with a unit may be quantities."""
     if isinstance(schema, list):
@@ -184,9 +142,7 @@ class _Problem:
             below = self.expected.below(key)
             # A location key that the schema lacks names the member of a union that was tried.
             self.of_union = below is None
-            if below is None:
-                self.expected = self.expected.member(key)
-            else:
+            if below is not None:
                 self.mapping, self.expected = self.expected, below
                 self.keys.append(key)
         self.unknown = unknown
@@ -208,7 +164,7 @@ class _Problem:
             return f"must be {self.mapping.words_of_keys()}, not {self.name!r}"
         if kind == "missing":
             return f"is required: {self.expected.words()}"
-        if kind in _OWN_WORDS or kind.startswith("union_tag"):
+        if kind in _OWN_WORDS:
             return self.details["msg"].removeprefix("Value error, ")
         return f"must be {self.expected.words()}, not {self._value()}{self._hint()}"
 
@@ -281,11 +237,6 @@ class Expected:
         inner = [schema for outer in self.schemas for schema in _below(outer, key)]
         return self._resolved(inner, self.unit) if inner else None
 
-    def member(self, tag: str) -> Expected:
-        """Return what is expected of the member of a union that has a tag or title."""
-        chosen = tuple(schema for schema in self.schemas if _has_tag(schema, tag))
-        return replace(self, schemas=chosen or self.schemas)
-
     def keys(self) -> list[str]:
         """Return the valid keys of mappings, sorted."""
         return sorted({key for schema in self.schemas for key in schema.get("properties", ())})
@@ -299,11 +250,6 @@ class Expected:
         """Return the valid texts, where a list gives them."""
         found = (choice for schema in self.schemas for choice in _choices(schema))
         return [choice for choice in found if isinstance(choice, str)]
-
-    def takes_any_text(self) -> bool:
-        """Return whether any text may be valid, not only some of a list."""
-        texts = [schema for schema in self.schemas if schema.get("type") == "string"]
-        return not all(list(_choices(schema)) for schema in texts)
 
     def words(self) -> str:
         """Return what is expected, such as ``a number from 1 to 200 sr``."""
@@ -357,11 +303,6 @@ def _below(schema: Schema, key: str) -> Iterator[Schema]:
     elif schema.get("type") == "array" and key.isdecimal():
         fixed = schema.get("prefixItems", [])
         yield fixed[int(key)] if int(key) < len(fixed) else schema.get("items") or {}
-
-
-def _has_tag(schema: Schema, tag: str) -> bool:
-    tags = [inner.get("const") for inner in schema.get("properties", {}).values()]
-    return tag == schema.get("title") or tag in tags
 
 
 def _choices(schema: Schema) -> Iterator[str]:

@@ -151,40 +151,25 @@ class Bar(NamedTuple):
 
 
 @contextmanager
-def progress_bar(name: str, total: int | None, unit: str = "") -> Iterator[Bar]:
-    """Show progress on standard error if that is a terminal.
-
-    Parameters
-    ----------
-    name : str
-    total : int or None
-        None where it is not known, or grows.
-    unit : str, optional
-        What is counted, to show throughput and remaining time.
-    """
+def progress_bar(name: str) -> Iterator[Bar]:
+    """Show progress on standard error if that is a terminal; the total is what it grows to."""
     if not sys.stderr.isatty():
         yield Bar(lambda _: None, lambda _: None)
         return
     from rich import progress
     from rich.console import Console
-    from rich.text import Text
 
-    class Speed(progress.TextColumn):
-        def render(self, task: progress.Task) -> Text:
-            return Text(f"{task.speed or 0.0:.0f} {unit}/s")
-
-    columns: list[progress.ProgressColumn] = [
+    columns = (
         progress.TextColumn("{task.description}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
         progress.TimeElapsedColumn(),
-    ]
-    if unit:
-        columns[3:3] = [Speed("")]
-        columns += [progress.TextColumn("remaining"), progress.TimeRemainingColumn()]
+        progress.TextColumn("remaining"),
+        progress.TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     with progress.Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(name, total=total)
+        task = bar.add_task(name, total=None)
 
         def grow(number: int) -> None:
             bar.update(task, total=(bar.tasks[0].total or 0) + number)

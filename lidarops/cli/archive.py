@@ -104,7 +104,7 @@ def catalog(
     from lidarops.run.day_states import ChannelNames
 
     settings = loaded_campaign(campaign, archive, out, catalog)
-    with progress_bar("catalog", None) as bar:
+    with progress_bar("catalog") as bar:
         summary = update_catalog(settings, progress=bar.advance, wait=wait, workers=workers)
         rebuilt = None
         if rebuild:
@@ -226,7 +226,7 @@ def reprocess(
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
-    with progress_bar("reprocess", None, "granules") as bar:
+    with progress_bar("reprocess") as bar:
         chosen = pipeline.Options(
             force=force,
             thaw=thaw,

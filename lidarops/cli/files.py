@@ -228,7 +228,7 @@ def verify(
         check_archive_and_catalog(settings, archive=archive)
     with (
         Store(settings.catalog_url, settings.name, create=False) as store,
-        progress_bar("verify", None) as bar,
+        progress_bar("verify") as bar,
     ):
         checked, mismatches = 0, []
         for file in verify_archive(settings, store, inputs=not products_only):

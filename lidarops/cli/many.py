@@ -90,7 +90,7 @@ def aggregate(
         raise typer.BadParameter(f"{error}; there are {choices}") from error
     selection = parse_selection(kind, channel, station, instrument, utc(since), utc(until))
     root, runs = _root(out, with_runs=store)
-    with progress_bar("aggregate", None) as bar:
+    with progress_bar("aggregate") as bar:
         made = make_aggregates(
             root,
             selection,
@@ -189,7 +189,7 @@ def site(
     from lidarops.figures.wording import counted
     from lidarops.site.build import build_site
 
-    with progress_bar("site", None) as bar:
+    with progress_bar("site") as bar:
         made = build_site(
             out,
             workers=workers,

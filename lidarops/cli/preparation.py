@@ -84,7 +84,7 @@ def init(
     if not headers_only:
         from lidarops.run.first_look import look_at_data
 
-        with progress_bar("look at data", None, "instruments") as bar:
+        with progress_bar("look at data") as bar:
             looks, failed = look_at_data(text, contents, str(root), bar.advance)
         for key, reason in failed.items():
             say(f"{key}: no look at data, drafted from headers alone: {reason}")
@@ -117,18 +117,14 @@ def simulate(
 
     Example: lidarops simulate catalogs/demo.yaml --workers 2
     """
-    from contextlib import nullcontext
-
     from lidarops.campaign.model import load_campaign
     from lidarops.netcdf.write import write_plain
-    from lidarops.run.clusters import local_client
     from lidarops.simulate.campaign import simulate_campaign
 
     settings = load_campaign(campaign, archive=archive, output=out)
-    cluster = nullcontext() if workers == 1 else local_client(workers)
-    with progress_bar("simulate", None) as bar, cluster as client:
+    with progress_bar("simulate") as bar:
         simulated = simulate_campaign(
-            settings, client=client, progress=bar.advance, expect=bar.grow
+            settings, workers=workers, progress=bar.advance, expect=bar.grow
         )
     write_plain(simulated.truth, settings.truth_path)
     say(f"{len(simulated.paths)} raw files and truth.nc in {from_here(settings.archive)}")

@@ -17,8 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidarops.campaign.model import Campaign, campaign_schema
-from lidarops.campaign.yaml_errors import with_plain_numbers
+from lidarops.campaign.model import Campaign
 from lidarops.catalog.draft import drafted_instruments
 from lidarops.catalog.folder import (
     FileGroup,
@@ -88,7 +87,7 @@ def look_at_data(
     KeyboardInterrupt
         If the process is asked to stop.
     """
-    drafted = with_plain_numbers(yaml.safe_load(text), campaign_schema)
+    drafted = yaml.safe_load(text)
     looks: dict[str, FirstLook] = {}
     failed: dict[str, str] = {}
     for key, headers in drafted_instruments(contents).items():

@@ -44,6 +44,10 @@ _RAMAN_WAVELENGTH: Final = 355e-9
 """m."""
 _WATER_OVER_NITROGEN: Final = 2.5
 """Cross section of the lines of water vapour over that of nitrogen (`whiteman2003`)."""
+_SCALE_HEIGHT: Final = 2000.0
+"""m, in which the mixing ratio of water vapour falls to 1/e."""
+_ENTRAINMENT_DEPTH: Final = 100.0
+"""m, scale of the gradual decrease at the top of the boundary layer."""
 _MODES: Final = 256
 """Number of plane waves in the turbulence."""
 _TWILIGHT_AT_HORIZON: Final = 0.02
@@ -182,7 +186,7 @@ class Air:
         density = self._density(height)
         if lines.gas == "nitrogen":
             return np.asarray(NITROGEN_SHARE * density * cross_section)
-        ratio = lines.surface_mixing_ratio * np.exp(-np.maximum(height, 0.0) / lines.scale_height)
+        ratio = lines.surface_mixing_ratio * np.exp(-np.maximum(height, 0.0) / _SCALE_HEIGHT)
         return np.asarray(ratio / MASS_RATIO * density * _WATER_OVER_NITROGEN * cross_section)
 
     def molecules(self, height: Array, wavelength: float) -> Array:
@@ -210,7 +214,7 @@ class Air:
             yield air.homogeneous.aerosol, everywhere
         if air.boundary_layer is not None:
             layer = air.boundary_layer
-            rise = (layer.height.at(moment) - points.height) / layer.entrainment_depth
+            rise = (layer.height.at(moment) - points.height) / _ENTRAINMENT_DEPTH
             yield layer.aerosol, layer.extinction * expit(rise)
         for elevated in air.layers:
             if elevated.holds(moment):

@@ -8,44 +8,29 @@ import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import xarray as xr
 
 from lidarops.campaign.model import Campaign, Station
-from lidarops.campaign.simulated_instrument import DamageKind
+from lidarops.campaign.simulated_instrument import DamageKind, PhotonCounter
 from lidarops.campaign.simulation import SimulationSettings
 from lidarops.errors import CampaignError
-from lidarops.records import DetectionMode, Role
+from lidarops.records import Role
 from lidarops.simulate.files import Simulator
-from lidarops.simulate.planned_files import (
-    PlannedFile,
-    SimulatedInstrument,
-    channel_name,
-    photon_dead_time,
-)
+from lidarops.simulate.planned_files import PlannedFile, SimulatedInstrument, photon_dead_time
 from lidarops.simulate.truth import FileTruth, TruthTable
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
+from lidarops.system.processes import Processes
 
 Progress = Callable[[int], None]
-_Work = Sequence[tuple[PlannedFile, int | None]]
-"""Files of one instrument that are written together, and their rows in the truth, None for dark
-files."""
-_Batch = tuple[SimulatedInstrument, _Work]
+_Batch = tuple[SimulatedInstrument, Sequence[PlannedFile]]
+"""Files of one instrument that are written together."""
 _Plan = Sequence[tuple[SimulatedInstrument, Sequence[PlannedFile]]]
 """Every instrument with its files: dark ones first, then signal files in time."""
-_Truths = list[tuple[int | None, FileTruth]]
-"""Of the files of a batch."""
 
 _BATCH: Final = 64
 """Files that one worker writes at a time."""
-
-_QUEUE: Final = 4
-"""Batches submitted ahead per worker; the others are created when needed."""
 
 _FLAT_EARTH_LIMIT: Final = 300e3
 """m, largest distance of a station from the origin in horizontally varying air."""
@@ -67,7 +52,7 @@ class SimulatedCampaign:
 def simulate_campaign(
     campaign: Campaign,
     *,
-    client: Client | None = None,
+    workers: int = 1,
     progress: Progress | None = None,
     expect: Progress | None = None,
 ) -> SimulatedCampaign:
@@ -78,8 +63,8 @@ def simulate_campaign(
     campaign : Campaign
         With a `simulation`. Each simulated instrument needs ``files: <folder>/<prefix>*`` (and
         such `dark_files`, where it has any): folder and prefix name the files to be written.
-    client : distributed.Client, optional
-        Its workers write the files into the same folder; by default this process does.
+    workers : int, optional
+        Number of local processes that write the files; by default this process does.
     progress : callable, optional
         Called with the number of files written since the last call.
     expect : callable, optional
@@ -129,18 +114,12 @@ def simulate_campaign(
         expect(len(paths))
     rows = sum(planned.role is Role.SIGNAL for _, files in plan for planned in files)
     table = TruthTable(rows, {site.key: Simulator(site).grid for site, _ in plan})
-    work = _batches(plan)
-    results = (
-        (_write_batch(batch, archive) for batch in work)
-        if client is None
-        else _distributed(work, archive, client)
-    )
-    for truths in results:
-        for row, file_truth in truths:
-            if row is not None:
-                table.add(row, file_truth)
-        if progress:
-            progress(len(truths))
+    with Processes(workers, archive) as processes:
+        for (_, files), truths in processes.map_items(_write_batch, _batches(plan), at_a_time=1):
+            for file_truth in truths:
+                table.add(file_truth)
+            if progress:
+                progress(len(files))
     return SimulatedCampaign(archive, tuple(paths), table.dataset(campaign.name))
 
 
@@ -162,40 +141,21 @@ def _plan(campaign: Campaign) -> _Plan:
 
 
 def _batches(plan: _Plan) -> Iterator[_Batch]:
-    rows = count()
     for site, files in plan:
-        work = [(file, next(rows) if file.role is Role.SIGNAL else None) for file in files]
-        for first in range(0, len(work), _BATCH):
-            yield site, work[first : first + _BATCH]
+        for first in range(0, len(files), _BATCH):
+            yield site, files[first : first + _BATCH]
 
 
-def _distributed(work: Iterable[_Batch], archive: Path, client: Client) -> Iterator[_Truths]:
-    from distributed import as_completed  # noqa: PLC0415 - takes a second to import
-
-    def submit(batch: _Batch) -> Future[_Truths]:
-        return client.submit(_write_batch, batch, archive, pure=False)
-
-    workers = max(1, len(client.scheduler_info()["workers"]))
-    waiting = iter(work)
-    stream = as_completed([submit(batch) for batch in islice(waiting, _QUEUE * workers)])
-    try:
-        for future in stream:
-            yield future.result()
-            future.release()
-            for batch in islice(waiting, 1):
-                stream.add(submit(batch))
-    finally:
-        client.cancel(list(stream.futures))
-
-
-def _write_batch(batch: _Batch, archive: Path) -> _Truths:
-    site, work = batch
+def _write_batch(archive: Path, batch: _Batch) -> list[FileTruth]:
+    """Write some files, and return the truth of the signal files."""
+    site, files = batch
     simulator = Simulator(site)
-    truths: _Truths = []
-    for planned, row in work:
+    truths = []
+    for planned in files:
         content, truth = simulator.simulate(planned)
         _write_whole(archive / planned.path, content)
-        truths.append((row, truth))
+        if planned.role is Role.SIGNAL:
+            truths.append(truth)
     return truths
 
 
@@ -248,7 +208,7 @@ def _site(campaign: Campaign, settings: SimulationSettings, key: str) -> Simulat
         settings=settings,
         instrument=instrument,
         station=station,
-        origin=station if settings.own_air(key) else _origin(campaign, settings),
+        origin=station if simulated.atmosphere else _origin(campaign, settings),
         folder={role: folder for role, (folder, _) in places.items()},
         prefix={role: prefix for role, (_, prefix) in places.items()},
         damage={damage.index: damage.kind for damage in simulated.damage},
@@ -303,9 +263,10 @@ def _check_facts(site: SimulatedInstrument, files: Iterable[PlannedFile]) -> Non
             remedy="give the zenith angles of a scan, or use another dialect",
         )
     counted = [
-        channel_name(DetectionMode.PHOTON, detector)
+        name
         for detector in site.simulated.detectors
-        if detector.photon is not None
+        for name, recorder in detector.recorders.items()
+        if isinstance(recorder, PhotonCounter)
     ]
     for planned in files:
         for name in counted:

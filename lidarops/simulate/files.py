@@ -19,7 +19,6 @@ from lidarops.campaign.simulated_instrument import (
     Detector,
     PhotonCounter,
 )
-from lidarops.constants import LICEL_DISCRIMINATOR_STEP
 from lidarops.raw.licel import (
     Dataset,
     DatasetKind,
@@ -30,7 +29,7 @@ from lidarops.raw.licel import (
     new_dataset,
     new_header,
 )
-from lidarops.records import DetectionMode, Role
+from lidarops.records import Role
 from lidarops.simulate.analog import digitise
 from lidarops.simulate.atmosphere import (
     Air,
@@ -50,8 +49,6 @@ from lidarops.simulate.damage import damage_file
 from lidarops.simulate.planned_files import (
     PlannedFile,
     SimulatedInstrument,
-    channel_name,
-    modes,
     photon_dead_time,
     random_stream,
     scan_grid,
@@ -167,10 +164,9 @@ class Simulator:
         true: dict[str, float] = {}
         for detector in site.simulated.detectors:
             lights = self._lights(conditions, detector, random)
-            for mode in modes(detector):
-                name = channel_name(mode, detector)
+            for name, recorder in detector.recorders.items():
                 light = lights[_offset(conditions, name)]
-                counts[name], about = self._read_out(conditions, detector, mode, light, random)
+                counts[name], about = self._read_out(conditions, name, recorder, light, random)
                 true |= {f"{quantity}_{name}": value for quantity, value in about.items()}
         if site.dialect.scans:
             # The second memory is empty, although the header shares the shots between both.
@@ -251,36 +247,35 @@ class Simulator:
         key = acquisition.bins, acquisition.bin_width, acquisition.shots
         if key not in self._datasets:
             self._datasets[key] = tuple(
-                self._dataset(number, mode, shots, *_grid_of(acquisition, detector))
+                self._dataset(number, recorder, shots, *_grid_of(acquisition, detector))
                 for number, detector in enumerate(self.site.simulated.detectors)
                 for shots in self.site.dialect.shots_of_memories(acquisition.shots)
-                for mode in modes(detector)
+                for recorder in detector.recorders.values()
             )
         return self._datasets[key]
 
     def _dataset(
-        self, number: int, mode: DetectionMode, shots: int, bins: int, bin_width: float
+        self,
+        number: int,
+        recorder: AnalogRecorder | PhotonCounter,
+        shots: int,
+        bins: int,
+        bin_width: float,
     ) -> Dataset:
         """Return the line of a recorder of detector `number`."""
         detector, dialect = self.site.simulated.detectors[number], self.site.dialect
-        if mode is DetectionMode.ANALOG and detector.analog is not None:
-            recorder = Recorder(
+        if isinstance(recorder, AnalogRecorder):
+            written = Recorder(
                 DatasetKind.ANALOG,
                 f"BT{number}",
                 detector.high_voltage,
-                adc_bits=detector.analog.adc_bits,
-                input_range=detector.analog.adc_range * 1e-3,
+                adc_bits=recorder.adc_bits,
+                input_range=recorder.adc_range * 1e-3,
             )
         else:
-            level = (detector.photon or PhotonCounter()).discriminator_level
-            recorder = Recorder(
-                DatasetKind.PHOTON,
-                f"BC{number}",
-                detector.high_voltage,
-                discriminator=level * LICEL_DISCRIMINATOR_STEP,
-            )
+            written = Recorder(DatasetKind.PHOTON, f"BC{number}", detector.high_voltage)
         dataset = new_dataset(
-            recorder,
+            written,
             wavelength=detector.wavelength * 1e-9,
             polarisation=detector.polarisation,
             bins=bins,
@@ -293,23 +288,22 @@ class Simulator:
     def _read_out(
         self,
         conditions: _Conditions,
-        detector: Detector,
-        mode: DetectionMode,
+        channel: str,
+        recorder: AnalogRecorder | PhotonCounter,
         light: _Light,
         random: np.random.Generator,
     ) -> tuple[Counts, dict[str, float]]:
         """Return the counts of a recorder, and its true values."""
         unit, dark = 1.0, {}
-        if mode is DetectionMode.ANALOG and detector.analog is not None:
-            recorder = _drifted(detector.analog, conditions.hours)
-            counts = digitise(light.electrons, recorder, random=random)
-            unit, dark = recorder.gain, {"dark_offset": recorder.dark_offset}
+        if isinstance(recorder, AnalogRecorder):
+            drifted = _drifted(recorder, conditions.hours)
+            counts = digitise(light.electrons, drifted, random=random)
+            unit, dark = drifted.gain, {"dark_offset": drifted.dark_offset}
         else:
-            name = channel_name(mode, detector)
             counts = count_photons(
                 light.electrons,
-                dead_time=photon_dead_time(self.site, conditions.planned.start, name),
-                paralyzable=(detector.photon or PhotonCounter()).paralyzable,
+                dead_time=photon_dead_time(self.site, conditions.planned.start, channel),
+                paralyzable=recorder.paralyzable,
                 random=random,
             )
         return counts, {
@@ -326,9 +320,7 @@ class Simulator:
 
         All recorders of a detector share its photoelectrons, each in its own bins.
         """
-        offsets = sorted(
-            {_offset(conditions, channel_name(mode, detector)) for mode in modes(detector)}
-        )
+        offsets = sorted({_offset(conditions, name) for name in detector.recorders})
         bins, bin_width = _grid_of(conditions.acquisition, detector)
         first = offsets[0]
         if len(offsets) == 1 or self.site.settings.fast:

@@ -20,21 +20,15 @@ from lidarops.campaign.model import Instrument, InstrumentFacts, Station, channe
 from lidarops.campaign.simulated_instrument import (
     Acquisition,
     DamageKind,
-    Detector,
     DialectName,
     Pointing,
 )
-from lidarops.campaign.simulation import (
-    HorizontalPath,
-    InstrumentSimulation,
-    Lidar,
-    SimulationSettings,
-)
+from lidarops.campaign.simulation import InstrumentSimulation, SimulationSettings
 from lidarops.constants import EARTH_RADIUS
 from lidarops.errors import CampaignError
 from lidarops.raw.licel import Dataset, Laser, ScanGrid
 from lidarops.raw.licel_header import parse_dataset
-from lidarops.records import DetectionMode, Role
+from lidarops.records import Role
 from lidarops.simulate.damage import FOREIGN_NAME
 
 _MASK: Final = (1 << 64) - 1
@@ -212,7 +206,7 @@ class SimulatedInstrument:
     @property
     def scan(self) -> Pointing | None:
         """Sequence of zenith angles; None where the facts of the campaign give the pointing."""
-        return self.simulated.scan if isinstance(self.simulated, Lidar) else None
+        return self.simulated.scan
 
     @property
     def dialect(self) -> Dialect:
@@ -294,22 +288,7 @@ class SimulatedInstrument:
         if self.scan is not None:
             cycle = self.scan.cycle()
             return cycle[planned.index % len(cycle)]
-        if facts.zenith_angle is not None:
-            return facts.zenith_angle, facts.azimuth
-        level = isinstance(self.simulated, HorizontalPath)
-        return (90.0 if level else 0.0), facts.azimuth
-
-
-def channel_name(mode: DetectionMode, detector: Detector) -> str:
-    """Return the name of a channel, as the reader of raw files derives it from the header."""
-    return f"{mode.value}_{detector.label}"
-
-
-def modes(detector: Detector) -> tuple[DetectionMode, ...]:
-    """Return the detection modes of a detector, in the order of the datasets in a file."""
-    analog = () if detector.analog is None else (DetectionMode.ANALOG,)
-    photon = () if detector.photon is None else (DetectionMode.PHOTON,)
-    return analog + photon
+        return facts.zenith_angle or 0.0, facts.azimuth
 
 
 def photon_dead_time(site: SimulatedInstrument, start: datetime, channel: str) -> float:

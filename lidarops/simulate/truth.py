@@ -118,7 +118,7 @@ def _evenly(start: int, stop: int, cells: int) -> NDArray[np.intp]:
 
 
 class TruthTable:
-    """Truth of a campaign: one row per granule, filled in any order.
+    """Truth of a campaign: one row per granule.
 
     Parameters
     ----------
@@ -130,6 +130,7 @@ class TruthTable:
 
     def __init__(self, rows: int, grids: Mapping[str, TruthGrid]) -> None:
         self._rows = rows
+        self._filled = 0
         self._grids = grids
         texts = ("path", "instrument", "damage")
         numbers = ("total_extinction", "zenith_angle", "azimuth", "clock_error", "energy")
@@ -142,8 +143,9 @@ class TruthTable:
             key: {} for key in grids
         }
 
-    def add(self, row: int, truth: FileTruth) -> None:
-        """Fill one row."""
+    def add(self, truth: FileTruth) -> None:
+        """Fill the next row."""
+        row, self._filled = self._filled, self._filled + 1
         for name, value in truth.values.items():
             if name not in self._columns:
                 self._columns[name] = np.full(self._rows, np.nan)
@@ -161,17 +163,9 @@ class TruthTable:
             "handling": np.array(handled, dtype=str),
             "refused": np.array([act == Handling.REFUSE for act in handled], dtype=np.int8),
         }
-        # What no file states is left out.
-        known = [
-            name
-            for name in _VARIABLES
-            if name == "total_extinction"
-            or values[name].dtype != np.float64
-            or np.isfinite(values[name]).any()
-        ]
         of_channels = {name: name.rsplit("_", 2) for name in columns.keys() - _VARIABLES.keys()}
         truth = xr.Dataset(
-            {name: _row(values[name], *_VARIABLES[name]) for name in known},
+            {name: _row(values[name], *about) for name, about in _VARIABLES.items()},
             attrs={
                 "title": f"Truth of the simulated campaign {campaign}",
                 "comment": "P = P* + B R^-2 exp(-2 sigma R) beyond full overlap, with sigma in"

@@ -115,20 +115,19 @@ simulation:
   duration: 60
   instruments:
     lidar:
-      kind: horizontal
       aquisition: {}
 """
 
 
-def test_an_unknown_key_is_reported_with_the_keys_of_its_kind(tmp_path: Path) -> None:
+def test_an_unknown_key_is_reported_with_the_keys_there(tmp_path: Path) -> None:
     path = _write(tmp_path, MINIMAL + SIMULATED)
     with pytest.raises(CampaignError) as caught:
         load_campaign(path)
     (message,) = [line for line in str(caught.value).splitlines() if "aquisition" in line]
-    assert message.strip().startswith("line 18: ")
+    assert message.strip().startswith("line 17: ")
     assert "keys here are acquisition, " in message
-    assert "aerosol_extinction" in message
-    assert "scan" not in message
+    assert "scan" in message
+    assert "seed" not in message
 
 
 def test_equal_keys_in_different_mappings_are_valid(tmp_path: Path) -> None:
@@ -146,6 +145,9 @@ metadata: {license: x, comment: y}
     assert "given twice" not in str(caught.value)
     loop = MINIMAL + "metadata: &a {comment: x, program: *a}\n"
     with pytest.raises(CampaignError, match="program"):
+        load_campaign(_write(tmp_path, loop))
+    loop = MINIMAL + "vanished_share: &a [*a]\n"
+    with pytest.raises(CampaignError, match="contains itself"):
         load_campaign(_write(tmp_path, loop))
 
 

@@ -192,7 +192,6 @@ def test_prefect_file(repository: Path) -> None:
         "demo-nightly",
         "demo-full",
         "demo-catalog",
-        "maintenance",
     }
     for deployment in shipped.deployments:
         assert deployment.tags

@@ -60,9 +60,10 @@ simulation:
   duration: 2400
   instruments:
     pier-lidar:
-      kind: horizontal
-      aerosol_extinction: {minimum: 5.0e-5, maximum: 3.0e-4, hour_of_maximum: 18}
-      aerosol: {lidar_ratio: 50}
+      atmosphere:
+        homogeneous:
+          extinction: {minimum: 5.0e-5, maximum: 3.0e-4, hour_of_maximum: 18}
+          aerosol: {lidar_ratio: 50}
       acquisition: {interval: 120, shots: 3000, repetition_rate: 50, bins: 1200, dark_files: 2}
       detectors:
         - {wavelength: 532, signal_rate: 2.0, background: {night: 0.05, day: 5}, photon: {}}

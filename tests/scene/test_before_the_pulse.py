@@ -71,8 +71,7 @@ def written(folder: Path, pre_trigger: float, **facts: Any) -> Campaign:
             "duration": 3600,
             "instruments": {
                 "lidar": {
-                    "kind": "vertical",
-                    "boundary_layer": {"extinction": 1.2e-4},
+                    "atmosphere": {"boundary_layer": {"extinction": 1.2e-4}},
                     "acquisition": {"interval": 300, "shots": 3000, **grid},
                     "detectors": [detector],
                 }

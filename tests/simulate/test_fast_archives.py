@@ -59,7 +59,8 @@ def test_the_truth_of_a_fast_simulation_fits_its_signals(small):
         hill = _simulated(tree)["hill-lidar"]
         hill["detectors"] = hill["detectors"][:1]
         hill["acquisition"]["interval"] = 60
-        hill["boundary_layer"] = {"height": {"minimum": 100, "maximum": 3000, "hour_of_maximum": 6}}
+        height = {"minimum": 100, "maximum": 3000, "hour_of_maximum": 6}
+        hill["atmosphere"] = {"boundary_layer": {"height": height}}
 
     result = simulate_campaign(small(fast))
     truth = result.truth
@@ -85,7 +86,6 @@ def test_a_thin_layer_is_not_missed_by_coarse_truth(small):
     def cloud(tree):
         del _simulated(tree)["coast-lidar"]
         hill = _simulated(tree)["hill-lidar"]
-        hill["kind"] = "lidar"
         period = {"start": "2024-12-31", "stop": "2025-01-02"}
         hill["atmosphere"] = {"clouds": [{"extinction": 0.01, "base": 3000, "top": 3030, **period}]}
 

@@ -111,7 +111,7 @@ def test_values_that_do_not_fit_a_raw_file_are_refused(old, new, message):
         "duration": 600,
         "instruments": {
             "lidar": {
-                "kind": "vertical",
+                "atmosphere": {},
                 "acquisition": {"bin_width": 7.5},
                 "detectors": [
                     {

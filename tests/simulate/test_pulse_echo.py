@@ -103,7 +103,6 @@ def test_the_base_of_a_cloud_is_blurred_by_the_pulse(small):
     def pulsed(tree):
         del tree["simulation"]["instruments"]["coast-lidar"]
         hill = tree["simulation"]["instruments"]["hill-lidar"]
-        hill["kind"] = "lidar"
         hill["pulse"] = {"shape": "gaussian", "width": 400e-9}
         hill["atmosphere"] = {
             "clouds": [

@@ -32,9 +32,9 @@ def scan(dialect, damage=(), **acquisition):
     def change(tree):
         del tree["simulation"]["instruments"]["coast-lidar"]
         tree["simulation"]["duration"] = 240
-        tree["simulation"]["atmosphere"] = hill(tree).pop("atmosphere", {})
+        tree["simulation"]["atmosphere"] = {}
+        del hill(tree)["atmosphere"]
         hill(tree).update(
-            kind="lidar",
             damage=list(damage),
             scan={
                 "zenith_angles": [90.0 - elevation for elevation in ELEVATIONS],

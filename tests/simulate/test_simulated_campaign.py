@@ -210,7 +210,8 @@ def test_a_blinding_signal_saturates_but_does_not_crash(small):
         coast = _simulated(tree)["coast-lidar"]
         coast["acquisition"]["bin_width"] = 0.5
         coast["detectors"][0]["signal_rate"] = 1e5
-        coast["aerosol_extinction"] = {"minimum": 0.5, "maximum": 0.5}
+        extinction = {"minimum": 0.5, "maximum": 0.5}
+        coast["atmosphere"] = {"homogeneous": {"extinction": extinction}}
         for facts in tree["instruments"]["coast-lidar"]["facts"]:
             facts["full_overlap_range"] = 0
 

@@ -18,7 +18,7 @@ from lidarops.campaign.simulated_instrument import (
     PhotonCounter,
     Pointing,
 )
-from lidarops.campaign.simulation import HorizontalPath, SimulationSettings
+from lidarops.campaign.simulation import SimulationSettings
 
 
 def _coast(tree):
@@ -47,7 +47,6 @@ def test_the_small_campaign_counts_its_files(small):
         (lambda t: t["simulation"].update(duration=30), "no file fits"),
         (lambda t: t["simulation"].update(duration=float("inf")), "duration"),
         (lambda t: t["simulation"].update(start="2024-01-01T00:00:00.5Z"), "whole second"),
-        (lambda t: _coast(t).update(kind="diagonal"), "diagonal"),
         (lambda t: _coast(t).update(detectors=[]), "detectors"),
         (lambda t: _coast(t)["acquisition"].update(shots=605), "whole seconds"),
         (lambda t: _coast(t)["acquisition"].update(repetition_rate=7.5), "whole"),
@@ -64,15 +63,12 @@ def test_the_small_campaign_counts_its_files(small):
             lambda t: _coast(t)["acquisition"].update(shots=600_000, repetition_rate=10_000),
             "32 bits",
         ),
-        (lambda t: _coast(t)["aerosol_extinction"].update(maximum=200), "km-1"),
+        (
+            lambda t: _coast(t)["atmosphere"]["homogeneous"]["extinction"].update(maximum=200),
+            "km-1",
+        ),
         (lambda t: _coast(t)["detectors"][0].update(signal_rate=float("nan")), "signal_rate"),
         (lambda t: _coast(t)["detectors"].append(_coast(t)["detectors"][0]), "share wavelength"),
-        (
-            lambda t: _coast(t)["detectors"].append(
-                {**_coast(t)["detectors"][0], "wavelength": 355}
-            ),
-            "one wavelength",
-        ),
     ],
 )
 def test_a_campaign_that_cannot_be_simulated_is_refused(small, change, message):
@@ -108,15 +104,13 @@ def test_settings_are_frozen(small):
     with pytest.raises(ValidationError, match="frozen"):
         settings.seed = 3
     assert isinstance(settings, SimulationSettings)
-    assert isinstance(settings.instruments["coast-lidar"], HorizontalPath)
     assert Acquisition(shots=1200, repetition_rate=20).duration == 60
 
 
 def _as_lidar(tree, **keys):
-    """Give the coast lidar an atmosphere of its own."""
+    """Give the coast lidar another atmosphere, or none of its own."""
     coast = _coast(tree)
-    del coast["aerosol_extinction"]
-    coast["kind"] = "lidar"
+    del coast["atmosphere"]
     coast.update(keys)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -11,17 +10,9 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import CampaignError
-from lidarops.run import clusters
 from lidarops.simulate import campaign as module
 from lidarops.simulate.campaign import simulate_campaign
 from lidarops.simulate.files import Simulator
-
-
-@pytest.fixture(scope="module")
-def client():
-    """A client of two processes."""
-    with clusters.local_client(2) as started:
-        yield started
 
 
 def _contents(root):
@@ -39,15 +30,13 @@ def _scenery(tree):
         instrument["random_damage"] = {"fraction": 0.3, "kinds": ["garbage", "duplicate", "glitch"]}
 
 
-def test_two_processes_write_what_one_writes(small, client, monkeypatch):
+def test_two_processes_write_what_one_writes(small, monkeypatch):
     alone = small(_scenery, archive="alone")
     first = simulate_campaign(alone)
     expected = _contents(first.archive)
     monkeypatch.setattr(module, "_BATCH", 3)
     steps = []
-    second = simulate_campaign(
-        small(_scenery, archive="shared"), client=client, progress=steps.append
-    )
+    second = simulate_campaign(small(_scenery, archive="shared"), workers=2, progress=steps.append)
     assert _contents(second.archive) == expected
     assert second.truth.identical(first.truth)
     assert second.paths == first.paths
@@ -61,7 +50,7 @@ def test_two_processes_write_what_one_writes(small, client, monkeypatch):
         tree["simulation"]["instruments"]["coast-lidar"]["acquisition"]["dialect"] = "pilar"
 
     with pytest.raises(ValueError, match="Latin-1"):
-        simulate_campaign(small(unwritable, archive="bad"), client=client)
+        simulate_campaign(small(unwritable, archive="bad"), workers=2)
 
 
 def test_any_order_gives_the_same_files(small):
@@ -85,14 +74,7 @@ def test_the_number_of_files_is_told_before_the_first(small):
         simulate_campaign(small(lambda tree: tree.pop("simulation")))
 
 
-def test_the_command_line_writes_the_same_with_workers(small, client, tmp_path, monkeypatch):
-    started = []
-
-    def started_before(workers):
-        started.append(workers)
-        return nullcontext(client)
-
-    monkeypatch.setattr(clusters, "local_client", started_before)
+def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
     campaign = small(_scenery, archive="called")
     expected = _contents(simulate_campaign(campaign).archive)
     file = tmp_path / "small.yaml"
@@ -106,4 +88,3 @@ def test_the_command_line_writes_the_same_with_workers(small, client, tmp_path, 
         contents = _contents(folder)
         assert contents.pop("truth.nc")
         assert contents == expected
-    assert started == [2]

@@ -46,9 +46,7 @@ def _detector(outputs: dict[str, Any], rate: float, day: float = 5.0, **changes:
 def _level(extinction: float, detector: dict[str, Any], **changes: Any) -> dict[str, Any]:
     course = {"minimum": extinction, "maximum": extinction, "hour_of_maximum": 12}
     return {
-        "kind": "horizontal",
-        "aerosol": _AEROSOL,
-        "aerosol_extinction": course,
+        "atmosphere": {"homogeneous": {"aerosol": _AEROSOL, "extinction": course}},
         "detectors": [detector],
         **changes,
     }
@@ -74,12 +72,12 @@ _KINDS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "upward": (
         "west",
         _sections("photon_532o", "analog_532o"),
-        {"kind": "vertical", **_COLUMN, "detectors": [_detector(_BOTH, 20.0)]},
+        {"atmosphere": _COLUMN, "detectors": [_detector(_BOTH, 20.0)]},
     ),
     "vertical": (
         "west",
         {**_sections("analog_532o"), "elastic": {"channels": ["photon_532o"]}},
-        {"kind": "vertical", **_COLUMN, "detectors": [_detector(_BOTH, 20.0)]},
+        {"atmosphere": _COLUMN, "detectors": [_detector(_BOTH, 20.0)]},
     ),
     "cloudy": (
         "far",
@@ -88,9 +86,7 @@ _KINDS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
             "elastic": {"channels": ["photon_532o"]},
         },
         {
-            "kind": "vertical",
-            **_COLUMN,
-            "layers": [_CLOUD],
+            "atmosphere": {**_COLUMN, "layers": [_CLOUD]},
             "detectors": [_detector(_BOTH, 20.0)],
         },
     ),
@@ -101,7 +97,6 @@ _KINDS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
             **_sections("analog_532o"),
         },
         {
-            "kind": "lidar",
             "atmosphere": _COLUMN,
             "scan": {"zenith_angles": [0, 30, 50, 60, 70, 75, 80], "azimuth": 90},
             "detectors": [_detector(_BOTH, 20.0)],
@@ -147,7 +142,6 @@ def tree(*, profiles: int = 60, bins: int = 4000) -> dict[str, Any]:
             "station": name, "files": f"{name}-lidar/m*", "facts": [facts],
         }  # fmt: skip
         simulated[f"{name}-lidar"] = {
-            "kind": "lidar",
             "atmosphere": _AIR,
             "scan": {"zenith_angles": [90], "azimuth": azimuth},
             "acquisition": shooting,

@@ -105,7 +105,6 @@ def tree(
             "truth": {"cells": 512},
             "instruments": {
                 f"{name}-lidar": {
-                    "kind": "lidar",
                     "scan": {"zenith_angles": pointings[name][0], "azimuth": pointings[name][1]},
                     "acquisition": {
                         "interval": 60,

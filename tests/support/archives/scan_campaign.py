@@ -48,7 +48,6 @@ TREE: dict[str, Any] = {
         },
         "instruments": {
             "scanner": {
-                "kind": "lidar",
                 "scan": {
                     "zenith_angles": [0, 30, 45, 60, 70, 75],
                     "azimuth": 90,

@@ -51,8 +51,7 @@ TREE: dict[str, Any] = {
         "duration": 1200,
         "instruments": {
             "coast-lidar": {
-                "kind": "horizontal",
-                "aerosol_extinction": {"minimum": 2e-4, "maximum": 2e-4},
+                "atmosphere": {"homogeneous": {"extinction": {"minimum": 2e-4, "maximum": 2e-4}}},
                 "acquisition": {
                     "interval": 60,
                     "shots": 600,
@@ -76,7 +75,7 @@ TREE: dict[str, Any] = {
                 ],
             },
             "hill-lidar": {
-                "kind": "vertical",
+                "atmosphere": {"boundary_layer": {}},
                 "acquisition": {"interval": 300, "bins": 800},
                 "detectors": [
                     {
