@@ -72,7 +72,7 @@ def main(
 
     Example: python -m benchmarks stability --case raman
     """
-    with progress_bar("bench", None) as bar:
+    with progress_bar("bench") as bar:
         effort = Effort(quick, bar.advance, data)
         measured = measure(what, case, effort)
     written = None if out is None else measured.write(Path(out))

@@ -255,7 +255,7 @@ def read_product_facts(
         file = within(root, path)
         with opened_stored(file) as product:
             header = read_header(product, path, selection)
-            return header and _facts(product, file, header)
+            return None if header is None else _facts(product, file, header)
     except ProductError as error:
         return Refused(path, error.problem)
 

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
-from lidarops.system.files import copy_atomically, sha256_of
+from lidarops.system.files import sha256_of, write_atomically
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -120,7 +120,7 @@ def write_plain(dataset: xr.Dataset, path: Path) -> None:
         except (TypeError, ValueError) as error:
             raise ProductError(f"cannot be encoded: {error}", file=path) from error
         path.parent.mkdir(parents=True, exist_ok=True)
-        copy_atomically(whole, path)
+        write_atomically(path, whole.read_bytes())
 
 
 def chunk_sizes(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
