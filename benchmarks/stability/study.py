@@ -159,7 +159,7 @@ DRAWS: Final = (
     _blocks(_networks.plume, "plume", 3, 1500),
     _blocks(_networks.homogeneous, "homogeneous", 1, 2000, 3),
     _blocks(_networks.layered, "layered", 1, 2500, 3),
-    Draws("networks, varying lidar ratio", "network", _networks.score_lidar_ratios, 6, 200, 4),
+    Draws("networks, varying lidar ratio", "network", _networks.score_lidar_ratios, 6, 600, 4),
 )  # fmt: skip
 OTHERS: Final = (
     Other("flags", "flags", FLAGS, lambda quick: flag_rates.flag_rates(2 if quick else 60),

@@ -393,12 +393,25 @@ def test_the_night_of_manaus_agrees_with_clean_air_and_the_elastic_inversion(man
     z = raman["aerosol_extinction"].values / raman["aerosol_extinction_standard_error"].values
     assert np.mean(np.abs(z[clean]) < 1.96) > 0.85
     assert np.mean(np.abs(z[clean & usable]) < 1.96) > 0.85
-    # Aerosol of the free atmosphere, by both methods. All these Raman values are rejected.
+    # Aerosol of the free atmosphere, by both methods.
     haze = (r > 2600.0) & (r < 5000.0)
     with_55 = np.interp(r, elastic["range"].values, elastic["aerosol_backscatter"].values)
     away = raman["aerosol_backscatter"].values - with_55
     error = raman["aerosol_backscatter_standard_error"].values
     assert np.nanmean(np.abs(away[haze] / error[haze])) < 3.0
+
+
+def test_backscatters_of_manaus_are_rejected_for_their_own_flags_only(manaus):
+    """Not where extinction is, below a signal that falls less than that of air."""
+    raman = manaus[1]
+    value, error = (raman[f"aerosol_backscatter{end}"] for end in ("", "_standard_error"))
+    significant = (value > 3.0 * error).values
+    assert significant.sum() > 60
+    rejected = raman["aerosol_backscatter_usable"].values == 2
+    saturated = (raman["aerosol_backscatter_quality_flag"].values & Quality.SATURATED) != 0
+    np.testing.assert_array_equal(rejected[significant], saturated[significant])
+    assert rejected[significant].mean() < 0.05
+    assert (raman["usable"].values == 2)[significant].mean() > 0.2
 
 
 def test_the_slope_of_the_standard_atmosphere_is_off_by_its_stated_error(data_root):

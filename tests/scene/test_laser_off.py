@@ -16,7 +16,9 @@ from support.counts_read import counts_read
 import lidarops
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.flags import Quality
+from lidarops.netcdf.variables import judging
 from lidarops.raw.formats import RawFile, read_raw_header
+from lidarops.retrieve.raman.flags import CONCERNING
 from lidarops.run.archive import Options, reprocess
 from lidarops.run.reproduction import explain_difference, reproduce_product
 from lidarops.scene.profiles import lightless_profiles
@@ -223,6 +225,31 @@ def test_visits_of_scans_hold_no_profile_without_light(tmp_path):
     assert (several["shots"].values[without] == 0).all()
     assert np.isnan(several["vertical_optical_depth"].values[without]).all()
     assert not (bits[((bits & NO_SIGNAL) != 0)] & MISSING).any()
+
+
+def test_raman_products_hold_no_profile_without_light(repository, tmp_path):
+    """All channels of the laser: in a mean without any light, and in one that lacks a part."""
+    tree = yaml.safe_load((repository / "catalogs/raman.yaml").read_text(encoding="utf-8"))
+    tree["simulation"]["duration"] = 10_800
+    request = tree["instruments"]["valley-raman"]["products"]["raman"]
+    tree["instruments"]["valley-raman"]["products"] = {"raman": request | {"average": 3600}}
+    campaign = written(tmp_path, tree | {"archive": "raw", "output": "out"})
+    simulate_campaign(campaign)
+    # 21:00 to 22:00, and 22:20 to 22:40.
+    files = sorted(Path(campaign.archive).rglob("r*"))
+    for file in files[:6] + files[8:10]:
+        darken(file)
+    product = product_of(campaign, "raman")
+    assert product["profiles"].values.tolist() == [0, 4, 6]
+    assert product["profiles_left_out"].values.tolist() == [6, 2, 0]
+    assert product["shots"].values.tolist() == [0, 48_000, 72_000]
+    for name in CONCERNING:
+        bits = product[judging(name, product.variables)].values
+        assert (bits[0] & NO_SIGNAL).all(), name
+        assert not (bits[1:] & NO_SIGNAL).any(), name
+        assert not (bits[0] & MISSING).any(), name
+        assert np.isnan(product[name].values[0]).all(), name
+        assert np.isfinite(product[name].values[1:]).any(axis=1).all(), name
 
 
 def test_a_beam_without_light_is_no_gap_of_a_network(tmp_path):

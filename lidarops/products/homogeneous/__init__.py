@@ -82,8 +82,9 @@ class HomogeneousSettings(ChannelProduct):
         le=1,
         description="standard error of the logarithmic slope of the signal by air that is not"
         " homogeneous, as a share of 2 (extinction + 1 / mean range); model errors are in"
-        " proportion to it. Without one, the product states what covers the violations of simulated"
-        " scenes: state less where air is known to be calm",
+        " proportion to it. The default is chosen by the violations of simulated scenes, most of"
+        " which it covers; the page of results states the rest. State less where air is known to be"
+        " calm",
     )
     visibility: VisibilitySettings | None = Field(
         default=None, description="if given, adds visibility along the sections"

@@ -41,14 +41,15 @@ class RamanQuality(FlagBit):
     )
     PARTLY_CLOUDY = care(
         FIRST_OWN + 4,
-        f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or in the mean"
-        " over vertical_resolution: the value is that of cloudy and clear air",
+        f"some of the averaged profiles, not all, show a cloud within {_MARGIN} or, of extinction"
+        " and lidar ratio, in the mean over vertical_resolution: the value is that of cloudy and"
+        " clear air",
     )
     CLOUD = care(
         FIRST_OWN + 5,
-        f"the mean of the profiles shows a cloud within {_MARGIN} or in the mean over"
-        " vertical_resolution:"
-        " multiple scattering makes extinction too small, by more than its error states",
+        f"the mean of the profiles shows a cloud within {_MARGIN} or, of extinction and lidar"
+        " ratio, in the mean over vertical_resolution: multiple scattering makes extinction too"
+        " small, by more than its error states",
     )
     DOUBTFUL_WATER_VAPOUR = care(
         FIRST_OWN + 6,
@@ -98,6 +99,8 @@ CONCERNING: Final[Mapping[str, tuple[FlagBit, ...]]] = MappingProxyType(
     }
 )
 """Quantity -> the bits that say something of it."""
+OF_MEANS: Final = ("aerosol_extinction", "lidar_ratio")
+"""Quantities that are means over ``vertical_resolution``; others are those of the cell."""
 _OF_ELASTIC: Final = ("aerosol_backscatter", "lidar_ratio")
 """Quantities that are made of the elastic signal too."""
 

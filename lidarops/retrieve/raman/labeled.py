@@ -19,7 +19,7 @@ from lidarops.retrieve.background import estimate
 from lidarops.retrieve.clouds import labeled as _clouds
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.raman.backscatter import overlap_of
-from lidarops.retrieve.raman.flags import CONCERNING, RamanQuality, concerning
+from lidarops.retrieve.raman.flags import CONCERNING, OF_MEANS, RamanQuality, concerning
 from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
 from lidarops.retrieve.raman.scattering import nitrogen_line_share
 from lidarops.retrieve.raman.settings import RamanSettings
@@ -247,7 +247,10 @@ def retrieve(
     raman_bits |= elastic_bits & np.int32(Quality.INCOMPLETE_OVERLAP)
     result = retrieve_raman(of_raman, of_elastic, air, cells, settings, quality=raman_bits)
     stated = seen if overlap_is_stated or overlap is not None else np.full_like(seen, np.nan)
-    clouds, found = _cloud_variables(channels[0], result, beam, overlap_is_stated=overlap_is_stated)
+    clouds, near, in_mean = _cloud_variables(
+        channels[0], result, beam, overlap_is_stated=overlap_is_stated
+    )
+    found = result.quality | near
     variables = {
         **_variables(result, beam),
         **_overlap(result, beam, of_raman, stated),
@@ -267,7 +270,8 @@ def retrieve(
         if quantity in variables:
             # Those of the main quantity are the flags of the product.
             own = "" if quantity == "aerosol_extinction" else f"{quantity}_"
-            bits = concerning(quantity, found, elastic_bits)
+            of_mean = in_mean if quantity in OF_MEANS else np.zeros_like(in_mean)
+            bits = concerning(quantity, found | of_mean, elastic_bits)
             variables[f"{own}quality_flag"] = (_PLANE, bits)
     coords = {name: elastic[name] for name in elastic.coords if "range" not in elastic[name].dims}
     product = xr.Dataset(variables, coords={**coords, "range": ("range", cells.range)})
@@ -377,8 +381,8 @@ def _variables(result: RamanResult, beam: _Beam) -> dict[str, Any]:
 
 def _cloud_variables(
     elastic: _Channel, result: RamanResult, beam: _Beam, *, overlap_is_stated: bool
-) -> tuple[dict[str, Any], Flags]:
-    """Return the clouds of the elastic signal, and the quality with their bits."""
+) -> tuple[dict[str, Any], Flags, Flags]:
+    """Return the clouds of the elastic signal, and their bits: near a cell, and in its mean."""
     cells, distance = beam.cells, beam.air.range
     laser = beam.air.wavelength
     means = _clouds.MeanProfiles(
@@ -400,24 +404,24 @@ def _cloud_variables(
     fraction = largest_of_cells(clouds.fraction, cells)
     # A cloud of most profiles is one of their mean as well.
     partly = (state == _clouds.PARTLY_CLOUDY) | ((fraction > 0.0) & (fraction < 1.0))
-    quality = result.quality
+    near, in_mean = np.zeros((2, *result.quality.shape), np.int32)
     for mask, bit in (
         (partly, RamanQuality.PARTLY_CLOUDY),
         (state == _clouds.CLOUDY, RamanQuality.CLOUD),
     ):
-        near = touched(mask, result.vertical_resolution, cells.step)
-        near |= _clouds.with_margin(mask, cells.range)
-        quality = quality | np.where(near, np.int32(bit), np.int32(0))
+        near[_clouds.with_margin(mask, cells.range)] |= np.int32(bit)
+        in_mean[touched(mask, result.vertical_resolution, cells.step)] |= np.int32(bit)
     # Up to the last cell, beyond which no value has their bit.
     n = cells.stop
     heights = _clouds.cloud_heights(
         clouds.any[:, :n], distance[:n], beam.station_altitude, beam.climb
     )
-    return {
+    variables = {
         "cloud_mask": (_PLANE, state),
         "cloud_fraction": (_PLANE, fraction),
         **heights,
-    }, quality
+    }
+    return variables, near, in_mean
 
 
 def _overlap(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from support.cases import each
 from support.oracles.homogeneous import iterated_fit, section, signal
 from support.weights import by_weights
@@ -47,6 +48,22 @@ def test_model_error_is_the_effect_of_a_bent_signal(kind, extinction, length):
     slope = 1e-3 * (np.abs(extinction) + 1.0 / np.average(r, weights=weights))
     off = np.hypot(slope, refit[2] - extinction)
     assert fit.extinction_model_error[0] == pytest.approx(scale * off, rel=0.01)
+
+
+@each(("length", "share"), [(1700.0, (0.4, 0.65)), (8000.0, (0.1, 0.3))])
+def test_calm_air_makes_a_part_of_the_model_error(length, share):
+    """Errors of extinction over the stated ones, by eddies of 1 percent, correlated by
+    exp(-(distance / 100 m)^2), without noise."""
+    extinction = 0.03 * KM
+    r = np.arange(2500.0, 2500.0 + length, 7.5)
+    noise = np.random.default_rng(4).normal(size=(400, r.size))
+    eddies = gaussian_filter1d(noise, 50.0 / 7.5, axis=1, mode="wrap")
+    air = 1.0 + 0.01 * eddies / eddies.std()
+    depth = np.cumsum(extinction * (air - 1.0), axis=1) * 7.5
+    power = 370.0 + signal(r, 1e5, extinction) * air * np.exp(-2.0 * depth)
+    fit = fit_homogeneous_path(power, r, variance=1.0)
+    away = (fit.extinction - extinction) / fit.extinction_model_error
+    assert share[0] < np.sqrt(np.mean(away**2)) < share[1]
 
 
 def test_model_error_by_other_methods():

@@ -69,9 +69,9 @@ def averages(profiles):
     return elastic, raman
 
 
-def product_of(cloudy, cirrus=CIRRUS):
+def product_of(cloudy, cirrus=CIRRUS, light=3e5):
     """Return the product of half an hour, `cloudy` of whose profiles have a cirrus."""
-    clear, seen = (make_sky(HAZE + cloud, STEP, 3e5, window=WINDOW) for cloud in (0.0, cirrus))
+    clear, seen = (make_sky(HAZE + cloud, STEP, light, window=WINDOW) for cloud in (0.0, cirrus))
     # The cirrus has another lidar ratio than the haze.
     total = clear.air.backscatter + (HAZE + cirrus) / 50.0
     bright = seen.elastic * (1.0 + cirrus * (1.0 / CLOUD_RATIO - 1.0 / 50.0) / total)
@@ -137,6 +137,19 @@ def test_the_edges_of_a_cloud_are_to_be_used_with_care(partly_cloudy):
     assert raised(product_of(PROFILES), RamanQuality.CLOUD)[edges].all()
 
 
+def test_backscatter_has_the_bits_of_its_cell_and_extinction_those_of_its_mean():
+    product = product_of(PROFILES, light=1e4)
+    state, r = product["cloud_mask"].to_numpy()[0], product["range"].to_numpy()
+    cloud = r[state == 2]
+    beside = (r > cloud.min() - 330.0) & (r < cloud.max() + 330.0)
+    bits = product["aerosol_backscatter_quality_flag"].to_numpy()[0]
+    np.testing.assert_array_equal((bits & RamanQuality.CLOUD) != 0, beside)
+    reach = product["vertical_resolution"].to_numpy()[0] / 2.0
+    of_mean = (r + reach > cloud.min()) & (r - reach < cloud.max())
+    assert (of_mean & ~beside).any()
+    assert raised(product, RamanQuality.CLOUD)[of_mean | beside].all()
+
+
 def test_values_without_the_bit_are_right(partly_cloudy):
     """In the mean of clear and cloudy air."""
     r = partly_cloudy["range"].to_numpy()
@@ -144,12 +157,13 @@ def test_values_without_the_bit_are_right(partly_cloudy):
     length = np.nan_to_num(partly_cloudy["vertical_resolution"].to_numpy()[0], nan=60.0)
     extinction = mean_over(true, STEP, r, length, 300.0)
     backscatter = HAZE / 50.0 + CIRRUS / CLOUD_RATIO * 2 / PROFILES
-    good = (partly_cloudy["quality_flag"].to_numpy()[0] == 0) & inside(partly_cloudy, 400.0, 7500.0)
-    assert good.sum() > 60
-    for name, values in (
-        ("aerosol_extinction", extinction),
-        ("aerosol_backscatter", mean_over(backscatter, STEP, r, np.full(r.size, 60.0))),
+    of_cells = mean_over(backscatter, STEP, r, np.full(r.size, 60.0))
+    for name, flags, values in (
+        ("aerosol_extinction", "quality_flag", extinction),
+        ("aerosol_backscatter", "aerosol_backscatter_quality_flag", of_cells),
     ):
+        good = (partly_cloudy[flags].to_numpy()[0] == 0) & inside(partly_cloudy, 400.0, 7500.0)
+        assert good.sum() > 60
         error = partly_cloudy[f"{name}_standard_error"].to_numpy()[0]
         away = (partly_cloudy[name].to_numpy()[0] - values) / error
         assert np.abs(away[good]).max() < 4.0, name
