@@ -26,6 +26,9 @@ _UNCERTAIN: Final = MultiAngleQuality.NO_RESIDUAL | MultiAngleQuality.POOR_STRAT
 _LAYER_WIDTH: Final = (2.0, 4.0)
 """Standard deviation of a layer in altitude steps: 5 to 9 of them are its width at half maximum."""
 
+_LAYER_CELLS: Final = (3, 11)
+"""Least and most altitude steps of a layer with edges."""
+
 
 def _level(scene: Scene, _: Random) -> Scene:
     return replace(scene, outliers=0.0, gradient=0.0, variation=0.0)
@@ -36,18 +39,28 @@ def _calm(scene: Scene, rng: Random) -> Scene:
     return replace(_level(scene, rng), inhomogeneity=_logarithmic(rng, _CALM))
 
 
-def _layer(scene: Scene, rng: Random) -> Scene:
-    """Return calm clear air with a layer that several altitudes resolve."""
+def _layer(scene: Scene, rng: Random, shape: Callable[[Random, Array], Array]) -> Scene:
+    """Return calm clear air with a layer, of a shape by altitude steps from its centre."""
     height = 150.0 + 60.0 * np.arange(60, dtype=np.float64)
     air, haze = 1e-5 * np.exp(-height / 8000.0), np.exp(-height / rng.uniform(600.0, 3000.0))
-    width = 60.0 * rng.uniform(*_LAYER_WIDTH)
     centre = rng.uniform(height[3], height[-4], (len(scene.extinction), 1))
-    excess = rng.uniform(0.3, 3.0) * np.exp(-0.5 * ((height - centre) / width) ** 2)
+    excess = rng.uniform(0.3, 3.0) * shape(rng, (height - centre) / 60.0)
     particles = _logarithmic(rng, (2e-5, 4e-4)) * (haze + excess)
     return replace(
         _calm(scene, rng), altitude=height, extinction=air + particles,
         backscatter=air / 8.4 + particles / 50.0,
     )  # fmt: skip
+
+
+def _smooth(rng: Random, away: Array) -> Array:
+    """Return a shape that several altitudes resolve."""
+    return np.asarray(np.exp(-0.5 * (away / rng.uniform(*_LAYER_WIDTH)) ** 2))
+
+
+def _with_edges(rng: Random, away: Array) -> Array:
+    """Return a shape that begins and ends between two altitudes."""
+    half = 0.5 * rng.integers(*_LAYER_CELLS, endpoint=True)
+    return np.where((away >= -half) & (away < half), 1.0, 0.0)
 
 
 def _logarithmic(rng: Random, limits: tuple[float, float]) -> float:
@@ -122,7 +135,8 @@ FAILURES: Final[tuple[tuple[Failure, _Change, _Damage], ...]] = (
     (Failure("background error of each beam"), _level, _with_background),
     (Failure("everything at once"), _as_drawn, _plain),
     (Failure("calm air", satisfied=True), _calm, _plain),
-    (Failure("layer of a few altitudes", satisfied=True), _layer, _plain),
+    (Failure("layer of a few altitudes", satisfied=True), partial(_layer, shape=_smooth), _plain),
+    (Failure("layer with edges", satisfied=True), partial(_layer, shape=_with_edges), _plain),
 )
 
 
@@ -176,7 +190,8 @@ def score_short_scans(cluster: int, profiles: int, *, length: int) -> Iterator[S
     for words, change in (
         ("", _level),
         ("calm air, ", _calm),
-        ("layer of a few altitudes, ", _layer),
+        ("layer of a few altitudes, ", partial(_layer, shape=_smooth)),
+        ("layer with edges, ", partial(_layer, shape=_with_edges)),
     ):
         rng = np.random.default_rng((72, cluster, 0))
         scene = change(multiangle_cases.random_scene(cluster, profiles), rng)

@@ -263,7 +263,7 @@ def test_scans_where_the_model_holds_are_of_calm_air_and_of_a_layer_too():
     # The blocks of one geometry are one cluster.
     assert [*counted[["class", "quantity"]].itertuples(index=False, name=None)] == [
         (f"{words}blocks of 2", quantity)
-        for words in ("", "calm air, ", "layer of a few altitudes, ")
+        for words in ("", "calm air, ", "layer of a few altitudes, ", "layer with edges, ")
         for quantity in ("optical depth", "extinction")
     ]
 
