@@ -19,20 +19,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 71_100,
-    "lines of code alone": 46_490,
-    "modules": 280,
-    "dataclasses": 245,
-    "lines of dataclasses": 6_567,
-    "tuning numbers": 216,
+    "lines": 67_950,
+    "lines of code alone": 44_220,
+    "modules": 269,
+    "dataclasses": 220,
+    "lines of dataclasses": 6_169,
+    "tuning numbers": 214,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_945,
+    "lines of the largest package": 5_805,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 61, "functions": 593, "changes": 216},
-    "elastic": {"modules": 71, "functions": 740, "changes": 228},
+    "homogeneous": {"modules": 269, "functions": 593, "changes": 216},
+    "elastic": {"modules": 269, "functions": 740, "changes": 228},
 }
 
 
