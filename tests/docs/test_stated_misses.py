@@ -39,6 +39,9 @@ STATED = {
     ("multi-angle", "extinction", "layer of a few altitudes"): (
         "multiangle", "total_extinction", "layers of a few altitudes",
     ),
+    ("multi-angle", "extinction", "layer with edges"): (
+        "multiangle", "total_extinction", "layers of a few altitudes",
+    ),
     ("networks, plume, blocks of 1", "extinction", "plume, blocks of 1"): (
         "visibility", "", "with a plume",
     ),
