@@ -37,7 +37,7 @@ PURPOSES: Final = {
     "vocabulary": "errors, flags, settings, kinds",
 }
 """Package -> what it is for, in the words of the picture."""
-VOCABULARY: Final = {"errors", "flags", "constants", "settings", "kinds", "records"}
+VOCABULARY: Final = {"errors", "flags", "constants", "units", "settings", "kinds", "records"}
 
 WIDTH: Final = 1180
 ROW: Final = 92

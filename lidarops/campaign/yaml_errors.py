@@ -13,7 +13,8 @@ import yaml
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from lidarops.settings import NO_UNIT, PATTERN, is_small, nearest, written
+from lidarops.settings import NO_UNIT, nearest
+from lidarops.units import PATTERN, is_small, written
 
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"

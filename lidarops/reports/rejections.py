@@ -11,7 +11,8 @@ from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.records import LeftOut, Plan, PlannedStep, ProductRecord, SceneOutcome, file_channels
 from lidarops.scene.retrieval import settings_model
-from lidarops.settings import NO_UNIT, unit_of, written
+from lidarops.settings import NO_UNIT, unit_of
+from lidarops.units import written
 
 MANY: Final = 0.25
 """Least share of the values that a flag rejects to be named."""

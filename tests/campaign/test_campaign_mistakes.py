@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from lidarops.campaign.model import campaign_schema, load_campaign
 from lidarops.cli import app
 from lidarops.errors import CampaignError
-from lidarops.settings import written
+from lidarops.units import written
 
 CAMPAIGN = """\
 name: small

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support import factories
 
 from lidarops.campaign.model import campaign_schema, editor_schema, load_campaign
-from lidarops.settings import parse_quantity, written
+from lidarops.units import parse_quantity, written
 
 
 @pytest.mark.parametrize(
