@@ -21,8 +21,6 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, PydanticUndefined
 
-from lidarops.units import parse_quantity
-
 NO_UNIT: Final = "1"
 """Unit of a pure number or count."""
 _LEAST_RANGE: Final = 10.0
@@ -60,22 +58,11 @@ def quantity(
 
 
 def unit_of(model: type[BaseModel], key: str) -> str:
-    """Return the unit of a field; empty for texts and keys without a field."""
+    """Return the unit of a field; empty for pure numbers, texts and keys without a field."""
     field = model.model_fields.get(key)
     stated = field.json_schema_extra if field else None
-    return str(stated.get("unit", "")) if isinstance(stated, dict) else ""
-
-
-def _as_numbers(value: Any, unit: str) -> Any:
-    """Return quantities, such as ``4 ns``, as numbers in a unit; what is none stays as it is."""
-    if isinstance(value, str):
-        number = parse_quantity(value, unit)
-        return value if number is None else number
-    if isinstance(value, list):
-        return [_as_numbers(inner, unit) for inner in value]
-    if isinstance(value, dict):
-        return {key: _as_numbers(inner, unit) for key, inner in value.items()}
-    return value
+    unit = stated.get("unit", NO_UNIT) if isinstance(stated, dict) else NO_UNIT
+    return "" if unit == NO_UNIT else str(unit)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -215,17 +202,9 @@ BackgroundRange = Annotated[tuple[Metres, Metres], AfterValidator(_wide_enough)]
 
 
 class SettingsModel(BaseModel):
-    """Base of the models: frozen, without unknown keys; numbers with a unit may be quantities."""
+    """Base of the models: frozen, and without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _quantities_as_numbers(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
-            return given
-        units = {key: unit for key in given if (unit := unit_of(cls, key))}
-        return given | {key: _as_numbers(given[key], unit) for key, unit in units.items()}
 
     @classmethod
     def taken_from(cls, other: BaseModel, **given: Any) -> Self:

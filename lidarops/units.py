@@ -38,6 +38,11 @@ _SMALL: Final = {"s": (1e-6, "ns"), "m": (1e-4, "nm")}
 """Unit -> below which values are written in a smaller one."""
 
 
+def is_quantity(text: str) -> bool:
+    """Return whether a text is a number with something behind it, which may be a unit."""
+    return _QUANTITY.fullmatch(text) is not None
+
+
 def parse_quantity(text: str, unit: str) -> float | None:
     """Return the value of a text such as ``4 ns`` in a unit such as ``s``.
 

@@ -29,6 +29,7 @@ from lidarops.campaign.yaml_errors import (
     Loader,
     duplicate_keys,
     explain_yaml_error,
+    with_plain_numbers,
     with_quantities,
 )
 from lidarops.errors import CampaignError
@@ -712,13 +713,11 @@ def load_campaign(
             remedy="see catalogs/demo.yaml for an example",
         )
     try:
-        campaign = Campaign.model_validate(raw)
+        campaign = Campaign.model_validate(with_plain_numbers(raw, campaign_schema))
     except ValidationError as error:
         nodes = yaml.compose(text, Loader=yaml.SafeLoader)
         lines = explain_yaml_error(error, nodes, campaign_schema())
         raise CampaignError(_listed("is not a valid campaign:", lines), file=path) from error
-    except RecursionError as error:
-        raise CampaignError("holds a list that contains itself", file=path) from error
     base = path.resolve().parent
     if "://" in str(output or campaign.output):
         raise CampaignError(

@@ -1,11 +1,11 @@
-"""Read a YAML file of settings, and explain its errors by its schema.
+"""Read quantities of a YAML file by its schema, and explain its errors.
 
 Messages state the line, the key, the value, and what is expected there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from lidarops.settings import NO_UNIT, nearest
-from lidarops.units import PATTERN, is_small, written
+from lidarops.units import PATTERN, is_quantity, is_small, parse_quantity, written
 
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
@@ -81,6 +81,48 @@ def duplicate_keys(tree: yaml.Node | None) -> list[str]:
                 messages.append((line, message))
             lines[key.value] = line
     return [message for _, message in sorted(messages)]
+
+
+def with_plain_numbers(content: Any, schema: Callable[[], dict[str, Any]]) -> Any:
+    """Return the content of a file with quantities, such as ``4 ns``, as numbers in the unit there.
+
+    What is none, or has a unit of another dimension, is left for the validation to name.
+
+    Parameters
+    ----------
+    content : object
+        Of YAML.
+    schema : callable
+        Returns the JSON schema of the file, with units; called where a text may be a quantity.
+    """
+    texts = _texts(content)
+    return _plain(content, Expected.root(schema())) if any(map(is_quantity, texts)) else content
+
+
+def _texts(content: Any) -> Iterator[str]:
+    """Yield all texts that are values."""
+    stack, seen = [content], set[int]()
+    while stack:
+        value = stack.pop()
+        if isinstance(value, str):
+            yield value
+        # An anchor may contain itself.
+        elif isinstance(value, dict | list) and id(value) not in seen:
+            seen.add(id(value))
+            stack += value.values() if isinstance(value, dict) else value
+
+
+def _plain(content: Any, expected: Expected | None) -> Any:
+    if expected is None:
+        return content
+    if isinstance(content, dict):
+        return {key: _plain(value, expected.below(str(key))) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_plain(value, expected.below(str(k))) for k, value in enumerate(content)]
+    if isinstance(content, str) and expected.unit and not expected.takes_any_text():
+        number = parse_quantity(content, expected.unit)
+        return content if number is None else number
+    return content
 
 
 def with_quantities(schema: Any, unit: str | None = None) -> Any:
@@ -250,6 +292,11 @@ class Expected:
         """Return the valid texts, where a list gives them."""
         found = (choice for schema in self.schemas for choice in _choices(schema))
         return [choice for choice in found if isinstance(choice, str)]
+
+    def takes_any_text(self) -> bool:
+        """Return whether any text may be valid, not only some of a list."""
+        texts = [schema for schema in self.schemas if schema.get("type") == "string"]
+        return not all(list(_choices(schema)) for schema in texts)
 
     def words(self) -> str:
         """Return what is expected, such as ``a number from 1 to 200 sr``."""

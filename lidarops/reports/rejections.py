@@ -11,7 +11,7 @@ from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.records import LeftOut, Plan, PlannedStep, ProductRecord, SceneOutcome, file_channels
 from lidarops.scene.retrieval import settings_model
-from lidarops.settings import NO_UNIT, unit_of
+from lidarops.settings import unit_of
 from lidarops.units import written
 
 MANY: Final = 0.25
@@ -29,9 +29,7 @@ def settings_in_words(step: PlannedStep) -> Iterator[str]:
     """Yield the settings of a step with their units."""
     model = settings_model(step)
     for key, value in step.settings.items():
-        unit = unit_of(model, key)
-        if value is None or unit == NO_UNIT:
-            unit = ""
+        unit = "" if value is None else unit_of(model, key)
         words = written(value, unit) if isinstance(value, float) else f"{value} {unit}".rstrip()
         yield f"{key} {words}"
 

@@ -17,7 +17,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lidarops.campaign.model import Campaign
+from lidarops.campaign.model import Campaign, campaign_schema
+from lidarops.campaign.yaml_errors import with_plain_numbers
 from lidarops.catalog.draft import drafted_instruments
 from lidarops.catalog.folder import (
     FileGroup,
@@ -87,7 +88,7 @@ def look_at_data(
     KeyboardInterrupt
         If the process is asked to stop.
     """
-    drafted = yaml.safe_load(text)
+    drafted = with_plain_numbers(yaml.safe_load(text), campaign_schema)
     looks: dict[str, FirstLook] = {}
     failed: dict[str, str] = {}
     for key, headers in drafted_instruments(contents).items():

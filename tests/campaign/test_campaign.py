@@ -146,9 +146,6 @@ metadata: {license: x, comment: y}
     loop = MINIMAL + "metadata: &a {comment: x, program: *a}\n"
     with pytest.raises(CampaignError, match="program"):
         load_campaign(_write(tmp_path, loop))
-    loop = MINIMAL + "vanished_share: &a [*a]\n"
-    with pytest.raises(CampaignError, match="contains itself"):
-        load_campaign(_write(tmp_path, loop))
 
 
 def test_a_url_for_output_is_refused(tmp_path: Path) -> None:
