@@ -19,20 +19,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_950,
-    "lines of code alone": 44_220,
-    "modules": 269,
+    "lines": 67_937,
+    "lines of code alone": 44_197,
+    "modules": 270,
     "dataclasses": 220,
-    "lines of dataclasses": 6_169,
+    "lines of dataclasses": 6_174,
     "tuning numbers": 214,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_805,
+    "lines of the largest package": 5_806,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 59, "functions": 573, "changes": 216},
-    "elastic": {"modules": 69, "functions": 708, "changes": 228},
+    "homogeneous": {"modules": 59, "functions": 570, "changes": 215},
+    "elastic": {"modules": 69, "functions": 705, "changes": 227},
 }
 
 
