@@ -132,6 +132,7 @@ def test_whatever_the_library_raises_is_stated(
 ) -> None:
     product = _products(finished)[0]
     monkeypatch.setattr(read.xr, "open_dataset", _foreign(error))
+    monkeypatch.setattr(read.xr.backends.NetCDF4DataStore, "open", _foreign(error))
     for command in (
         ("inspect", product),
         ("plot", product, "--out", tmp_path / "figure.png"),
