@@ -167,7 +167,7 @@ def test_a_missing_variable_is_named(made, tmp_path, name):
     assert caught.value.field == name
 
 
-IMAGES = ("elastic-aerosol-backscatter",)
+IMAGES = ("Aerosol backscatter against time and range",)
 
 
 class TestGallery:
@@ -187,7 +187,10 @@ class TestGallery:
     def test_a_run_shows_images_and_a_profile(self, archive, made):
         filled = self.run(archive, {"elastic.nc": made})
         assert not filled.problems
-        assert [picture.view for picture in filled.pictures] == [*IMAGES, "profile"]
+        assert [picture.caption.partition(":")[0] for picture in filled.pictures] == [
+            *IMAGES,
+            "Profile at 2026-03-01 10",
+        ]
         for picture in filled.pictures:
             assert picture.caption.endswith(": 532 nm, photon counting, Lidar One")
             assert picture.figure.words
@@ -200,5 +203,5 @@ class TestGallery:
     def test_a_run_without_references_has_no_profile(self, archive, made):
         made["quality_flag"][:] |= np.int32(ElasticQuality.NO_REFERENCE)
         filled = self.run(archive, {"none.nc": made})
-        assert [picture.view for picture in filled.pictures] == [*IMAGES]
+        assert [picture.caption.partition(":")[0] for picture in filled.pictures] == [*IMAGES]
         assert not filled.problems

@@ -463,11 +463,11 @@ class TestManyScenes:
         found = re.findall(r"<summary>(Range|Extinction)", shown)
         assert found == ["Range", "Extinction", "Range"]
         pictures = run_page.gallery.fill(run).pictures
-        assert [(one.view, bool(one.lacking)) for one in pictures] == [
-            ("signal", False),
-            ("homogeneous", False),
-            ("signal", False),
-            ("homogeneous", True),
+        assert [(one.caption.split()[0], bool(one.lacking)) for one in pictures] == [
+            ("Range-corrected", False),
+            ("Extinction", False),
+            ("Range-corrected", False),
+            ("Extinction", True),
         ]
         assert "<summary>Extinction" in folded
         reason = flags_of("homogeneous").named("poor_fit").description

@@ -329,6 +329,7 @@ _CHECKS = {
 def test_a_vertical_sign_on_a_level_path_is_refused(small):
     def level(tree):
         _coast(tree)["damage"] = [{"kind": "zenith_minus_90", "index": 1}]
+        _coast(tree)["scan"] = {"zenith_angles": [80, 90]}
         for facts in tree["instruments"]["coast-lidar"]["facts"]:
             del facts["zenith_angle"]
 

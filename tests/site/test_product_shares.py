@@ -32,7 +32,7 @@ def test_the_calendar_states_the_share_of_usable_profiles():
     by_day = {"2026-03-01": [entry(16)]}
     day = words(pages.day("odesa", "2026-03-01", by_day, None, None))
     assert "1 product; 16.0 % of profiles usable" in day.replace("\N{NO-BREAK SPACE}", " ")
-    page = words(pages.year("odesa", 2026, [entry(16)], ["2026"]))
+    page = words(pages.year("odesa", "2026", {"2026": [entry(16)]}))
     assert "16.0 % of profiles usable, 1 product" in page.replace("\N{NO-BREAK SPACE}", " ")
 
 
