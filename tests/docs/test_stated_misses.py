@@ -42,6 +42,15 @@ STATED = {
     ("multi-angle", "extinction", "layer with edges"): (
         "multiangle", "total_extinction", "layers of a few altitudes",
     ),
+    ("scans, blocks of 1", "extinction", "layer with edges, blocks of 1"): (
+        "multiangle", "total_extinction", "layers of a few altitudes",
+    ),
+    ("scans, blocks of 2", "extinction", "layer of a few altitudes, blocks of 2"): (
+        "multiangle", "total_extinction", "layers of a few altitudes",
+    ),
+    ("scans, blocks of 2", "extinction", "layer with edges, blocks of 2"): (
+        "multiangle", "total_extinction", "layers of a few altitudes",
+    ),
     ("networks, plume, blocks of 1", "extinction", "plume, blocks of 1"): (
         "visibility", "", "with a plume",
     ),
