@@ -141,9 +141,6 @@ def build_site(
         done = processes.map_items(_page, tasks, at_a_time=1, lost=_crashed)
         entries, problems, made = _collected(done, progress)
     built = Site(site / pages.INDEX, len(entries), made, tuple(problems))
-    stated = _stated(entries, problems, links, below)
-    if built.index.is_file() and (site / MANIFEST).read_bytes() == stated:
-        return built
     entries = list(_linked(site, entries, links))
     expected = _write_calendar(site, entries, problems, links, below)
     _write(site, MANIFEST, _stated(entries, problems, links, below))

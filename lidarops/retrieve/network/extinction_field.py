@@ -208,7 +208,7 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
     """Return extinction at the near crossings, with flags."""
     shape = estimate.extinction.shape
     near = beams.layout.near_crossing
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         # Rounding of a singular system may make a variance negative.
         finite = np.isfinite(np.sqrt(estimate.variance))
         finite &= np.abs(estimate.extinction) < air_visibility.LARGEST_EXTINCTION
