@@ -401,7 +401,6 @@ def _stated(
     document = {
         "format": _FORMAT,
         "products_at": links.products,
-        "links": links.outside(entries),
         "below": below,
         "version": _version(),
         "products": [asdict(entry) for entry in entries],

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -75,13 +73,6 @@ class Links:
         if not (reports and place):
             return ""
         return _link(place, f"{reports[-1].parent.name}/index.html", page)
-
-    def outside(self, entries: Sequence[Entry]) -> str:
-        """Return a digest of where the first page and those of products lead outside the site."""
-        targets = [self.report(""), self.catalog("")]
-        for entry in entries:
-            targets += self.product(entry, entry.page), self.stac(entry, entry.page)
-        return hashlib.sha256("\n".join(targets).encode()).hexdigest()
 
     def _stac(self, name: str, page: str) -> str:
         place = self.stac_at or (STAC_BESIDE if self.beside else "")
