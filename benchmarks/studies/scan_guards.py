@@ -24,7 +24,6 @@ from lidarops.retrieve.multiangle import (
     optical_depth,
     smooth_profile,
 )
-from lidarops.retrieve.multiangle._smoothing import choose_smoothing
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -39,10 +38,6 @@ def _at(place: Any, **changes: Any) -> Context:
 
 def _nothing(*_: Any) -> None:
     return None
-
-
-def _by_likelihood(weight: Array, likelihood: Array, risk: Array) -> tuple[Array, Array]:
-    return choose_smoothing(weight, likelihood, np.zeros_like(risk))
 
 
 def _zero(*_: Any) -> float:
@@ -64,10 +59,7 @@ GUARDS: Final = (
         "few residuals: inflation",
         off=without((smooth_profile, "inflation", lambda noise: np.ones(noise.freedom.size))),
     ),
-    Guard(
-        "Cp beside the likelihood",
-        off=without((_smoothing, "choose_smoothing", _by_likelihood)),
-    ),
+    Guard("Cp beside the likelihood", off=_at(_smoothing, rougher=np.inf)),
     Guard("calibration", off=without((smooth_profile, "Calibration", _uncalibrated))),
     Guard(
         "calibration: scale of profiles",

@@ -82,17 +82,24 @@ def polarisation_difference(one: xr.Dataset, other: xr.Dataset) -> float:
     return float(np.sqrt(((first[name] - second[name]) ** 2 / variance).mean()))
 
 
+CAUTIOUS = pytest.mark.xfail(
+    strict=True, reason="stated errors of this scan are some 1.5 times too large"
+)
+
+
+@CAUTIOUS
 def test_parallel_and_perpendicular_see_the_same_optical_depth(products):
-    # 0.63, for a dead time that is assumed to be known to 20 %: a cautious one.
-    assert 0.55 < polarisation_difference(*(products[channel] for channel in REFERENCE)) < 0.85
+    # For a dead time that is assumed to be known to 20 %.
+    assert 0.85 < polarisation_difference(*(products[channel] for channel in REFERENCE)) < 1.15
 
 
+@CAUTIOUS
 @pytest.mark.slow
 @pytest.mark.parametrize("uncertainty", [0.1, 0.15, 0.2, "estimate"])
 def test_polarisations_differ_as_the_stated_error_of_the_dead_time(
     uncertainty, data_root, tmp_path
 ):
-    """0.77 to 0.63 of them from 10 to 20 %; 5 % are contradicted, and rejected."""
+    """A dead time known to 5 % is contradicted, and rejected."""
     tree = yaml.safe_load(CAMPAIGN.read_text())
     lidar = tree["instruments"]["savant"]
     for channel, dead_time in zip(REFERENCE, (6.2e-9, 6.8e-9), strict=True):
@@ -108,7 +115,7 @@ def test_polarisations_differ_as_the_stated_error_of_the_dead_time(
     )
     assert record is not None
     pair = [xr.load_dataset(Path(record.products) / p.path) for p in record.scenes[0].products]
-    assert 0.55 < polarisation_difference(*pair) < 0.85
+    assert 0.85 < polarisation_difference(*pair) < 1.15
 
 
 @pytest.mark.parametrize("channel", ["analog_355p", "analog_355s"])

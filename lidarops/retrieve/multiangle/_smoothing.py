@@ -20,7 +20,7 @@ _LOGARITHM_EVERY: Final = 4
 """Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
 _PER_DECADE: Final = 6
 _GRID: Final = 10.0 ** (np.arange(11 * _PER_DECADE + 1) / _PER_DECADE - 10.0)
-"""Dimensionless weights of smoothness, rising; a larger one would cost the solution its digits."""
+"""Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
 _NEGLIGIBLE: Final = 1e-6
 """Relative likelihood below which a weight is left out of the average: less than the 12 bits of a
 stored value."""
@@ -178,7 +178,7 @@ class Smoother(NamedTuple):
         return mean, self.mean(variance + away**2)
 
 
-# Shares of weights by restricted likelihood and Cp ------------------------------------------------
+# Choice of the weight by restricted likelihood on a fixed grid ------------------------------------
 
 
 @compiled
@@ -203,10 +203,23 @@ def _misfits(
     return out
 
 
+class Scores(NamedTuple):
+    """The criteria for some weights, summed over the scored profiles of a block."""
+
+    weight: Array
+    """(smoothing,): rising."""
+    likelihood: Array
+    """(smoothing,): minus twice the restricted log-likelihood, up to a constant."""
+    risk: Array
+    """(smoothing,): Mallows' Cp, up to a constant."""
+    freedom: Array
+    """(smoothing,): effective degrees of freedom of a typical profile."""
+
+
 def score_smoothing(
     bands: Array, estimates: Array, typical: Array, stiffness: Array, weight: Array
-) -> tuple[Array, Array]:
-    """Score weights for the profiles of one block, formula 2 of the page.
+) -> Scores:
+    """Score weights for the profiles of one block, formula 2 of the page (`patterson1971`).
 
     Parameters
     ----------
@@ -217,12 +230,6 @@ def score_smoothing(
         Precision of a typical profile, whose degrees of freedom are those of all.
     stiffness : (3, altitude) float64
     weight : (smoothing,) float64
-
-    Returns
-    -------
-    tuple of (smoothing,) float64
-        Minus twice the restricted log-likelihood (`patterson1971`), and Mallows' Cp
-        (`mallows1973`), up to constants.
     """
     altitudes, profiles = estimates.shape
     right = multiply(bands, estimates)
@@ -230,7 +237,8 @@ def score_smoothing(
     likelihood -= (altitudes - 1) * profiles * np.log(weight)
     # Where a pivot lost all its digits, the weight is too large.
     likelihood = np.where(np.isfinite(likelihood), likelihood, np.inf)
-    return likelihood, risk + 2.0 * profiles * freedom(typical, stiffness, weight)
+    left = freedom(typical, stiffness, weight)
+    return Scores(weight, likelihood, risk + 2.0 * profiles * left, left)
 
 
 def freedom(bands: Array, stiffness: Array, weight: Array) -> Array:
@@ -247,41 +255,34 @@ def freedom(bands: Array, stiffness: Array, weight: Array) -> Array:
     return np.asarray((bands[0] * diagonal + 2.0 * bands[1] * beside).sum(axis=0))
 
 
-def stiffest(typical: Array, stiffness: Array, unit: float) -> float:
-    """Return the weight that leaves a typical profile the least degrees of freedom allowed.
+def weights_up_to(largest: float, unit: float, *, one: bool = True) -> Array:
+    """Return the weights to choose from: those of a grid in `unit`, and the largest one.
 
-    Parameters
-    ----------
-    typical : (2, altitude, 1) float64
-    stiffness : (3, altitude) float64
-    unit : float
-        Of the weights of the grid; the result is within it.
+    Without a limit, smooth extinction below would deny the top of a layer above, where the data are
+    too noisy to show it. An average, without `one`, is over the grid alone: the limit beside its
+    last weight would count twice (`test_bench_false_values`).
     """
-    weight = _GRID * unit
-    left = freedom(typical, stiffness, weight)
-    return float(np.exp(np.interp(-THRESHOLDS.least_smooth_freedom, -left, np.log(weight))))
+    grid = _GRID * unit
+    if one and largest <= grid[-1]:
+        return np.append(grid[grid < largest], largest)
+    return grid[: max(int(np.searchsorted(grid, largest, side="right")), 1)]
 
 
-def weights_up_to(largest: float, unit: float) -> Array:
-    """Return weights to average over, (smoothing,), in equal ratios up to the largest one.
-
-    They begin where the grid in `unit` begins. Weights at fixed places would enter the average all
-    at once where the limit passes them.
-    """
-    below = max(int(_PER_DECADE * np.log10(largest / (_GRID[0] * unit))), 0)
-    return np.asarray(largest * 10.0 ** (np.arange(-below, 1) / _PER_DECADE))
-
-
-def choose_smoothing(weight: Array, likelihood: Array, risk: Array) -> tuple[Array, Array]:
-    """Return the weights to average over, and their shares, from the scores of weights up to one.
+def choose_smoothing(scores: Scores, *, one: bool) -> tuple[Array, Array]:
+    """Return the weight of a block, or without `one` the weights to average over, and their shares.
 
     Profiles of a block have similar shapes, but the likelihood treats them as independent; in
-    clouds it then smooths too much. Cp uses the known noise, but is erratic. Shares of their sum
-    follow both, and change no more abruptly than the data do.
+    clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
+    gives 1.2 times the degrees of freedom, and lowers the weight by at most a factor of 10.
     """
-    criterion = likelihood + risk
-    share = np.exp(-0.5 * (criterion - criterion.min()))
-    # An integral over the logarithm: half the step of the largest weight lies beyond it.
-    share[-1] *= 0.5
-    kept = share > _NEGLIGIBLE
-    return weight[kept], share[kept] / share[kept].sum()
+    admitted = (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
+    last = int(np.flatnonzero(admitted)[-1]) if admitted.any() else 0
+    likelihood = scores.likelihood[: last + 1]
+    if one:
+        likely = int(np.argmin(likelihood))
+        risky = max(int(np.argmin(scores.risk[: last + 1])), likely - _PER_DECADE)
+        rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
+        return scores.weight[[risky if rougher else likely]], np.ones(1)
+    share = np.exp(-0.5 * (likelihood - likelihood.min()))
+    kept = np.flatnonzero(share > _NEGLIGIBLE)
+    return scores.weight[kept], share[kept] / share[kept].sum()

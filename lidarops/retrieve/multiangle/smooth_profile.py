@@ -107,8 +107,8 @@ def smooth_optical_depth(
 ) -> VerticalResult:
     """Return profiles with smooth extinction from optical depths of single altitudes.
 
-    Solutions are averaged over weights of smoothness. Their shares and the calibration of the
-    standard errors are common to the profiles.
+    The weight of smoothness and the calibration of the standard errors are common to the profiles.
+    With fewer than 8 profiles, solutions are averaged over the weight.
 
     Parameters
     ----------
@@ -142,11 +142,11 @@ def smooth_optical_depth(
     of_typical = correlated_precision(*typical, noise.correlation)
     weight, share = _choose(bands, estimates, precise, altitude, of_typical)
     smoother = Smoother.of(bands, stiffness, weight, share)
-    middle = float(np.exp(share @ np.log(weight)))
-    sandwich = Sandwich.of(typical, of_typical, noise.correlation, stiffness, middle)
+    likeliest = float(weight[share.argmax()])
+    sandwich = Sandwich.of(typical, of_typical, noise.correlation, stiffness, likeliest)
     within = (np.cumsum(used[::-1], axis=0)[::-1] > 0).T
     change = None
-    if len(within) >= THRESHOLDS.fewest_to_calibrate:
+    if len(within) >= THRESHOLDS.fewest_to_choose:
         rough = Smoother.of(bands, stiffness, THRESHOLDS.pilot * weight, share).respond(estimates)
         change = np.where(within, (rough - smoother.respond(rough)).T, np.nan)
     return _result(smoother, estimates, altitude, within, weight, (sandwich, widened, change))
@@ -172,24 +172,19 @@ def _choose(
     stiffness = _smoothing.penalty(altitude)
     highest = int(np.flatnonzero((information > 0.0).any(axis=1))[-1])
     unit = float(information[information > 0.0].mean()) * altitude[highest] ** 3
-    largest = min(
-        _largest_smoothing(estimates, information, altitude[:, np.newaxis]),
-        _smoothing.stiffest(of_typical, stiffness, unit),
-    )
-    weight = _smoothing.weights_up_to(largest, unit)
-    every = every_nth(estimates.shape[1])
+    profiles = estimates.shape[1]
+    one = profiles >= THRESHOLDS.fewest_to_choose
+    largest = _largest_smoothing(estimates, information, altitude[:, np.newaxis])
+    weight = _smoothing.weights_up_to(largest, unit, one=one)
+    every = every_nth(profiles)
     scores = _smoothing.score_smoothing(
         bands[..., every].copy(), estimates[:, every], of_typical, stiffness, weight
     )
-    return _smoothing.choose_smoothing(weight, *scores)
+    return _smoothing.choose_smoothing(scores, one=one)
 
 
 def _largest_smoothing(estimates: Array, information: Array, altitude: Array) -> float:
-    """Return the weight with which extinction may change by its mean within a scale height.
-
-    Without a limit, smooth extinction below would deny the top of a layer above, where the data are
-    too noisy to show it.
-    """
+    """Return the weight with which extinction may change by its mean within a scale height."""
     known = float((information * altitude**2).sum())
     mean = float((information * estimates * altitude).sum()) / known
     return THRESHOLDS.scale_height / (mean**2 + 1.0 / known)

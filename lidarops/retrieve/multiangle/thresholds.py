@@ -124,15 +124,18 @@ class Thresholds(NamedTuple):
 
     # Smoothness and its errors (`smooth_profile`).
     least_smooth_freedom: float = 2.0
-    """Degrees of freedom that the largest weight of smoothness leaves: those of a straight line and
-    one more; by definition."""
+    """Degrees of freedom below which a weight of smoothness is not allowed: a straight line and one
+    more; by definition."""
     scale_height: float = 2000.0
     """m over which extinction may change by its mean: scale height of aerosol. Without a limit of
     smoothness, extinctions and optical depths around the top of a haze are false
     (`test_errors_around_the_top_of_a_haze_cover_the_truth`)."""
-    fewest_to_calibrate: int = 8
-    """Profiles from which errors are calibrated; by coverage in the ten scenes of
-    `test_smooth_profile`."""
+    fewest_to_choose: int = 8
+    """Profiles from which one weight of smoothness is chosen, and errors are calibrated; with
+    fewer, solutions are averaged; by coverage in the ten scenes of `test_smooth_profile`."""
+    rougher: float = 1.2
+    """Ratio of degrees of freedom from which Cp is preferred to the likelihood; by coverage in the
+    same scenes."""
     pilot: float = 0.01
     """Weight of smoothness of the pilot solution over that of the solution; by coverage in the same
     scenes."""

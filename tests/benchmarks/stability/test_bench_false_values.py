@@ -152,11 +152,6 @@ def networks(cluster, profiles):
     yield from takewhile(lambda chunk: chunk.failure.name != "gaps", chunks)
 
 
-MORE_FALSE = pytest.mark.xfail(
-    strict=True,
-    reason="since scans are fitted in two passes and averaged over their smoothness, too many"
-    " extinctions are false in calm air, and in layers of a few altitudes in single cycles",
-)
 KNOWN = verdicts.above_target()
 """Classes and quantities that miss the target; `docs/results/reasons.json` says why."""
 
@@ -168,14 +163,13 @@ KNOWN = verdicts.above_target()
         pytest.param(homogeneous_paths.score_short_sections, 600, 300, 0.0, id="short sections"),
         pytest.param(recorded_signals.score_signals, 200, 50, 0.0, id="signal chain"),
         pytest.param(elastic_skies.score_elastic, 400, 20, 0.0, id="elastic"),
-        pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle", marks=MORE_FALSE),
+        pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
         pytest.param(
             partial(random_scans.score_short_scans, length=1),
             400,
             4,
             0.0,
             id="scans, blocks of 1",
-            marks=MORE_FALSE,
         ),
         pytest.param(
             partial(random_scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"

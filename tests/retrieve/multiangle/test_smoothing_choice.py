@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
-from support.oracles import angle_scenes
-from support.oracles.angle_scenes import clear, cloud
 from support.oracles.banded_matrices import dense
 
 from lidarops.retrieve.multiangle import _smoothing
 from lidarops.retrieve.multiangle._smoothing import (
+    Scores,
     choose_smoothing,
-    freedom,
     score_smoothing,
-    stiffest,
     weights_up_to,
 )
 from lidarops.retrieve.multiangle.altitude_correlation import correlated_precision
-from lidarops.retrieve.multiangle.smooth_profile import smooth_optical_depth
 
-GRID = weights_up_to(10.0, 1.0)
+GRID = weights_up_to(np.inf, 1.0)
+A_DECADE = 6
 HEIGHTS = 25
 ALTITUDE = 100.0 + 30.0 * np.arange(HEIGHTS)
 
@@ -39,7 +34,9 @@ def block(profiles, correlation, rng):
 def test_likelihood_is_the_restricted_one_of_the_marginal_distribution(correlation):
     """Gaussian model: estimates are a straight line, an integrated random walk and noise."""
     bands, estimates, stiffness, unit = block(3, correlation, np.random.default_rng(0))
-    likelihood, _ = score_smoothing(bands, estimates, bands[..., :1].copy(), stiffness, GRID * unit)
+    likelihood = score_smoothing(
+        bands, estimates, bands[..., :1].copy(), stiffness, GRID * unit
+    ).likelihood
     prior = np.linalg.pinv(dense(stiffness), rcond=1e-11, hermitian=True)
     line = ALTITUDE[:, np.newaxis]
     expected = np.zeros(GRID.size)
@@ -68,105 +65,62 @@ def test_risk_estimates_the_true_error_without_bias():
     stiffness, unit = _smoothing.penalty(ALTITUDE), 50.0 * ALTITUDE[-1] ** 3
     estimates = truth + rng.multivariate_normal(np.zeros(HEIGHTS), covariance, size=64)
     typical = bands[..., :1].copy()
-    _, risk = score_smoothing(bands, estimates.T.copy(), typical, stiffness, GRID * unit)
-    left = freedom(typical, stiffness, GRID * unit)
+    scored = score_smoothing(bands, estimates.T.copy(), typical, stiffness, GRID * unit)
     weight = dense(bands[..., 0])
     for i in range(0, GRID.size, 6):
         smoother = np.linalg.inv(weight + GRID[i] * unit * dense(stiffness)) @ weight
         error = estimates @ smoother.T - truth
         loss = np.einsum("ti,ij,tj->", error, weight, error)
-        assert risk[i] == pytest.approx(loss + 64 * HEIGHTS, rel=0.1)
-        assert left[i] == pytest.approx(np.trace(smoother), rel=1e-6)
+        assert scored.risk[i] == pytest.approx(loss + 64 * HEIGHTS, rel=0.1)
+        assert scored.freedom[i] == pytest.approx(np.trace(smoother), rel=1e-6)
 
 
-INDEX = np.arange(GRID.size)
+FREEDOM = np.geomspace(20.0, 1.0, GRID.size)
 
 
-@pytest.mark.parametrize("last", [25, 40, 66])
-def test_weights_are_averaged_by_likelihood_and_risk(last):
-    weight = GRID[: last + 1]
-    likelihood, risk = (INDEX - 30.0) ** 2, 0.5 * (INDEX - 10.0) ** 2
-    weights, share = choose_smoothing(weight, likelihood[: last + 1], risk[: last + 1])
-    expected = np.exp(-0.5 * (likelihood + risk)[: last + 1])
-    expected[-1] /= 2.0
-    where = np.searchsorted(weight, weights)
-    np.testing.assert_array_equal(weight[where], weights)
-    np.testing.assert_allclose(share, expected[where] / expected[where].sum(), rtol=1e-12)
-    assert expected[where].sum() / expected.sum() > 1.0 - 1e-4
+def chosen(likely, risky, freedom=FREEDOM, *, one=True):
+    """Return the choice from parabolas with minima at given indices."""
+    index = np.arange(GRID.size)
+    scores = Scores(GRID, (index - likely) ** 2.0, (index - risky) ** 2.0, freedom)
+    return choose_smoothing(scores, one=one)
 
 
-def test_weights_rise_in_equal_ratios_to_the_largest_one():
+def test_likelihood_decides_where_the_risk_agrees():
+    assert chosen(30, 29)[0] == GRID[30]
+    assert chosen(30, 35)[0] == GRID[30]
+
+
+def test_risk_decides_where_it_gives_more_freedom_up_to_a_decade():
+    assert chosen(30, 25)[0] == GRID[25]
+    assert chosen(30, 5)[0] == GRID[30 - A_DECADE]
+
+
+def test_at_least_two_degrees_of_freedom_are_left():
+    weight, _ = chosen(66, 66)
+    assert 2.0 <= FREEDOM[weight == GRID] < 2.1
+
+
+def test_the_largest_weight_is_one_of_those_to_choose_from():
     weights = weights_up_to(1.2 * GRID[15], 1.0)
-    assert weights[-1] == 1.2 * GRID[15]
-    np.testing.assert_allclose(weights, 1.2 * GRID[:16], rtol=1e-12)
+    np.testing.assert_array_equal(weights, [*GRID[:16], 1.2 * GRID[15]])
     np.testing.assert_array_equal(weights_up_to(1e-12, 1.0), [1e-12])
 
 
-def test_the_stiffest_weight_leaves_two_degrees_of_freedom():
-    bands, _, stiffness, unit = block(1, 0.3, np.random.default_rng(2))
-    weight = stiffest(bands, stiffness, unit)
-    assert freedom(bands, stiffness, np.array([weight])) == pytest.approx(2.0, abs=0.02)
+def test_an_average_is_over_the_grid_alone():
+    """The limit beside the last weight of the grid would count twice."""
+    np.testing.assert_array_equal(weights_up_to(1.2 * GRID[15], 1.0, one=False), GRID[:16])
+    np.testing.assert_array_equal(weights_up_to(1e-12, 1.0, one=False), GRID[:1])
+
+
+def test_small_block_is_averaged_by_likelihood():
+    weights, share = chosen(30, 5, one=False)
+    assert share.sum() == pytest.approx(1.0)
+    weight = np.exp(-0.5 * (np.arange(GRID.size) - 30.0) ** 2)
+    where = np.searchsorted(GRID, weights)
+    expected = weight[where] / weight[where].sum()
+    np.testing.assert_allclose(share, expected, rtol=1e-12)
+    assert weight[where].sum() / weight.sum() > 1.0 - 1e-4
 
 
 def test_data_that_never_reach_two_degrees_of_freedom_are_smoothed_least():
-    bands, _, stiffness, unit = block(1, 0.0, np.random.default_rng(2))
-    assert stiffest(bands[:, :1], stiffness[:, :1], unit) == pytest.approx(GRID[0] * unit)
-
-
-# A path between two draws of noise -----------------------------------------------------------
-
-STEP = 6e-9
-"""Shortest step along the path: far above the digits of values, and far below their errors."""
-VALUES, ERRORS = 0.2, 0.2
-"""Largest change of a value, in its error, and of the logarithm of an error."""
-
-
-def solutions_between(scene, correlation, seed):
-    """Return a function that solves 12 cycles at a place between two draws of their noise."""
-    rng = np.random.default_rng(seed)
-    first, second = (angle_scenes.estimates(scene, 12, rng, correlation) for _ in range(2))
-
-    def solve(place):
-        mixed = (1.0 - place) * first.optical_depth + place * second.optical_depth
-        result = smooth_optical_depth(mixed, first.information, scene.altitude, noise=first.noise)
-        return (
-            (result.optical_depth, result.optical_depth_standard_error),
-            (result.extinction, result.extinction_standard_error),
-        )
-
-    return solve
-
-
-def jump(one, other):
-    """Return the largest differences of values in errors, and of the logarithm of errors."""
-    values = [np.abs(a - b) / np.fmin(e, f) for (a, e), (b, f) in zip(one, other, strict=True)]
-    errors = [np.abs(np.log(e / f)) for (_, e), (_, f) in zip(one, other, strict=True)]
-    return max(map(np.nanmax, values)), max(map(np.nanmax, errors))
-
-
-@pytest.mark.parametrize(
-    ("scene", "correlation", "seed"),
-    [
-        (cloud(), 0.8, 0),
-        (cloud(), 0.0, 1),
-        (cloud(largest=15.0), 0.8, 1),
-        (clear(3000.0), 0.7, 0),
-    ],
-)
-def test_a_hair_of_noise_changes_values_and_errors_by_little(scene, correlation, seed):
-    """One weight, by the least of criteria with two minima, jumps up to 0.8 errors in clouds."""
-    solve = solutions_between(scene, correlation, seed)
-    places = np.linspace(0.0, 1.0, 41)
-    solved = [solve(place) for place in places]
-    at = int(np.argmax([sum(jump(*pair)) for pair in itertools.pairwise(solved)]))
-    (low, high), (below, above) = places[at : at + 2], solved[at : at + 2]
-    while high - low > STEP:
-        middle = 0.5 * (low + high)
-        between = solve(middle)
-        if sum(jump(below, between)) > sum(jump(between, above)):
-            high, above = middle, between
-        else:
-            low, below = middle, between
-    values, errors = jump(below, above)
-    assert values < VALUES
-    assert errors < ERRORS
+    assert chosen(66, 66, np.ones(GRID.size))[0] == GRID[0]
