@@ -2,7 +2,8 @@
 
 ``python tests/crash/soak.py --kills 1000 --seed 1 --folder /tmp/soak`` kills the process groups, or
 only the first process, of runs on the command line, with dask workers and as flows, of aggregate,
-site, publish and report, at random moments. In half of them calls of the system fail now and then.
+site, publish and report, at random moments. In half of them calls of the system fail now and then,
+and in a quarter a raw file is damaged until the command has ended.
 After each kill the ledger holds only what is on the disk, and every product and published file is
 absent or right; after each round of kills, undisturbed commands give what they give without kills.
 
@@ -48,6 +49,7 @@ os.environ.setdefault("SOURCE_DATE_EPOCH", "1700000000")
 TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
+from support import damage  # noqa: E402
 from support.archives import crash_archive  # noqa: E402
 from support.faults import sitecustomize as faults  # noqa: E402
 
@@ -65,6 +67,19 @@ FRESH = 12
 """One of so many commands starts by the console script."""
 RATES = (0.0005, 0.005, 0.05)
 """Shares of the calls on files that fail in a disturbed command."""
+DAMAGED = 0.25
+"""Share of the commands that meet a damaged raw file."""
+DAMAGES: dict[str, Callable[[Path, random.Random], object]] = {
+    "truncated": lambda file, rng: file.write_bytes(damage.truncate(file.read_bytes(), rng)),
+    "empty": lambda file, _: file.write_bytes(b""),
+    "zeroed page": lambda file, _: file.write_bytes(bytes(512) + file.read_bytes()[512:]),
+    "flipped line ends": lambda file, rng: file.write_bytes(
+        damage.flip_line_end(file.read_bytes(), rng)
+    ),
+    "vanished": lambda file, _: file.unlink(),
+    "unreadable": lambda file, _: (file.unlink(), file.symlink_to(file)),
+}
+"""For which a file is refused; a flipped digit of a time would make another scene."""
 TAG = "LIDAROPS_TEST_SOAK"
 COMMANDS = ("reprocess", "force", "site", "aggregate", "publish", "report")
 WEIGHTS = (6, 2, 2, 2, 2, 1)
@@ -84,6 +99,8 @@ class Tally:
     ended: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     """Calls of the system that failed on purpose."""
+    damages: Counter[str] = field(default_factory=Counter)
+    """Raw files damaged while a command ran."""
     disturbed: int = 0
     """Commands in which calls of the system may fail."""
     unentered: int = 0
@@ -191,8 +208,9 @@ class Soak:
         name = {14: "cluster", 29: "pool", 44: "cluster", 59: "flow"}.get(number % 60, name)
         fresh = name not in GROUPS and number % FRESH == 0
         disturbed = self.rng.random() < 0.5
-        self.disturbed |= disturbed
         self.tally.disturbed += disturbed
+        damaged = self._damage(place)
+        self.disturbed |= disturbed or damaged is not None
         wrong = f"{self.rng.getrandbits(31)} {self.rng.choice(RATES)}" if disturbed else ""
         moment = self.rng.uniform(0.0, self.took[name] + fresh * self.start_up)
         process = _start(_command(place, name), place, wrong, fresh=fresh)
@@ -211,7 +229,20 @@ class Soak:
             assert time.monotonic() - began < GIVE_UP, f"{name}: {left} live on"
             time.sleep(0.02)
         self.tally.slowest_end = max(self.tally.slowest_end, time.monotonic() - began)
+        if damaged is not None:
+            damaged.unlink(missing_ok=True)
+            shutil.copy(self.calm / "raw" / damaged.name, damaged)
         self._check(place, killed=status is None, workers=2 if name in ("cluster", "flow") else 1)
+
+    def _damage(self, place: Path) -> Path | None:
+        """Damage a raw file in a part of the commands, and return it."""
+        if self.rng.random() >= DAMAGED:
+            return None
+        file = self.rng.choice(sorted((place / "raw").iterdir()))
+        name = self.rng.choice(list(DAMAGES))
+        DAMAGES[name](file, self.rng)
+        self.tally.damages[name] += 1
+        return file
 
     def _check(self, place: Path, *, killed: bool, workers: int) -> None:
         unentered = set(crash_archive.wrong_rows(place))
