@@ -13,11 +13,12 @@ Prefect do.
 Moments are counted in CPU time of the command, so that kills fall evenly on it on any machine.
 ``--jobs`` soaks that many archives beside each other.
 
-A file is renamed first and entered in the ledger then, because the two cannot be one operation:
-the other order would enter files that do not exist. A kill in between leaves a file that the
-ledger does not know. That shows only where the bytes differ from those before, so where a part of
-the files of a scene could not be read before or now. Then only one scene of each worker may be
-concerned, ``verify`` must name these files, each must be right, and the next run makes them again.
+A file is renamed first and entered in the ledger then, because the two cannot be one operation: the
+other order would enter files that do not exist. A kill in between, or a disk that fails as the
+renaming is made durable, leaves a file that the ledger does not know. That shows only where the
+bytes differ from those before, so where a part of the files of a scene could not be read before or
+now. Then only one scene of each worker may be concerned, ``verify`` must name these files, each
+must be right, and the next run makes them again.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ class Tally:
     disturbed: int = 0
     """Commands in which calls of the system may fail."""
     unentered: int = 0
-    """Kills between the renaming of a changed product and its entry in the ledger."""
+    """Commands that ended between the renaming of a changed product and its entry in the ledger."""
     rounds: int = 0
     tracebacks: int = 0
     """Disturbed commands that ended with a traceback instead of a message."""
@@ -232,7 +233,8 @@ class Soak:
         if damaged is not None:
             damaged.unlink(missing_ok=True)
             shutil.copy(self.calm / "raw" / damaged.name, damaged)
-        self._check(place, killed=status is None, workers=2 if name in ("cluster", "flow") else 1)
+        workers = 2 if name in ("cluster", "flow") else 1
+        self._check(place, interrupted=status is None or disturbed, workers=workers)
 
     def _damage(self, place: Path) -> Path | None:
         """Damage a raw file in a part of the commands, and return it."""
@@ -244,12 +246,12 @@ class Soak:
         self.tally.damages[name] += 1
         return file
 
-    def _check(self, place: Path, *, killed: bool, workers: int) -> None:
+    def _check(self, place: Path, *, interrupted: bool, workers: int) -> None:
         unentered = set(crash_archive.wrong_rows(place))
         new = unentered - self.unentered
         if new:
             self.tally.unentered += 1
-            assert killed, f"the ledger does not hold {new}"
+            assert interrupted, f"the ledger does not hold {new}"
             assert self.disturbed, f"the ledger does not hold {new}"
             assert all((place / "out/products" / path).exists() for path in new)
             scenes = {path.rpartition("_")[2] for path in new}
