@@ -24,6 +24,7 @@ from lidarops.retrieve.multiangle import (
     optical_depth,
     smooth_profile,
 )
+from lidarops.retrieve.multiangle._smoothing import Scores, choose_smoothing
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
@@ -38,6 +39,10 @@ def _at(place: Any, **changes: Any) -> Context:
 
 def _nothing(*_: Any) -> None:
     return None
+
+
+def _by_likelihood(scores: Scores, *, one: bool) -> tuple[Array, Array]:
+    return choose_smoothing(scores._replace(risk=np.zeros_like(scores.risk)), one=one)
 
 
 def _zero(*_: Any) -> float:
@@ -59,7 +64,10 @@ GUARDS: Final = (
         "few residuals: inflation",
         off=without((smooth_profile, "inflation", lambda noise: np.ones(noise.freedom.size))),
     ),
-    Guard("Cp beside the likelihood", off=_at(_smoothing, rougher=np.inf)),
+    Guard(
+        "Cp beside the likelihood",
+        off=without((_smoothing, "choose_smoothing", _by_likelihood)),
+    ),
     Guard("calibration", off=without((smooth_profile, "Calibration", _uncalibrated))),
     Guard(
         "calibration: scale of profiles",

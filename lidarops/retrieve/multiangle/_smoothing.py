@@ -19,7 +19,8 @@ _PAD: Final = 2
 _LOGARITHM_EVERY: Final = 4
 """Pivots multiplied before a logarithm is taken; four of any allowed size do not overflow."""
 _PER_DECADE: Final = 6
-_GRID: Final = 10.0 ** (np.arange(11 * _PER_DECADE + 1) / _PER_DECADE - 10.0)
+_ROUGHEST: Final = 1e-10
+_SMOOTHEST: Final = 10.0
 """Dimensionless weights of smoothness; a larger one would cost the solution its digits."""
 _NEGLIGIBLE: Final = 1e-6
 """Relative likelihood below which a weight is left out of the average: less than the 12 bits of a
@@ -178,7 +179,7 @@ class Smoother(NamedTuple):
         return mean, self.mean(variance + away**2)
 
 
-# Choice of the weight by restricted likelihood on a fixed grid ------------------------------------
+# Choice of the weight by restricted likelihood and Cp ---------------------------------------------
 
 
 @compiled
@@ -255,34 +256,33 @@ def freedom(bands: Array, stiffness: Array, weight: Array) -> Array:
     return np.asarray((bands[0] * diagonal + 2.0 * bands[1] * beside).sum(axis=0))
 
 
-def weights_up_to(largest: float, unit: float, *, one: bool = True) -> Array:
-    """Return the weights to choose from: those of a grid in `unit`, and the largest one.
+def weights_up_to(largest: float, unit: float) -> Array:
+    """Return the weights to choose from, in equal ratios up to the largest one.
 
-    Without a limit, smooth extinction below would deny the top of a layer above, where the data are
-    too noisy to show it. An average, without `one`, is over the grid alone: the limit beside its
-    last weight would count twice (`test_bench_false_values`).
+    They hang from it, so that none enters abruptly where it moves. Without a limit, smooth
+    extinction below would deny the top of a layer above, where the data are too noisy to show it.
     """
-    grid = _GRID * unit
-    if one and largest <= grid[-1]:
-        return np.append(grid[grid < largest], largest)
-    return grid[: max(int(np.searchsorted(grid, largest, side="right")), 1)]
+    largest = min(largest, _SMOOTHEST * unit)
+    below = max(int(_PER_DECADE * np.log10(largest / (_ROUGHEST * unit))), 0)
+    return np.asarray(largest * 10.0 ** (np.arange(-below, 1) / _PER_DECADE))
 
 
 def choose_smoothing(scores: Scores, *, one: bool) -> tuple[Array, Array]:
     """Return the weight of a block, or without `one` the weights to average over, and their shares.
 
+    Shares are integrals over the logarithm of the weight, up to the last one that is allowed.
     Profiles of a block have similar shapes, but the likelihood treats them as independent; in
-    clouds it then smooths too much. Cp uses the known noise, but is erratic. It is used only if it
-    gives 1.2 times the degrees of freedom, and lowers the weight by at most a factor of 10.
+    clouds it then smooths too much. Cp uses the known noise, but is erratic. The one weight is the
+    mean by both: that of the least score would jump for a hair of noise.
     """
-    admitted = (scores.freedom >= THRESHOLDS.least_smooth_freedom) & np.isfinite(scores.likelihood)
-    last = int(np.flatnonzero(admitted)[-1]) if admitted.any() else 0
-    likelihood = scores.likelihood[: last + 1]
+    place = np.arange(scores.weight.size)
+    last = np.interp(-THRESHOLDS.least_smooth_freedom, -scores.freedom, place)
+    within = np.clip(last - place + 0.5, 0.0, 1.0)
+    score = scores.likelihood + scores.risk if one else scores.likelihood
+    score = np.where(within > 0.0, score, np.inf)
+    share = within * np.exp(-0.5 * (score - score.min()))
+    share /= share.sum()
     if one:
-        likely = int(np.argmin(likelihood))
-        risky = max(int(np.argmin(scores.risk[: last + 1])), likely - _PER_DECADE)
-        rougher = scores.freedom[risky] > THRESHOLDS.rougher * scores.freedom[likely]
-        return scores.weight[[risky if rougher else likely]], np.ones(1)
-    share = np.exp(-0.5 * (likelihood - likelihood.min()))
-    kept = np.flatnonzero(share > _NEGLIGIBLE)
+        return np.exp([share @ np.log(scores.weight)]), np.ones(1)
+    kept = share > _NEGLIGIBLE * share.max()
     return scores.weight[kept], share[kept] / share[kept].sum()

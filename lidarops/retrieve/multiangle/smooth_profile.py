@@ -142,8 +142,8 @@ def smooth_optical_depth(
     of_typical = correlated_precision(*typical, noise.correlation)
     weight, share = _choose(bands, estimates, precise, altitude, of_typical)
     smoother = Smoother.of(bands, stiffness, weight, share)
-    likeliest = float(weight[share.argmax()])
-    sandwich = Sandwich.of(typical, of_typical, noise.correlation, stiffness, likeliest)
+    middle = float(np.exp(share @ np.log(weight)))
+    sandwich = Sandwich.of(typical, of_typical, noise.correlation, stiffness, middle)
     within = (np.cumsum(used[::-1], axis=0)[::-1] > 0).T
     change = None
     if len(within) >= THRESHOLDS.fewest_to_choose:
@@ -175,7 +175,7 @@ def _choose(
     profiles = estimates.shape[1]
     one = profiles >= THRESHOLDS.fewest_to_choose
     largest = _largest_smoothing(estimates, information, altitude[:, np.newaxis])
-    weight = _smoothing.weights_up_to(largest, unit, one=one)
+    weight = _smoothing.weights_up_to(largest, unit)
     every = every_nth(profiles)
     scores = _smoothing.score_smoothing(
         bands[..., every].copy(), estimates[:, every], of_typical, stiffness, weight

@@ -133,9 +133,6 @@ class Thresholds(NamedTuple):
     fewest_to_choose: int = 8
     """Profiles from which one weight of smoothness is chosen, and errors are calibrated; with
     fewer, solutions are averaged; by coverage in the ten scenes of `test_smooth_profile`."""
-    rougher: float = 1.2
-    """Ratio of degrees of freedom from which Cp is preferred to the likelihood; by coverage in the
-    same scenes."""
     pilot: float = 0.01
     """Weight of smoothness of the pilot solution over that of the solution; by coverage in the same
     scenes."""

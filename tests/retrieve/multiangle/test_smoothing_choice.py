@@ -16,7 +16,6 @@ from lidarops.retrieve.multiangle._smoothing import (
 from lidarops.retrieve.multiangle.altitude_correlation import correlated_precision
 
 GRID = weights_up_to(np.inf, 1.0)
-A_DECADE = 6
 HEIGHTS = 25
 ALTITUDE = 100.0 + 30.0 * np.arange(HEIGHTS)
 
@@ -75,47 +74,70 @@ def test_risk_estimates_the_true_error_without_bias():
         assert scored.freedom[i] == pytest.approx(np.trace(smoother), rel=1e-6)
 
 
+INDEX = np.arange(GRID.size)
 FREEDOM = np.geomspace(20.0, 1.0, GRID.size)
+FEWEST = float(np.interp(-2.0, -FREEDOM, INDEX))
+"""Place of the weight that leaves two degrees of freedom."""
 
 
 def chosen(likely, risky, freedom=FREEDOM, *, one=True):
-    """Return the choice from parabolas with minima at given indices."""
-    index = np.arange(GRID.size)
-    scores = Scores(GRID, (index - likely) ** 2.0, (index - risky) ** 2.0, freedom)
+    """Return the choice from parabolas with minima at given places."""
+    scores = Scores(GRID, (INDEX - likely) ** 2.0, (INDEX - risky) ** 2.0, freedom)
     return choose_smoothing(scores, one=one)
 
 
-def test_likelihood_decides_where_the_risk_agrees():
-    assert chosen(30, 29)[0] == GRID[30]
-    assert chosen(30, 35)[0] == GRID[30]
+def place_of(choice):
+    """Return the place on the grid of the one weight that is chosen."""
+    (weight,), share = choice
+    np.testing.assert_array_equal(share, [1.0])
+    return float(np.interp(np.log(weight), np.log(GRID), INDEX))
 
 
-def test_risk_decides_where_it_gives_more_freedom_up_to_a_decade():
-    assert chosen(30, 25)[0] == GRID[25]
-    assert chosen(30, 5)[0] == GRID[30 - A_DECADE]
+def test_likelihood_and_risk_together_decide():
+    for likely, risky in ((30, 30), (30, 20), (20, 30), (30, 21)):
+        middle = 0.5 * (likely + risky)
+        assert place_of(chosen(likely, risky)) == pytest.approx(middle, abs=1e-6)
 
 
-def test_at_least_two_degrees_of_freedom_are_left():
-    weight, _ = chosen(66, 66)
-    assert 2.0 <= FREEDOM[weight == GRID] < 2.1
+@pytest.mark.parametrize("tilt", [-0.1, 0.0, 0.1])
+def test_one_weight_is_the_mean_of_two_that_are_as_good(tilt):
+    risk = np.full(GRID.size, 200.0)
+    risk[20], risk[26] = -tilt, tilt
+    scores = Scores(GRID, np.zeros(GRID.size), risk, FREEDOM)
+    assert place_of(choose_smoothing(scores, one=True)) == pytest.approx(
+        23.0 - 1.5 * tilt, rel=0.01
+    )
 
 
-def test_the_largest_weight_is_one_of_those_to_choose_from():
+@pytest.mark.parametrize("one", [False, True])
+def test_two_degrees_of_freedom_are_left_within_half_a_step(one):
+    weights, _ = chosen(66, 66, one=one)
+    assert abs(np.interp(np.log(weights[-1]), np.log(GRID), INDEX) - FEWEST) < 0.5
+
+
+@pytest.mark.parametrize("one", [False, True])
+def test_the_choice_moves_with_the_limit_of_freedom_and_never_jumps(one):
+    def mean(factor):
+        weight, share = chosen(52, 52, factor * FREEDOM, one=one)
+        return share @ np.log(weight)
+
+    # Over two steps of the grid.
+    moved = np.diff([mean(factor) for factor in np.linspace(1.0, 1.1, 200)])
+    assert np.all(moved > 0.0)
+    assert moved.max() < 0.02 * np.log(10.0)
+
+
+def test_weights_rise_in_equal_ratios_to_the_largest_one():
     weights = weights_up_to(1.2 * GRID[15], 1.0)
-    np.testing.assert_array_equal(weights, [*GRID[:16], 1.2 * GRID[15]])
+    assert weights[-1] == 1.2 * GRID[15]
+    np.testing.assert_allclose(weights, 1.2 * GRID[:16], rtol=1e-12)
     np.testing.assert_array_equal(weights_up_to(1e-12, 1.0), [1e-12])
-
-
-def test_an_average_is_over_the_grid_alone():
-    """The limit beside the last weight of the grid would count twice."""
-    np.testing.assert_array_equal(weights_up_to(1.2 * GRID[15], 1.0, one=False), GRID[:16])
-    np.testing.assert_array_equal(weights_up_to(1e-12, 1.0, one=False), GRID[:1])
 
 
 def test_small_block_is_averaged_by_likelihood():
     weights, share = chosen(30, 5, one=False)
     assert share.sum() == pytest.approx(1.0)
-    weight = np.exp(-0.5 * (np.arange(GRID.size) - 30.0) ** 2)
+    weight = np.exp(-0.5 * (INDEX - 30.0) ** 2)
     where = np.searchsorted(GRID, weights)
     expected = weight[where] / weight[where].sum()
     np.testing.assert_allclose(share, expected, rtol=1e-12)
@@ -123,4 +145,4 @@ def test_small_block_is_averaged_by_likelihood():
 
 
 def test_data_that_never_reach_two_degrees_of_freedom_are_smoothed_least():
-    assert chosen(66, 66, np.ones(GRID.size))[0] == GRID[0]
+    assert place_of(chosen(66, 66, np.geomspace(1.9, 1.0, GRID.size))) == 0.0
