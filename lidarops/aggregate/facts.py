@@ -305,19 +305,20 @@ def read_header(product: Any, path: str, selection: ProductSelection) -> Header 
 
 
 def _facts(product: Any, file: Path, header: Header) -> Facts:
+    attributes = vars(product)
     flags = {
         name: xr.Variable(variable.dimensions, variable[...], vars(variable))
         for name, variable in product.variables.items()
         if name.endswith(QUALITY_FLAG)
     }
-    bits = all_bits(xr.Dataset(flags, attrs=vars(product)))
+    bits = all_bits(xr.Dataset(flags, attrs=attributes))
     counts = FlagCounter(rejecting_mask(bits))
     for variable in flags.values():
         counts.add(variable.values)
     height = "station_altitude" if "station_altitude" in product.variables else "altitude"
     return Facts(
         **{stated.name: getattr(header, stated.name) for stated in fields(header)},
-        campaign=product.lidarops_campaign,
+        campaign=attributes["lidarops_campaign"],
         wavelength=_middle(product, "wavelength") * 1e-9,
         latitude=_middle(product, "latitude"),
         longitude=_middle(product, "longitude"),
@@ -325,7 +326,7 @@ def _facts(product: Any, file: Path, header: Header) -> Facts:
         sha256=sha256_of(file),
         size=file.stat().st_size,
         verdicts=counts.verdicts,
-        code_version=product.lidarops_code_version,
+        code_version=attributes["lidarops_code_version"],
         flagged={
             bit.word.upper(): counts.carried[bit.mask] for bit in bits if bit.mask in counts.carried
         },

@@ -154,16 +154,15 @@ class Lock(AbstractContextManager["Lock"]):
     def held_by(self) -> str:
         """Return in words who holds the lock, and when it last gave a sign of life; empty if none.
 
-        A clock ahead of that of the database gives no age.
+        Where the clock of the holder is ahead of that of the database, the age is 0.
         """
         current = self.holder()
         if current is None:
             return ""
         since = datetime.fromtimestamp(current.acquired, UTC)
-        age = max(current.silent, 0.0)
         return (
             f"held by {current.holder} since {since:%Y-%m-%d %H:%M:%S} UTC, with a sign of life"
-            f" {age:.0f} s ago"
+            f" {max(current.silent, 0.0):.0f} s ago"
         )
 
     def holder(self) -> Holder | None:
@@ -246,7 +245,7 @@ def _machine() -> str:
 
 
 def process_start(process: int) -> str:
-    """Return the start time of a process in units of its system; empty if it does not run."""
+    """Return when a process started, in units of its system; empty without one or without /proc."""
     # The program name, in brackets, may hold blanks.
     fields = _text_of_file(f"/proc/{process}/stat").rpartition(")")[2].split()
     return fields[19] if len(fields) > 19 and fields[0] != "Z" else ""

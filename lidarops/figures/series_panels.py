@@ -69,7 +69,8 @@ def series_figures(
         panels = [series_panel(x, few, quantity) for quantity in quantities]
         words = [series_in_words(few, quantities[0])]
         for quantity, panel in zip(quantities, panels, strict=True):
-            values = quantity.factor * finite([_usable(one, quantity.name) for one in few])
+            good = finite([one.values(quantity.name)[one.flag == 0] for one in few])
+            values = quantity.factor * good
             beyond = np.count_nonzero((values < panel.y.low) | (values > panel.y.high))
             if beyond:
                 words.append(f"{counted(int(beyond), 'value')} of {quantity.words} beyond the axis")
@@ -85,7 +86,7 @@ def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> P
     parts = [(days(one.time), factor * one.values(name), one.flag, one.rejected) for one in series]
     at, value, flag, rejected = (np.concatenate(part) for part in zip(*parts, strict=True))
     layers += flag_marks(at, value, (flag != 0) & ~rejected, rejected, _FLAGGED)
-    good = [factor * _usable(one, name) for one in series]
+    good = [factor * one.values(name)[one.flag == 0] for one in series]
     if not finite(good).size:
         good = [factor * one.values(name) for one in series]
     return Panel(x, percentile_axis(quantity.label, good), tuple(layers))
@@ -105,10 +106,6 @@ def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
     return [band, Curve(x, y, style, mark, label=label)]
 
 
-def _usable(one: TimeSeries, name: str) -> Floats:
-    return np.asarray(one.values(name)[one.flag == 0])
-
-
 def _with_gaps(time: Times, *values: Floats) -> tuple[Floats, ...]:
     """Return positions and values with NaN at gaps, so that no line crosses a gap."""
     cuts = [stretch.start for stretch in segments(time)][1:]
@@ -117,10 +114,11 @@ def _with_gaps(time: Times, *values: Floats) -> tuple[Floats, ...]:
 
 
 def series_in_words(series: Sequence[TimeSeries], quantity: Quantity) -> str:
-    """Return the span of unflagged values and the number of flagged values of each series."""
+    """Return the span of usable values and the number of flagged values of each series."""
     words = []
     for one in series:
-        span = span_in_words(quantity.factor * _usable(one, quantity.name), quantity.units)
+        usable = one.values(quantity.name)[~one.rejected]
+        span = span_in_words(quantity.factor * usable, quantity.units)
         flagged = counted(int(np.count_nonzero(one.flag)), "flagged value")
         words.append(f"{one.label}: {span}, {flagged}".removeprefix(": "))
     return "; ".join(words)

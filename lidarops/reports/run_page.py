@@ -124,7 +124,7 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
         lacking=[picture for picture in filled.pictures if picture.lacking],
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
         undrawn=filled.undrawn,
-        hashes=run_tables.hashes(record)[:ROWS],
+        hashes=run_tables.hashes(record),
         run_file=FILE_NAME if (folder / FILE_NAME).is_file() else "",
         rows=ROWS,
     )  # fmt: skip

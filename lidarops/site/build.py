@@ -99,8 +99,8 @@ def build_site(
 
     Pages need neither server nor network; one script draws their figures. The page of a product
     depends only on the product, except its links, which are written anew in each build. It is kept
-    while the sha256 of the product, the page and lidarops do not change; where nothing has changed,
-    all pages are. Equal archives give equal bytes, for any number of workers.
+    while the sha256 of the product, the page and lidarops do not change. Equal archives give equal
+    bytes, for any number of workers.
 
     Parameters
     ----------
@@ -397,7 +397,7 @@ def _version() -> str:
 def _stated(
     entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
 ) -> bytes:
-    """Return the manifest, which states all that the site follows from."""
+    """Return the manifest, which states from what pages were made, and what went wrong."""
     document = {
         "format": _FORMAT,
         "products_at": links.products,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -82,6 +83,15 @@ def test_damaged_and_foreign_files_are_refused_and_others_read(tmp_path: Path):
     assert isinstance(results.pop(good), Facts)
     assert set(results) == {damaged, "products/foreign.nc", "products/text.nc"}
     assert all(isinstance(file, Refused) and file.reason for file in results.values())
+
+
+def test_an_attribute_that_a_product_lacks_is_named(tmp_path: Path):
+    path = add_day(tmp_path, 0)
+    with netCDF4.Dataset(tmp_path / path, "a") as product:
+        del product.lidarops_campaign
+    refused = read_product_facts(tmp_path, path)
+    assert isinstance(refused, Refused)
+    assert "lidarops_campaign" in refused.reason
 
 
 def test_hidden_files_and_aggregates_are_not_listed(tmp_path: Path):

@@ -109,6 +109,11 @@ def test_one_profile_and_all_flagged_and_all_missing():
     product = homogeneous(times(START, 5, 60.0))
     product["quality_flag"][:] = int(HomogeneousQuality.POOR_FIT)
     assert "no usable value, 5 flagged values" in drawn(product)[0].words
+    # Values to use with care are usable.
+    product["quality_flag"][:] = int(Quality.PILE_UP)
+    words = drawn(product)[0].words
+    assert "km⁻¹, 5 flagged values" in words
+    assert "no usable value" not in words
     for name in ("total_extinction", "background"):
         product[name][:] = np.nan
     assert drawn(product)

@@ -415,6 +415,8 @@ class TestManyScenes:
         page = built(many, tmp_path / "report")
         assert "The first 40 of 300 scenes; all are in the run record." in page.text
         assert "The first 40 of 300 files; all are" in page.text
+        # The hashes of 300 plans and 6 products.
+        assert "The first 40 of 306 rows; all are" in page.text
         assert "raw/99" not in page.text
 
     def test_figures_are_limited_and_the_other_channels_are_listed(self, archive, tmp_path):
