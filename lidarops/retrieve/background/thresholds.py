@@ -36,10 +36,11 @@ class Thresholds(NamedTuple):
     chosen."""
     rejection: float = 1.1e-2
     """Probability that a window is rejected where the shape is right. With 1e-3, errors of clean
-    ranges are 7 % smaller, but .4 instead of .3 % of elastic values beside bright sky are false
-    (`test_noisy_windows_state_what_they_cannot_see`)."""
+    ranges are 7 % smaller, but .4 instead of .3 % of elastic values beside bright sky are false;
+    simulations."""
     aerosol_odds: float = 0.055
-    """Odds of aerosol between the starts of two windows, before the data are seen (same test)."""
+    """Odds of aerosol between the starts of two windows, before the data are seen; the same
+    simulations."""
     negative: float = 3.0
     """Standard errors below zero beyond which an amplitude is flagged negative; assumed."""
     largest_condition: float = 30.0
