@@ -72,7 +72,7 @@ class BeamBlock:
 
     def typical(self) -> BeamBlock:
         """Return the profiles from which what a block has in common is estimated."""
-        every = every_nth(len(self.noise))
+        every = typical_profiles(self.noise)
         return replace(
             self, logarithm=self.logarithm[every], noise=self.noise[every], alive=self.alive[every]
         )
@@ -97,14 +97,6 @@ class Regression:
         """Return one column as (profile, altitude)."""
         return self.table[:, number]
 
-    def typical(self) -> Regression:
-        """Return the fit of `BeamBlock.typical`."""
-        every = every_nth(len(self.table))
-        return replace(
-            self, table=self.table[every], residual=self.residual[every],
-            leverage=self.leverage[every],
-        )  # fmt: skip
-
     def within(self, beams: BeamBlock) -> Booleans:
         """Return where the beams that are needed are alive and give an optical depth."""
         return np.asarray((beams.alive >= beams.needed) & np.isfinite(self.column(kh.TAU)))
@@ -123,6 +115,16 @@ class Regression:
 def every_nth(profiles: int) -> slice:
     """Return every n-th profile, so that at most 32 are left."""
     return slice(None, None, max(-(-profiles // _TYPICAL), 1))
+
+
+def typical_profiles(noise: Array) -> Indices:
+    """Return every n-th of the profiles with more than two beams, in which residuals show the air.
+
+    Of all where there are few, or none of these. `noise` is that of `BeamBlock`.
+    """
+    shown = np.count_nonzero(noise < np.inf, axis=1).max(axis=1) > 2
+    every = np.flatnonzero(shown | ~shown.any() | (len(noise) <= _TYPICAL))
+    return every[every_nth(every.size)]
 
 
 def make_beam_block(
