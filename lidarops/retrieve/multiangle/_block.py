@@ -302,7 +302,7 @@ def take_logarithms(
     """Correct the logarithms of range-corrected signals for the bias caused by noise.
 
     Formula 3 of ``docs/algorithms/multiangle.md``; the expectation of the signal is the mean of
-    two altitudes on either side.
+    two altitudes on either side, moved towards a sample that is farther than noise explains.
 
     Parameters
     ----------
@@ -329,9 +329,10 @@ def take_logarithms(
                 around, others = sums[0, k] - own, sums[2, k] - row[2, k + _PAD]
                 spread = (sums[1, k] - spread) / others if others > 0.0 else spread
                 slack = _FARTHEST * np.sqrt(spread)
-                guess = around / others if around > 0.0 else own
-                guess = min(max(guess, own - slack), own + slack)
-                ratio = max(spread / (guess * guess), _LEAST_NOISE)
+                mean = around / others if around > 0.0 else own
+                guess = min(max(mean, own - slack), own + slack)
+                # Where the signal stands out, as in a cloud, it has more counts, and more noise.
+                ratio = max(spread * max(guess / mean, 1.0) / (guess * guess), _LEAST_NOISE)
                 known = min(ratio, _LARGEST_RATIO)
                 on = k < end and own > 0.0
                 v[k] = ratio * (1.0 + 2.5 * known) if on else np.inf
