@@ -1,6 +1,6 @@
 """Ablation of the guards of networks: ``python -m benchmarks.studies.network_guards [NETWORKS]``.
 
-Every variant solves the same random networks (`benchmarks.stability.lidar_networks`) and blocks
+Every variant solves the same random networks (`benchmarks.scenes.lidar_networks`) and blocks
 in which noise rises, in steep fields, and with outliers in curved air. The table in
 ``docs/algorithms/network.md`` states shares with all guards, then the differences without one of
 them, in percent, each with its Monte Carlo error from the scatter between networks.

@@ -62,8 +62,6 @@ STATED = {
 """Part, quantity and class of the benchmark: product, variable (none: the file) and words."""
 FLAGGED = {
     "short sections": "NOISE_UNCERTAIN marks these values",
-    "correlated noise": "products measure the correlation",
-    "scans of photon counts": "products smooth the counts",
 }
 """Parts of the benchmark whose missed classes no comment states, and why."""
 

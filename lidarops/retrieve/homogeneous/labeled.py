@@ -89,7 +89,7 @@ def fit_homogeneous_path(
     Raises
     ------
     RetrievalInputError
-        Where units, dimensions or sections are invalid.
+        Where units or ranges are invalid, or a section holds too few bins.
     """
     distance, edges = _distance(power), np.asarray(sections, dtype=np.float64)
     power = power.transpose(..., "range")

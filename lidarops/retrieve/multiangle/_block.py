@@ -72,7 +72,7 @@ class BeamBlock:
 
     def typical(self) -> BeamBlock:
         """Return the profiles from which what a block has in common is estimated."""
-        every = every_nth(len(self.noise))
+        every = typical_profiles(self.noise)
         return replace(
             self, logarithm=self.logarithm[every], noise=self.noise[every], alive=self.alive[every]
         )
@@ -97,14 +97,6 @@ class Regression:
         """Return one column as (profile, altitude)."""
         return self.table[:, number]
 
-    def typical(self) -> Regression:
-        """Return the fit of `BeamBlock.typical`."""
-        every = every_nth(len(self.table))
-        return replace(
-            self, table=self.table[every], residual=self.residual[every],
-            leverage=self.leverage[every],
-        )  # fmt: skip
-
     def within(self, beams: BeamBlock) -> Booleans:
         """Return where the beams that are needed are alive and give an optical depth."""
         return np.asarray((beams.alive >= beams.needed) & np.isfinite(self.column(kh.TAU)))
@@ -123,6 +115,16 @@ class Regression:
 def every_nth(profiles: int) -> slice:
     """Return every n-th profile, so that at most 32 are left."""
     return slice(None, None, max(-(-profiles // _TYPICAL), 1))
+
+
+def typical_profiles(noise: Array) -> Indices:
+    """Return every n-th of the profiles with more than two beams, in which residuals show the air.
+
+    Of all where there are few, or none of these. `noise` is that of `BeamBlock`.
+    """
+    shown = np.count_nonzero(noise < np.inf, axis=1).max(axis=1) > 2
+    every = np.flatnonzero(shown | ~shown.any() | (len(noise) <= _TYPICAL))
+    return every[every_nth(every.size)]
 
 
 def make_beam_block(
@@ -300,7 +302,7 @@ def take_logarithms(
     """Correct the logarithms of range-corrected signals for the bias caused by noise.
 
     Formula 3 of ``docs/algorithms/multiangle.md``; the expectation of the signal is the mean of
-    two altitudes on either side.
+    two altitudes on either side, moved towards a sample that is farther than noise explains.
 
     Parameters
     ----------
@@ -327,9 +329,10 @@ def take_logarithms(
                 around, others = sums[0, k] - own, sums[2, k] - row[2, k + _PAD]
                 spread = (sums[1, k] - spread) / others if others > 0.0 else spread
                 slack = _FARTHEST * np.sqrt(spread)
-                guess = around / others if around > 0.0 else own
-                guess = min(max(guess, own - slack), own + slack)
-                ratio = max(spread / (guess * guess), _LEAST_NOISE)
+                mean = around / others if around > 0.0 else own
+                guess = min(max(mean, own - slack), own + slack)
+                # Where the signal stands out, as in a cloud, it has more counts, and more noise.
+                ratio = max(spread * max(guess / mean, 1.0) / (guess * guess), _LEAST_NOISE)
                 known = min(ratio, _LARGEST_RATIO)
                 on = k < end and own > 0.0
                 v[k] = ratio * (1.0 + 2.5 * known) if on else np.inf

@@ -55,10 +55,10 @@ def correlation_of_air(
     value, expected = np.nan_to_num(residual) * weight, scatter * free * weight
     products = (value[..., 1:] * value[..., :-1]).sum(axis=1)
     norms = (expected[..., 1:] * expected[..., :-1]).sum(axis=1)
-    on = leverage < 1.0
-    beams = on.sum(axis=1)
+    on = noise < np.inf
     pairs = (on[..., 1:] != on[..., :-1]).any(axis=1) & (norms > 0.0)
-    pairs &= np.minimum(beams[:, 1:], beams[:, :-1]) > len(columns)
+    spare = on.sum(axis=1) - np.where(on, leverage, 0.0).sum(axis=1)
+    pairs &= np.minimum(spare[:, 1:], spare[:, :-1]) > 0.5
     if pairs.any():
         norms[pairs] *= _common_share(on, leverage, columns, *np.nonzero(pairs))
     norm = float(norms.sum())
@@ -69,16 +69,18 @@ def _common_share(on: Booleans, leverage: Array, columns: Array, t: Indices, k: 
     """Return the trace of the product of what the fits of altitudes k and k + 1 leave.
 
     Over the sum of the roots of what they leave of each beam: 1 if they use the same beams. For
-    beams of equal weight.
+    beams of equal weight. A fit has the first columns, as many as its leverages add up to.
     """
     bases = []
     for j in (k, k + 1):
         basis: list[Array] = []
-        for column in columns:
-            own = np.where(on[t, :, j], column[:, j].T, 0.0)
+        used = np.where(on[t, :, j], leverage[t, :, j], 0.0).sum(axis=1, keepdims=True)
+        for number, column in enumerate(columns):
+            own = np.where(on[t, :, j] & (number + 0.5 < used), column[:, j].T, 0.0)
             for other in basis:
                 own = own - (own * other).sum(axis=1, keepdims=True) * other
-            basis.append(own / np.sqrt((own**2).sum(axis=1, keepdims=True)))
+            length = np.sqrt((own**2).sum(axis=1, keepdims=True))
+            basis.append(np.divide(own, length, out=np.zeros_like(own), where=length > 0.0))
         bases.append(np.stack(basis))
     left = 1.0 - leverage[t, :, k], 1.0 - leverage[t, :, k + 1]
     both = on[t, :, k] & on[t, :, k + 1]

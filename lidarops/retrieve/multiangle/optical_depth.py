@@ -399,10 +399,10 @@ def _regression(
 
 def _correlation(beams: BeamBlock, fit: Regression) -> float:
     """Return the correlation of the air at neighbouring altitudes, which residuals show."""
-    some, columns = fit.typical(), beams.columns
+    every = _block.typical_profiles(beams.noise)
     return correlation_of_air(
-        some.residual, beams.typical().noise, some.leverage, fit.inhomogeneity,
-        columns if beams.sides else columns[:2],
+        fit.residual[every], beams.noise[every], fit.leverage[every], fit.inhomogeneity,
+        beams.columns if beams.sides else beams.columns[:2],
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ FOUND = 0.95
 """Probability that twice the target is found."""
 CONFINED = 0.3
 """Share of the values that are false in a network that has false ones: as large as in the random
-networks of `test_bench_lidar_networks.py`. Of other retrievals, values beyond 1.96 errors show how
+networks of `test_bench_random_networks.py`. Of other retrievals, values beyond 1.96 errors show how
 those of one geometry depend on each other."""
 
 

@@ -202,6 +202,24 @@ def test_weak_signals_are_not_biased(ratio):
 # Standard errors ----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("method", ["kano_hamilton", "joint"])
+def test_errors_in_a_thin_cloud_are_those_of_its_counts(method):
+    """A cloud of one altitude in air of 15 to 350 counts, whose noise is less than that of it."""
+    rng, height = np.random.default_rng(11), 200.0 + 50.0 * np.arange(60)
+    depth, beta = 5e-5 * height, np.where(np.arange(60) == 30, 300.0, 1.0)
+    square = (height * PATHS[:, np.newaxis]) ** 2
+    counts = 1.0 + 1.2e9 / square * beta * np.exp(-2.0 * PATHS[:, np.newaxis] * depth)
+    signal = (rng.poisson(counts, (320, *counts.shape)) - 1.0) * square
+    away = []
+    for cycles in np.split(signal, 40):
+        result = retrieve_optical_depth(
+            cycles, ANGLES, height, variance=counts * square**2, method=method
+        )
+        error = result.optical_depth - depth
+        away.append((error / result.optical_depth_standard_error)[:, 30])
+    assert 0.7 < np.sqrt(np.mean(np.square(away))) < 1.1
+
+
 @each("method", ["kano_hamilton", "two_angle"])
 @each("correlation", [0.0, 0.6, 0.9])
 def test_extinction_allows_for_errors_that_neighbouring_altitudes_share(method, correlation):

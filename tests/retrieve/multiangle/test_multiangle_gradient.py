@@ -55,6 +55,29 @@ def test_a_cycle_cut_short_fits_no_gradient_that_its_beams_cannot_tell(method):
     assert np.all(result.optical_depth_gradient_error[1] > 0.0)
 
 
+SIDES = np.array([0.0, *4 * [30.0, 45.0, 60.0, 70.0]])
+AZIMUTH = np.array([0.0, *np.repeat([0.0, 180.0, 90.0, 270.0], 4)])
+
+
+@pytest.mark.parametrize("method", ["kano_hamilton", "joint"])
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_altitudes_with_beams_to_one_side_alone_have_values_with_errors(method, correlation):
+    """Every other altitude holds beams to the north alone, which fit no gradient."""
+    rng, path = np.random.default_rng(7), slant_path(SIDES, ALTITUDE)
+    air = rng.normal(size=(40, *path.shape))
+    for k in range(1, ALTITUDE.size):
+        air[..., k] *= np.sqrt(1.0 - correlation**2)
+        air[..., k] += correlation * air[..., k - 1]
+    signal = np.exp(0.02 * air - 2.0 * path * 1e-4 * ALTITUDE)
+    signal[:, AZIMUTH > 0.0, ::2] = np.nan
+    result = retrieve_optical_depth(
+        signal, SIDES, ALTITUDE, variance=1e-8 * signal**2, azimuth=AZIMUTH, method=method
+    )
+    away = (result.extinction - 1e-4) / result.extinction_standard_error
+    assert np.isfinite(away).all()
+    assert 0.5 < np.sqrt(np.mean(away**2)) < 1.5
+
+
 LOW = np.arange(65.0, 85.1, 0.4)
 CELLS = np.arange(60.0, 3001.0, 60.0)
 

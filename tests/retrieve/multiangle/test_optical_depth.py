@@ -397,6 +397,24 @@ def test_no_noise_is_taken_as_very_little(small):
     assert nothing.optical_depth == pytest.approx(little.optical_depth, abs=1e-11)
 
 
+@pytest.mark.parametrize("beams", [1, 2])
+@pytest.mark.parametrize("first", [0, 1])
+def test_cycles_that_show_no_residual_do_not_stand_for_the_others(beams, first):
+    """Every other one of 64: what a block has in common comes from at most 32."""
+    atmosphere = clear()
+    signal, variance, tau = signals(
+        np.random.default_rng(4), 64, ANGLES, atmosphere, ratio=3000, inhomogeneity=0.1
+    )
+    signal[first::2, beams:] = np.nan
+    result = retrieve_optical_depth(
+        signal, ANGLES, atmosphere[0], variance=variance, method="kano_hamilton"
+    )
+    whole = slice(1 - first, None, 2)
+    deviation = (result.optical_depth - tau) / result.optical_depth_standard_error
+    assert np.nanmean(deviation[whole] ** 2) == pytest.approx(1.0, abs=0.3)
+    assert np.nanmedian(result.inhomogeneity) == pytest.approx(0.1, rel=0.1)
+
+
 def test_two_beams_have_no_residual(small):
     signal, variance, height, _ = small
     ends = [0, 11]
