@@ -242,11 +242,13 @@ class _Sections(ProductStream):
             for name in ("total_extinction_model_error", "background_model_error")
         }
         sections = sections.assign(
-            quality_flag=sections["quality_flag"] | slanted,
-            shots=shots,
-            slope_error=stated,
-            retrieval_method=LAYOUT.rows["retrieval_method"].code(settings.method),
-            **errors,
+            {
+                **errors,
+                "quality_flag": sections["quality_flag"] | slanted,
+                "shots": shots,
+                "slope_error": stated,
+                "retrieval_method": LAYOUT.rows["retrieval_method"].code(settings.method),
+            }
         )
         if settings.visibility is not None:
             wavelength = self._signal.wavelength
