@@ -405,21 +405,6 @@ def _azimuth_sector(case: ChannelCase[Any]) -> float:
     return 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
 
 
-def fixed_zenith(case: ChannelCase[Any]) -> tuple[float, str]:
-    """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
-    stated = _zenith_angles(case)
-    angles = [angle for angle in stated if angle is not None]
-    if len(angles) < len(stated):
-        return math.nan, "neither headers nor campaign give the zenith angle"
-    if max(angles) - min(angles) > FIXED:
-        reason = f"the zenith angle of the beam changes from {min(angles):g} to {max(angles):g}"
-        return math.nan, f"{reason} degree"
-    if max(angles) > STEEPEST:
-        reason = f"at a zenith angle of {max(angles):g} degree the beam does not reach"
-        return math.nan, f"{reason} aerosol-free air"
-    return max(angles), ""
-
-
 def reference_limits(
     case: ChannelCase[Any], window: ReferenceSettings
 ) -> tuple[float, ReferenceSettings | str]:
@@ -427,9 +412,17 @@ def reference_limits(
 
     Along the beam, up to its last bin; or why there can be no window.
     """
-    zenith, reason = fixed_zenith(case)
-    if reason:
-        return zenith, reason
+    stated = _zenith_angles(case)
+    angles = [angle for angle in stated if angle is not None]
+    if len(angles) < len(stated):
+        return math.nan, "neither headers nor campaign give the zenith angle"
+    zenith = max(angles)
+    if zenith - min(angles) > FIXED:
+        reason = f"the zenith angle of the beam changes from {min(angles):g} to {zenith:g}"
+        return math.nan, f"{reason} degree"
+    if zenith > STEEPEST:
+        reason = f"at a zenith angle of {zenith:g} degree the beam does not reach"
+        return math.nan, f"{reason} aerosol-free air"
     # A window is a set of bin centres.
     reach = case.last - 0.5 * case.channel.bin_width
     along = window.along(1.0 / math.cos(math.radians(zenith)))

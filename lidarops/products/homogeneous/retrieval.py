@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -227,8 +227,8 @@ class _Sections(ProductStream):
     def __init__(self, settings: HomogeneousPlan, signal: ChannelSignal) -> None:
         self._settings, self._signal = settings.homogeneous, signal
 
-    def add(self, chunk: Chunk) -> Iterator[xr.Dataset]:
-        """Yield the sections of the next profiles, with visibility where it is requested."""
+    def add(self, chunk: Chunk) -> list[xr.Dataset]:
+        """Return the sections of the next profiles, with visibility where it is requested."""
         settings, profiles = self._settings, self._signal.profiles
         shots = profiles.shots(chunk.counts)
         sections = self._retrieved(chunk.profiles(profiles), shots)
@@ -254,11 +254,12 @@ class _Sections(ProductStream):
             wavelength = self._signal.wavelength
             definition = VisibilityDefinition(wavelength, **dict(settings.visibility))
             sections = _with_visibility(sections, definition)
-        if chunk.rows.start == 0:
-            paper = _PAPERS.get(settings.method)
-            frame = sections.drop_dims("time").assign_attrs(references=paper or "")
-            yield frame.assign_coords(self._signal.source.geometry.variables)
-        yield sections.assign_coords(chunk.geometry.variables)
+        rows = sections.assign_coords(chunk.geometry.variables)
+        if chunk.rows.start:
+            return [rows]
+        paper = _PAPERS.get(settings.method)
+        frame = sections.drop_dims("time").assign_attrs(references=paper or "")
+        return [frame.assign_coords(self._signal.source.geometry.variables), rows]
 
     def _retrieved(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.Dataset:
         settings, quality = self._settings, conditioned["quality"]
