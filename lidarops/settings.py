@@ -16,6 +16,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    TypeAdapter,
     WithJsonSchema,
     model_validator,
 )
@@ -57,11 +58,10 @@ def quantity(
     return Field(default, description=text or None, json_schema_extra={"unit": unit}, **limits)
 
 
-def unit_of(model: type[BaseModel], key: str) -> str:
+def unit_of(model: type, key: str) -> str:
     """Return the unit of a field; empty for pure numbers, texts and keys without a field."""
-    field = model.model_fields.get(key)
-    stated = field.json_schema_extra if field else None
-    unit = stated.get("unit", NO_UNIT) if isinstance(stated, dict) else NO_UNIT
+    fields = TypeAdapter(model).json_schema()["properties"]
+    unit = fields.get(key, {}).get("unit", NO_UNIT)
     return "" if unit == NO_UNIT else str(unit)
 
 
@@ -364,3 +364,8 @@ class ReferenceSettings(SettingsModel):
         if self.highest - self.lowest < self.width:
             raise ValueError("highest must be at least width above lowest")
         return self
+
+    def along(self, stretch: float) -> Self:
+        """Return the limits along a beam that is `stretch` m long per m of height."""
+        limits = ("lowest", "highest", "width")
+        return self.model_copy(update={name: getattr(self, name) * stretch for name in limits})

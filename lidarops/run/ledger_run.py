@@ -411,7 +411,7 @@ _Product = tuple["Recipe", NewProduct]
 
 
 def _scene(product: _Product) -> str:
-    return product[0].plan.scene
+    return product[0].scene
 
 
 def _day_in(path: str) -> int | None:
@@ -444,13 +444,13 @@ def _read_product(campaign: Campaign, path: str) -> _Product:
     with reading(file):
         recipe = Recipe.of(file)
         keys, kind, channel = recipe.settings["keys"], recipe.kind, recipe.channel
-        if recipe.campaign_name != campaign.name:
-            raise ProductError(f"is a product of campaign {recipe.campaign_name!r}", file=file)
+        if recipe.campaign != campaign.name:
+            raise ProductError(f"is a product of campaign {recipe.campaign!r}", file=file)
         if kind not in kinds():
             raise ProductError(f"is of the unknown kind {kind!r}", file=file)
         names = (keys["station"], keys["instrument"], kind, channel)
         start = datetime.fromisoformat(recipe.settings["window"][0])
-        name = product_path(names, recipe.plan.scene, start)
+        name = product_path(names, recipe.scene, start)
         if path != name:
             raise ProductError(f"should have the name {name}", file=file)
         status = file.stat()
@@ -482,7 +482,7 @@ def _verdicts(file: Path) -> Verdicts:
 def _outcome(products: tuple[_Product, ...]) -> tuple[SceneOutcome, tuple[NewProduct, ...]]:
     """Return the outcome of a scene that gave some products, and these."""
     recipe = products[0][0]
-    keys, scene = recipe.settings["keys"], recipe.plan.scene
+    keys, scene = recipe.settings["keys"], recipe.scene
     inputs = [used for stated, _ in products for used in stated.inputs]
     new = tuple(entry for _, entry in products)
     outcome = SceneOutcome(

@@ -30,6 +30,7 @@ from lidarops.records import (
     LeftOut,
     Plan,
     PlannedStep,
+    Provenance,
     Role,
     Scene,
     Stamp,
@@ -60,18 +61,10 @@ _RAW: Final = (Role.SIGNAL, Role.DARK)
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class Recipe(Provenance):
     """What a product was made from, and how, according to itself."""
 
     file: Path
-    kind: str
-    channel: str
-    campaign_name: str
-    settings: Mapping[str, Any]
-    plan: Plan
-    inputs: tuple[InputRecord, ...]
-    code_version: str
-    versions: Mapping[str, str]
     stamp: Stamp
     """Version and time of writing that the product states."""
 
@@ -83,13 +76,16 @@ class Recipe:
             entities = document["entity"]
             attributes = entities["lidarops:product"]
             software = document["agent"]["lidarops:software"]
+            settings = json.loads(attributes["lidarops:settings"])
+            plan = _plan(json.loads(entities["lidarops:plan"]["lidarops:json"]))
             recipe = cls(
                 file=file,
+                campaign=str(attributes["lidarops:campaign"]),
+                scene=plan.scene,
                 kind=str(attributes["lidarops:kind"]),
                 channel=str(attributes["lidarops:channel"]),
-                campaign_name=str(attributes["lidarops:campaign"]),
-                settings=json.loads(attributes["lidarops:settings"]),
-                plan=_plan(json.loads(entities["lidarops:plan"]["lidarops:json"])),
+                settings=settings,
+                plan=plan,
                 inputs=_inputs(entities, document["used"]),
                 code_version=software["lidarops:code_version"],
                 versions=dict(package.split(" ", 1) for package in software["lidarops:versions"]),
@@ -111,14 +107,14 @@ class Recipe:
                 )
         return recipe
 
-    def campaign(self, archive: Path, folder: Path, output: Path) -> Campaign:
+    def as_campaign(self, archive: Path, folder: Path, output: Path) -> Campaign:
         """Return a campaign that gives only this product; its other inputs are in `folder`."""
         settings = self.settings
         try:
             campaign = Campaign.model_validate(
                 {
                     **settings["campaign"],
-                    "name": self.campaign_name,
+                    "name": self.campaign,
                     "archive": str(archive),
                     "output": str(output),
                     "metadata": settings["metadata"],
@@ -149,7 +145,7 @@ class Recipe:
             "instruments": {keys["instrument"]: _instrument(settings, products)},
         }
 
-    def scene(self, archive: Path) -> Scene:
+    def as_scene(self, archive: Path) -> Scene:
         """Return the scene of the product, from the headers of the raw files in a folder."""
         settings = self.settings
         try:
@@ -185,8 +181,8 @@ class Recipe:
         read = (_granule(archive, record, keys["instrument"], part["facts"]) for record in raw)
         granules = sorted((_named(g, self.plan, part["facts"]) for g in read), key=_order)
         return Scene(
-            id=self.plan.scene,
-            campaign=self.campaign_name,
+            id=self.scene,
+            campaign=self.campaign,
             station=keys["station"],
             instrument=keys["instrument"],
             start=start,
@@ -447,7 +443,7 @@ def _answer_of_catalog(
     if not url:
         return None
     try:
-        with Store(url, recipe.campaign_name, create=False) as store:
+        with Store(url, recipe.campaign, create=False) as store:
             return question(store)
     except CatalogError:
         # A catalog that was not given but only found may be unusable.
@@ -531,7 +527,7 @@ def _software(recipe: Recipe) -> Iterator[Difference]:
 
 def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator[Difference]:
     """Yield the differences between a product and the one made from its inputs now."""
-    campaign, scene = recipe.campaign(root, folder, out), recipe.scene(root)
+    campaign, scene = recipe.as_campaign(root, folder, out), recipe.as_scene(root)
     # Version and time of writing are those of the file, so that every byte can be compared.
     product = recipe.kind, recipe.channel
     places = {product: Place(recipe.stamp)}
@@ -542,7 +538,7 @@ def _made_again(recipe: Recipe, root: Path, folder: Path, out: Path) -> Iterator
     if record is None:
         refused = "; ".join(f"{file.path}: {file.reason}" for file in outcome.refused)
         problem = outcome.error or refused or f"no longer gives a {recipe.kind} product"
-        yield Difference("processing", recipe.plan.scene, problem)
+        yield Difference("processing", recipe.scene, problem)
         return
     if record.sha256 != sha256_of(recipe.file):
         files = (recipe.file, out / "products" / record.path)

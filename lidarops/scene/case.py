@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+from pydantic_core import to_jsonable_python
 
 from lidarops.campaign.model import ChannelFacts, InstrumentFacts, channel_facts
 from lidarops.errors import SceneError
@@ -93,7 +95,7 @@ class ChannelCase(Generic[R_co]):
         self,
         name: str,
         reason: str,
-        settings: SettingsModel | None = None,
+        settings: Any = None,
         *,
         needs: Sequence[str] = (),
         number: float | None = None,
@@ -105,7 +107,7 @@ class ChannelCase(Generic[R_co]):
         Parameters
         ----------
         name, reason : str
-        settings : SettingsModel, optional
+        settings : SettingsModel or dataclass, optional
         needs : sequence of str
             Entries from which it takes something, if the plan holds them: ``name``, or
             ``channel/name`` of another channel.
@@ -116,7 +118,7 @@ class ChannelCase(Generic[R_co]):
         warning : str
             Why its results may be of no use; `lidarops plan` prints it.
         """
-        stated = {} if settings is None else settings.model_dump(mode="json", exclude_none=True)
+        stated = {} if settings is None else to_jsonable_python(settings, exclude_none=True)
         left = self.leave(name, reason, number=number, rule=rule)
         origin = {item.name: getattr(left, item.name) for item in fields(left)}
         return PlannedStep(settings=stated, needs=tuple(needs), warning=warning, **origin)

@@ -206,12 +206,14 @@ def scene_facts(campaign: Campaign, scene: Scene) -> InstrumentFacts:
     return campaign.instruments[scene.instrument].facts_at(moment or scene.start)
 
 
-def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str, Any]:
+def facts_settings(campaign: Campaign, scene: Scene, plan: Plan, channel: str) -> dict[str, Any]:
     """Return the facts about an instrument on which a product depends.
 
     Parameters
     ----------
-    known : InstrumentFacts
+    campaign : Campaign
+    scene : Scene
+        Of one instrument.
     plan : Plan
         Plan of the product, from `plan_closure`.
     channel : str
@@ -220,9 +222,11 @@ def facts_settings(known: InstrumentFacts, plan: Plan, channel: str) -> dict[str
     Returns
     -------
     dict
-        `known` as plain JSON types, without the edges of its validity period, because closing a
-        period changes nothing within it.
+        As plain JSON types, without the edges of their validity period, because closing a period
+        changes nothing within it.
     """
+    # Products of products state the facts that those were made with.
+    known = scene_facts(campaign, scene) if reads_files(plan) else InstrumentFacts()
     settings = known.model_dump(mode="json")
     channels = {step.channel for step in plan.steps} | {channel}
     read = ancillary_files(plan.steps)

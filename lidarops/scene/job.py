@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Self, TypeVar
 
-from lidarops.campaign.model import Campaign, InstrumentFacts, Station
+from lidarops.campaign.model import Campaign, Station
 from lidarops.errors import (
     CatalogError,
     LidarOpsError,
@@ -180,13 +180,10 @@ def recorded_settings(
         dependent = _network_settings(campaign, whole, plan, kind, channel)
     else:
         instrument = campaign.instruments[whole.instrument]
-        reads_files = dependence.reads_files(plan)
-        # Other products state the facts that they were made with.
-        facts = dependence.scene_facts(campaign, whole) if reads_files else InstrumentFacts()
         request = instrument.products.requested[kind]
         dependent = {
             "station": campaign.stations[whole.station].model_dump(mode="json"),
-            "facts": dependence.facts_settings(facts, plan, channel),
+            "facts": dependence.facts_settings(campaign, whole, plan, channel),
             # `lidarops reproduce` also needs these to make the same bytes.
             "instrument": instrument.name,
             # As if only this product were requested, here and below.
@@ -214,9 +211,7 @@ def _network_settings(
         "members": {
             member.instrument: {
                 "station": campaign.stations[member.station].model_dump(mode="json"),
-                "facts": dependence.facts_settings(
-                    dependence.scene_facts(campaign, member), plan, channel
-                ),
+                "facts": dependence.facts_settings(campaign, member, plan, channel),
                 "instrument": campaign.instruments[member.instrument].name,
                 "keys": {"station": member.station, "instrument": member.instrument},
                 "files": sorted(file.path for file in (*member.granules, *member.dark)),

@@ -18,7 +18,6 @@ from typing import Any, Final, Generic, Literal, TypeVar, get_args
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from pydantic import BaseModel
 
 from lidarops.campaign.model import Campaign, ChannelFacts, Station
 from lidarops.constants import FIXED, KNOWN_SHAPE_PAPERS, LEAST_SPREAD, STEEPEST
@@ -36,7 +35,7 @@ from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.scene.case import ChannelCase, Entries, Entry, prepared_channels, range_offset
 from lidarops.scene.pipe import Stages
 from lidarops.scene.profiles import BEFORE, ChannelSignal, Chunk, ProductStream
-from lidarops.settings import SettingsModel, quantity
+from lidarops.settings import ReferenceSettings, SettingsModel, quantity
 
 FEWEST_BINS: Final = BACKGROUND.fewest_bins
 """Fewest bins of a section, and of the range of a background."""
@@ -224,8 +223,8 @@ def streams_of(steps: Sequence[PlannedStep], signal: ChannelSignal) -> dict[str,
     }
 
 
-def settings_model(step: PlannedStep) -> type[BaseModel]:
-    """Return the model of the settings of an entry of a plan."""
+def settings_model(step: PlannedStep) -> Any:
+    """Return the model of the settings of an entry of a plan, of pydantic or a dataclass."""
     fields = Stages.model_fields
     if step.product:
         known = making(step.product, Making)
@@ -234,9 +233,7 @@ def settings_model(step: PlannedStep) -> type[BaseModel]:
         )
     annotation = fields[step.name].annotation
     # None is what a product states where the entry is left out.
-    models = [model for model in (*get_args(annotation), annotation) if model is not NoneType]
-    found: type[BaseModel] = models[0]
-    return found
+    return next(m for m in (*get_args(annotation), annotation) if m is not NoneType)
 
 
 def with_methods(product: xr.Dataset, signal: ChannelSignal, *, known_shape: bool) -> xr.Dataset:
@@ -408,19 +405,34 @@ def _azimuth_sector(case: ChannelCase[Any]) -> float:
     return 360.0 - math.degrees(widest_azimuth_gap(np.radians(azimuth)))
 
 
-def fixed_zenith(case: ChannelCase[Any]) -> tuple[float, str]:
-    """Return the zenith angle of a fixed beam in degree, or NaN and why there is none."""
+def reference_limits(
+    case: ChannelCase[Any], window: ReferenceSettings
+) -> tuple[float, ReferenceSettings | str]:
+    """Return the zenith angle of a fixed beam, degree, and its limits of the reference window.
+
+    Along the beam, up to its last bin; or why there can be no window.
+    """
     stated = _zenith_angles(case)
     angles = [angle for angle in stated if angle is not None]
     if len(angles) < len(stated):
         return math.nan, "neither headers nor campaign give the zenith angle"
-    if max(angles) - min(angles) > FIXED:
-        reason = f"the zenith angle of the beam changes from {min(angles):g} to {max(angles):g}"
+    zenith = max(angles)
+    if zenith - min(angles) > FIXED:
+        reason = f"the zenith angle of the beam changes from {min(angles):g} to {zenith:g}"
         return math.nan, f"{reason} degree"
-    if max(angles) > STEEPEST:
-        reason = f"at a zenith angle of {max(angles):g} degree the beam does not reach"
+    if zenith > STEEPEST:
+        reason = f"at a zenith angle of {zenith:g} degree the beam does not reach"
         return math.nan, f"{reason} aerosol-free air"
-    return max(angles), ""
+    # A window is a set of bin centres.
+    reach = case.last - 0.5 * case.channel.bin_width
+    along = window.along(1.0 / math.cos(math.radians(zenith)))
+    top = min(along.highest, reach)
+    if top - along.lowest < along.width * (1.0 - 1e-9):
+        return zenith, (
+            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
+            f" above {window.lowest:g} m"
+        )
+    return zenith, along.model_copy(update={"highest": top})
 
 
 class WindowSettings(SettingsModel):

@@ -19,20 +19,20 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_937,
-    "lines of code alone": 44_197,
-    "modules": 270,
-    "dataclasses": 220,
-    "lines of dataclasses": 6_174,
+    "lines": 67_792,
+    "lines of code alone": 44_098,
+    "modules": 269,
+    "dataclasses": 219,
+    "lines of dataclasses": 6_114,
     "tuning numbers": 214,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_806,
+    "lines of the largest package": 5_802,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 59, "functions": 570, "changes": 215},
-    "elastic": {"modules": 69, "functions": 705, "changes": 227},
+    "homogeneous": {"modules": 59, "functions": 567, "changes": 215},
+    "elastic": {"modules": 69, "functions": 705, "changes": 226},
 }
 
 

@@ -8,7 +8,7 @@ import xarray as xr
 from support.products.drawn import figures, images
 
 from lidarops.figures.panels import BLANK, codes_of
-from lidarops.products.multiangle.scan_images import read_scan
+from lidarops.products.multiangle.figures import read_scan
 
 STATION = 180.0
 ALTITUDE = STATION + 100.0 * np.arange(1, 31)

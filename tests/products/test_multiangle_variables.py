@@ -9,7 +9,7 @@ from support.products.encoded_products import build_product
 from support.products.made_products import context, multiangle
 
 from lidarops.errors import ProductError
-from lidarops.products.multiangle.baseline import blocked_in_words
+from lidarops.products.multiangle.retrieval import blocked_in_words
 
 
 def test_layers_have_their_errors():

@@ -11,6 +11,7 @@ from lidarops.settings import (
     ChannelProduct,
     PartOfDay,
     ReferenceSettings,
+    SettingsModel,
     average_interval,
     background_method,
     quantity,
@@ -21,26 +22,31 @@ if TYPE_CHECKING:
     from lidarops.catalog.folder import InstrumentHeaders
 
 
-class ElasticSettings(ChannelProduct):
-    """The ``elastic`` product: backscatter and extinction of aerosol, from a lidar ratio."""
+class ElasticAssumptions(SettingsModel):
+    """What the inversion assumes, as the campaign states it."""
 
-    channels: list[str] = Field(
-        min_length=1,
-        description="glued_532o is glued from analog_532o and photon_532o of the files",
-    )
     lidar_ratio: Annotated[float, Field(ge=1, le=200)] = quantity(
         50.0, unit="sr", description="of particles, extinction over backscatter, at all heights"
     )
     lidar_ratio_standard_error: float = quantity(
         10.0, unit="sr", ge=0, le=100, description="of lidar_ratio"
     )
-    average: PartOfDay = average_interval()
-    background: Literal["known_shape", "tail_mean"] = background_method()
-    reference: ReferenceSettings = ReferenceSettings()
     molecular_relative_error: float = quantity(
         0.01, unit="1", ge=0, le=1, description="standard error of the density of the air, relative"
     )
     least_signal_to_noise: float = signal_to_noise_limit()
+
+
+class ElasticSettings(ChannelProduct, ElasticAssumptions):
+    """The ``elastic`` product: backscatter and extinction of aerosol, from a lidar ratio."""
+
+    channels: list[str] = Field(
+        min_length=1,
+        description="glued_532o is glued from analog_532o and photon_532o of the files",
+    )
+    average: PartOfDay = average_interval()
+    background: Literal["known_shape", "tail_mean"] = background_method()
+    reference: ReferenceSettings = ReferenceSettings()
 
 
 def _section(headers: InstrumentHeaders) -> tuple[str, ...]:

@@ -7,12 +7,10 @@ from typing import Final
 from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import KindFigures, image_view
 from lidarops.figures.profile_panels import ProfileQuantity, profile_view
+from lidarops.products.elastic.variables import LAYOUT
 
 _MEGA: Final = 1e6
 _UNIT: Final = "Mm⁻¹ sr⁻¹"
-_CAUSES: Final = (
-    *("noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline"),
-)
 _IMAGE: Final = ImageQuantity("aerosol backscatter", _MEGA, _UNIT, (0.01, 10.0))
 """Colours from background aerosol to dust and cirrus."""
 _PROFILE: Final = ProfileQuantity(
@@ -21,7 +19,7 @@ _PROFILE: Final = ProfileQuantity(
     _MEGA,
     reference="molecular_backscatter",
     window=("reference_bottom", "reference_top"),
-    budget=_CAUSES,
+    budget=tuple(error.cause for error in LAYOUT.rows["aerosol_backscatter"].errors),
 )
 
 FIGURES: Final = KindFigures(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import partial
 from typing import Any, Final
 
 import xarray as xr
 
-from lidarops.products.elastic import ElasticSettings
+from lidarops.products.elastic import ElasticAssumptions, ElasticSettings
 from lidarops.products.elastic.variables import LAYOUT
 from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
@@ -23,43 +22,13 @@ from lidarops.scene.retrieval import (
     Workload,
     average,
     before_pulse,
-    fixed_zenith,
+    reference_limits,
     with_low_signal_to_noise,
     with_methods,
 )
-from lidarops.settings import SettingsModel, quantity
+from lidarops.settings import SettingsModel
 
 Case = ChannelCase[ElasticSettings]
-
-
-class ReferenceWindowSettings(SettingsModel):
-    """Settings of the entry ``reference``."""
-
-    lowest: float = quantity(unit="m", description="along the beam")
-    highest: float = quantity(unit="m", description="along the beam")
-    width: float = quantity(unit="m", description="along the beam")
-    scattering_ratio: float
-    relative_error: float
-
-
-def _reference_limits(case: Case) -> ReferenceWindowSettings | str:
-    """Return where the reference window may lie, along the beam; or why there can be none."""
-    zenith, reason = fixed_zenith(case)
-    if reason:
-        return reason
-    stretch = 1.0 / math.cos(math.radians(zenith))
-    window = case.request.reference
-    # A window is a set of bin centres.
-    reach = case.last - 0.5 * case.channel.bin_width
-    bottom, top = window.lowest * stretch, min(window.highest * stretch, reach)
-    if top - bottom < window.width * stretch * (1.0 - 1e-9):
-        return (
-            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
-            f" above {window.lowest:g} m"
-        )
-    return ReferenceWindowSettings.taken_from(
-        window, lowest=bottom, highest=top, width=window.width * stretch
-    )
 
 
 def _known_shape(case: Case) -> Entry:
@@ -84,17 +53,11 @@ def _lidar_ratio(case: Case) -> dict[str, Any]:
     }
 
 
-class InversionSettings(SettingsModel):
-    """Settings of the entry ``elastic``."""
+class InversionSettings(ElasticAssumptions):
+    """Settings of the entry ``elastic``; with a profile, the lidar ratio holds above it."""
 
-    lidar_ratio: float = quantity(
-        unit="sr", description="above a measured profile where one is given"
-    )
-    lidar_ratio_standard_error: float = quantity(unit="sr", description="of lidar_ratio")
     lidar_ratio_profile: str | None = None
-    """Ancillary file of both over altitude."""
-    molecular_relative_error: float
-    least_signal_to_noise: float
+    """Ancillary file of the lidar ratio and its error over altitude."""
 
 
 class ElasticPlan(SettingsModel):
@@ -102,13 +65,14 @@ class ElasticPlan(SettingsModel):
 
     average: AverageSettings
     known_shape: NoSettings | None = None
-    reference: ReferenceWindowSettings
+    reference: Reference
     elastic: InversionSettings
 
 
 def _needs(case: Case) -> Entries:
     """Invert the averaged elastic signals, where a fixed beam reaches aerosol-free air."""
-    limits, request = _reference_limits(case), case.request
+    request = case.request
+    _, limits = reference_limits(case, request.reference)
     if isinstance(limits, str):
         yield case.leave("elastic", limits)
         return
@@ -116,7 +80,8 @@ def _needs(case: Case) -> Entries:
     yield average(case, request.average, reason)
     yield _known_shape(case)
     reason = "windows within the campaign's limits are tested against the molecular profile"
-    yield case.run("reference", reason, limits, number=limits.highest - limits.lowest)
+    reference = Reference(**dict(limits))
+    yield case.run("reference", reason, reference, number=limits.highest - limits.lowest)
     settings = InversionSettings.taken_from(request, **_lidar_ratio(case))
     taken = (
         "read", "overlap", "noise", "glue", "molecular", "average", "known_shape", "reference"
@@ -143,7 +108,7 @@ class _Inversion(ProductStream):
     def __init__(self, settings: ElasticPlan, signal: ChannelSignal) -> None:
         self._settings, self._signal = settings.elastic, signal
         self._known_shape = settings.known_shape is not None
-        self._reference = Reference(**dict(settings.reference))
+        self._reference = settings.reference
         self._averages = Averages(
             [signal.profiles],
             signal.source.geometry,

@@ -13,6 +13,7 @@ from lidarops.settings import (
     BackgroundRange,
     ChannelProduct,
     Metres,
+    SettingsModel,
     VisibilitySettings,
     located_error,
     quantity,
@@ -31,15 +32,9 @@ _OF_METHOD: Final = {
 """Key -> the only method that uses it."""
 
 
-class HomogeneousSettings(ChannelProduct):
-    """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
+class PathAssumptions(SettingsModel):
+    """How a section is solved, and what is assumed of it."""
 
-    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
-    sections: list[tuple[Metres, Metres]] = quantity(
-        unit="m",
-        min_length=1,
-        description="near and far end of each section whose air is homogeneous",
-    )
     method: Method = Field(
         default="auto",
         description="known_background takes the background from the far range, for paths that end"
@@ -55,18 +50,6 @@ class HomogeneousSettings(ChannelProduct):
         le=0.1,
         description="of molecules and particles, for linearized (known to some percent) and"
         " known_extinction",
-    )
-    background_range: BackgroundRange | None = quantity(
-        None,
-        unit="m",
-        description="far range of known_background; the last tenth of the bins by default",
-    )
-    background: dict[str, tuple[float, NonNegative]] | None = quantity(
-        None,
-        unit="MHz or mV",
-        description="of known_background, in place of the far range: the background of each"
-        " channel, measured separately, and its standard error; MHz for photon counting, mV for"
-        " analog, with dead time and dark signal corrected",
     )
     lag: int | None = quantity(
         None,
@@ -88,6 +71,29 @@ class HomogeneousSettings(ChannelProduct):
     )
     visibility: VisibilitySettings | None = Field(
         default=None, description="if given, adds visibility along the sections"
+    )
+
+
+class HomogeneousSettings(ChannelProduct, PathAssumptions):
+    """The ``homogeneous`` product: background, amplitude and extinction of range sections."""
+
+    channels: list[str] = Field(min_length=1, description="names of channels, such as photon_532o")
+    sections: list[tuple[Metres, Metres]] = quantity(
+        unit="m",
+        min_length=1,
+        description="near and far end of each section whose air is homogeneous",
+    )
+    background_range: BackgroundRange | None = quantity(
+        None,
+        unit="m",
+        description="far range of known_background; the last tenth of the bins by default",
+    )
+    background: dict[str, tuple[float, NonNegative]] | None = quantity(
+        None,
+        unit="MHz or mV",
+        description="of known_background, in place of the far range: the background of each"
+        " channel, measured separately, and its standard error; MHz for photon counting, mV for"
+        " analog, with dead time and dark signal corrected",
     )
 
     @model_validator(mode="after")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -12,7 +12,7 @@ import xarray as xr
 
 from lidarops.constants import CUBIC_PAPER, LEAST_SQUARES_PAPER
 from lidarops.flags import Quality
-from lidarops.products.homogeneous import HomogeneousSettings, Method
+from lidarops.products.homogeneous import HomogeneousSettings, Method, PathAssumptions
 from lidarops.products.homogeneous.variables import LAYOUT
 from lidarops.records import DetectionMode, is_glued
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
@@ -21,19 +21,18 @@ from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error, counts_per_power
 from lidarops.scene.case import ALL_STEPS, REQUESTED, ChannelCase, Entries, Entry, NoSettings
-from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, in_one_batch
+from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream
 from lidarops.scene.retrieval import (
     ANALOG_NOISE,
     FEWEST_BINS,
     WINDOW,
     Retrieval,
     WindowSettings,
-    Workload,
     bins_within,
     moves,
     tail,
 )
-from lidarops.settings import NO_UNIT, SettingsModel, VisibilitySettings, quantity
+from lidarops.settings import SettingsModel, quantity
 
 Case = ChannelCase[HomogeneousSettings]
 
@@ -72,13 +71,9 @@ def _window(case: Case, level: Sequence[Section], method: Method) -> Entry:
     return case.run(WINDOW, reason, WindowSettings(bins=((0, bins),)), number=float(bins))
 
 
-class PathSettings(SettingsModel):
-    """Settings of the entry ``homogeneous``."""
+class PathSettings(PathAssumptions):
+    """Settings of the entry ``homogeneous``, whose method is the one that runs."""
 
-    method: Method
-    extinction: float | None = quantity(
-        None, unit="m-1", description="of `linearized` and `known_extinction`"
-    )
     sections: tuple[Section, ...] = quantity(unit="m")
     background_range: tuple[float, float] | None = quantity(
         None, unit="m", description="far range of `known_background`"
@@ -86,9 +81,6 @@ class PathSettings(SettingsModel):
     background: tuple[float, float] | None = quantity(
         None, unit="MHz or mV", description="given one of `known_background`, and its error"
     )
-    lag: int | None = quantity(None, unit=NO_UNIT, description="of `cubic`, bins")
-    slope_error: float | None = None
-    visibility: VisibilitySettings | None = None
 
 
 class HomogeneousPlan(SettingsModel):
@@ -185,19 +177,6 @@ def _retrieved(case: Case, level: list[Section], method: Method) -> Entry:
     )
 
 
-def _held(settings: HomogeneousPlan, work: Workload) -> float:
-    """Return the bytes of the values of all sections."""
-    return _BYTES_OF_A_SECTION * work.profiles * len(settings.homogeneous.sections)
-
-
-_BYTES_OF_A_SECTION: Final = 400.0
-"""Bytes per section of a profile: about 25 variables, and copies while they are written. 30,000
-more sections raised the measured peak by 1 MB only: this is an upper bound."""
-
-_PARTS: Final = 64
-"""Number of chunks whose sections are joined: a Dataset takes more than the few values in it."""
-
-
 def _whence(settings: HomogeneousSettings, method: Method) -> str:
     """Return in words where the background comes from."""
     if settings.background:
@@ -247,19 +226,40 @@ class _Sections(ProductStream):
 
     def __init__(self, settings: HomogeneousPlan, signal: ChannelSignal) -> None:
         self._settings, self._signal = settings.homogeneous, signal
-        self._parts: list[xr.Dataset] = []
 
-    def add(self, chunk: Chunk) -> Iterable[xr.Dataset]:
-        """Retrieve the sections of the next profiles."""
-        profiles = self._signal.profiles
+    def add(self, chunk: Chunk) -> list[xr.Dataset]:
+        """Return the sections of the next profiles, with visibility where it is requested."""
+        settings, profiles = self._settings, self._signal.profiles
         shots = profiles.shots(chunk.counts)
         sections = self._retrieved(chunk.profiles(profiles), shots)
         slanted = labeled.not_level(sections, chunk.geometry["zenith_angle"])
-        sections = sections.assign(quality_flag=sections["quality_flag"] | slanted, shots=shots)
-        self._parts.append(sections.assign_coords(chunk.geometry.variables))
-        if len(self._parts) == _PARTS:
-            self._parts = [self._joined()]
-        return ()
+        stated = settings.slope_error
+        stated = THRESHOLDS.model_error if stated is None else stated
+        # Errors of the model are proportional to it.
+        scale = stated / THRESHOLDS.model_error
+        errors = {
+            name: scale * sections[name]
+            for name in ("total_extinction_model_error", "background_model_error")
+        }
+        sections = sections.assign(
+            {
+                **errors,
+                "quality_flag": sections["quality_flag"] | slanted,
+                "shots": shots,
+                "slope_error": stated,
+                "retrieval_method": LAYOUT.rows["retrieval_method"].code(settings.method),
+            }
+        )
+        if settings.visibility is not None:
+            wavelength = self._signal.wavelength
+            definition = VisibilityDefinition(wavelength, **dict(settings.visibility))
+            sections = _with_visibility(sections, definition)
+        rows = sections.assign_coords(chunk.geometry.variables)
+        if chunk.rows.start:
+            return [rows]
+        paper = _PAPERS.get(settings.method)
+        frame = sections.drop_dims("time").assign_attrs(references=paper or "")
+        return [frame.assign_coords(self._signal.source.geometry.variables), rows]
 
     def _retrieved(self, conditioned: xr.Dataset, shots: xr.DataArray) -> xr.Dataset:
         settings, quality = self._settings, conditioned["quality"]
@@ -299,32 +299,6 @@ class _Sections(ProductStream):
         name = "total_extinction"
         return fitted.assign({f"{name}_baseline_error": np.abs(moved[name] - fitted[name])})
 
-    def _joined(self) -> xr.Dataset:
-        joined: xr.Dataset = xr.concat(
-            self._parts, dim="time", data_vars="minimal", coords="minimal"
-        )
-        return joined
-
-    def results(self) -> Iterator[xr.Dataset]:
-        """Yield all profiles, with visibility along the sections where it is requested."""
-        sections, requested = self._joined(), self._settings.visibility
-        stated = self._settings.slope_error
-        stated = THRESHOLDS.model_error if stated is None else stated
-        # They are proportional to it.
-        scale = stated / THRESHOLDS.model_error
-        errors = {
-            name: scale * sections[name]
-            for name in ("total_extinction_model_error", "background_model_error")
-        }
-        sections = sections.assign({**errors, "slope_error": stated})
-        if requested is not None:
-            definition = VisibilityDefinition(self._signal.wavelength, **dict(requested))
-            sections = _with_visibility(sections, definition)
-        method = self._settings.method
-        product = sections.assign(retrieval_method=LAYOUT.rows["retrieval_method"].code(method))
-        paper = _PAPERS.get(method)
-        return in_one_batch(product.assign_attrs(references=paper) if paper else product)
-
 
 def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> xr.Dataset:
     systematic = sections["total_extinction_model_error"]
@@ -341,4 +315,4 @@ def _with_visibility(sections: xr.Dataset, definition: VisibilityDefinition) -> 
     return sections.assign(along).assign_attrs(steps=definition.words)
 
 
-RETRIEVAL: Final = Retrieval(settings=HomogeneousPlan, needs=_needs, stream=_Sections, held=_held)
+RETRIEVAL: Final = Retrieval(settings=HomogeneousPlan, needs=_needs, stream=_Sections)

@@ -19,17 +19,11 @@ import xarray as xr
 
 from lidarops.constants import KNOWN_SHAPE_PAPERS, MULTIANGLE_PAPER
 from lidarops.errors import RetrievalInputError
+from lidarops.flags import Quality
 from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.multiangle import MultiAngleSettings, ScanSettings
-from lidarops.products.multiangle.baseline import (
-    add_low_beams,
-    blocked_in_words,
-    held_of_low_beams,
-    plan_baseline,
-    with_baseline,
-)
 from lidarops.products.multiangle.variables import LAYOUT
-from lidarops.records import Granule
+from lidarops.records import DetectionMode, Granule
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
 from lidarops.retrieve.multiangle import labeled, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle.analog_baseline import AnalogBaseline, BlockedBeams
@@ -40,8 +34,16 @@ from lidarops.retrieve.multiangle.optical_depth import (
     OpticalDepthSettings,
 )
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, Entry, NoSettings
-from lidarops.scene.profiles import ChannelSignal, Chunk, Indices, ProductStream, in_one_batch
+from lidarops.scene.profiles import (
+    ChannelSignal,
+    Chunk,
+    Indices,
+    ProductStream,
+    Profiles,
+    in_one_batch,
+)
 from lidarops.scene.retrieval import (
     BackgroundSettings,
     Retrieval,
@@ -58,6 +60,12 @@ Numbers = tuple[tuple[float, ...], ...]
 """Angles, or bounds of time, of each granule."""
 _FEWEST_DIRECTIONS: Final = 2
 """Two paths define a slope."""
+_UNKNOWN: Final = np.int32(Quality.INPUT_MISSING | Quality.SATURATED)
+"""Bits of bins that show nothing; what blocks a beam may stand where the overlap is incomplete."""
+_NAMED: Final = 6
+"""Most blocked beams that notes name."""
+_TOGETHER: Final = 8
+"""Profiles that are averaged together; the result does not depend on it."""
 LOWEST_ELEVATION: Final = math.degrees(math.asin(1.0 / THRESHOLDS.longest_path))
 """degree; lower beams are longer than the longest path, but for the curvature of the Earth."""
 
@@ -202,6 +210,27 @@ def _single_beams(case: Case, directions: Beams) -> str:
     )
 
 
+def _baseline(case: Case) -> Entry:
+    """Subtract the analog baseline that blocked beams show.
+
+    For analog channels of scans with beams so low that they may be blocked.
+    """
+    if case.channel.mode is DetectionMode.PHOTON:
+        return case.leave("baseline", "photon counting has no analog baseline")
+    angles = [granule.zenith_angle for granule in case.scene.granules]
+    lowest = 90.0 - max((angle for angle in angles if angle is not None), default=0.0)
+    limit = f"{THRESHOLDS.lowest_free:g} degree above the horizon"
+    if lowest >= THRESHOLDS.lowest_free:
+        reason = f"no beam is lower than {limit}, where trees and buildings may block it"
+        return case.leave("baseline", reason, number=lowest)
+    reason = (
+        f"beams lower than {limit} may be blocked: decided from the data, from what lies"
+        " behind obstructions"
+    )
+    taken = ("noise", "glue", "background")
+    return case.run("baseline", reason, needs=taken, number=lowest)
+
+
 def _gradient(case: Case, directions: Beams) -> Entry:
     """Include a horizontal gradient of backscatter in the error, unless that is excluded."""
     largest = case.request.largest_gradient
@@ -299,7 +328,7 @@ def _needs(case: Case) -> Entries:
         yield case.leave("multiangle", reason, number=float(directions.count))
         return
     yield background(case, case.request.background)
-    yield plan_baseline(case)
+    yield _baseline(case)
     yield _gradient(case, directions)
     yield _gradient_regressor(case, directions)
     yield _vertical(case, directions)
@@ -341,13 +370,20 @@ def _together(settings: MultiAnglePlan, work: Workload) -> int:  # noqa: ARG001
 def _held(settings: MultiAnglePlan, work: Workload) -> float:
     """Return the bytes of the cycles, of low beams, and of what is retrieved from them."""
     scan = settings.multiangle
-    low = 0.0 if settings.baseline is None else held_of_low_beams(work)
-    return low + _BYTES_OF_AN_ALTITUDE * work.profiles * scan.highest / scan.step
+    beams = _BYTES_OF_AN_ALTITUDE * work.profiles * scan.highest / scan.step
+    if settings.baseline is None:
+        return beams
+    # So low that they may be blocked.
+    limit = 90.0 - THRESHOLDS.lowest_free
+    low = sum((granule.zenith_angle or 0.0) > limit for granule in work.scene.granules)
+    return beams + _BYTES_OF_A_BIN * min(_TOGETHER, low) * work.bins
 
 
 _BYTES_OF_AN_ALTITUDE: Final = 430.0
 """Bytes per altitude of a beam of a cycle at the peak of the retrieval, as ``python -m benchmarks
 throughput --case memory`` measures."""
+_BYTES_OF_A_BIN: Final = 90.0
+"""Bytes per bin of a low beam while it is averaged, at the peak."""
 
 
 class _Scans(ProductStream):
@@ -386,7 +422,7 @@ class _Scans(ProductStream):
     def add(self, chunk: Chunk) -> Iterable[xr.Dataset]:
         """Average the cycles of the next profiles over altitude cells."""
         profiles = self._signal.profiles
-        add_low_beams(self._blocked, chunk, profiles)
+        _add_low_beams(self._blocked, chunk, profiles)
         self._cycles.add(chunk.profiles(profiles), chunk.rows.start)
         return ()
 
@@ -423,9 +459,69 @@ class _Scans(ProductStream):
         if papers:
             optical_depth = optical_depth.assign_attrs(references="\n".join(papers))
         if baseline is not None:
-            optical_depth = with_baseline(optical_depth, baseline, self._signal.source.geometry)
+            optical_depth = _with_baseline(optical_depth, baseline, self._signal.source.geometry)
         least = settings.least_signal_to_noise
         return in_one_batch(with_low_signal_to_noise(optical_depth, LAYOUT.weighed, least))
+
+
+def _add_low_beams(beams: BlockedBeams, chunk: Chunk, profiles: Profiles) -> None:
+    """Take the beams of a chunk that are so low that they may be blocked."""
+    conditioned, first = chunk.profiles(profiles), chunk.rows.start
+    elevation = 90.0 - chunk.geometry["zenith_angle"].to_numpy()
+    low = np.flatnonzero(elevation < THRESHOLDS.lowest_free)
+    for start in range(0, low.size, _TOGETHER):
+        rows = low[start : start + _TOGETHER]
+        power, variance, quality, length = (
+            conditioned[name].to_numpy()[rows]
+            for name in ("power", "variance", "quality", CORRELATION_LENGTH)
+        )
+        missing = (quality & _UNKNOWN) != 0
+        values = np.where(missing, np.nan, power)
+        beams.add(values, variance * length[:, np.newaxis], first + rows)
+
+
+def blocked_in_words(product: xr.Dataset) -> list[str]:
+    """Return one note on the low beams that are blocked; none where all are free.
+
+    Channels with the same blocked beams have the same note, so that it is reported once: the range
+    is that of the product. Obstructions of steeper beams are clouds.
+    """
+    known = product["beam_obstruction"].notnull().any("time").to_numpy()
+    elevation = 90.0 - product["beam_zenith_angle"].to_numpy()
+    blocked = np.flatnonzero(known & (elevation < THRESHOLDS.lowest_free))
+    if not blocked.size:
+        return []
+    sides = product["beam_azimuth"].to_numpy() if "beam_azimuth" in product.coords else None
+    beams = [
+        f"{elevation[beam]:.3g}" + ("" if sides is None else f" (azimuth {sides[beam]:.3g})")
+        for beam in blocked
+    ]
+    more = f" and {blocked.size - _NAMED} more" if blocked.size > _NAMED else ""
+    return [
+        (
+            f"blocked beams: elevation {', '.join(beams[:_NAMED])}{more}"
+            " degree, from the range in beam_obstruction of the product"
+        )
+    ]
+
+
+def _with_baseline(
+    product: xr.Dataset, baseline: AnalogBaseline, geometry: xr.Dataset
+) -> xr.Dataset:
+    """Return a product with the baseline that was subtracted, and the profiles that show it."""
+    blocked = {
+        f"blocked_{name}": ("blocked", geometry[name].to_numpy()[baseline.profile])
+        for name in ("zenith_angle", "azimuth")
+        if name in geometry
+    }
+    return product.assign(
+        {
+            "analog_baseline": ("baseline_range", baseline.power),
+            "analog_baseline_standard_error": ("baseline_range", baseline.standard_error),
+            "blocked_range": ("blocked", baseline.obstruction),
+            **blocked,
+        }
+    ).assign_coords(baseline_range=baseline.range)
 
 
 RETRIEVAL: Final = Retrieval(

@@ -31,7 +31,7 @@ from lidarops.scene.retrieval import (
     Workload,
     average,
     before_pulse,
-    fixed_zenith,
+    reference_limits,
     with_low_signal_to_noise,
     with_methods,
 )
@@ -70,19 +70,6 @@ class RamanPlan(SettingsModel):
     raman: RetrievalEntry
 
 
-def _beam(case: Case) -> tuple[float, str]:
-    """Return the zenith angle of the beam, degree, and why it has no reference window."""
-    zenith, reason = fixed_zenith(case)
-    stretch, window = 1.0 / math.cos(math.radians(zenith)), case.request.reference
-    reach = case.last - 0.5 * case.channel.bin_width
-    if min(window.highest * stretch, reach) < (window.lowest + window.width) * stretch:
-        reason = (
-            f"the last bin at {reach:g} m is too near for a reference window of {window.width:g} m"
-            f" above {window.lowest:g} m"
-        )
-    return zenith, reason
-
-
 def _absent(case: Case, channel: str, gas: str, shift: float) -> str:
     """Return why a Raman channel of a gas cannot be used; empty where it can."""
     try:
@@ -111,9 +98,10 @@ def _needs(case: Case) -> Entries:
     Where a fixed beam reaches the reference window, and the files hold the channels.
     """
     request, name = case.request, case.channel.name
-    zenith, reason = _beam(case)
+    zenith, limits = reference_limits(case, request.reference)
     nitrogen, water = request.nitrogen[name], request.water_vapour.get(name)
-    reason = reason or _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
+    absent = _absent(case, nitrogen, "nitrogen", NITROGEN_SHIFT)
+    reason = limits if isinstance(limits, str) else absent
     if reason:
         yield case.leave("raman", reason)
         return

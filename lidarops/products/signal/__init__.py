@@ -7,13 +7,25 @@ from typing import TYPE_CHECKING, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from lidarops.kinds import Kind
-from lidarops.settings import BackgroundRange, ChannelProduct, quantity, signal_to_noise_limit
+from lidarops.settings import (
+    BackgroundRange,
+    ChannelProduct,
+    SettingsModel,
+    quantity,
+    signal_to_noise_limit,
+)
 
 if TYPE_CHECKING:
     from lidarops.catalog.folder import InstrumentHeaders
 
 
-class SignalSettings(ChannelProduct):
+class RangeCorrection(SettingsModel):
+    """What follows the correction for range; also the settings of the entry ``signal``."""
+
+    least_signal_to_noise: float = signal_to_noise_limit()
+
+
+class SignalSettings(ChannelProduct, RangeCorrection):
     """The ``signal`` product: background-subtracted, range-corrected signals."""
 
     channels: list[str] | Literal["all"] = Field(
@@ -27,8 +39,6 @@ class SignalSettings(ChannelProduct):
         default="tail_mean",
         description="mean of background_range, or the cubic of a homogeneous section there",
     )
-
-    least_signal_to_noise: float = signal_to_noise_limit()
 
     @model_validator(mode="after")
     def _has_its_section(self) -> Self:

@@ -12,7 +12,7 @@ import xarray as xr
 from lidarops.constants import CUBIC_PAPER
 from lidarops.flags import Quality
 from lidarops.netcdf.variables import BACKGROUND_METHOD
-from lidarops.products.signal import SignalSettings
+from lidarops.products.signal import RangeCorrection, SignalSettings
 from lidarops.products.signal.variables import LAYOUT
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries
@@ -27,12 +27,6 @@ from lidarops.scene.retrieval import (
     with_low_signal_to_noise,
 )
 from lidarops.settings import SettingsModel
-
-
-class RangeCorrection(SettingsModel):
-    """Settings of the entry ``signal``."""
-
-    least_signal_to_noise: float
 
 
 class SignalPlan(SettingsModel):
@@ -60,9 +54,8 @@ def _needs(case: ChannelCase[SignalSettings]) -> Entries:
         yield case.run("background", reason, before)
     else:
         yield background(case, case.request.background, limits)
-    settings = RangeCorrection(least_signal_to_noise=case.request.least_signal_to_noise)
     taken = ("overlap", "noise", "glue", "background")
-    yield case.run("signal", REQUESTED, settings, needs=taken)
+    yield case.run("signal", REQUESTED, RangeCorrection.taken_from(case.request), needs=taken)
 
 
 class _Signals(ProductStream):

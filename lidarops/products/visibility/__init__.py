@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import timedelta
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 from pydantic import Field, model_validator
 
 from lidarops.kinds import Kind
+from lidarops.retrieve.network.settings import NetworkAssumptions
 from lidarops.settings import (
     BackgroundRange,
     NetworkProduct,
@@ -23,15 +24,11 @@ if TYPE_CHECKING:
     from lidarops.catalog.folder import InstrumentHeaders
 
 NAME: Final = "visibility"
-PriorName = Literal["block", "none"]
-MultiplierValue = Annotated[float, Field(ge=0, le=1)] | Literal["chosen"]
-
-
 _MOST_AVERAGES: Final = 500
 """Averages of a block, whose memory and time grow with the square and the cube of their number."""
 
 
-class VisibilityProductSettings(NetworkProduct):
+class VisibilityProductSettings(NetworkProduct, NetworkAssumptions):
     """The ``visibility`` product: extinction and visibility where beams of lidars cross."""
 
     average: PartOfDay = Field(
@@ -40,24 +37,7 @@ class VisibilityProductSettings(NetworkProduct):
     block: PartOfDay = Field(
         default=timedelta(hours=6), description="interval of averages that are one field"
     )
-    prior: PriorName = Field(
-        default="block",
-        description="block: the averages of a block are one field that changes slowly; none: each"
-        " average is solved alone",
-    )
-    multiplier: MultiplierValue | None = quantity(
-        None,
-        unit="1",
-        description="lambda of Drabenko et al., 0 to 1 or chosen: solve one triangle of beams at"
-        " each crossing instead of all beams together",
-    )
     visibility: VisibilitySettings = VisibilitySettings()
-    tolerance: float = quantity(
-        15.0, unit="m", gt=0, le=1000, description="largest distance of beams at a crossing"
-    )
-    smallest_angle: float = quantity(
-        2.0, unit="degree", gt=0, lt=90, description="least angle between beams at a crossing"
-    )
     farthest: float | None = quantity(
         None, unit="m", ge=10, description="largest range used; by default the last bin"
     )
@@ -70,24 +50,6 @@ class VisibilityProductSettings(NetworkProduct):
     )
     exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = quantity(
         {}, unit="1", description="exponent of instruments that differ"
-    )
-    exponent_relative_error: float = quantity(
-        0.1, unit="1", ge=0, le=0.5, description="relative error of the exponent"
-    )
-    lidar_ratio_relative_error: float = quantity(
-        0.07,
-        unit="1",
-        ge=0,
-        le=0.5,
-        description="relative error of the lidar ratio of a crossing against the others,"
-        " from aerosol mixtures and humidity",
-    )
-    overlap_relative_error: float = quantity(
-        0.003,
-        unit="1",
-        ge=0,
-        le=0.5,
-        description="relative error of the overlap at the nearest crossing of a beam",
     )
     background_range: BackgroundRange | None = quantity(
         None, unit="m", description="by default the last tenth of the bins"
@@ -113,10 +75,6 @@ class VisibilityProductSettings(NetworkProduct):
                 "exponents",
                 unknown[0],
             )
-
-    def exponent_of(self, instrument: str) -> float:
-        """Return the exponent m of the beams of an instrument."""
-        return self.exponents.get(instrument, self.exponent)
 
 
 def _section(members: Sequence[InstrumentHeaders]) -> tuple[str, ...]:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from lidarops.campaign.model import Campaign, ChannelFacts, InstrumentFacts, Station, channel_facts
+from lidarops.campaign.model import ChannelFacts, InstrumentFacts, Station, channel_facts
 from lidarops.flags import Quality
-from lidarops.products.visibility import NAME, MultiplierValue, PriorName, VisibilityProductSettings
+from lidarops.products.visibility import NAME, VisibilityProductSettings
 from lidarops.products.visibility.variables import LAYOUT
 from lidarops.records import (
-    ChannelLayout,
     DetectionMode,
     Granule,
     LeftOut,
@@ -29,6 +28,7 @@ from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.background.estimate import window_before
 from lidarops.retrieve.network import geometry, labeled
 from lidarops.retrieve.network.labeled import BeamAverages
+from lidarops.retrieve.network.settings import NetworkAssumptions
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled_averaging import joined
 from lidarops.scene.case import (
@@ -92,84 +92,57 @@ class BeamPlan(SettingsModel):
     exponent: float
 
 
-@dataclass(frozen=True, slots=True)
-class _MemberCase:
-    """The scene of one member of a network, as the rules see it."""
+def _member(case: NetworkCase[VisibilityProductSettings], scene: Scene, name: str) -> Case:
+    """Return the case of a channel of an instrument, given its scene."""
+    facts, channel = scene_facts(case.campaign, scene), member_channel(scene.layout, name)
+    return ChannelCase(
+        scene,
+        channel,
+        facts,
+        channel_facts(facts, name),
+        case.request,
+        all_steps=case.campaign.all_steps,
+        member=scene.instrument,
+        requesters=(NAME,),
+    )
 
-    scene: Scene
-    """Scene of the member."""
-    campaign: Campaign
-    settings: VisibilityProductSettings
 
-    @property
-    def facts(self) -> InstrumentFacts:
-        """Facts about the instrument."""
-        return scene_facts(self.campaign, self.scene)
+def _why_not(case: Case) -> tuple[str, float | None]:
+    """Return why a member cannot take part (empty where it can), and the deciding number."""
+    facts, channel, limits = case.facts, case.channel, case.request.background_range
+    if math.isnan(case.facts_of_channel.wavelength or channel.wavelength):
+        return NO_WAVELENGTH, None
+    if not (facts.overlap_profile or facts.full_overlap_range > 0):
+        return (
+            "the campaign gives neither full_overlap_range nor overlap_profile: an overlap"
+            " error of 1 percent at the nearest crossing changes extinction there by 5 percent"
+        ), facts.full_overlap_range
+    last = channel.bins * channel.bin_width
+    if limits and limits[0] >= last:
+        return f"background_range begins beyond the last bin, which ends at {last:g} m", last
+    if any(_granule_pointing(granule, facts) is None for granule in case.scene.granules):
+        return "neither headers nor campaign give the pointing of all beams", None
+    return "", None
 
-    @property
-    def channel(self) -> ChannelLayout:
-        """The channel that the network uses."""
-        return member_channel(self.scene.layout, self.settings.channel)
 
-    def channel_case(self, channel: ChannelLayout) -> ChannelCase[VisibilityProductSettings]:
-        """Return the case of a channel."""
-        return ChannelCase(
-            self.scene,
-            channel,
-            self.facts,
-            channel_facts(self.facts, channel.name),
-            self.settings,
-            all_steps=self.campaign.all_steps,
-            member=self.scene.instrument,
-            requesters=(NAME,),
+def _pointings(case: Case) -> Iterator[BeamPlan]:
+    """Yield the beams of a member, each once."""
+    found = (_granule_pointing(granule, case.facts) for granule in case.scene.granules)
+    end = float(channel_ranges(case.channel, case.facts_of_channel)[-1])
+    instrument, settings = case.scene.instrument, case.request
+    distinct: list[tuple[float, float]] = []
+    for direction in sorted({direction for direction in found if direction is not None}):
+        if not any(angle_between(direction, other) <= _SAME_POINTING for other in distinct):
+            distinct.append(direction)
+    for zenith, azimuth in distinct:
+        yield BeamPlan(
+            instrument=instrument,
+            zenith_angle=zenith,
+            azimuth=azimuth,
+            nearest=case.facts.full_overlap_range,
+            farthest=min(end, settings.farthest or end),
+            exponent=settings.exponents.get(instrument, settings.exponent),
         )
-
-    def why_not(self) -> tuple[str, float | None]:
-        """Return why a member cannot take part (empty where it can), and the deciding number."""
-        name, facts = self.settings.channel, self.facts
-        glued = joined_layout(self.scene.layout, [name])
-        held = [channel.name for channel in (*self.scene.layout, *glued)]
-        if name not in held:
-            return f"the files hold no {name}, only {', '.join(held)}", None
-        photon = channel_facts(facts, name)
-        if math.isnan(photon.wavelength or self.channel.wavelength):
-            return NO_WAVELENGTH, None
-        if not (facts.overlap_profile or facts.full_overlap_range > 0):
-            return (
-                "the campaign gives neither full_overlap_range nor overlap_profile: an overlap"
-                " error of 1 percent at the nearest crossing changes extinction there by 5 percent"
-            ), facts.full_overlap_range
-        last = self.channel.bins * self.channel.bin_width
-        if self.settings.background_range and self.settings.background_range[0] >= last:
-            return f"background_range begins beyond the last bin, which ends at {last:g} m", last
-        if any(_granule_pointing(granule, facts) is None for granule in self.scene.granules):
-            return "neither headers nor campaign give the pointing of all beams", None
-        return "", None
-
-    def pointings(self) -> Iterator[BeamPlan]:
-        """Yield the beams of the member, each once."""
-        directions = sorted(
-            {
-                direction
-                for granule in self.scene.granules
-                if (direction := _granule_pointing(granule, self.facts)) is not None
-            }
-        )
-        end = float(channel_ranges(self.channel, channel_facts(self.facts, self.channel.name))[-1])
-        farthest = min(end, self.settings.farthest or end)
-        distinct: list[tuple[float, float]] = []
-        for direction in directions:
-            if not any(angle_between(direction, other) <= _SAME_POINTING for other in distinct):
-                distinct.append(direction)
-        for zenith, azimuth in distinct:
-            yield BeamPlan(
-                instrument=self.scene.instrument,
-                zenith_angle=zenith,
-                azimuth=azimuth,
-                nearest=self.facts.full_overlap_range,
-                farthest=farthest,
-                exponent=self.settings.exponent_of(self.scene.instrument),
-            )
 
 
 def _granule_pointing(granule: Granule, facts: InstrumentFacts) -> tuple[float, float] | None:
@@ -195,10 +168,7 @@ def angle_between(pointing: tuple[float, float], other: tuple[float, float]) -> 
 
 
 def crossings(
-    beams: Sequence[BeamPlan],
-    stations: Mapping[str, Station],
-    tolerance: float,
-    smallest_angle: float,
+    beams: Sequence[BeamPlan], stations: Mapping[str, Station], settings: NetworkAssumptions
 ) -> geometry.Network:
     """Return the crossings of beams of instruments at stations; see `geometry.build_network`."""
     owners = [stations[beam.instrument] for beam in beams]
@@ -208,10 +178,10 @@ def crossings(
             geometry.Beam(*place, beam.azimuth, 90.0 - beam.zenith_angle)
             for place, beam in zip(places, beams, strict=True)
         ],
-        tolerance=tolerance,
+        tolerance=settings.tolerance,
         nearest=[beam.nearest for beam in beams],
         farthest=[beam.farthest for beam in beams],
-        smallest_angle=smallest_angle,
+        smallest_angle=settings.smallest_angle,
     )
 
 
@@ -256,23 +226,13 @@ def _prior(case: Case) -> Entry:
     return case.run("prior", reason, number=settings.block / settings.average)
 
 
-class NetworkSettings(VisibilitySettings):
+class NetworkSettings(VisibilitySettings, NetworkAssumptions):
     """Settings of the entry ``visibility``."""
 
     beams: tuple[BeamPlan, ...]
     wavelength: float
     """m."""
     block_seconds: float
-    prior: PriorName
-    multiplier: MultiplierValue | None = None
-    """Of triangles of beams, instead of all beams together."""
-    tolerance: float
-    """m."""
-    smallest_angle: float
-    """degree."""
-    exponent_relative_error: float
-    lidar_ratio_relative_error: float
-    overlap_relative_error: float
 
     @property
     def definition(self) -> VisibilityDefinition:
@@ -296,11 +256,6 @@ class MemberPlan(SettingsModel):
     range_window: WindowSettings | None = None
 
 
-def _needs(case: NetworkCase[VisibilityProductSettings]) -> Entries:
-    """Retrieve extinction and visibility where the beams of a network cross."""
-    return _NetworkPlan(case).entries()
-
-
 def _held(settings: VisibilityPlan, work: Workload) -> float:
     """Return the bytes of the averages of all beams."""
     bins = max(channel.bins for member in work.scene.members for channel in member.layout)
@@ -314,148 +269,134 @@ _BYTES_OF_A_BIN: Final = 60.0
 measured."""
 
 
-class _NetworkPlan:
-    """The plan of a scene of a network."""
+def _needs(case: NetworkCase[VisibilityProductSettings]) -> Entries:
+    """Retrieve extinction and visibility where the beams of a network cross.
 
-    def __init__(self, case: NetworkCase[VisibilityProductSettings]) -> None:
-        self._scene, self._campaign, self._settings = case.scene, case.campaign, case.request
-        self._members = [
-            _MemberCase(member, case.campaign, case.request) for member in case.scene.members
-        ]
-        self._stations = {
-            member.instrument: case.campaign.stations[member.station]
-            for member in case.scene.members
-        }
+    The entries of the members that take part come first, then those of the whole network.
+    """
+    scene, name = case.scene, case.request.channel
+    joint = ChannelCase(
+        scene, product_channel(name), InstrumentFacts(), ChannelFacts(), case.request, product=NAME
+    )
+    able: list[Case] = []
+    for member in _members(case, joint):
+        if isinstance(member, ChannelCase):
+            able.append(member)
+        else:
+            yield member
+    prepared = [entry for own in able for entry in _prepared(case, own)]
+    yield from (entry for entry in prepared if isinstance(entry, LeftOut))
+    steps = [entry for entry in prepared if isinstance(entry, PlannedStep)]
+    wavelengths = [step.settings["wavelength"] for step in steps if step.name == READ_STEP]
+    beams = [beam for own in able for beam in _pointings(own)]
+    stations = {m.instrument: case.campaign.stations[m.station] for m in scene.members}
+    reason = _why_none(joint, beams, wavelengths)
+    if reason is None:
+        yield from _without_lonely_beams(joint, beams, stations)
+        if not beams:
+            why_none = "no beam has two crossings with other beams, between which it is attenuated"
+            reason = joint.leave(NAME, why_none, number=0.0, rule="some_meet")
+    if reason is not None:
+        yield reason
+        return
+    used = {beam.instrument for beam in beams}
+    yield from (step for step in steps if step.instrument in used)
+    network = crossings(beams, stations, joint.request)
+    for own in able:
+        numbers = [n for n, beam in enumerate(beams) if beam.instrument == own.member]
+        if numbers:
+            farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
+            yield _window(replace(own, product=NAME), farthest)
+    yield from _joint(joint, beams, network, min(wavelengths))
 
-    def entries(self) -> Entries:
-        """Yield the entries of the members that take part, then those of the whole network."""
-        yield from self._absent()
-        able = []
-        for member in self._members:
-            why, number = member.why_not()
-            if why:
-                yield self._left(member.scene.instrument, why, number, "member")
-            else:
-                able.append(member)
-        prepared = [entry for member in able for entry in self._prepared(member)]
-        yield from (entry for entry in prepared if isinstance(entry, LeftOut))
-        wavelengths = [
-            step.settings["wavelength"]
-            for step in prepared
-            if isinstance(step, PlannedStep) and step.name == READ_STEP
-        ]
-        beams = [beam for member in able for beam in member.pointings()]
-        reason = self._why_none(beams, wavelengths)
-        kept: list[BeamPlan] = []
-        if reason is None:
-            kept = beams
-            yield from self._without_lonely_beams(kept)
-            if not kept:
-                why = "no beam has two crossings with other beams, between which it is attenuated"
-                reason = self._joint_case.leave(NAME, why, number=0.0, rule="some_meet")
-        if reason is not None:
-            yield reason
+
+def _members(case: NetworkCase[VisibilityProductSettings], joint: Case) -> Iterator[Case | Entry]:
+    """Yield the cases of the members that can take part, and why others cannot."""
+    scenes, name = {scene.instrument: scene for scene in case.scene.members}, case.request.channel
+    for member in case.campaign.networks[case.scene.instrument].instruments:
+        if member not in scenes:
+            yield _left(joint, member, "no granule in the window", 0.0, "member_present")
+    for member, scene in scenes.items():
+        held = [c.name for c in (*scene.layout, *joined_layout(scene.layout, [name]))]
+        if name not in held:
+            why = f"the files hold no {name}, only {', '.join(held)}"
+            yield _left(joint, member, why, None, "member")
+            continue
+        own = _member(case, scene, name)
+        why, number = _why_not(own)
+        yield _left(joint, member, why, number, "member") if why else own
+
+
+def _left(joint: Case, member: str, reason: str, number: float | None, rule: str) -> Entry:
+    return replace(joint, member=member).leave(NAME, reason, number=number, rule=rule)
+
+
+def _prepared(case: NetworkCase[VisibilityProductSettings], own: Case) -> Entries:
+    """Yield the steps from the counts of an instrument to its signal."""
+    name = own.channel.name
+    for channel in dict.fromkeys((*file_channels(name), name)):
+        yield from plan_stages(_member(case, own.scene, channel))
+    yield background(replace(own, product=NAME), "tail_mean", own.request.background_range)
+
+
+def _why_none(joint: Case, beams: Sequence[BeamPlan], wavelengths: Sequence[float]) -> Entry | None:
+    """Return why there can be no network, whatever the crossings."""
+    if wavelengths and max(wavelengths) - min(wavelengths) > _SAME_WAVELENGTH:
+        listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
+        reason = f"the instruments have different wavelengths: {listed} nm"
+        number = max(wavelengths) - min(wavelengths)
+        return joint.leave(NAME, reason, number=number, rule="one_wavelength")
+    if len(beams) > THRESHOLDS.most_beams:
+        reason = f"{len(beams)} beams exceed the limit of {THRESHOLDS.most_beams}"
+        return joint.leave(NAME, reason, number=float(len(beams)), rule="few_beams")
+    return None
+
+
+def _without_lonely_beams(
+    joint: Case, beams: list[BeamPlan], stations: Mapping[str, Station]
+) -> Entries:
+    """Take out beams with fewer than two crossings, until all remaining beams have two."""
+    while beams:
+        network = crossings(beams, stations, joint.request)
+        counts = {beam: int(network.on_beam(n)[0].size) for n, beam in enumerate(beams)}
+        lonely = [beam for beam in beams if counts[beam] < 2]
+        for beam in lonely:
+            pointing = f"zenith angle {beam.zenith_angle:g} and azimuth {beam.azimuth:g} degree"
+            reason = f"the beam at {pointing} has fewer than two crossings with other beams"
+            yield _left(joint, beam.instrument, reason, float(counts[beam]), "beams_meet")
+            beams.remove(beam)
+        if not lonely:
             return
-        used = {beam.instrument for beam in kept}
-        yield from (
-            step for step in prepared if isinstance(step, PlannedStep) and step.instrument in used
-        )
-        yield from self._joint(kept, min(wavelengths))
 
-    def _absent(self) -> Entries:
-        present = {member.instrument for member in self._scene.members}
-        for name in self._campaign.networks[self._scene.instrument].instruments:
-            if name not in present:
-                yield self._left(name, "no granule in the window", 0.0, "member_present")
 
-    def _left(self, member: str, reason: str, number: float | None, rule: str) -> Entry:
-        case = replace(self._joint_case, member=member)
-        return case.leave(NAME, reason, number=number, rule=rule)
-
-    def _prepared(self, member: _MemberCase) -> Entries:
-        """Yield the steps from the counts of an instrument to its signal."""
-        name = self._settings.channel
-        for channel in dict.fromkeys((*file_channels(name), name)):
-            case = member.channel_case(member_channel(member.scene.layout, channel))
-            yield from plan_stages(case)
-        of_product = replace(case, product=NAME)
-        yield background(of_product, "tail_mean", self._settings.background_range)
-
-    @property
-    def _joint_case(self) -> Case:
-        """The case of the steps of the whole network."""
-        channel = product_channel(self._settings.channel)
-        return ChannelCase(
-            self._scene, channel, InstrumentFacts(), ChannelFacts(), self._settings, product=NAME
-        )
-
-    def _why_none(self, beams: Sequence[BeamPlan], wavelengths: Sequence[float]) -> Entry | None:
-        """Return why there can be no network, whatever the crossings."""
-        if wavelengths and max(wavelengths) - min(wavelengths) > _SAME_WAVELENGTH:
-            listed = ", ".join(f"{metres * 1e9:g}" for metres in sorted(set(wavelengths)))
-            reason = f"the instruments have different wavelengths: {listed} nm"
-            number = max(wavelengths) - min(wavelengths)
-            return self._joint_case.leave(NAME, reason, number=number, rule="one_wavelength")
-        if len(beams) > THRESHOLDS.most_beams:
-            reason = f"{len(beams)} beams exceed the limit of {THRESHOLDS.most_beams}"
-            number = float(len(beams))
-            return self._joint_case.leave(NAME, reason, number=number, rule="few_beams")
-        return None
-
-    def _crossings(self, beams: Sequence[BeamPlan]) -> geometry.Network:
-        settings = self._settings
-        return crossings(beams, self._stations, settings.tolerance, settings.smallest_angle)
-
-    def _without_lonely_beams(self, beams: list[BeamPlan]) -> Entries:
-        """Take out beams with fewer than two crossings, until all remaining beams have two."""
-        while beams:
-            network = self._crossings(beams)
-            counts = {beam: int(network.on_beam(n)[0].size) for n, beam in enumerate(beams)}
-            lonely = [beam for beam in beams if counts[beam] < 2]
-            for beam in lonely:
-                pointing = f"zenith angle {beam.zenith_angle:g} and azimuth {beam.azimuth:g} degree"
-                reason = f"the beam at {pointing} has fewer than two crossings with other beams"
-                yield self._left(beam.instrument, reason, float(counts[beam]), "beams_meet")
-                beams.remove(beam)
-            if not lonely:
-                return
-
-    def _joint(self, beams: Sequence[BeamPlan], wavelength: float) -> Entries:
-        """Yield the read windows of the instruments, and the steps of the whole network."""
-        network, settings = self._crossings(beams), self._settings
-        for member in self._members:
-            name = member.scene.instrument
-            numbers = [n for n, beam in enumerate(beams) if beam.instrument == name]
-            if numbers:
-                farthest = max(float(network.on_beam(n)[1][-1]) for n in numbers)
-                case = replace(member.channel_case(member.channel), product=NAME)
-                yield _window(case, farthest)
-        case = self._joint_case
-        reason = "signals are averaged before the retrieval: noise biases means of retrieved values"
-        yield average(case, settings.average, reason)
-        yield _prior(case)
-        by_triangles = (
-            ""
-            if settings.multiplier is None
-            else f"; solved by triangles with the multiplier {settings.multiplier}"
-        )
-        yield case.run(
-            NAME,
-            f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
-            f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones"
-            f"{by_triangles}",
-            NetworkSettings.taken_from(
-                settings,
-                beams=tuple(beams),
-                wavelength=wavelength,
-                block_seconds=settings.block.total_seconds(),
-                **dict(settings.visibility.resolved),
-            ),
-            needs=(
-                "read", "overlap", "noise", "glue", "background", WINDOW, "average", "prior"
-            ),
-            number=float(network.crossings),
-        )  # fmt: skip
+def _joint(
+    case: Case, beams: Sequence[BeamPlan], network: geometry.Network, wavelength: float
+) -> Entries:
+    """Yield the steps of the whole network."""
+    settings = case.request
+    reason = "signals are averaged before the retrieval: noise biases means of retrieved values"
+    yield average(case, settings.average, reason)
+    yield _prior(case)
+    by_triangles = (
+        ""
+        if settings.multiplier is None
+        else f"; solved by triangles with the multiplier {settings.multiplier}"
+    )
+    yield case.run(
+        NAME,
+        f"{len(beams)} beams of {len({beam.instrument for beam in beams})} instruments have"
+        f" {network.crossings} crossings, {int(network.near_crossing.sum())} of them near ones"
+        f"{by_triangles}",
+        NetworkSettings.taken_from(
+            settings,
+            beams=tuple(beams),
+            wavelength=wavelength,
+            block_seconds=settings.block.total_seconds(),
+            **dict(settings.visibility.resolved),
+        ),
+        needs=("read", "overlap", "noise", "glue", "background", WINDOW, "average", "prior"),
+        number=float(network.crossings),
+    )
 
 
 # Making -------------------------------------------------------------------------------------------
@@ -484,16 +425,10 @@ class _NetworkStream(NetworkStream):
         stations = {beam.member.instrument: beam.member.station for beam in self._beams}
         retrieved = labeled.retrieve_network(
             [beam.signals() for beam in self._beams],
-            crossings(settings.beams, stations, settings.tolerance, settings.smallest_angle),
-            labeled.NetworkSettings(
-                block_intervals=round(settings.block_seconds / self._seconds),
-                visibility=settings.definition,
-                prior=settings.prior,
-                multiplier=settings.multiplier,
-                exponent_relative_error=settings.exponent_relative_error,
-                lidar_ratio_relative_error=settings.lidar_ratio_relative_error,
-                overlap_relative_error=settings.overlap_relative_error,
-            ),
+            crossings(settings.beams, stations, settings),
+            settings,
+            block_intervals=round(settings.block_seconds / self._seconds),
+            visibility=settings.definition,
         )
         method = "beams_with_prior" if settings.prior == "block" else "beams_without_prior"
         if settings.multiplier is not None:

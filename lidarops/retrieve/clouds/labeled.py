@@ -7,7 +7,7 @@ rise may be that of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,7 @@ from lidarops.retrieve.signal.labeled import (
     baseline_error,
     counts_per_power,
 )
+from lidarops.settings import quantity
 
 _CARRIED: Final = WITHHELD | int(Quality.PILE_UP | Quality.SINGLE_RECORD)
 _OUTLIER: Final = np.int32(Quality.OUTLIER)
@@ -45,12 +46,9 @@ _INCOMPLETE_OVERLAP: Final = np.int32(Quality.INCOMPLETE_OVERLAP)
 class Reference:
     """Search range of the reference window, and the scattering ratio assumed in it."""
 
-    lowest: float
-    """m along the beam."""
-    highest: float
-    """m along the beam."""
-    width: float
-    """m along the beam."""
+    lowest: Annotated[float, quantity(unit="m", description="along the beam")]
+    highest: Annotated[float, quantity(unit="m", description="along the beam")]
+    width: Annotated[float, quantity(unit="m", description="along the beam")]
     scattering_ratio: float
     relative_error: float
     """Relative standard error of the scattering ratio."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from lidarops.retrieve.network._beam_signals import SignalChange
 from lidarops.retrieve.network.extinction_field import NetworkResult
 from lidarops.retrieve.network.flags import REJECTING, NetworkQuality
 from lidarops.retrieve.network.geometry import Network
+from lidarops.retrieve.network.settings import NetworkAssumptions
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.signal.labeled import CORRELATION_LENGTH, baseline_error
 
@@ -55,26 +56,6 @@ class BeamAverages:
     """degree."""
 
 
-@dataclass(frozen=True, slots=True)
-class NetworkSettings:
-    """Settings of the retrieval, and relative errors for its systematic errors."""
-
-    block_intervals: int
-    """Number of clock intervals that are one field."""
-    visibility: VisibilityDefinition
-    prior: str = "block"
-    multiplier: float | Literal["chosen"] | None = None
-    """Of triangles of beams (drabenko2021), instead of all beams together; see
-    `extinction_field.retrieve_network`."""
-    exponent_relative_error: float = 0.1
-    """Relative error of the exponent m."""
-    lidar_ratio_relative_error: float = 0.07
-    """Relative error of the constant between backscatter^m and extinction at one crossing, against
-    the others."""
-    overlap_relative_error: float = 0.003
-    """At the nearest used range of a beam; falls linearly to 0 at the farthest."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Signals:
     """Signals of all beams on common intervals."""
@@ -97,7 +78,12 @@ class _Signals:
 
 
 def retrieve_network(
-    beams: Sequence[BeamAverages], network: Network, settings: NetworkSettings
+    beams: Sequence[BeamAverages],
+    network: Network,
+    settings: NetworkAssumptions,
+    *,
+    block_intervals: int,
+    visibility: VisibilityDefinition,
 ) -> xr.Dataset:
     """Retrieve extinction and visibility where the beams of several lidars meet.
 
@@ -111,7 +97,10 @@ def retrieve_network(
     beams : sequence of BeamAverages
     network : Network
         With the same beams.
-    settings : NetworkSettings
+    settings : NetworkAssumptions
+    block_intervals : int
+        Number of clock intervals that are one field.
+    visibility : VisibilityDefinition
 
     Returns
     -------
@@ -127,13 +116,13 @@ def retrieve_network(
     if len(beams) != network.beams:
         raise RetrievalInputError(f"are {len(beams)} for {network.beams} beams", field="beams")
     given = np.unique(np.concatenate([beam.interval for beam in beams]))
-    intervals = _without_gaps(given, settings.block_intervals)
+    intervals = _without_gaps(given, block_intervals)
     signals = _gather_signals(beams, intervals, network)
     result = extinction_field.retrieve_network(
         signals.power, signals.range, network, variance=signals.variance,
         overlap=signals.overlap, full_overlap_range=[beam.nearest for beam in beams],
         exponent=[beam.exponent for beam in beams], prior=settings.prior,
-        blocks=intervals // settings.block_intervals, multiplier=settings.multiplier,
+        blocks=intervals // block_intervals, multiplier=settings.multiplier,
     )  # fmt: skip
     errors = _errors(result, signals, network, settings)
     near = np.flatnonzero(network.near_crossing)
@@ -142,14 +131,14 @@ def retrieve_network(
     )
     freedom = result.degrees_of_freedom
     dimensions = ("time", "crossing")
-    visibility = visibility_of_extinction(extinction, random, systematic, settings.visibility)
+    seen = visibility_of_extinction(extinction, random, systematic, visibility)
     flags = _quality_flags(result, errors, signals, network)[:, near]
     multiplier = {"multiplier": (dimensions, result.multiplier[:, near])}
     if settings.multiplier is None:
         multiplier = {}
     product = xr.Dataset(
         {
-            **{name: (dimensions, values) for name, values in visibility.items()},
+            **{name: (dimensions, values) for name, values in seen.items()},
             "total_extinction": (dimensions, extinction),
             "total_extinction_standard_error": (dimensions, random),
             "total_extinction_systematic_error": (dimensions, systematic),
@@ -163,7 +152,7 @@ def retrieve_network(
             **multiplier,
         },
         coords=_coordinates(beams, intervals, network, near),
-        attrs={"steps": _describe_steps(beams, network, settings)},
+        attrs={"steps": _describe_steps(beams, network, settings, visibility)},
     )
     return product.isel(time=np.isin(intervals, given))
 
@@ -232,7 +221,7 @@ def _bins_used(grid: Array, network: Network) -> int:
 
 
 def _errors(
-    result: NetworkResult, signals: _Signals, network: Network, settings: NetworkSettings
+    result: NetworkResult, signals: _Signals, network: Network, settings: NetworkAssumptions
 ) -> tuple[Array, Array, Array]:
     """Return (interval, crossing) errors of extinction, m-1; NaN where there is no value.
 
@@ -385,10 +374,11 @@ def _coordinates(
 def _describe_steps(
     beams: Sequence[BeamAverages],
     network: Network,
-    settings: NetworkSettings,
+    settings: NetworkAssumptions,
+    visibility: VisibilityDefinition,
 ) -> str:
     """Return a description of the beams, their crossings and the definition of visibility."""
-    texts = [settings.visibility.words]
+    texts = [visibility.words]
     if settings.multiplier is not None:
         texts.append(f"triangles of beams, with the multiplier {settings.multiplier}")
     for index, beam in enumerate(beams):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal
 
 from lidarops.settings import Metres, ReferenceSettings, background_method, quantity
 
@@ -15,11 +15,6 @@ class RamanReference(ReferenceSettings):
         6000.0, unit="m", description="least height of the window above the station"
     )
     width: float = quantity(2000.0, unit="m", ge=100, le=20_000, description="of the window")
-
-    def along(self, stretch: float) -> Self:
-        """Return the limits along a beam that is `stretch` m long per m of height."""
-        limits = ("lowest", "highest", "width")
-        return self.model_copy(update={name: getattr(self, name) * stretch for name in limits})
 
 
 _REFERENCE: Final = RamanReference()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from support.products.made_network import EXTINCTION, beam, network, product, without
+from support.products.made_network import EXTINCTION, beam, product, solved, without
 
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
@@ -15,14 +15,7 @@ from lidarops.kinds import flags_of
 from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.network import labeled
 from lidarops.retrieve.network.flags import NetworkQuality
-from lidarops.retrieve.network.labeled import NetworkSettings, retrieve_network
 from lidarops.retrieve.network.thresholds import THRESHOLDS
-
-PLAIN = NetworkSettings(block_intervals=72, visibility=VisibilityDefinition(wavelength=532e-9))
-
-
-def solved(beams, **changes):
-    return retrieve_network(beams, network(), replace(PLAIN, **changes))
 
 
 def test_homogeneous_air_is_within_the_errors():
@@ -189,7 +182,7 @@ def test_visibility_follows_the_definition():
 
 def test_the_number_of_beams_must_match_the_network():
     with pytest.raises(RetrievalInputError, match="beams"):
-        retrieve_network([beam(0)], network(), PLAIN)
+        solved([beam(0)])
 
 
 def test_bins_that_are_not_used_do_not_matter(monkeypatch):

@@ -11,16 +11,14 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.network import geometry
-from lidarops.retrieve.network.labeled import (
-    BeamAverages,
-    NetworkSettings,
-    retrieve_network,
-)
+from lidarops.retrieve.network.labeled import BeamAverages, retrieve_network
+from lidarops.retrieve.network.settings import NetworkAssumptions
 
 STATIONS = ((47.25, 11.3, 600.0), (47.25, 11.353, 600.0), (47.2811, 11.3265, 600.0))
 AZIMUTHS = (70.0, 310.0, 190.0)
 RANGE = np.arange(2400) * 7.5 + 3.75
 EXTINCTION = 4e-4
+VISIBILITY = VisibilityDefinition(wavelength=532e-9)
 START = np.datetime64("2025-06-01T20:00:00", "ns")
 
 
@@ -77,14 +75,27 @@ def beam(
     return BeamAverages(**(defaults | changes))
 
 
+def solved(
+    beams: list[BeamAverages],
+    *,
+    block_intervals: int = 72,
+    visibility: VisibilityDefinition = VISIBILITY,
+    **assumed: Any,
+) -> xr.Dataset:
+    """Return what is retrieved from averages of the beams."""
+    return retrieve_network(
+        beams,
+        network(),
+        NetworkAssumptions(**assumed),
+        block_intervals=block_intervals,
+        visibility=visibility,
+    )
+
+
 def product(intervals: int = 6, **settings: Any) -> xr.Dataset:
     """Return the product of all three beams."""
-    values = {
-        "block_intervals": 72,
-        "visibility": VisibilityDefinition(wavelength=532e-9),
-    } | settings
     beams = [beam(number, intervals=intervals) for number in range(3)]
-    retrieved = retrieve_network(beams, network(), NetworkSettings(**values))
+    retrieved = solved(beams, **settings)
     return retrieved.assign(retrieval_method=0)
 
 
