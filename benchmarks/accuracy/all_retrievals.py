@@ -7,12 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from benchmarks.accuracy import elastic, homogeneous, multiangle, network
-from benchmarks.accuracy.comparison import drawn_setting, method_name, score_of
-from benchmarks.harness.figure import Figure, Score, Scores
-from benchmarks.harness.results import Effort, Results, Study, Work
-
-Works = Mapping[str, Sequence[Work]]
-"""Works by retrieval."""
+from benchmarks.harness.figure import Figure, Score, Scores, Work
+from benchmarks.harness.results import Effort, Results, Study
 
 
 def measure_all(effort: Effort) -> Study:
@@ -29,56 +25,34 @@ def measure_all(effort: Effort) -> Study:
         "scans over zenith angle": multiangle.measure_multiangle(effort),
         "networks of lidars": network.measure_network(effort),
     }
-    works = {name: study.works for name, study in studies.items()}
-    best = Results(
-        "The most accurate of our methods and of the peers",
-        best_methods(works),
-        "Of methods whose errors differ by less than 2 Monte Carlo errors, the fastest. One "
-        "setting of each retrieval; the tables below list all. 95 %: share of truths in the stated "
-        "interval. In brackets: Monte Carlo standard error.",
-        case="error of",
-    )
     beside = Results(
         "Ours beside the strongest peer",
-        against_peers(works),
-        "All settings that peers solve too. Ratios of ours over that of the peer; equal if the "
-        "errors differ by less than 2 Monte Carlo errors.",
+        against_peers({name: study.works for name, study in studies.items()}),
+        "All settings that peers solve too. Of methods whose errors differ by less than 2 Monte "
+        "Carlo errors, the fastest; none that knows more than the profile. Ratios of ours over "
+        "that of the peer; equal if the errors differ by less than 2 Monte Carlo errors.",
         case="error of",
         method="ours",
     )
-    tables = [replace(study.results[0], folded=True) for study in studies.values()]
     others = [
         replace(results, title=f"{name.split()[0].capitalize()}: {results.title}")
         for name, study in studies.items()
         for results in study.results[1:]
     ]
+    tables = [study.results[0] for study in studies.values()]
     charts = [chart for study in studies.values() for chart in study.charts]
-    every = [work for group in works.values() for work in group]
-    return Study([best, beside, *tables, *others], charts, every)
+    works = [work for study in studies.values() for work in study.works]
+    return Study([beside, *tables, *others], charts, works)
 
 
-def best_methods(works: Works) -> Scores:
-    """Return the best of our methods and of the peers for each retrieval and quantity.
+def against_peers(works: Mapping[str, Sequence[Work]]) -> Scores:
+    """Return the most accurate of our methods beside that of the peers, in every setting.
 
-    Of methods whose errors differ by less than 2 Monte Carlo errors, the best is the fastest.
+    Parameters
+    ----------
+    works : mapping of sequences of Work
+        By retrieval.
     """
-    scores: Scores = {}
-    for retrieval, every in works.items():
-        for quantity in dict.fromkeys(work.quantity for work in every):
-            group = [w for w in every if w.quantity == quantity and not w.informed]
-            setting = drawn_setting([work.setting for work in group])
-            for ours in (True, False):
-                rivals = [work for work in group if work.ours is ours and work.setting == setting]
-                if rivals:
-                    best = _best(rivals)
-                    scores[f"{retrieval}, {setting}: {quantity}", method_name(best)] = score_of(
-                        best
-                    )
-    return scores
-
-
-def against_peers(works: Works) -> Scores:
-    """Return the most accurate of our methods beside that of the peers, in every setting."""
     scores: Scores = {}
     for retrieval, every in works.items():
         for quantity, setting in dict.fromkeys((work.quantity, work.setting) for work in every):

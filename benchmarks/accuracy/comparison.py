@@ -12,6 +12,8 @@ from benchmarks.harness.figure import (
     Figure,
     Mask,
     Score,
+    Scores,
+    Work,
     cpu_time,
     mean_by_block,
     root_by_block,
@@ -20,7 +22,7 @@ from benchmarks.harness.figure import (
     timed,
 )
 from benchmarks.harness.plots import Chart
-from benchmarks.harness.results import Results, Study, Work, frame
+from benchmarks.harness.results import Results, Study
 
 RMSE: Final = "RMSE"
 BIAS: Final = "mean error"
@@ -64,45 +66,23 @@ def time_profiles(
 def comparison(
     retrieval: str, works: Sequence[Work], note: str, others: Sequence[Results] = ()
 ) -> Study:
-    """Return the study of the methods of one retrieval, with other tables of it."""
-    scores = {
-        (f"{work.quantity}; {work.setting}", method_name(work)): score_of(work) | work.more
-        for work in works
-    }
-    table = Results(f"{retrieval.capitalize()}: all methods", scores, note, case="error of")
-    return Study([table, *others], [methods_chart(retrieval, works)], works)
+    """Return the study of the methods of one retrieval, with other tables of it.
 
-
-def method_name(work: Work) -> str:
-    """Return the name of a method; that of a peer says so."""
-    return work.method if work.ours else f"peer: {work.method}"
-
-
-def score_of(work: Work) -> Score:
-    """Return error, coverage and time of a method."""
-    coverage = None if work.coverage is None else share(work.coverage)
-    return {RMSE: work.error, COVERAGE: coverage, CPU_TIME: work.time}
-
-
-def drawn_setting(settings: Sequence[str]) -> str:
-    """Return the setting that stands for all of a retrieval."""
-    return next((setting for setting in settings if setting in _DRAWN), settings[0])
-
-
-def methods_chart(retrieval: str, works: Sequence[Work]) -> Chart:
-    """Return the errors against run time in two settings that peers solve too."""
-    quantity = works[0].quantity
+    Its chart shows the first quantity in two settings that peers solve too.
+    """
+    scores: Scores = {}
+    for work in works:
+        key = f"{work.quantity}; {work.setting}", f"{'' if work.ours else 'peer: '}{work.method}"
+        figures = {RMSE: work.error, COVERAGE: work.coverage, CPU_TIME: work.time}
+        scores[key] = figures | work.more
+    title, quantity = retrieval.capitalize(), works[0].quantity
+    table = Results(f"{title}: all methods", scores, note, case="error of")
     drawn = [work for work in works if work.quantity == quantity]
     settings = list(dict.fromkeys(work.setting for work in drawn if not work.ours))
-    last = drawn_setting(settings)
-    chosen = {settings[0], last if last != settings[0] else settings[-1]}
-    scores = {
-        (work.setting, work.method): score_of(work) for work in drawn if work.setting in chosen
-    }
-    return Chart(
+    last = next((setting for setting in settings if setting in _DRAWN), settings[-1])
+    chart = Chart(
         "all-" + retrieval.replace(" ", "-"),
-        f"{retrieval.capitalize()}: RMSE of {quantity} against CPU time",
-        frame(scores),
-        RMSE,
-        {work.method for work in drawn if not work.ours or work.informed},
+        f"{title}: RMSE of {quantity} against CPU time",
+        [work for work in drawn if work.setting in {settings[0], last}],
     )
+    return Study([table, *others], [chart], works)

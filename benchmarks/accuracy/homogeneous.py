@@ -17,19 +17,17 @@ from benchmarks.accuracy.comparison import (
     score_errors,
     time_profiles,
 )
-from benchmarks.accuracy.homogeneous_peers import SLOW, iterative_peers
+from benchmarks.accuracy.homogeneous_peers import PEERS
 from benchmarks.harness.figure import (
     CPU_TIME,
     Figure,
     Score,
-    Scores,
+    Work,
     cpu_time,
-    mean_by_block,
     share,
 )
-from benchmarks.harness.results import Effort, Results, Study, Work
+from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes.homogeneous_paths import (
-    BACKGROUND,
     QUANTITIES,
     TAIL_MEAN,
     PathSolver,
@@ -37,12 +35,9 @@ from benchmarks.scenes.homogeneous_paths import (
     methods,
     scenarios,
 )
-from lidarops.retrieve.background.cubic_and_tail import cubic
-from lidarops.retrieve.homogeneous.path_fit import HomogeneousMethod
 
 PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
-_SLOW_SHARE: Final = 20
 _WARM: Final = 64
 _ROUNDS: Final = 3
 """Timed calls, of which the least counts: others share the processor."""
@@ -52,47 +47,33 @@ _NOTE: Final = (
     "Paths of 225 bins through white noise, from 2.5 or 10.5 km over 1.7 or 8 km, extinction 0.01 "
     "to 5 per km, signal 15 to 100 000 times the noise. The bound is the inverse Fisher matrix of "
     "background, amplitude and extinction. Profiles that a method rejects do not count for its "
-    "error. The iterative peers start from the fit of the mean of 64 profiles, and test no "
-    "residuals. Median over the paths of the RMSE over the bound; its largest value, and the "
+    "error. The peer starts from the fit of the mean of 64 profiles, and tests no residuals. "
+    "Median over the paths of the RMSE over the bound; its largest value, and the "
     "largest mean error, each over all paths; mean shares of flagged and rejected profiles."
 )
 
 
 def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study:
-    """Solve simulated profiles by every method of `fit_homogeneous_path` and by iterative peers.
+    """Solve simulated profiles by every method of `fit_homogeneous_path` and by the peer.
 
     Parameters
     ----------
     effort : Effort
     profiles : int, optional
-        Per scenario; the peers of scipy get a twentieth of them, at least 16.
+        Per scenario.
     """
     count = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
-    solvers = {**methods(), **iterative_peers()}
+    solvers = {**methods(), **PEERS}
     scores: dict[str, list[Score]] = {name: [] for name in solvers}
     for seed, scenario in enumerate(scenarios(quick=effort.quick)):
         power = scenario.powers(count, seed)
         for name, solver in solvers.items():
-            few = max(count // _SLOW_SHARE, 16) if name in SLOW else count
-            rounds = 1 if name in SLOW else _ROUNDS
-            scores[name].append(score_path(solver, scenario, power[:few], rounds))
+            scores[name].append(score_path(solver, scenario, power))
         effort.progress(1)
-    offsets = Results(
-        "Mean error of the background, in units of the noise of one profile",
-        published_offsets(count),
-        "Tables 1 and 2 of bobrovsky2024 give a background that decreases with the length of the "
-        "section. This is due to noise: with a lag of one bin and no correction for the noise, the "
-        "cubic counts part of the signal as background, however many profiles are averaged. The "
-        "remaining error of the direct fit is the bias of all least-squares solutions to second "
-        "order in the noise; averaging removes it. Mean error and, in brackets, its standard "
-        "error: of the cubic with a lag of one bin, and of the direct fit with its scatter.",
-        case="section",
-        method="mean of",
-    )
-    return comparison("homogeneous path", list(_works(scores)), _NOTE, [offsets])
+    return comparison("homogeneous path", list(_works(scores)), _NOTE)
 
 
-def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int = 1) -> Score:
+def score_path(solver: PathSolver, scenario: Scenario, power: Any) -> Score:
     """Return errors over the Cramér-Rao bound, flags and time of one solver on one path.
 
     Parameters
@@ -100,11 +81,9 @@ def score_path(solver: PathSolver, scenario: Scenario, power: Any, rounds: int =
     solver : PathSolver
     scenario : Scenario
     power : (profile, bin) float
-    rounds : int
-        Timed calls.
     """
     solver(power[:_WARM], scenario)
-    spent, solution = time_profiles(partial(solver, power, scenario), len(power), rounds)
+    spent, solution = time_profiles(partial(solver, power, scenario), len(power), _ROUNDS)
     score: Score = {
         "flagged": share(float(solution.flagged.mean())),
         "rejected": share(float(solution.rejected.mean())),
@@ -137,7 +116,7 @@ def _works(scores: dict[str, list[Score]]) -> Iterator[Work]:
                 errors[half],
                 _ranked(paths, f"{quantity}: {COVERAGE}")[half],
                 cpu_time(float(np.median(times))),
-                ours=method not in {*iterative_peers(), TAIL_MEAN},
+                ours=method not in {*PEERS, TAIL_MEAN},
                 informed=method in _INFORMED,
                 more={
                     "worst": errors[-1],
@@ -154,59 +133,3 @@ def _ranked(paths: Sequence[Score], quantity: str) -> list[Figure]:
     """Return the figures of a quantity on all paths that have one, the smallest first."""
     figures = [score[quantity] for score in paths if quantity in score]
     return sorted(figures, key=lambda figure: figure.value)
-
-
-# Background of the published cubic ------------------------------------------------------------
-
-_PAPER_LENGTHS: Final = ((2500.0, (1e3, 2e3, 4e3, 6e3, 8e3)), (10500.0, (1e3, 2e3, 2.5e3)))
-_PAPER_STEP: Final = 15.0
-_PAPER_SIGNAL: Final = 17.0
-_PAPER_EXTINCTION: Final = 3e-5
-_AVERAGED: Final = 100
-_PUBLISHED: Final = {1e3: 10.6, 4e3: 6.5, 6e3: 1.5, 8e3: 1.2}
-"""bobrovsky2024, table 1, less an assumed truth of 37.00, over an assumed noise of 0.1."""
-
-
-def published_offsets(count: int) -> Scores:
-    """Return the errors of background for the signals of the published tables.
-
-    The tables do not state the signal. A signal of 17 times the noise at 2.5 km, bins of 15 m and
-    an extinction of 0.03 km-1 reproduce the decrease of the published background with length.
-    """
-    sections = [(start, length) for start, lengths in _PAPER_LENGTHS for length in lengths]
-    scores: Scores = {}
-    for averaged, (seed, (start, length)) in product((1, _AVERAGED), enumerate(sections)):
-        path = published_path(start, length, averaged)
-        score = _offset(path, path.powers(count, seed), averaged**0.5)
-        if start < 5e3:
-            score["published"] = _PUBLISHED.get(length)
-        scores[f"{start / 1e3:g} + {length / 1e3:g} km", f"{averaged}"] = score
-    return scores
-
-
-def published_path(start: float, length: float, averaged: int) -> Scenario:
-    """Return a section of the published tables, whose profiles are means of so many."""
-    away = start - _PAPER_LENGTHS[0][0]
-    fade = np.exp(-2 * _PAPER_EXTINCTION * away) * (_PAPER_LENGTHS[0][0] / start) ** 2
-    # The mean of white noise is white noise: powers in units of its standard deviation.
-    scale = averaged**0.5
-    bins = round(length / _PAPER_STEP) + 1
-    signal = float(_PAPER_SIGNAL * fade) * scale
-    return Scenario(start, length, _PAPER_EXTINCTION, signal, BACKGROUND * scale, bins)
-
-
-def _offset(path: Scenario, power: Any, scale: float) -> Score:
-    # A variance of 0 means no noise, so that its bias is not subtracted, as published.
-    published = cubic(power, path.range, lag=1, variance=0.0).background
-    solution = methods()[HomogeneousMethod.DIRECT](power, path)
-    background = solution.values["background"]
-    errors = {"lag 1": published - path.background, "direct": background - path.background}
-    return {
-        "length of the section (km)": path.length / 1e3,
-        **{
-            name: mean_by_block(error / scale, np.isfinite(error), 1)
-            for name, error in errors.items()
-        },
-        "scatter": float(np.nanstd(background)) / scale,
-        "flagged": share(float(solution.flagged.mean())),
-    }

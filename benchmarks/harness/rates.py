@@ -6,11 +6,8 @@ it differs from the truth by more than 4 stated standard errors.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -32,8 +29,6 @@ from lidarops.flags import FlagBit, Quality, rejecting
 
 FALSE: Final = 4.0
 """Stated standard errors beyond which a value is false."""
-FINE: Final = 2.5
-"""Stated standard errors within which a value needed no flag."""
 COVERED: Final = 1.96
 """Stated standard errors within which 95 percent of the values should be."""
 ONE: Final = 1.0
@@ -274,7 +269,6 @@ def counts(values: ScoredValues) -> dict[str, Any]:
         "false hidden": plain & false & hidden,
         "false half": plain & false & half,
         "false bare": bare & false,
-        "fine rejected": valued & rejected & (size <= FINE * stated),
         "solvable": solvable,
         "solvable rejected": solvable & ~plain,
     }
@@ -288,13 +282,6 @@ def counts(values: ScoredValues) -> dict[str, Any]:
         **{name: float(np.count_nonzero(mask)) for name, mask in masks.items()},
         "sizes": np.histogram(sizes[~np.isnan(sizes)], _EDGES)[0],
     }
-
-
-# Reasons for targets that are not met ---------------------------------------------------------
-
-REASONS: Final = Path(__file__).parents[2] / "docs/results/reasons.json"
-Reason = dict[str, str]
-"""``why``, and patterns of the part, quantity, class, target and verdict that it is for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,22 +298,3 @@ class Unmet:
     def __str__(self) -> str:
         place = f"{self.name} ({self.quantity})" if self.quantity else self.name
         return f"{self.part}: {place}, {self.target} {self.judgement}"
-
-
-def read_reasons(file: Path = REASONS) -> list[Reason]:
-    """Return the reasons of a file, the most special ones first; none without the file."""
-    return list(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else []
-
-
-def why(one: Unmet, reasons: Sequence[Reason]) -> str:
-    """Return the reason of a target that is not met; empty if none is stated."""
-    texts = {"part": one.part, "quantity": one.quantity, "class": one.name, "target": one.target,
-             "verdict": one.judgement.verdict}  # fmt: skip
-    return next(
-        (
-            reason["why"]
-            for reason in reasons
-            if all(fnmatchcase(text, reason.get(key, "*")) for key, text in texts.items())
-        ),
-        "",
-    )

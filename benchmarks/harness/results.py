@@ -6,7 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -16,9 +16,9 @@ import pandas as pd
 from benchmarks.harness.figure import (
     Figure,
     Judgement,
-    Score,
     Scores,
     Unit,
+    Work,
     format_time,
     with_error,
 )
@@ -126,35 +126,11 @@ class Results:
     case: str = "case"
     """Heading of the column of cases."""
     method: str = "method"
-    folded: bool = False
-    """Whether the table is left out in a terminal."""
 
     @property
     def table(self) -> pd.DataFrame:
         """The scores as texts."""
         return table(frame(self.scores), case=self.case, method=self.method)
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """Error and run time of one method in one setting, for the comparison of methods."""
-
-    setting: str
-    quantity: str
-    """With its unit."""
-    method: str
-    error: Figure
-    """Root mean square."""
-    coverage: Figure | None
-    """Share of truths in the stated 95 percent interval; None if the method states none."""
-    time: Figure
-    """CPU time per profile."""
-    ours: bool = True
-    """Whether a method of lidarops; else a peer."""
-    informed: bool = False
-    """Whether the method knows more than the profile."""
-    more: Score = field(default_factory=dict)
-    """Further figures of the method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +142,6 @@ class Study:
     works: Sequence[Work] = ()
     missed: Sequence[str] = ()
     """Targets that are missed; the command fails where there is one."""
-    unnamed: Sequence[str] = ()
-    """Those of them for which no reason is stated."""
     date: str = ""
     cpu_seconds: float = 0.0
     """CPU time of the whole benchmark, with its child processes."""

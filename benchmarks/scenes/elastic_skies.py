@@ -32,7 +32,6 @@ from lidarops.retrieve.clouds.labeled import Reference
 from lidarops.retrieve.elastic import labeled
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.labeled import constant_ratio
-from lidarops.retrieve.homogeneous import path_fit
 from lidarops.retrieve.signal.labeled import DEAD_TIME_ERROR
 from lidarops.settings import ReferenceSettings
 from lidarops.simulate.signal import backscatter_signal, bin_centres
@@ -78,10 +77,6 @@ class SimulatedSky:
     air: MolecularProfile
     range: Array
     """m."""
-    molecular_backscatter: Array
-    """m-1 sr-1."""
-    molecular_extinction: Array
-    """m-1."""
     shape: Array
     """Shape of the molecular signal, m-3 sr-1."""
     signal: Array
@@ -110,17 +105,9 @@ class SimulatedSky:
 
 
 def _sky(air: MolecularProfile, signal: Array, backscatter: Array) -> SimulatedSky:
-    molecular = air.backscatter(RANGE, WAVELENGTH)
-    extinction = air.extinction(RANGE, WAVELENGTH)
-    return SimulatedSky(
-        air=air,
-        range=RANGE,
-        molecular_backscatter=molecular,
-        molecular_extinction=extinction,
-        shape=known_shape.molecular_shape(molecular, extinction, RANGE),
-        signal=signal / signal.max() * BRIGHTEST,
-        backscatter=backscatter,
-    )
+    molecules = air.backscatter(RANGE, WAVELENGTH), air.extinction(RANGE, WAVELENGTH)
+    shape = known_shape.molecular_shape(*molecules, RANGE)
+    return SimulatedSky(air, RANGE, shape, signal / signal.max() * BRIGHTEST, backscatter)
 
 
 def particles(height: npt.ArrayLike) -> Array:
@@ -186,21 +173,14 @@ BackgroundMethod = Callable[[Array, SimulatedSky], Backgrounds]
 KNOWN_SHAPE: Final = "known_shape"
 KNOWN_CLEAN_RANGE: Final = "known_shape, from 6 km"
 TAIL_MEAN: Final = "tail_mean"
-HOMOGENEOUS: Final = "homogeneous"
 
 
 def background_methods() -> dict[str, BackgroundMethod]:
-    """Return the methods of the background by name.
-
-    `homogeneous` and `cubic` assume a homogeneous path, which a vertical one is not. They use the
-    range above 6 km, to show how large their errors are.
-    """
+    """Return the methods of the background by name."""
     return {
         KNOWN_SHAPE: _known_shape,
         KNOWN_CLEAN_RANGE: partial(_known_shape, start=CLEAN_FROM),
         TAIL_MEAN: lambda counts, sky: _backgrounds(cubic_and_tail.tail_mean(counts, sky.range)),
-        HOMOGENEOUS: partial(_above_aerosol, path_fit.fit_homogeneous_path),
-        "cubic": partial(_above_aerosol, cubic_and_tail.cubic),
     }
 
 
@@ -208,12 +188,6 @@ def _known_shape(counts: Array, sky: SimulatedSky, start: float | None = None) -
     return _backgrounds(
         known_shape.fit_known_shape(counts, sky.range, sky.shape, exposure=SHOTS, start=start)
     )
-
-
-def _above_aerosol(fit: Callable[..., Any], counts: Array, sky: SimulatedSky) -> Backgrounds:
-    far = sky.range >= CLEAN_FROM
-    variance = 1.0 / count_weight(counts[:, far])
-    return _backgrounds(fit(counts[:, far], sky.range[far], variance=variance))
 
 
 def _backgrounds(result: Any) -> Backgrounds:

@@ -15,8 +15,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from benchmarks.harness.figure import Array, Mask, Random, correlated, log_uniform
-from benchmarks.harness.rates import COVERED, Failure, ScoredValues
+from benchmarks.harness.figure import (
+    Array,
+    Mask,
+    Random,
+    Scores,
+    Target,
+    correlated,
+    log_uniform,
+)
+from benchmarks.harness.rates import COVERED, Failure, Part, ScoredValues, shares
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.homogeneous import path_fit
@@ -323,18 +331,19 @@ def _excess(paths: Paths, rng: Random) -> Array:
 def _overlap(paths: Paths, rng: Random) -> Array:
     lost = rng.uniform(0.0, 0.3, paths.signal.shape)
     scale = log_uniform(rng, 0.02, 1.0, paths.signal.shape) * paths.depth[:, -1:]
-    return paths.clean * (1.0 - lost * np.exp(-paths.depth / scale))
+    return np.asarray(paths.clean * (1.0 - lost * np.exp(-paths.depth / scale)))
 
 
 def _turbulent(paths: Paths, rng: Random) -> Array:
     amount = log_uniform(rng, 1e-3, 0.2, paths.signal.shape)
-    return paths.clean * np.exp(amount * correlated(rng, paths.clean.shape, rng.uniform(0.0, 0.95)))
+    eddies = correlated(rng, paths.clean.shape, rng.uniform(0.0, 0.95))
+    return np.asarray(paths.clean * np.exp(amount * eddies))
 
 
 def _afterpulse(paths: Paths, rng: Random) -> Array:
     share = log_uniform(rng, 1e-4, 0.1, paths.signal.shape)
     scale = log_uniform(rng, 0.05, 1.0, paths.signal.shape) * paths.depth[:, -1:]
-    return paths.clean + share * paths.signal * np.exp(-paths.depth / scale)
+    return np.asarray(paths.clean + share * paths.signal * np.exp(-paths.depth / scale))
 
 
 def _saturated(paths: Paths, rng: Random) -> Array:
@@ -344,7 +353,7 @@ def _saturated(paths: Paths, rng: Random) -> Array:
 def _bent(paths: Paths, rng: Random) -> Array:
     """Return signals of a detector that loses a share proportional to the signal."""
     lost = log_uniform(rng, 1e-3, 0.3, paths.signal.shape)
-    return paths.clean * (1.0 - lost * paths.clean / paths.signal)
+    return np.asarray(paths.clean * (1.0 - lost * paths.clean / paths.signal))
 
 
 def _with_gaps(power: Array, rng: Random) -> Array:
@@ -539,3 +548,38 @@ def score_dying_signals(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     fit = _fitted(paths, rng.standard_normal((profiles, 40)))
     failure = Failure("signal that dies within a bin", satisfied=True)
     yield _scored(failure, "extinction", paths.extinction[:, 0], fit)
+
+
+# Few photon counts ------------------------------------------------------------------------------
+
+_FEW: Final = (1.0, 0.3, 0.1, 0.02)
+"""Photon counts of a bin."""
+_COUNTED: Final = 100
+"""Profiles of a cluster."""
+_NEEDLESS: Final = Target(1e-3, own=True)
+"""Largest share of profiles that are flagged although the model holds."""
+
+
+def few_counts(cluster: int, counts: float) -> Iterator[Part]:
+    """Yield how many profiles of few photon counts are flagged although the model holds."""
+    rng = np.random.default_rng((82, cluster))
+    distance = 2500.0 + 37.5 * np.arange(225)
+    signal = log_uniform(rng, 3.0, 100.0)
+    fall = (distance[0] / distance) ** 2 * np.exp(-2e-4 * (distance - distance[0]))
+    mean = counts * (1.0 + signal * fall)
+    drawn = rng.poisson(mean, (_COUNTED, mean.size)).astype(float)
+    for limits, exposure in (("normal limits", None), ("Poisson limits, as in products", 1.0)):
+        fit = path_fit.fit_homogeneous_path(
+            drawn, distance, variance=mean, noise=path_fit.Noise(exposure=exposure)
+        )
+        for bit in (Quality.OUTLIER, HomogeneousQuality.POOR_FIT):
+            flagged = float(np.count_nonzero(fit.quality & np.int32(bit)))
+            yield f"{bit.name}, {limits}", f"{counts:g} counts a bin", flagged, _COUNTED
+
+
+def few_count_scores(clusters: int) -> Scores:
+    """Return the shares of flagged profiles, by flag and counts of a bin."""
+    parts = [
+        part for few in _FEW for cluster in range(clusters) for part in few_counts(cluster, few)
+    ]
+    return shares(parts, lambda case, _: _NEEDLESS if "Poisson" in case else None)

@@ -200,24 +200,21 @@ def _power(net: geometry.Network, bins: Array, extinction: Extinction) -> Array:
 # Solvers --------------------------------------------------------------------------------------
 
 
-def _solve(power: Array, variance: Array, signals: Signals, prior: FieldPrior) -> NetworkResult:
-    """Solve profiles (profile, beam, range), block by block."""
+def solve(
+    power: Array, variance: Array, clean: Signals, length: int = BLOCK, **options: Any
+) -> NetworkResult:
+    """Solve profiles (profile, beam, range) in blocks of a length, with further arguments."""
     return extinction_field.retrieve_network(
-        power,
-        signals.range,
-        signals.network,
-        variance=variance,
-        full_overlap_range=FULL_OVERLAP,
-        blocks=np.arange(len(power)) // BLOCK,
-        prior=prior.value,
-    )
+        power, clean.range, clean.network, variance=variance, full_overlap_range=FULL_OVERLAP,
+        blocks=np.arange(len(power)) // length, **options,
+    )  # fmt: skip
 
 
 NO_PRIOR: Final = "network, no prior"
 NETWORK: Final = "network"
 SOLVERS: Final = {
-    NO_PRIOR: partial(_solve, prior=FieldPrior.NONE),
-    NETWORK: partial(_solve, prior=FieldPrior.BLOCK),
+    NO_PRIOR: partial(solve, prior=FieldPrior.NONE.value),
+    NETWORK: partial(solve, prior=FieldPrior.BLOCK.value),
 }
 """The retrieval with its priors, by name."""
 
@@ -230,7 +227,7 @@ _DOUBTED: Final = np.int32(NetworkQuality.POORLY_DETERMINED)
 
 DrawAir = Callable[[Random], Air]
 Damage = Callable[[Array, Array, Signals, Random], dict[str, Any]]
-"""Returns changed arguments of the retrieval, given power, variance, clean signals and numbers."""
+"""Returns changed arguments of `solve`, given power, variance, clean signals and numbers."""
 
 
 def random_network(rng: Random) -> LidarLine:
@@ -247,6 +244,14 @@ def random_network(rng: Random) -> LidarLine:
         for lidar in east
     )
     return LidarLine("random", tuple(float(x) for x in east), elevations, farthest=2500.0)
+
+
+def random_signals(rng: Random, draw_air: DrawAir) -> Signals | None:
+    """Return clean signals of a random network; None where its beams do not meet."""
+    net = random_network(rng).network()
+    if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
+        return None
+    return signals(net, draw_air(rng))
 
 
 def homogeneous(rng: Random) -> Air:
@@ -280,7 +285,7 @@ def plume(rng: Random, *, drift: float = 0.0) -> Air:
     return Air("plume", at, moving=drift != 0.0)
 
 
-def _thin_layer(rng: Random) -> Air:
+def thin_layer(rng: Random) -> Air:
     """Return a layer of a few bins, in which the signal is curved within a fit."""
     value = log_uniform(rng, 1e-4, 5e-3)
     excess, depth = rng.uniform(0.3, 3.0), rng.uniform(10.0, 60.0)
@@ -290,10 +295,6 @@ def _thin_layer(rng: Random) -> Air:
         return np.asarray(value * (1.0 + excess * np.exp(-((up - height) ** 2) / (2.0 * depth**2))))
 
     return Air("thin layer", lambda _: field)
-
-
-def _drifting_plume(rng: Random) -> Air:
-    return plume(rng, drift=300.0)
 
 
 _FACTORS: Final = (2.0, 10.0)
@@ -373,13 +374,13 @@ FAILURES: Final[tuple[tuple[Failure, DrawAir, Damage], ...]] = (
     (Failure("none, homogeneous", satisfied=True), homogeneous, _undamaged),
     (Failure("none, layered", satisfied=True), layered, _undamaged),
     (Failure("none, plume", satisfied=True), plume, _undamaged),
-    (Failure("plume that drifts within a block"), _drifting_plume, _undamaged),
+    (Failure("plume that drifts within a block"), partial(plume, drift=300.0), _undamaged),
     (Failure("gaps", satisfied=True), layered, _with_gaps),
     (Failure("outliers"), layered, _with_outliers),
     (Failure("overlap error"), layered, _with_overlap),
     (Failure("wrong exponent"), layered, _with_exponent),
     (Failure("background left in the signals"), layered, _with_offset),
-    (Failure("layer of a few bins"), _thin_layer, _with_little_noise),
+    (Failure("layer of a few bins"), thin_layer, _with_little_noise),
     (Failure("air that changes everywhere"), changing, _undamaged),
     (Failure("one bad profile"), plume, _with_a_bad_profile),
 )
@@ -402,7 +403,7 @@ def score_networks(
     """
     for index, (failure, draw_air, damage) in held_first(FAILURES):
         # Curvature has a similar effect in every layer: half of the clusters are enough.
-        if draw_air is _thin_layer and cluster % 2 == 1:
+        if draw_air is thin_layer and cluster % 2 == 1:
             continue
         if cluster >= of_all and not (damage is _undamaged and draw_air in _DECIDABLE):
             continue
@@ -422,23 +423,17 @@ def _solve_damaged(
     rng: Random, draw_air: DrawAir, damage: Damage, profiles: int
 ) -> tuple[NetworkResult, Array] | None:
     """Return the result and the truth; None where the beams do not meet."""
-    noise = log_uniform(rng, 1e-3, 0.3)
-    net = random_network(rng).network()
-    if net.crossings < 2 or not np.all(np.diff(np.bincount(net.passages.beam)) == 0):
+    noise, clean = log_uniform(rng, 1e-3, 0.3), random_signals(rng, draw_air)
+    if clean is None or np.ptp(np.bincount(clean.network.passages.beam)):
         return None
-    clean = signals(net, draw_air(rng))
     power, variance = clean.draw(noise, profiles, int(rng.integers(2**31)))
-    given: dict[str, Any] = {"power": power, "variance": variance}
+    given: dict[str, Any] = {"power": power, "variance": variance, "clean": clean}
     given |= damage(power, variance, clean, rng)
     try:
-        result = extinction_field.retrieve_network(
-            range=clean.range, network=net, full_overlap_range=FULL_OVERLAP,
-            blocks=np.arange(profiles) // BLOCK, **given,
-        )  # fmt: skip
+        return solve(**given), clean.truth(profiles)
     except LidarOpsError:
         # Beams without two crossings in range raise an error.
         return None
-    return result, clean.truth(profiles)
 
 
 # Short blocks, and lidar ratios -------------------------------------------------------------------
@@ -453,15 +448,6 @@ _VARIED: Final = {
 """What is declared, by the rms variation of the lidar ratio within a network and words."""
 
 
-def _drawn(rng: Random, draw_air: DrawAir) -> tuple[Signals, float] | None:
-    """Return clean signals of a random network, and the noise; None where beams do not meet."""
-    noise = log_uniform(rng, 1e-3, 0.3)
-    net = random_network(rng).network()
-    if net.crossings < 2 or np.bincount(net.passages.beam).min() < 2:
-        return None
-    return signals(net, draw_air(rng)), noise
-
-
 def score_short_blocks(
     cluster: int, profiles: int, *, draw_air: DrawAir, name: str, length: int
 ) -> Iterator[ScoredValues]:
@@ -470,15 +456,11 @@ def score_short_blocks(
     `length` is the number of profiles of a block.
     """
     rng = np.random.default_rng((81, cluster))
-    drawn = _drawn(rng, draw_air)
-    if drawn is None:
+    noise, clean = log_uniform(rng, 1e-3, 0.3), random_signals(rng, draw_air)
+    if clean is None:
         return
-    clean, noise = drawn
     power, variance = clean.draw(noise, profiles, int(rng.integers(2**31)))
-    result = extinction_field.retrieve_network(
-        power, clean.range, clean.network, variance=variance, full_overlap_range=FULL_OVERLAP,
-        blocks=np.arange(profiles) // length,
-    )  # fmt: skip
+    result = solve(power, variance, clean, length)
     yield scored(Failure(name, satisfied=True), result, clean.truth(profiles), 0.0)
 
 
@@ -496,10 +478,9 @@ def scored(failure: Failure, result: NetworkResult, truth: Array, systematic: An
 def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     """Yield results of networks whose lidar ratio varies along a wave of random direction."""
     rng = np.random.default_rng((86, cluster))
-    drawn = _drawn(rng, plume)
-    if drawn is None:
+    noise, clean = log_uniform(rng, 1e-3, 0.3), random_signals(rng, plume)
+    if clean is None:
         return
-    clean, noise = drawn
     net = clean.network
     wave = 2.0 * np.pi / log_uniform(rng, *_LONG_WAVES, (2,))
     at = net.origin[:, :, np.newaxis] + net.direction[:, :, np.newaxis] * clean.range
@@ -508,12 +489,9 @@ def score_lidar_ratios(cluster: int, profiles: int) -> Iterator[ScoredValues]:
     for varied, declared in _VARIED.items():
         ratio = np.exp(varied * np.sqrt(2.0) * np.sin(phase))
         power, variance = replace(clean, power=clean.power / ratio).draw(noise, profiles, seed)
-        result = extinction_field.retrieve_network(
-            power, clean.range, net, variance=variance, full_overlap_range=FULL_OVERLAP
-        )
+        result = solve(power, variance, clean)
         for words, error in declared.items():
-            name = f"lidar ratio varies by {100.0 * varied:g} %, {words}"
+            failure = Failure(f"lidar ratio varies by {100.0 * varied:g} %, {words}")
             # As products state it.
             systematic = labeled.lidar_ratio_error(result, net, clean.range, error)
-            failure = Failure(name)
             yield scored(failure, result, clean.truth(profiles), systematic)

@@ -101,15 +101,21 @@ def _analog(
 ) -> Errors:
     shots = int(log_uniform(rng, 20.0, 300.0))
     level, noise = log_uniform(rng, *levels), log_uniform(rng, *noises)
+    return select(_digitized(rng, level, noise, shots, profiles), level * _STEP, "voltage")
+
+
+def _digitized(
+    rng: Random, level: Array | float, noise: float, shots: int, profiles: int
+) -> counts_to_signal.Signal:
+    """Return the signal of a level with noise, both in steps of the digitizer."""
     total = np.zeros((profiles, _BINS))
     for _ in range(shots):
         sampled = np.rint(level + noise * rng.standard_normal(total.shape, dtype=np.float32))
         total += np.clip(sampled, 0.0, 2**_BITS - 1)
-    signal = counts_to_signal.analog_signal(
+    return counts_to_signal.analog_signal(
         total.astype(np.int32), np.full(profiles, shots), _RANGE[:_BINS], adc_bits=_BITS,
         input_range=np.full(profiles, 0.5),
     )  # fmt: skip
-    return select(signal, level * _STEP, "voltage")
 
 
 def _far(
@@ -217,13 +223,7 @@ def score_digitizers(cluster: int, profiles: int) -> Iterator[ScoredValues]:
         distance = _RANGE[:_BINS]
         fall = (300.0 / np.maximum(distance, 300.0)) ** 2
         level = float(rng.uniform(20.0, 60.0)) + float(rng.uniform(500.0, 3500.0)) * fall
-        total = np.zeros((profiles, _BINS))
-        for _ in range(shots):
-            total += np.rint(level + noise * rng.standard_normal(total.shape, dtype=np.float32))
-        signal = counts_to_signal.analog_signal(
-            total.astype(np.int32), np.full(profiles, shots), distance, adc_bits=_BITS,
-            input_range=np.full(profiles, 0.5),
-        )  # fmt: skip
+        signal = _digitized(rng, level, noise, shots, profiles)
         error = np.asarray(signal.power - level * _STEP, dtype=np.float64)
         stated = np.sqrt(np.asarray(signal.variance, dtype=np.float64))
         steep = (distance > 320.0) & (distance < 1200.0)

@@ -29,8 +29,6 @@ from benchmarks.harness.rates import (
     Unmet,
     collect,
     rates,
-    read_reasons,
-    why,
 )
 from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.scenes import (
@@ -39,16 +37,15 @@ from benchmarks.scenes import (
     lidar_networks,
     raman_skies,
     recorded_signals,
+    scans,
 )
-from benchmarks.stability import flag_rates, random_scans, reproducibility
 
 LONGEST: Final = 1200.0
 """s, most CPU time of the whole benchmark."""
 COST: Final = "CPU time of the parts"
-FLAGS: Final = "Flags of few photon counts, and bits that decide alone"
+FLAGS: Final = "Flags of few photon counts"
 LIGHT: Final = "Profiles without light of the laser"
 DEAD_TIMES: Final = "Estimated dead times that are missing or differ by more than 2 stated errors"
-REPRODUCIBLE: Final = "Order of profiles, machine and work"
 WHOLE: Final = "all parts"
 _NOTE: Final = (
     "A value is false if it differs from the truth by more than "
@@ -131,18 +128,16 @@ def _blocks(
 
 
 def _scans(length: int) -> Draws:
-    score = partial(random_scans.score_short_scans, length=length)
+    score = partial(scans.score_short_scans, length=length)
     return Draws(f"scans, blocks of {length}", "multiangle", score, 8, 400, 4)
 
 
-_paths, _scanned, _networks = homogeneous_paths, random_scans, lidar_networks
+_paths, _scanned, _networks = homogeneous_paths, scans, lidar_networks
 DRAWS: Final = (
     Draws("homogeneous", "homogeneous", _paths.score_homogeneous, 1000, 400, 4, 1e-3, pooled=True),
     Draws("signal chain", "signal", recorded_signals.score_signals, 50, 500, 20, 0.05, pooled=True),
     Draws("elastic", "elastic", elastic_skies.score_elastic, 20, 400, 6, 0.05, pooled=True),
     Draws("multi-angle", "multiangle", _scanned.score_scans, 8, 400, 6, 0.13, pooled=True),
-    Draws("scans of any and of calm air", "multiangle", _scanned.score_scan_methods, 8, 400, 6,
-          pooled=True),
     Draws("network", "network", partial(_networks.score_networks, of_all=300), 50, 700, 4, 0.05,
           pooled=True),
     Draws("Raman", "raman", raman_skies.score_raman, 8, 500, 6, 0.05, pooled=True),
@@ -162,7 +157,8 @@ DRAWS: Final = (
     Draws("networks, varying lidar ratio", "network", _networks.score_lidar_ratios, 6, 600, 4),
 )  # fmt: skip
 OTHERS: Final = (
-    Other("flags", "flags", FLAGS, lambda quick: flag_rates.flag_rates(2 if quick else 60),
+    Other("flags", "flags", FLAGS,
+          lambda quick: homogeneous_paths.few_count_scores(2 if quick else 60),
           ("flag", "condition")),
     Other("dead times", "signal", DEAD_TIMES,
           lambda quick: recorded_signals.dead_time_scores(2 if quick else 310),
@@ -170,9 +166,6 @@ OTHERS: Final = (
     Other("light", "light", LIGHT,
           lambda quick: recorded_signals.light_scores(10 if quick else 200),
           ("profiles", "condition")),
-    Other("order and machine", "order", REPRODUCIBLE,
-          lambda quick: reproducibility.measure_reproducibility(*((2, 1) if quick else (60, 6))),
-          ("case", "figure")),
 )  # fmt: skip
 
 
@@ -202,13 +195,8 @@ def measure_stability(
     note = "CPU time with child processes and compilation."
     results.append(Results(COST, of_cost, note, method="part"))
     unmet += unmet_targets(COST, of_cost)
-    missed = [one for one in unmet if one.judgement.verdict is Verdict.MISSED]
-    reasons = read_reasons()
-    return Study(
-        results,
-        missed=[str(one) for one in missed],
-        unnamed=[str(one) for one in missed if reasons and not why(one, reasons)],
-    )
+    missed = [str(one) for one in unmet if one.judgement.verdict is Verdict.MISSED]
+    return Study(results, missed=missed)
 
 
 CASES: Final[dict[str, Callable[[Effort], Study]]] = {

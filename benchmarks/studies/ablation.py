@@ -141,21 +141,17 @@ def _jackknife(events: Array, trials: Array) -> tuple[float, Array]:
     return float(events.sum() / max(trials.sum(), 1.0)), others
 
 
-def write_table(page: Path, mark: str, lines: Iterable[str]) -> None:
-    """Write the lines of a table into a page, between two marks of that name."""
-    text = page.read_text(encoding="utf-8")
-    before, begin, rest = text.partition(f"<!-- {mark} -->\n")
-    _, end, after = rest.partition(f"<!-- end of {mark} -->")
-    if not (begin and end):
-        raise ValueError(f"{page} has no marks of the name {mark!r}")
-    page.write_text("".join((before, begin, *(f"{line}\n" for line in lines), end, after)), "utf-8")
-
-
 def write_guards(
     page: str, score: ScoreCluster, clusters: int, guards: Sequence[Guard], mark: str = "guards"
 ) -> None:
     """Write the table of guards into a page, between two marks of that name."""
-    write_table(PAGES / page, mark, table(measure(score, range(clusters), guards)))
+    file = PAGES / page
+    before, begin, rest = file.read_text(encoding="utf-8").partition(f"<!-- {mark} -->\n")
+    _, end, after = rest.partition(f"<!-- end of {mark} -->")
+    if not (begin and end):
+        raise ValueError(f"{file} has no marks of the name {mark!r}")
+    lines = (f"{line}\n" for line in table(measure(score, range(clusters), guards)))
+    file.write_text("".join((before, begin, *lines, end, after)), "utf-8")
 
 
 def requested_number(description: str | None, default: int) -> int:

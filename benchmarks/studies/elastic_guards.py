@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-import types
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from functools import cache, partial
-from pathlib import Path
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final
 
-import numba
 import numpy as np
 
 from benchmarks.scenes import elastic_skies
@@ -35,27 +31,6 @@ PROFILES: Final = 10
 def _same(power: Any, range_: Any, variance: Any, **_: Any) -> Any:
     noise = np.broadcast_to(variance, np.shape(power))
     return outlying_bins.BridgedProfiles(power, noise, np.zeros(np.shape(power), np.bool_))
-
-
-@cache
-def _variant(old: str, new: str) -> types.ModuleType:
-    """Return the module of outlying bins with another text."""
-    source = Path(outlying_bins.__file__).read_text()
-    assert old in source, old
-    module = types.ModuleType("outlying_bins_variant")
-    sys.modules[module.__name__] = module
-    # Numba keeps no compiled code of a module without a file.
-    uncached = "@numba.njit(nogil=True, error_model='numpy')"
-    text = source.replace(old, new).replace("@compiled", uncached)
-    module.__dict__["numba"] = numba
-    exec(compile(text, "<variant>", "exec"), module.__dict__)
-    return module
-
-
-def bridges(old: str, new: str) -> AbstractContextManager[object]:
-    """Return the context in which a text in the detection of outlying bins is replaced."""
-    variant = _variant(old, new).bridge_outliers
-    return replaced((outlying_bins, "bridge_outliers", variant))
 
 
 _FIND: Final = layers.find_layers
@@ -110,13 +85,6 @@ GUARDS: Final = (
     Guard("skewed errors", off=with_thresholds(inversion, skewed=0.0)),
     Guard("longest gap", off=with_thresholds(inversion, longest_gap=np.inf)),
     Guard("bridging of outliers", off=without((outlying_bins, "bridge_outliers", _same))),
-    Guard("outlier: contrast", off=partial(bridges, "THRESHOLDS.least_contrast", "0.0")),
-    Guard("outlier: step", off=partial(bridges, "if not step <= allowed:", "if False:")),
-    Guard("outlier: equal counts", off=partial(bridges, "THRESHOLDS.most_equal", "9")),
-    Guard(
-        "outlier: one neighbour left out",
-        off=partial(bridges, "j, _farthest(j, q), usable_range", "j, -1, usable_range"),
-    ),
 )
 
 if __name__ == "__main__":

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
 from benchmarks.harness.figure import Array
-from benchmarks.stability import random_scans
+from benchmarks.scenes import scans
 from benchmarks.studies.ablation import (
-    PAGES,
-    Context,
     Guard,
-    measure,
     requested_number,
-    table,
+    with_thresholds,
     without,
-    write_table,
+    write_guards,
 )
 from lidarops.retrieve.multiangle import (
     _calibration,
@@ -26,27 +24,13 @@ from lidarops.retrieve.multiangle import (
 )
 from lidarops.retrieve.multiangle._smoothing import Scores, choose_smoothing
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 CLUSTERS: Final = 50
 PROFILES: Final = 8
 
 
-def _at(place: Any, **changes: Any) -> Context:
-    """Replace thresholds that a module reads."""
-    return without((place, "THRESHOLDS", THRESHOLDS._replace(**changes)))
-
-
-def _nothing(*_: Any) -> None:
-    return None
-
-
 def _by_likelihood(scores: Scores, *, one: bool) -> tuple[Array, Array]:
     return choose_smoothing(scores._replace(risk=np.zeros_like(scores.risk)), one=one)
-
-
-def _zero(*_: Any) -> float:
-    return 0.0
 
 
 def _uncalibrated(
@@ -58,8 +42,11 @@ def _uncalibrated(
 GUARDS: Final = (
     Guard("NO_RESIDUAL", int(MultiAngleQuality.NO_RESIDUAL)),
     Guard("INTERPOLATED", int(MultiAngleQuality.INTERPOLATED)),
-    Guard("gradients that residuals show", off=without((optical_depth, "visible_gradient", _zero))),
-    Guard("path variation", off=without((optical_depth, "path_variation_from", _nothing))),
+    Guard(
+        "gradients that residuals show",
+        off=without((optical_depth, "visible_gradient", lambda *_: 0.0)),
+    ),
+    Guard("path variation", off=without((optical_depth, "path_variation_from", lambda *_: None))),
     Guard(
         "few residuals: inflation",
         off=without((smooth_profile, "inflation", lambda noise: np.ones(noise.freedom.size))),
@@ -73,11 +60,10 @@ GUARDS: Final = (
         "calibration: scale of profiles",
         off=without((smooth_profile, "relative_squares", lambda depth, *_: np.ones(len(depth)))),
     ),
-    Guard("calibration: least scale", off=_at(_calibration, least_scale=0.0)),
+    Guard("calibration: least scale", off=with_thresholds(_calibration, least_scale=0.0)),
     Guard("correlation", off=without((optical_depth, "correlation_of_air", lambda *_: 0.0))),
 )
 
 if __name__ == "__main__":
-    clusters = range(requested_number(__doc__, CLUSTERS))
-    counts = measure(lambda k: random_scans.score_scans(k, PROFILES), clusters, GUARDS)
-    write_table(PAGES / "multiangle.md", "guards", table(counts))
+    score = partial(scans.score_scans, profiles=PROFILES)
+    write_guards("multiangle.md", score, requested_number(__doc__, CLUSTERS), GUARDS)

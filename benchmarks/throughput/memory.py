@@ -34,77 +34,66 @@ _VARIANTS: Final = 4
 """Number of different profiles; files repeat them."""
 _ZENITH_ANGLES: Final = (0.0, 30.0, 45.0, 60.0, 70.0, 75.0, 80.0, 85.0)
 """degree, in the headers of consecutive files: one cycle of a scan."""
-_SLANTED: Final = 80.0
-"""degree; sections may be retrieved, and the beam reaches the reference window of ``elastic``."""
 _DARK_SHARE: Final = 0.1
 """Dark files for each file of the scene."""
-_DARK: Final = {"dark_files": "d*"}
-_ANALOG: Final = ["analog_532o"]
-_PHOTON: Final = ["photon_532o"]
-_HOMOGENEOUS: Final[Mapping[str, Any]] = {"channels": _PHOTON, "sections": [[750, 6000]]}
+_ANALOG: Final[dict[str, Any]] = {"channels": ["analog_532o"]}
+_PHOTON: Final[dict[str, Any]] = {"channels": ["photon_532o"]}
+_MINUTE: Final[dict[str, Any]] = {"average": "1min"}
 _NETWORK: Final = {
     "west": ("012", 47.25, 11.3, 70.0),
     "east": ("345", 47.25, 11.353, 310.0),
     "north": ("6789", 47.2811, 11.3265, 190.0),
 }
 """Last digits of the files, latitude, longitude and azimuth of each lidar; all are level."""
+_WITH_DARK: Final = ", dark files"
+_VISIBILITY: Final = "visibility"
+_OF_ONE: Final[Mapping[str, tuple[float | None, Mapping[str, Any]]]] = {
+    "signal": (0.0, {"signal": {}}),
+    f"signal{_WITH_DARK}": (0.0, {"signal": _ANALOG}),
+    "homogeneous": (90.0, {"homogeneous": _PHOTON | {"sections": [[750, 6000]]}}),
+    "elastic": (0.0, {"elastic": _ANALOG}),
+    "elastic, 1 min": (0.0, {"elastic": _ANALOG | _MINUTE}),
+    f"elastic, 1 min{_WITH_DARK}": (0.0, {"elastic": _ANALOG | _MINUTE}),
+    "elastic, glued": (0.0, {"elastic": {"channels": ["glued_532o"]}}),
+    # At 80 degrees sections may be retrieved, and the beam reaches the reference window.
+    "signal, homogeneous and elastic": (80.0, {
+        "signal": {},
+        "homogeneous": _PHOTON | {"sections": [[750, 1250]]},
+        "elastic": _PHOTON | {"reference": {"lowest": 1000, "highest": 4000}},
+    }),
+    "multiangle": (None, {"multiangle": _PHOTON | {"step": 15}}),
+}  # fmt: skip
+"""Zenith angle, degree, and products of one lidar, by case; without an angle, it scans."""
+CASES: Final = (*_OF_ONE, _VISIBILITY)
+"""Rows of the table; all have the same files."""
 
 
-def _of_one(
-    zenith_angle: float | None, products: Mapping[str, Any], **instrument: Any
-) -> dict[str, Any]:
-    """Return the part of a campaign file with one lidar; without an angle, it scans."""
-    facts: dict[str, float] = {"full_overlap_range": 300}
-    if zenith_angle is not None:
-        facts |= {"zenith_angle": zenith_angle}
-    lidar = {"station": "here", "files": "h*", "facts": [facts], "products": dict(products)}
-    return {"instruments": {"lidar": lidar | instrument}}
+def _instrument(station: str, files: Any, products: Mapping[str, Any], **facts: Any) -> Any:
+    return {"station": station, "files": files, "facts": [facts], "products": dict(products)}
+
+
+def _one_lidar(case: str) -> dict[str, Any]:
+    """Return stations and instruments of a campaign file with one lidar."""
+    angle, products = _OF_ONE[case]
+    pointing = {} if angle is None else {"zenith_angle": angle}
+    lidar = _instrument("here", "h*", products, full_overlap_range=300, **pointing)
+    dark = {"dark_files": "d*"} if case.endswith(_WITH_DARK) else {}
+    here = {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}
+    return {"stations": {"here": here}, "instruments": {"lidar": lidar | dark}}
 
 
 def _network() -> dict[str, Any]:
-    """Return the part of a campaign file with a network."""
-    return {
-        "stations": {
-            name: {"name": name, "latitude": latitude, "longitude": longitude, "altitude": 600}
-            for name, (_, latitude, longitude, _) in _NETWORK.items()
-        },
-        "instruments": {
-            name: {
-                "station": name,
-                "files": [f"h*{digit}" for digit in digits],
-                "facts": [{"full_overlap_range": 150, "zenith_angle": 90.0, "azimuth": azimuth}],
-                "products": {},
-            }
-            for name, (digits, _, _, azimuth) in _NETWORK.items()
-        },
-        "networks": {
-            "valley": {"instruments": list(_NETWORK), "visibility": {"channel": "photon_532o"}}
-        },
-    }
-
-
-CASES: Final[Mapping[str, Mapping[str, Any]]] = {
-    "signal": _of_one(0, {"signal": {}}),
-    "signal, dark files": _of_one(0, {"signal": {"channels": _ANALOG}}, **_DARK),
-    "homogeneous": _of_one(90, {"homogeneous": _HOMOGENEOUS}),
-    "elastic": _of_one(0, {"elastic": {"channels": _ANALOG}}),
-    "elastic, 1 min": _of_one(0, {"elastic": {"channels": _ANALOG, "average": "1min"}}),
-    "elastic, 1 min, dark files": _of_one(
-        0, {"elastic": {"channels": _ANALOG, "average": "1min"}}, **_DARK
-    ),
-    "elastic, glued": _of_one(0, {"elastic": {"channels": ["glued_532o"]}}),
-    "signal, homogeneous and elastic": _of_one(
-        _SLANTED,
-        {
-            "signal": {},
-            "homogeneous": {"channels": _PHOTON, "sections": [[750, 1250]]},
-            "elastic": {"channels": _PHOTON, "reference": {"lowest": 1000, "highest": 4000}},
-        },
-    ),
-    "multiangle": _of_one(None, {"multiangle": {"channels": _PHOTON, "step": 15}}),
-    "visibility": _network(),
-}
-"""Part of the campaign file of each row of the table; all have the same files."""
+    """Return stations, instruments and network of a campaign file with a network."""
+    stations, instruments = {}, {}
+    for name, (digits, latitude, longitude, azimuth) in _NETWORK.items():
+        stations[name] = {"name": name, "latitude": latitude, "longitude": longitude,
+                          "altitude": 600}  # fmt: skip
+        files = [f"h*{digit}" for digit in digits]
+        instruments[name] = _instrument(
+            name, files, {}, full_overlap_range=150, zenith_angle=90.0, azimuth=azimuth
+        )
+    valley = {"instruments": list(_NETWORK), "visibility": {"channel": "photon_532o"}}
+    return {"stations": stations, "instruments": instruments, "networks": {"valley": valley}}
 
 
 class Peak(NamedTuple):
@@ -123,7 +112,7 @@ def measure_memory(effort: Effort) -> Study:
     """Measure the peak memory of processes, by size of the scene and products."""
     scores: Scores = {}
     smallest: dict[str, Peak] = {}
-    for peak in measure_peaks(SIZES[:2] if effort.quick else SIZES, tuple(CASES)):
+    for peak in measure_peaks(SIZES[:2] if effort.quick else SIZES, CASES):
         first = smallest.setdefault(peak.case, peak)
         more = peak.raw - first.raw
         scores[peak.case, f"{peak.raw:.0f}"] = {
@@ -181,17 +170,11 @@ def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
 
 def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
-    settings = {
-        "name": "memory",
-        "title": "Campaign of a benchmark",
-        "archive": "raw",
-        "output": "out",
-        "stations": {"here": {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}},
-        **CASES[case],
-    }
+    settings = {"name": "memory", "title": "Campaign of a benchmark", "archive": "raw"}
+    sites = _network() if case == _VISIBILITY else _one_lidar(case)
     out.mkdir()
     file = out / "campaign.yaml"
-    file.write_text(yaml.safe_dump(settings), encoding="utf-8")
+    file.write_text(yaml.safe_dump(settings | {"output": "out"} | sites), encoding="utf-8")
     return load_campaign(file, archive=str(folder), output=str(out))
 
 

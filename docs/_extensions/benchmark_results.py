@@ -51,15 +51,10 @@ class Selection(NamedTuple):
 SELECTIONS: Final = {
     "accuracy": Selection(
         "python -m benchmarks accuracy --quick --out bench",
-        ("The most accurate", "Ours beside", "Homogeneous path:", "Elastic inversion:",
-         "Scans over zenith", "Networks: Networks and scipy"),
+        ("Ours beside", "Homogeneous path:", "Elastic inversion:", "Scans over zenith",
+         "Networks of lidars:"),
         figures=("all-homogeneous-path", "all-elastic-inversion", "all-scans-over-zenith-angle",
                  "all-networks-of-lidars"),
-    ),
-    "background": Selection(
-        "python -m benchmarks accuracy --case homogeneous --quick --out bench",
-        ("Mean error of the background",),
-        ("length of the section (km)", "lag 1", "direct", "scatter", "flagged", "published"),
     ),
     "memory": Selection(
         "python -m benchmarks throughput --case memory --out bench", ("Peak memory",)
@@ -74,12 +69,10 @@ SELECTIONS: Final = {
         ("clusters", "values", "not rejected", "within 1.96", "95 % target", "within 1",
          "68 % target", "stated / median error", "false, random error", "and not uncertain",
          "target", "of these undetectable", "and below 3.5", "without any flag",
-         "needlessly flagged", "needless target", "share", "largest change, in stated errors",
-         "CPU time"),
+         "needlessly flagged", "needless target", "share", "CPU time"),
     ),
     "throughput": Selection(
-        "python -m benchmarks throughput --quick --out bench", ("float32, dense", "float32, 30 %"),
-        figures=("time",),
+        "python -m benchmarks throughput --quick --out bench", ("float32, dense", "float32, 30 %")
     ),
 }  # fmt: skip
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 PARTS: Final[dict[str, Callable[[], str]]] = {
     "accuracy": partial(benchmark_results.page, "accuracy"),
     "before-after": before_after.page,
-    "background": partial(benchmark_results.page, "background"),
     "campaign-keys": campaign_keys.page,
     "command-line": command_line.page,
     "every-function": python_api.every_function,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from typing import Final
 
 import benchmark_results
 import tables
 from benchmark_results import Row
 
-from benchmarks.harness import rates
 from benchmarks.harness.figure import CPU_TIME, Judgement, Verdict, share_text
 from benchmarks.harness.rates import SATISFIED, SHARE, TARGET, TARGETS, Unmet
 from benchmarks.harness.results import cell
@@ -94,11 +95,23 @@ def _rows() -> Iterator[Row]:
         yield from rows
 
 
-def stated_reasons() -> list[rates.Reason]:
+Reason = dict[str, str]
+"""``why``, and patterns of the part, quantity, class, target and verdict that it is for."""
+
+
+def stated_reasons() -> list[Reason]:
     """Return the reasons for targets that are not met, the most special ones first."""
-    return rates.read_reasons()
+    file = benchmark_results.RESULTS / "reasons.json"
+    return list(json.loads(file.read_text(encoding="utf-8")))
 
 
 def why(one: Unmet) -> str:
     """Return the reason of a target that is not met; empty if none is stated."""
-    return rates.why(one, stated_reasons())
+    texts = {"part": one.part, "quantity": one.quantity, "class": one.name, "target": one.target,
+             "verdict": one.judgement.verdict}  # fmt: skip
+    fits = (
+        reason["why"]
+        for reason in stated_reasons()
+        if all(fnmatchcase(text, reason.get(key, "*")) for key, text in texts.items())
+    )
+    return next(fits, "")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,14 +19,12 @@ from lidarops.figures.panels import (
     Mark,
     Panel,
     codes_of,
-    number,
     time_axis,
     units,
 )
 from lidarops.figures.raster import Raster
 from lidarops.figures.time_axis import days
 from lidarops.figures.wording import percent
-from lidarops.flags import Quality
 
 Floats = NDArray[np.float64]
 Line = tuple[float, float]
@@ -101,10 +99,9 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
         height=_HEIGHT,
         bar=Axis(label, *ends, log=True) if ends else None,
     )
-    words = _in_words(shown, reach, ends)
+    words = ["Dark grey at or below zero", *_in_words(shown, reach)]
     if not (values > 0).any():
-        words = ["No usable value above zero", *words]
-    words.append(f"shown to {along} {far / 1e3:.3g} km")
+        words[0] = "No usable value above zero"
     title = f"{quantity.name[:1].upper()}{quantity.name[1:]}"
     return Figure(f"{title} against time and {name}", "; ".join(words), (panel,))
 
@@ -150,36 +147,20 @@ def _altitude(rasters: Sequence[Raster]) -> Line | None:
     return None if line is None or abs(line[1]) < _UPRIGHT else line
 
 
-def _in_words(
-    rasters: Sequence[Raster], reach: float, ends: tuple[float, float] | None
-) -> list[str]:
-    words = []
-    if ends:
-        words.append(
-            f"Colour scale from {number(ends[0])} to {number(ends[1])}, dark grey at or below 0"
-        )
+def _in_words(rasters: Sequence[Raster], reach: float) -> Iterator[str]:
     if reach > 0:
-        words.append(f"noise dominates beyond {reach / 1e3:.3g} km")
+        yield f"noise dominates beyond {reach / 1e3:.3g} km"
     measured = sum((raster.profiles.sum() * raster.length for raster in rasters), _NO_TIME)
     drawn = sum(((raster.stop - raster.start).sum() for raster in rasters), _NO_TIME)
     if measured < _HALF * drawn:
-        words.append(f"measured in {percent(float(measured / drawn))} of the time that is filled")
+        yield f"measured in {percent(float(measured / drawn))} of the time that is filled"
     flagged = float(np.concatenate([raster.flagged for raster in rasters], axis=None).mean())
     if flagged:
-        bits = {bit.word: bit for raster in rasters for bit in raster.bits if bit.rejects}
-        bits.pop(Quality.INPUT_MISSING.word, None)
-        words.append(f"light grey, {percent(flagged)}: flagged {', '.join(bits)}")
-    care = np.average([r.with_care for r in rasters], weights=[r.profiles.sum() for r in rasters])
-    if care:
-        caring = {bit.word for raster in rasters for bit in raster.bits if not bit.rejects}
-        words.append(
-            f"{percent(care)} of the bins shown: use with care ({', '.join(sorted(caring))})"
-        )
+        yield f"light grey, {percent(flagged)}: not to use"
     clouds = np.concatenate([raster.clouds for raster in rasters])
     if np.isfinite(clouds).any():
         known = int(np.isfinite(clouds).sum())
-        words.append(f"cloud base in {known} of {clouds.size} columns (triangles)")
-    return words
+        yield f"cloud base in {known} of {clouds.size} columns (triangles)"
 
 
 def colour_limits(values: Floats) -> tuple[float, float] | None:

@@ -1,23 +1,28 @@
 """What a kind of product states about its figures, and how pages and reports find it.
 
-A kind has a module ``figures``, which holds `KindFigures` by the name ``FIGURES``. Products of
-other kinds are drawn by `lidarops.figures.any_kind`.
+A kind has a module ``figures``, which holds `KindFigures` by the name ``FIGURES``. Of products of
+other kinds, the main variable is drawn against time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from lidarops.figures.image_panels import ImageQuantity, image_figure
-from lidarops.figures.panels import Figure
+from lidarops.figures.panels import Figure, units
 from lidarops.figures.raster import Raster, raster_variables, read_raster
+from lidarops.figures.series_data import TimeSeries, join
+from lidarops.figures.series_panels import SERIES, Quantity, series_figures
 from lidarops.kinds import kinds
+from lidarops.netcdf.stored_flags import judge
+from lidarops.netcdf.variables import layout_of, possible_judges, summary_of
 
 Content = TypeVar("Content")
 
@@ -86,3 +91,96 @@ def preferred_variables() -> tuple[str, ...]:
     """Return the preferred variables of all kinds, in the order of their rank."""
     known = (figures_of(kind) for kind in kinds())
     return tuple(dict.fromkeys(figures.preferred for figures in known if figures is not None))
+
+
+# Products of any kind --------------------------------------------------------------------------
+
+_BULK: Final = 64_000_000
+"""Bytes of a variable above which only some profiles are read."""
+
+AnyContent = tuple[str, Quantity, tuple[TimeSeries, ...]]
+"""Title, the variable, and its series."""
+
+
+def _main_name(product: xr.Dataset) -> str | None:
+    """Return the name of the main variable of a product; None without a variable over time.
+
+    The first of: the preferred variables of all kinds, variables with a standard error,
+    floating-point variables.
+    """
+    if "time" not in product.variables or product["time"].dtype.kind != "M":
+        return None
+    over_time = [
+        str(name)
+        for name, variable in product.data_vars.items()
+        if variable.dims[:1] == ("time",) and variable.dtype.kind == "f" and variable.size
+    ]
+    preferred = [name for name in preferred_variables() if name in over_time]
+    uncertain = [name for name in over_time if f"{name}_standard_error" in product]
+    return next(iter([*preferred, *uncertain, *over_time]), None)
+
+
+def view_of(kind: str, name: str | None = None) -> View[AnyContent]:
+    """Return the view of a variable; of the main one for kinds without figures, or unknown."""
+    data = layout_of(kind).data if kind in kinds() and not name else ()
+    uncertain = [row.name for row in data if row.uncertain]
+    names = [name] if name else dict.fromkeys([*uncertain, *preferred_variables()])
+    errors = (f"{name}_standard_error" for name in names)
+    judges = dict.fromkeys(flags for name in names for flags in possible_judges(name))
+    summaries = (summary_of(flags) for flags in judges)
+    variables = "time", *names, *errors, *judges, *summaries
+    return View(kind, variables, partial(_read, name), _draw)
+
+
+def views_of(kind: str) -> Sequence[View[Any]]:
+    """Return the views of products of any kind, known or not."""
+    figures = figures_of(kind)
+    return figures.views if figures is not None else (view_of(kind),)
+
+
+def _read(name: str | None, product: xr.Dataset, _: int) -> AnyContent | None:
+    """Return the series with the most values; of a large variable, only of some profiles."""
+    name = name or _main_name(product)
+    if name is None:
+        return None
+    step = max(1, -(-product[name].nbytes // _BULK))
+    some = product.isel(time=slice(None, None, step))
+    some = some.isel(time=np.argsort(some["time"].values, kind="stable"))
+    variable = some[name]
+
+    def table(other: str) -> xr.DataArray:
+        """Return another variable along the dimensions of this one; NaN if there is none."""
+        has = other in some and some[other].dims == variable.dims
+        return some[other] if has else xr.full_like(variable, np.nan)
+
+    shape = variable.sizes["time"], -1
+    values, errors = (
+        table(which).values.reshape(shape).astype(np.float64)
+        for which in (name, f"{name}_standard_error")
+    )
+    judged = judge(some, name)
+    flags = judged.bits.reshape(shape)
+    time = some["time"].values.astype("datetime64[ns]")
+    most_values = np.argsort(-np.isfinite(values).sum(axis=0), kind="stable")[:SERIES]
+    series = tuple(
+        TimeSeries(
+            pd.DataFrame(
+                {"flag": flags[:, k], name: values[:, k], f"{name}_standard_error": errors[:, k]},
+                index=time,
+            ),
+            judged.rejecting,
+            label=f"{variable.dims[1]} {k}" if variable.ndim > 1 else "",
+            key=(k,),
+        )
+        for k in np.sort(most_values).tolist()
+    )
+    title = str(variable.attrs.get("long_name", name))
+    few = f", {len(series)} of {values.shape[1]} series" if values.shape[1] > len(series) else ""
+    quantity = Quantity(name, 1.0, units(str(variable.attrs.get("units", ""))))
+    return f"{title[:1].upper()}{title[1:]}{few}", quantity, series
+
+
+def _draw(contents: Sequence[AnyContent]) -> Iterator[Figure]:
+    title, quantity, _ = contents[0]
+    joined = join(one for _, other, more in contents for one in more if other == quantity)
+    return series_figures(joined[:SERIES], (quantity,), title)

@@ -24,13 +24,7 @@ from lidarops.figures.time_axis import (
     profile_bounds,
 )
 from lidarops.flags import Quality
-from lidarops.netcdf.stored_flags import (
-    StoredBit,
-    bits_of,
-    flags_names,
-    quality_bits,
-    rejecting_mask,
-)
+from lidarops.netcdf.stored_flags import bits_of, flags_names, quality_bits, rejecting_mask
 from lidarops.netcdf.variables import judging, possible_judges
 
 Floats = NDArray[np.float64]
@@ -71,8 +65,8 @@ class Raster:
     edges: Floats
     """(row + 1,) Edges of the rows along range, m."""
     sums: Sums
-    """(5, column, row) Sums of the usable bins, of their variances, of their number, of the number
-    of bins that a quality bit rejects, without missing data, and of bins to use with care."""
+    """(4, column, row) Sums of the usable bins, of their variances, of their number, and of the
+    number of bins that a quality bit rejects, without missing data."""
     bins: Floats
     """(row,) Number of bins along range in a row."""
     profiles: NDArray[np.int64]
@@ -82,8 +76,6 @@ class Raster:
     clouds: Floats
     """(column,) Range of the lowest cloud base, m; NaN without a cloud."""
     units: str
-    bits: tuple[StoredBit, ...]
-    """All bits that any bin carries."""
     altitude: tuple[float, float] | None
     """Altitude at range 0 in m, and its change per m of range; None if unknown."""
 
@@ -99,12 +91,6 @@ class Raster:
         rejected = self.sums[3]
         blocks = self.profiles[:, None] * self.bins[None, :]
         return np.asarray((rejected > 0) & (2 * rejected >= blocks))
-
-    @property
-    def with_care(self) -> float:
-        """Share of bins to use with care."""
-        bins = float(self.profiles.sum() * self.bins.sum())
-        return float(self.sums[4].sum(dtype=np.float64)) / bins
 
     @property
     def reach(self) -> float:
@@ -197,8 +183,7 @@ def read_raster(
     missing = sum(bit.mask for bit in known if bit.word == Quality.INPUT_MISSING.word)
     masks = rejecting_mask(known), missing
     names = quantity, f"{quantity}_standard_error", judge
-    sums, carried = zip(*_reduced(product[[*names]], names, masks, columns, rows), strict=True)
-    union = int(np.bitwise_or.reduce(carried))
+    sums = [*_reduced(product[[*names]], names, masks, columns, rows)]
     start, stop = column_edges(starts, stops, columns)
     return Raster(
         start=start,
@@ -210,15 +195,14 @@ def read_raster(
         length=np.median(stops - starts),
         clouds=_clouds(product, columns),
         units=str(product[quantity].attrs.get("units", "")),
-        bits=tuple(bit for bit in known if bit.mask & union),
         altitude=_altitude(product, ranges),
     )
 
 
 def _reduced(
     product: xr.Dataset, names: Names, masks: tuple[int, int], columns: Indices, rows: Indices
-) -> Iterator[tuple[Sums, int]]:
-    """Yield sums over blocks of columns, and the union of their bits."""
+) -> Iterator[Sums]:
+    """Yield sums over blocks of columns."""
     edges = [*columns, product.sizes["time"]]
     longest = int(np.diff(edges).max())
     step = max(1, _READ_BYTES // (8 * product[names[0]].shape[1] * longest))
@@ -230,13 +214,13 @@ def _reduced(
 
 def _sums(
     product: xr.Dataset, names: Names, masks: tuple[int, int], columns: Indices, rows: Indices
-) -> tuple[Sums, int]:
+) -> Sums:
     signal, error = (product[name].values.astype(np.float64) for name in names[:2])
     flag = quality_bits(product[names[2]])
     rejected, missing = ((flag & mask) != 0 for mask in masks)
     good = np.isfinite(signal) & ~rejected & ~missing
     known = np.where(good, signal, 0.0), np.where(good, error, 0.0) ** 2
-    parts = *known, good, rejected & ~missing, good & (flag != 0)
+    parts = *known, good, rejected & ~missing
     sums = np.zeros((len(parts), columns.size, rows.size), dtype=np.float32)
     for total, part in zip(sums, parts, strict=True):
         by_row = part.astype(np.float64, copy=False)
@@ -244,7 +228,7 @@ def _sums(
         if rows.size < part.shape[1]:
             by_row = np.add.reduceat(by_row, rows, axis=1)
         total[:] = np.add.reduceat(by_row, columns, axis=0)
-    return sums, int(np.bitwise_or.reduce(flag, axis=None))
+    return sums
 
 
 def _clouds(product: xr.Dataset, columns: Indices) -> Floats:

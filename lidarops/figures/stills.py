@@ -66,14 +66,10 @@ def still(figure: Figure, suffix: str) -> bytes:
         tall = max(heights) + _ROOM if figure.beside else sum(heights) + _ROOM + 0.3 * len(panels)
         canvas = Canvas(figsize=(_WIDTH, tall), dpi=_SCREEN, layout="constrained")
         shape = (1, len(panels)) if figure.beside else (len(panels), 1)
-        ratios = None if figure.beside else heights
-        grid = canvas.add_gridspec(*shape, height_ratios=ratios)
+        ratios = {} if figure.beside else {"height_ratios": heights}
+        every = canvas.subplots(*shape, squeeze=False, gridspec_kw=ratios).ravel()
         seen: set[str] = set()
-        first: Axes | None = None
-        for place, panel in enumerate(panels):
-            shared = first if panel.x == panels[0].x and not figure.beside else None
-            axes = canvas.add_subplot(grid[place], sharex=shared)
-            first = first or axes
+        for place, (axes, panel) in enumerate(zip(every, panels, strict=True)):
             last = figure.beside or place + 1 == len(panels) or panels[place + 1].x != panel.x
             _draw(canvas, axes, panel, seen, labelled=last)
         canvas.suptitle(visible(figure.caption), fontsize=10)
@@ -104,21 +100,14 @@ def _draw(canvas: Canvas, axes: Axes, panel: Panel, seen: set[str], *, labelled:
 
 
 def _legend(axes: Axes, seen: set[str]) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    new = {
-        words: handle for handle, words in zip(handles, labels, strict=True) if words not in seen
-    }
+    shown = zip(*axes.get_legend_handles_labels(), strict=True)
+    new = {words: handle for handle, words in shown if words not in seen}
     seen.update(new)
     if new:
         axes.legend(
-            new.values(),
-            new.keys(),
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            ncols=2,
-            fontsize=8,
-            borderaxespad=0.2,
-        )
+            new.values(), new.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2,
+            fontsize=8, borderaxespad=0.2,
+        )  # fmt: skip
 
 
 def _bar(canvas: Canvas, axes: Axes, bar: Axis) -> None:

@@ -7,7 +7,7 @@ read in one process or several; figures and their order do not depend on the num
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, groupby
@@ -17,15 +17,13 @@ from typing import Any, Final
 import xarray as xr
 
 from lidarops.errors import ProductError
-from lidarops.figures.any_kind import views_of
-from lidarops.figures.kind_figures import View
+from lidarops.figures.kind_figures import View, views_of
 from lidarops.figures.panels import Figure
-from lidarops.figures.product_names import attribute, light_in_words
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.wording import counted, named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
-from lidarops.netcdf.read import open_product, opened_product
+from lidarops.netcdf.read import open_product
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord
 from lidarops.system.processes import CRASHED, Processes
@@ -71,14 +69,13 @@ class Group:
         """Why no value is usable: the rejecting bits that most values carry; empty if one is."""
         if self.kind not in kinds() or any(product.usable != 0 for product in self.products):
             return ""
-        flags = flags_of(self.kind)
-        counts: Counter[str] = Counter()
+        known, counts = flags_of(self.kind), Counter[str]()
         for product in self.products:
             counts.update(product.flagged)
         rejecting = (
             (bit.description, count)
             for name, count in counts.items()
-            if (bit := flags.named(name)) is not None and bit.severity is Severity.REJECT
+            if (bit := known.named(name)) is not None and bit.severity is Severity.REJECT
         )
         return named_shares(rejecting, sum(product.values for product in self.products))
 
@@ -133,8 +130,7 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
             for view in views_of(group.kind):
                 contents = list(_read(processes, group, view, gallery.problems))
                 if contents:
-                    title = _title(group, gallery.problems)
-                    gallery.pictures += [_picture(one, group, title) for one in view.draw(contents)]
+                    gallery.pictures += [_picture(one, group) for one in view.draw(contents)]
     return gallery
 
 
@@ -191,26 +187,10 @@ def _reason(path: Path, error: BaseException) -> str:
     return words or type(error).__name__
 
 
-def _picture(drawn: Figure, group: Group, title: str) -> Picture:
-    scenes = counted(len(group.products), "scene")
-    words = f"{scenes}. {drawn.words}."
-    caption = f"{drawn.caption}: {title}"
+def _picture(drawn: Figure, group: Group) -> Picture:
+    words = f"{counted(len(group.products), 'scene')}. {drawn.words}."
+    caption = f"{drawn.caption}: {group.label}"
     return Picture(drawn, group.instrument, caption, group.lacking, words)
-
-
-def _title(group: Group, unreadable: Collection[str]) -> str:
-    """Return channel and instrument as people call them, by the first product that can be read."""
-    for product in group.products:
-        # What crashed another process would crash this one.
-        if product.path in unreadable:
-            continue
-        try:
-            with opened_product(group.root / product.path) as opened:
-                name = attribute(opened, "instrument", group.instrument)
-                return f"{light_in_words(opened) or group.channel}, {name}"
-        except ProductError:
-            continue
-    return group.label
 
 
 def _groups(record: RunRecord) -> list[Group]:

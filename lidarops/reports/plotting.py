@@ -12,9 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import LidarOpsError, ProductError
-from lidarops.figures.any_kind import view_of, views_of
 from lidarops.figures.image_panels import ImageQuantity
-from lidarops.figures.kind_figures import View, image_view
+from lidarops.figures.kind_figures import View, image_view, view_of, views_of
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.figures.raster import COLUMNS
 from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading

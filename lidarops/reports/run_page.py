@@ -33,6 +33,15 @@ _SHOWN: Final = 9
 """Most figures on the page, of each instrument in turn; the others are folded."""
 
 
+_TABLES: Final = (
+    run_tables.summary, run_tables.verdict, run_tables.outcome_class, run_tables.changed_products,
+    run_tables.findings, run_tables.instruments, run_tables.left_out, run_tables.carried_out,
+    run_tables.scenes_without_product, run_tables.flags, run_tables.refused,
+    run_tables.failed_rows, run_tables.internal_errors, run_tables.hashes,
+)  # fmt: skip
+"""What the template shows of a record, by the name of the function."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunReport:
     """Files of a report."""
@@ -94,40 +103,25 @@ def _render(record: RunRecord, folder: Path, filled: Gallery) -> str:
     problems = dict.fromkeys(missing, "the file is missing")
     problems |= filled.problems
     pictures = _by_instrument([one for one in filled.pictures if not one.lacking])
-    return _environment().get_template("run.html").render(
+    template = _environment().get_template("run.html")
+    return template.render(
         record=record,
+        rows=ROWS,
         version=record.version,
-        summary=run_tables.summary(record),
-        verdict=run_tables.verdict(record),
-        outcome=run_tables.outcome_class(record),
         difference=difference(record, folder),
-        changes=run_tables.changed_products(record),
         overview=_overview(pictures),
-        findings=run_tables.findings(record),
         unmet=unmet_rows(record.findings),
-        instruments=run_tables.instruments(record),
         scenes=record.scenes[:ROWS],
         links=links,
-        left_out=run_tables.left_out(record),
-        without_product=run_tables.scenes_without_product(record),
-        steps=run_tables.carried_out(record),
-        flags=run_tables.flags(record),
         rejections=list(rejection_rows(record.scenes)),
-        refused=run_tables.refused(record),
-        failed=[
-            (scene.scene, scene.station, scene.instrument, scene.granules, scene.error)
-            for scene in run_tables.failed_scenes(record)
-        ],
-        internal=run_tables.internal_errors(record),
         problems=sorted(problems.items()),
         pictures=pictures,
         lacking=[picture for picture in filled.pictures if picture.lacking],
         drawn={name: number for number, (name, _) in enumerate(pictures, 1)},
         undrawn=filled.undrawn,
-        hashes=run_tables.hashes(record),
         run_file=FILE_NAME if (folder / FILE_NAME).is_file() else "",
-        rows=ROWS,
-    )  # fmt: skip
+        **{table.__name__: table(record) for table in _TABLES},
+    )
 
 
 @cache

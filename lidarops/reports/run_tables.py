@@ -127,6 +127,15 @@ def failed_scenes(record: RunRecord) -> list[SceneOutcome]:
     return [scene for scene in record.scenes if scene.error and not scene.internal]
 
 
+def failed_rows(record: RunRecord) -> list[Row]:
+    """Return the failed scenes with their reasons."""
+    return [
+        {"scene": scene.scene, "station": scene.station, "instrument": scene.instrument,
+         "granules": scene.granules, "reason": scene.error}
+        for scene in failed_scenes(record)
+    ]  # fmt: skip
+
+
 def internal_errors(record: RunRecord) -> list[SceneOutcome]:
     """Return the scenes that ended with an internal error, a bug of lidarops."""
     return [scene for scene in record.scenes if scene.internal]

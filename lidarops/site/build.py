@@ -20,10 +20,9 @@ from markupsafe import Markup
 
 from lidarops import __version__
 from lidarops.errors import CatalogError, ProductError, UnavailableError
-from lidarops.figures import any_kind, browser
-from lidarops.figures.kind_figures import View, figures_of
+from lidarops.figures import browser
+from lidarops.figures.kind_figures import View, figures_of, view_of
 from lidarops.figures.panels import Figure
-from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
@@ -31,16 +30,17 @@ from lidarops.netcdf.read import UNREADABLE, opened_product, reading
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.site import pages, product_contents
-from lidarops.site.links import BESIDE, Links
-from lidarops.site.neighbours import with_neighbours
 from lidarops.site.paths import (
+    BESIDE,
     CALENDAR_HEIGHT,
+    Links,
     day_page,
     month_list,
     product_folder,
     year_page,
 )
-from lidarops.site.product_entry import Entry, Problem
+from lidarops.site.product_contents import attribute, light_in_words, scalar
+from lidarops.site.product_entry import Entry, Problem, with_neighbours
 from lidarops.site.quality import Quality, read_quality
 from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
@@ -57,7 +57,6 @@ _FORMAT: Final = "lidarops site"
 _READ_BYTES: Final = 16_000_000
 """Most bytes of a variable that is read as a whole."""
 _ALWAYS: Final = "time", TIME_BOUNDS, QUALITY_FLAG, USABLE
-_EMPTY: Final = "No figure of the product"
 _OURS: Final = ("product", "station")
 """Folders that only the site writes to."""
 
@@ -189,11 +188,12 @@ def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
     if known.sha256 != sha256:
         return False
     # Read only: what is written is held to the folder of the site.
-    files = (site / name for name in known.files)
-    return all(
-        file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest
-        for file, digest in zip(files, known.digests, strict=True)
-    )
+    page = site / known.page
+    return page.is_file() and _digest(page.read_bytes()) == known.digest
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry:
@@ -212,7 +212,7 @@ def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry
             path=path,
             sha256=sha256,
             size=file.stat().st_size,
-            digests=(),
+            digest="",
             campaign=product_contents.campaign(opened),
             station=station,
             place=attribute(opened, "platform", station),
@@ -233,16 +233,11 @@ def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry
             profiles=quality.profiles,
             available=quality.available,
             lacking=quality.lacking,
-            alt=figures[0][0].text if figures else _EMPTY,
             problem="; ".join(filter(None, problems)),
         )
-        contents = (
-            pages.product(entry, stored, quality, origin, figures),
-            browser.thumbnail(figures[0][0] if figures else None),
-        )
-    for name, content in zip(entry.files, contents, strict=True):
-        _write(site, name, content)
-    return replace(entry, digests=tuple(hashlib.sha256(c).hexdigest() for c in contents))
+        page = pages.product(entry, stored, quality, origin, figures)
+    _write(site, entry.page, page)
+    return replace(entry, digest=_digest(page))
 
 
 def _decoded(stored: xr.Dataset, kind: str) -> xr.Dataset:
@@ -301,7 +296,7 @@ def _draw(
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
         whole = xr.decode_cf(stored, decode_timedelta=False)
-        return _figures(whole, [any_kind.view_of(kind)], quality), problem
+        return _figures(whole, [view_of(kind)], quality), problem
     except UNREADABLE as error:
         return [], problem or f"it cannot be drawn: {error}"
 
@@ -343,14 +338,14 @@ def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entr
         page = within(site, entry.page).read_bytes()
         linked = pages.with_navigation(page, pages.navigation(entry, neighbours, links))
         _write(site, entry.page, linked)
-        yield replace(entry, digests=(hashlib.sha256(linked).hexdigest(), *entry.digests[1:]))
+        yield replace(entry, digest=_digest(linked))
 
 
 def _write_calendar(
     site: Path, entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
 ) -> set[str]:
     """Write all calendar pages; return the files that belong in the site's folders."""
-    expected = {name for entry in entries for name in entry.files}
+    expected = {entry.page for entry in entries}
 
     def write(name: str, content: bytes) -> None:
         expected.add(name)
@@ -430,9 +425,6 @@ def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
             below,
         ):
             return {}
-        known = [
-            Entry(**item | {"digests": tuple(item["digests"])}) for item in document["products"]
-        ]
-        return {entry.path: entry for entry in known}
+        return {item["path"]: Entry(**item) for item in document["products"]}
     except (ValueError, KeyError, TypeError):
         return {}

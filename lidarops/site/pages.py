@@ -14,16 +14,20 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from lidarops.figures.panels import Figure
-from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment
 from lidarops.figures.wording import SEVERITIES, counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
-from lidarops.site.links import Links
-from lidarops.site.neighbours import Neighbours
-from lidarops.site.paths import day_page, href, month_list, slug, year_page
-from lidarops.site.product_contents import citation, contact, variables
-from lidarops.site.product_entry import Entry, Problem, ShareGrade, mean_availability
+from lidarops.site.paths import Links, day_page, href, month_list, slug, year_page
+from lidarops.site.product_contents import UNKNOWN, citation, contact, variables
+from lidarops.site.product_entry import (
+    GRADES,
+    Entry,
+    Neighbours,
+    Problem,
+    grade_of,
+    mean_availability,
+)
 from lidarops.site.quality import Quality
 
 INDEX: Final = "index.html"
@@ -43,7 +47,7 @@ def _templates() -> Environment:
     """Return the templates, with the functions that they call."""
     own = environment("lidarops.site")
     own.globals |= {
-        "grades": list(ShareGrade),
+        "grades": GRADES,
         "weekdays": calendar.day_name[:],
         "month_name": calendar.month_name[:],
         "sheet": SHEET,
@@ -172,9 +176,8 @@ def _order(entry: Entry) -> tuple[Any, ...]:
 def _cell(entries: Iterable[Entry]) -> dict[str, Any]:
     """Return what a day or month shows: the share of usable profiles, and its grade."""
     share = mean_availability(entries)
-    if share is None:
-        return {"share": "", "of": "", "grade": ShareGrade.UNKNOWN}
-    return {"share": percent(share), "of": " of profiles usable", "grade": ShareGrade.of(share)}
+    words = ("", "") if share is None else (percent(share), " of profiles usable")
+    return {"share": words[0], "of": words[1], "grade": grade_of(share)}
 
 
 def grouped(entries: Iterable[Entry], by: str) -> dict[str, list[Entry]]:

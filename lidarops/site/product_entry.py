@@ -1,58 +1,36 @@
-"""The entry of a product in the calendar, and grades of the share of usable profiles."""
+"""The entry of a product in the calendar, its grade, and the products beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from datetime import datetime
 from statistics import fmean
 from typing import Final
 
+from lidarops.kinds import rank_of
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import Verdicts
 from lidarops.site.paths import product_page
 
-
-class ShareGrade(StrEnum):
-    """Grade of a share of profiles with a usable value."""
-
-    MOST = "most"
-    SOME = "some"
-    FEW = "few"
-    NONE = "none"
-    UNKNOWN = "unknown"
-
-    @property
-    def css(self) -> str:
-        """CSS class."""
-        return f"g-{self.name.lower()}"
-
-    @property
-    def meaning(self) -> str:
-        """Range of shares in words."""
-        return _MEANING[self]
-
-    @classmethod
-    def of(cls, share: float | None) -> ShareGrade:
-        """Return the grade of a share of usable profiles (0 to 1; None without quality flags)."""
-        if share is None:
-            return cls.UNKNOWN
-        if share <= 0.0:
-            return cls.NONE
-        if share < _SOME:
-            return cls.FEW
-        return cls.SOME if share < _MOST else cls.MOST
-
-
-_SOME: Final = 0.25
-_MOST: Final = 0.75
-_MEANING: Final = {
-    ShareGrade.MOST: "75 % or more of the profiles usable",
-    ShareGrade.SOME: "25 to 75 % usable",
-    ShareGrade.FEW: "less than 25 % usable",
-    ShareGrade.NONE: "no profile usable",
-    ShareGrade.UNKNOWN: "no quality flags",
+GRADES: Final = {
+    "most": "75 % or more of the profiles usable",
+    "some": "25 to 75 % usable",
+    "few": "less than 25 % usable",
+    "none": "no profile usable",
+    "unknown": "no quality flags",
 }
+"""Grades of a share of profiles with a usable value, in words."""
+
+
+def grade_of(share: float | None) -> str:
+    """Return the grade of a share of usable profiles (0 to 1; None without quality flags)."""
+    if share is None:
+        return "unknown"
+    if share <= 0.0:
+        return "none"
+    return "few" if share < 0.25 else "some" if share < 0.75 else "most"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +41,8 @@ class Entry:
     """Relative to the folder of the products."""
     sha256: str
     size: int
-    digests: tuple[str, ...]
-    """sha256 of the files of the page, in the order of `files`."""
+    digest: str
+    """sha256 of the page."""
     campaign: str
     """Title of the campaign."""
     station: str
@@ -96,8 +74,6 @@ class Entry:
     """Number of profiles with a usable value below the height that matters."""
     lacking: str
     """Why no value is usable; empty if one is."""
-    alt: str
-    """Description of the thumbnail."""
     problem: str
     """What is wrong with the product; empty if nothing."""
 
@@ -105,16 +81,6 @@ class Entry:
     def page(self) -> str:
         """Relative to the site."""
         return product_page(self.path)
-
-    @property
-    def thumbnail(self) -> str:
-        """Relative to the site."""
-        return self.page.removesuffix(".html") + ".png"
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Files of the page, relative to the site."""
-        return self.page, self.thumbnail
 
     @property
     def label(self) -> str:
@@ -142,9 +108,9 @@ class Entry:
         return Verdicts.of(self.values, unflagged=self.unflagged, usable=self.usable)
 
     @property
-    def grade(self) -> ShareGrade:
+    def grade(self) -> str:
         """Grade of the share of usable profiles."""
-        return ShareGrade.of(self.availability)
+        return grade_of(self.availability)
 
     @property
     def availability(self) -> float | None:
@@ -170,3 +136,51 @@ def mean_availability(entries: Iterable[Entry]) -> float | None:
     retrieved = [share for kind, share in known if is_retrieved(kind)]
     shares = retrieved or [share for _, share in known]
     return fmean(shares) if shares else None
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbours:
+    """Products beside one product."""
+
+    before: Entry | None
+    """The previous product of the same instrument, kind and channel."""
+    after: Entry | None
+    siblings: tuple[Entry, ...]
+    """Of the other kinds and channels of the instrument, the product nearest in time among those of
+    the same day that overlap this one."""
+
+
+def with_neighbours(entries: Sequence[Entry]) -> Iterator[tuple[Entry, Neighbours]]:
+    """Yield every product with those beside it, in the given order."""
+    series: dict[tuple[str, ...], list[Entry]] = defaultdict(list)
+    days: dict[tuple[str, ...], list[Entry]] = defaultdict(list)
+    for entry in sorted(entries, key=lambda entry: (entry.start, entry.path)):
+        series[_series(entry)].append(entry)
+        days[entry.station, entry.instrument, entry.day].append(entry)
+    ends: dict[str, tuple[Entry | None, Entry | None]] = {}
+    for group in series.values():
+        befores, afters = [None, *group[:-1]], [*group[1:], None]
+        for entry, before, after in zip(group, befores, afters, strict=True):
+            ends[entry.path] = before, after
+    for entry in entries:
+        same_day = days[entry.station, entry.instrument, entry.day]
+        yield entry, Neighbours(*ends[entry.path], _siblings(entry, same_day))
+
+
+def _series(entry: Entry) -> tuple[str, ...]:
+    return entry.station, entry.instrument, entry.kind, entry.channel
+
+
+def _siblings(entry: Entry, same_day: Iterable[Entry]) -> tuple[Entry, ...]:
+    start = datetime.fromisoformat(entry.start)
+    overlapping = [
+        other
+        for other in same_day
+        # A product without length overlaps one that starts with it.
+        if other.start == entry.start or (other.start < entry.stop and entry.start < other.stop)
+    ]
+    nearest: dict[tuple[str, ...], Entry] = {}
+    for other in sorted(overlapping, key=lambda o: abs(datetime.fromisoformat(o.start) - start)):
+        nearest.setdefault(_series(other), other)
+    del nearest[_series(entry)]
+    return tuple(nearest[key] for key in sorted(nearest, key=lambda key: (rank_of(key[2]), key)))

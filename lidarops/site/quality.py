@@ -10,7 +10,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import Axis, Band, Figure, Panel, time_axis
-from lidarops.figures.product_names import scalar
 from lidarops.figures.time_axis import column_edges, column_starts, days, profile_bounds
 from lidarops.figures.wording import named_shares, percent
 from lidarops.netcdf.stored_flags import (
@@ -26,6 +25,7 @@ from lidarops.netcdf.stored_flags import (
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.records import Verdicts
 from lidarops.site.paths import CALENDAR_HEIGHT
+from lidarops.site.product_contents import scalar
 
 Floats = NDArray[np.float64]
 
@@ -128,10 +128,10 @@ def _figure(product: xr.Dataset, shares: Floats) -> Figure:
         Band(along, good, usable, "full care", label="use with care"),
         Band(along, usable, np.full(along.size, 100.0), "full reject", label="do not use"),
     )
+    panel = Panel(time_axis(left, right), Axis("values (%)", 0.0, 100.0), layers, _HEIGHT)
     mean = shares.mean(axis=1)
     words = (
         f"On average {percent(mean[0])} of the values good,"
         f" {percent(max(0.0, 1.0 - mean.sum()))} to use with care, {percent(mean[1])} not to use"
     )
-    panel = Panel(time_axis(left, right), Axis("values (%)", 0.0, 100.0), layers, _HEIGHT)
     return Figure("Quality over time", words, (panel,))

@@ -19,11 +19,11 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_792,
-    "lines of code alone": 44_098,
-    "modules": 269,
-    "dataclasses": 219,
-    "lines of dataclasses": 6_114,
+    "lines": 67_687,
+    "lines of code alone": 44_013,
+    "modules": 265,
+    "dataclasses": 220,
+    "lines of dataclasses": 6_153,
     "tuning numbers": 214,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.harness.figure import CPU_TIME, Figure, cpu_time, share, with_error
+from benchmarks.harness.figure import CPU_TIME, Figure, Work, cpu_time, share, with_error
 from benchmarks.harness.plots import Chart, draw
 from benchmarks.harness.results import Results, Study, frame, table
 from lidarops.errors import CatalogError
@@ -80,9 +80,16 @@ def test_times_have_a_suitable_unit(nanoseconds, text):
     assert lines(table(frame({("", "m"): {"time": cpu_time(nanoseconds)}}))) == [("m", text)]
 
 
-@pytest.mark.parametrize("quantity", ["RMSE", CPU_TIME])
-def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time(quantity):
-    chart = Chart("work", "Errors & times", frame(results()), quantity, {"peer"})
+WORKS = [
+    Work(case, "depth", method, Figure(rmse, 0.1), None, cpu_time(time), ours=method == "ours")
+    for case, method, rmse, time in (
+        ("clear", "ours", 2.0, 3e3), ("clear", "peer", 1.0, 5e6), ("cloud", "peer", 4.0, 1e3),
+    )
+]  # fmt: skip
+
+
+def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time():
+    chart = Chart("work", "Errors & times", WORKS)
     drawn = draw(chart)
     assert drawn == draw(chart)
     text = drawn.decode()
@@ -91,16 +98,16 @@ def test_a_chart_names_methods_and_cases_and_is_drawn_alike_each_time(quantity):
 
 
 def test_a_study_writes_its_json_and_charts(tmp_path):
-    tables = [Results("Shown", results()), Results("Folded", results(), "A note.", folded=True)]
-    charts = [Chart("work", "Errors", frame(results()), "RMSE")]
+    tables = [Results("Shown", results()), Results("Noted", results(), "A note.")]
+    charts = [Chart("work", "Errors", WORKS)]
     study = Study(tables, charts, date="2024-01-01")
     assert study.figures("Shown")["cloud", "peer", "RMSE"].value == 4e3
     written = study.write(tmp_path / "sub")
     assert (written.parent / "work.svg").is_file()
     content = json.loads(written.read_text())
     assert content["date"] == "2024-01-01"
-    assert content["notes"] == {"Shown": "", "Folded": "A note."}
-    row = content["tables"]["Folded"][1]
+    assert content["notes"] == {"Shown": "", "Noted": "A note."}
+    row = content["tables"]["Noted"][1]
     assert (row["case"], row["method"], row["quantity"]) == ("clear", "ours", "RMSE")
     assert (row["value"], row["error"], row["unit"]) == (2.0, 0.1, "")
     with pytest.raises(CatalogError, match="cannot be written"):

@@ -33,23 +33,23 @@ def taken(tmp_path, monkeypatch):
             "code": "0123456789abcdef",
         },
         "headings": {
-            "The most accurate of all": ["scene", "solver"],
-            "The most accurate of one": ["case", "method"],
+            "Ours beside all": ["scene", "solver"],
+            "Ours beside one": ["case", "method"],
             "Another": ["case", "method"],
         },
         "notes": {
-            "The most accurate of all": "Of all scenes.",
-            "The most accurate of one": "Of all scenes.",
+            "Ours beside all": "Of all scenes.",
+            "Ours beside one": "Of all scenes.",
             "Another": "",
         },
         "tables": {
-            "The most accurate of all": [
+            "Ours beside all": [
                 {**row, "method": "peer", "quantity": "RMSE", "value": 2.0, "unit": ""},
                 {**row, "quantity": "RMSE", "value": 1.2500001, "error": 0.01, "unit": ""},
                 {**row, "quantity": "95 %", "value": 0.951, "unit": "1"},
                 {**row, "quantity": "CPU time", "value": 2500.0, "unit": "ns"},
             ],
-            "The most accurate of one": [
+            "Ours beside one": [
                 {**row, "quantity": "RMSE", "value": 1.0, "unit": ""},
             ],
             "Another": [],
@@ -69,7 +69,7 @@ def taken(tmp_path, monkeypatch):
 def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
     kept = json.loads((taken / "accuracy.json").read_text())
     assert kept["tables"] == {
-        "The most accurate of all": [
+        "Ours beside all": [
             ["path", "peer", {"RMSE": [2.0, 0.0, ""]}],
             [
                 *("path", "ours"),
@@ -80,7 +80,7 @@ def test_a_result_is_taken_with_its_machine_and_figures(taken) -> None:
                 },
             ],
         ],
-        "The most accurate of one": [["path", "ours", {"RMSE": [1.0, 0.0, ""]}]],
+        "Ours beside one": [["path", "ours", {"RMSE": [1.0, 0.0, ""]}]],
     }
     assert (taken / "accuracy-all-homogeneous-path.svg").read_text() == "all-homogeneous-path"
     page = benchmark_results.page("accuracy")

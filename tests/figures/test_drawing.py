@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import subprocess
 import sys
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image as Pictures
 from support.products.drawn import decoded, described
 
 from lidarops.figures import browser
@@ -102,18 +100,6 @@ def test_an_axis_that_is_not_finite_is_no_json():
     panel = Panel(Axis("x", 0.0, np.nan), UP, (Curve(ONE, ONE),))
     with pytest.raises(ValueError, match="JSON"):
         browser.inline(Figure("c", "w", (panel,)))
-
-
-def test_thumbnails_are_small_and_show_every_column():
-    left = np.array([0.0, 0.4, 0.9])
-    image = Image(np.full((3, 4), 99, np.uint8), left, left + 1e-4, np.linspace(0.0, 1.0, 5))
-    panel = Panel(Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0), (image,))
-    with Pictures.open(io.BytesIO(browser.thumbnail(Figure("c", "w", (panel,))))) as picture:
-        shown = np.asarray(picture)
-    assert (shown == 99).all(axis=0).sum() == 3
-    line = Panel(panel.x, panel.y, (Curve(np.linspace(0, 1, 500), np.linspace(0, 1, 500)),))
-    assert len(browser.thumbnail(Figure("c", "w", (line,)))) < 4_000
-    assert len(browser.thumbnail(None)) < 1_000
 
 
 def test_drawing_libraries_are_imported_only_where_something_is_drawn():

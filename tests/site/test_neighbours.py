@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from lidarops.site.neighbours import with_neighbours
-from lidarops.site.product_entry import Entry
+from lidarops.site.product_entry import Entry, with_neighbours
 
 ENTRY = Entry(
-    path="", sha256="", size=1, digests=(), campaign="c", station="s",
+    path="", sha256="", size=1, digest="", campaign="c", station="s",
     place="S", instrument="i", name="I", kind="signal", channel="a", light="", latitude=None,
     longitude=None, altitude=None, license="", start="", stop="", values=0, usable=0,
-    unflagged=0, profiles=1, available=1, lacking="", alt="", problem="",
+    unflagged=0, profiles=1, available=1, lacking="", problem="",
 )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from benchmarks.__main__ import BENCHMARKS, app, measure
 from benchmarks.accuracy import homogeneous
-from benchmarks.accuracy.homogeneous_peers import PROJECTION, iterative_peers
+from benchmarks.accuracy.homogeneous_peers import PEERS
 from benchmarks.harness.figure import CPU_TIME
 from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes.homogeneous_paths import (
@@ -31,6 +31,7 @@ from lidarops.errors import CampaignError
 
 pytestmark = pytest.mark.slow
 
+(PROJECTION,) = PEERS
 PATH = Scenario(2500.0, 8000.0, 3e-5, 1000.0)
 PATHS = [PATH, Scenario(10500.0, 1700.0, 1e-4, 1e4), Scenario(2500.0, 8000.0, 5e-3, 1e4)]
 
@@ -146,7 +147,7 @@ def test_every_peer_agrees_with_the_direct_fit(path):
     power = path.powers(20)
     direct = methods()["direct"](power, path)
     bound = path.least_errors()
-    for name, solver in iterative_peers().items():
+    for name, solver in PEERS.items():
         peer = solver(power, path)
         for quantity in QUANTITIES:
             distance = np.abs(peer.values[quantity] - direct.values[quantity]) / bound[quantity]
@@ -158,8 +159,8 @@ def test_every_peer_agrees_with_the_direct_fit(path):
 def test_the_compiled_fit_rejects_profiles_that_cannot_converge():
     power = PATH.powers(3)
     power[1] = np.nan
-    solved = iterative_peers()[PROJECTION](power, PATH)
-    alone = iterative_peers()[PROJECTION](power[:1], PATH)
+    solved = PEERS[PROJECTION](power, PATH)
+    alone = PEERS[PROJECTION](power[:1], PATH)
     assert solved.rejected.tolist() == [False, True, False]
     # They start from the mean of other profiles.
     assert solved.values["extinction"][0] == pytest.approx(alone.values["extinction"][0], rel=1e-3)
@@ -168,7 +169,7 @@ def test_the_compiled_fit_rejects_profiles_that_cannot_converge():
 def test_peers_start_from_the_data_alone():
     power = PATH.powers(20)
     elsewhere = replace(PATH, extinction=1e-3, background=0.0, signal=1.0)
-    for name, solver in iterative_peers().items():
+    for name, solver in PEERS.items():
         known, unknown = (solver(power, path).values for path in (PATH, elsewhere))
         assert np.array_equal(known["extinction"], unknown["extinction"]), name
 
@@ -201,7 +202,7 @@ def test_scores_of_known_errors():
 
 
 def test_least_squares_reaches_the_bound():
-    solvers = {"direct": methods()["direct"], PROJECTION: iterative_peers()[PROJECTION]}
+    solvers = {"direct": methods()["direct"], PROJECTION: PEERS[PROJECTION]}
     for seed, path in enumerate(scenarios(quick=True)):
         power = path.powers(200, seed)
         for (method, solver), quantity in product(solvers.items(), QUANTITIES):
@@ -216,27 +217,12 @@ def test_least_squares_reaches_the_bound():
 )
 def test_every_method_that_solves_a_quantity_is_compared(accuracy, quantity, given):
     names = {work.method for work in accuracy.works if work.quantity.startswith(quantity)}
-    assert names - {TAIL_MEAN} == (set(methods()) | set(iterative_peers())) - {given, TAIL_MEAN}
-
-
-def test_lag_1_is_biased_as_published_and_least_squares_is_not():
-    scores = homogeneous.published_offsets(1500)
-    for length, expected in {1: 10.2, 4: 2.7, 6: 1.4, 8: 0.8}.items():
-        score = scores[f"2.5 + {length} km", "1"]
-        assert score["lag 1"].value == pytest.approx(expected, abs=0.3)
-    for (section, averaged), score in scores.items():
-        assert score["lag 1"].value > 50 * score["lag 1"].error
-        if averaged != "1" and section in {f"2.5 + {length} km" for length in (2, 4, 6, 8)}:
-            start, length = (1e3 * float(part) for part in section.removesuffix(" km").split("+"))
-            path = homogeneous.published_path(start, length, int(averaged))
-            rest = score["direct"].value - background_bias(path) / math.sqrt(int(averaged))
-            assert abs(rest) < 4 * score["direct"].error
-            assert score["direct"].error < 0.02 * score["lag 1"].value
+    assert names - {TAIL_MEAN} == (set(methods()) | set(PEERS)) - {given, TAIL_MEAN}
 
 
 def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
     settings = [results.title for results in timed.results]
-    assert len(settings) == 8
+    assert len(settings) == 4
     for setting in settings:
         rows = timed.figures(setting)
         assert rows[setting, READ, "reads"].value == 1.0

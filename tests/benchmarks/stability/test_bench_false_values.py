@@ -18,8 +18,8 @@ from benchmarks.scenes import (
     lidar_networks,
     raman_skies,
     recorded_signals,
+    scans,
 )
-from benchmarks.stability import random_scans
 from lidarops.flags import Quality, rejecting
 
 pytestmark = pytest.mark.slow
@@ -163,16 +163,16 @@ KNOWN = verdicts.above_target()
         pytest.param(homogeneous_paths.score_short_sections, 600, 300, 0.0, id="short sections"),
         pytest.param(recorded_signals.score_signals, 200, 50, 0.0, id="signal chain"),
         pytest.param(elastic_skies.score_elastic, 400, 20, 0.0, id="elastic"),
-        pytest.param(random_scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
+        pytest.param(scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
         pytest.param(
-            partial(random_scans.score_short_scans, length=1),
+            partial(scans.score_short_scans, length=1),
             400,
             4,
             0.0,
             id="scans, blocks of 1",
         ),
         pytest.param(
-            partial(random_scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
+            partial(scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
         ),
         pytest.param(raman_skies.score_raman, 1000, 4, 0.0, id="Raman"),
         pytest.param(networks, 1500, 50, CONFINED, id="network"),

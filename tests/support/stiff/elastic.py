@@ -56,8 +56,8 @@ def elastic_arguments(draws: int = 1, *, level: float = 1.0, noise: bool = True)
     return {
         "power": power[:, bins],
         "range": air.range[bins],
-        "molecular_backscatter": air.molecular_backscatter[bins],
-        "molecular_extinction": air.molecular_extinction[bins],
+        "molecular_backscatter": air.air.backscatter(air.range, elastic_skies.WAVELENGTH)[bins],
+        "molecular_extinction": air.air.extinction(air.range, elastic_skies.WAVELENGTH)[bins],
         "lidar_ratio": elastic_skies.LIDAR_RATIO,
         "reference": (7000.0, 8000.0),
         "variance": variance[:, bins],

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.accuracy import multiangle_cases
-from benchmarks.accuracy.multiangle_cases import Scene
+from benchmarks.scenes import scans
+from benchmarks.scenes.scans import Scene
 from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
@@ -59,11 +59,11 @@ def _drawn(scene_of: Any, profiles: int, *seed: int) -> tuple[Scene, Array, Arra
 
 
 def _clear() -> Scene:
-    return multiangle_cases.clear(3000.0)
+    return scans.clear(3000.0)
 
 
 def _short() -> Scene:
-    return multiangle_cases.clear(3000.0, bins=60)
+    return scans.clear(3000.0, bins=60)
 
 
 def scan_arguments(
@@ -135,7 +135,7 @@ def _blocks_of_constant() -> Answer:
 
 
 def _varying() -> Scene:
-    return replace(multiangle_cases.cloud(0.8, largest=15.0), variation=1.0)
+    return replace(scans.cloud(0.8, largest=15.0), variation=1.0)
 
 
 def _with_gaps(**more: Any) -> dict[str, Any]:
