@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_937,
-    "lines of code alone": 44_197,
+    "lines": 68_151,
+    "lines of code alone": 44_355,
     "modules": 270,
     "dataclasses": 220,
-    "lines of dataclasses": 6_174,
+    "lines of dataclasses": 6_180,
     "tuning numbers": 215,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_806,
+    "lines of the largest package": 5_823,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 59, "functions": 570, "changes": 215},
