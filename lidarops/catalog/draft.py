@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
+from itertools import pairwise
 from pathlib import PurePosixPath
 from statistics import median
 from types import MappingProxyType
@@ -42,6 +43,8 @@ _ASSUMED_OVERLAP: Final = 500.0
 _USED: Final = frozenset({Purpose.MEASUREMENT, Purpose.DARK})
 """Purposes of files that a campaign names; others are a question."""
 _DAY: Final = timedelta(days=1)
+_SECOND: Final = timedelta(seconds=1)
+"""Resolution of start and stop."""
 _PROFILES: Final = (".csv", ".nc")
 """Endings of files that may be soundings."""
 _PACKED: Final = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
@@ -88,7 +91,6 @@ def draft_campaign(
     *,
     archive: str,
     output: str,
-    name: str,
     schema: str,
     looks: Mapping[str, FirstLook] = MappingProxyType({}),
 ) -> str:
@@ -101,8 +103,6 @@ def draft_campaign(
         Folder of the raw files, as the file states it.
     output : str
         Folder of catalog, products and reports, as the file states it.
-    name : str
-        From which the name of the campaign is made.
     schema : str
         Place of the JSON schema, for editors.
     looks : mapping, optional
@@ -115,7 +115,7 @@ def draft_campaign(
     """
     known = drafted_instruments(contents)
     if not known:
-        reasons = [reason for _, reason in contents.refused[:1]]
+        reasons = [f"{path}: {reason}" for path, reason in contents.refused[:1]]
         packed = "".join(f"unpack {path}, or " for path in _packed(contents)[:1])
         raise CatalogError(
             "holds no raw file that can be used" + "".join(f": {reason}" for reason in reasons),
@@ -124,17 +124,19 @@ def draft_campaign(
         )
     scanning = [headers for headers in known.values() if _scans(headers)]
     sites = dict(zip(known, _sites(list(known.values())), strict=True))
+    places = list(dict.fromkeys(sites.values()))
+    title = f"Lidar measurements at {', '.join(site.name or site.key for site in places)}"
     lines = [
         f"# yaml-language-server: $schema={schema}",
         "# Written by `lidarops init` from the headers of the raw files.",
         "# A question mark in a comment: headers do not state it, or cannot be trusted; check it.",
-        f"name: {_key(name)}",
-        f"title: {_text(f'Lidar measurements of {name}')}  # ?",
+        f"name: {_key(' '.join(site.key for site in places))}",
+        f"title: {_text(title)}  # ?",
         f"archive: {_text(archive)}",
         f"output: {_text(output)}  # catalog, products and reports, of this campaign alone",
         "",
         "stations:",
-        *(line for site in dict.fromkeys(sites.values()) for line in site.lines()),
+        *(line for site in places for line in site.lines()),
         "",
         "instruments:",
     ]
@@ -178,7 +180,7 @@ def _position(group: FileGroup) -> tuple[Position, float | None, HeaderOrder]:
     Longitude is first, unless the second one cannot be a latitude.
     """
     low, high = _ALTITUDES
-    altitude = group.headers[0].altitude
+    ((altitude, _),) = Counter(header.altitude for header in group.headers).most_common(1)
     known = altitude if altitude is not None and low <= altitude <= high else None
     coordinates = group.coordinates
     if coordinates is None or max(map(abs, coordinates)) > 180.0:
@@ -204,6 +206,10 @@ def _instrument(
     yield f"  {key}:"
     yield f"    station: {site.key}"
     yield f"    files: {_list(headers.files)}"
+    unlit, looked = (headers.look.unlit, headers.look.files) if headers.look else ((), 0)
+    if 0 < len(unlit) < looked:
+        such = f"such as {_text(unlit[0])}: dark files?"
+        yield f"    # ? {len(unlit)} of {looked} files show no light of the laser, {such}"
     if headers.dark_files:
         yield f"    dark_files: {_list(headers.dark_files)}  # ? by the words in their path"
     else:
@@ -230,11 +236,12 @@ def _instrument(
 
 def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     yield "    facts:"
-    yield f"      - clock_offset: 0  # ? s, clock of the files minus UTC; {_clock(headers.main)}"
+    clock = "; ".join(_clock(headers.main, headers.look)) or "-18000 for UTC-5"
+    yield f"      - clock_offset: 0  # ? s, clock of the files minus UTC; {clock}"
     yield from (f"        {line}" for line in _pointing(headers))
     yield from (f"        {line}" for line in _full_overlap(headers.look))
-    if headers.look is not None and headers.look.late_light is not None:
-        late, width = headers.look.late_light, headers.layout[0].bin_width
+    if headers.look is not None and headers.look.begins is not None:
+        late, width = headers.look.begins, headers.layout[0].bin_width
         place = f"light begins there, in bin {late / width:.0f} of {width:g} m"
         yield (
             f"        # pre_trigger: {late:.0f} m  # ? {place}: at which range of the record does"
@@ -252,6 +259,8 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
     stated = {channel.name for channel in headers.main.layout if channel.wavelength > 0}
     several = Counter(map(label_of, {c.name for group in headers.signal for c in group.layout}))
     alike = Counter((label_of(c.name), c.recorder) for c in headers.layout)
+    shifts = {c.device: c.bin_shift for c in headers.main.headers[0].channels if c.bin_shift}
+    lags = headers.look.lags if headers.look else {}
     for channel in headers.layout:
         photon = channel.mode is DetectionMode.PHOTON
         facts = ["dead_time: estimate"] if photon and channel.name in estimated else []
@@ -264,34 +273,42 @@ def _facts(headers: InstrumentHeaders, *, estimates: bool) -> Iterator[str]:
         grid = f"{channel.bins} bins of {channel.bin_width:g} m{recorder}"
         question = "; ? wavelength, whose dot the header lacks" if lost_dot else ""
         question += _unknown(channel, estimated=channel.name in estimated)
+        alone = channel.name.replace("analog_", "glued_") not in headers.pairs
+        shift = shifts.get(channel.recorder) if alone or channel.name in lags else None
+        question += _shift(channel, lags.get(channel.name), shift)
         yield f"          {channel.name}: {{{', '.join(facts)}}}  # {grid}{question}"
 
 
-def _clock(group: FileGroup) -> str:
-    """Return what is to be said of the clock: files that contradict their neighbours or names.
-
-    Or an example.
-    """
-    files = sorted(
-        (path, header.start) for path, header in zip(group.files, group.headers, strict=True)
-    )
-    beside = zip(files, files[1:], files[2:], strict=False)
-    lone = [
-        path
-        for (_, before), (path, start), (_, after) in beside
-        if before <= after and not before - _DAY <= start <= after + _DAY
-    ]
-    if lone:
-        return f"{lone[0]} starts more than a day away from those beside it by name"
+def _clock(group: FileGroup, look: FirstLook | None) -> Iterator[str]:
+    """Yield what is to be said of the clock: what contradicts names, the sky and other files."""
+    members = list(zip(group.files, group.headers, strict=True))
     away = [
         (header.start - named).total_seconds()
-        for path, header in zip(group.files, group.headers, strict=True)
+        for path, header in members
         if (named := time_in_path(path, header.format))
     ]
-    hours = round(median(away) / 1800.0) / 2.0 if away else 0.0
-    if not hours:
-        return "-18000 for UTC-5"
-    return f"headers are {hours:+g} h from names: one of both is local time"
+    if hours := round(median(away) / 1800.0) / 2.0 if away else 0.0:
+        yield f"headers are {hours:+g} h from names: one of both is local time"
+    if look is not None and look.clock is not None:
+        yield "the light of the sky fits {:+g} to {:+g} h".format(*look.clock)
+    spans = sorted((header.start, header.stop) for _, header in members)
+    twice = sum(start < stop - _SECOND for (_, stop), (start, _) in pairwise(spans))
+    if twice:
+        yield f"files that start before another one stops: {twice}; is a clock hour there twice?"
+    starts = sorted((path, header.start) for path, header in members)
+    for (_, before), (path, start), (_, after) in zip(starts, starts[1:], starts[2:], strict=False):
+        if before <= after and not before - _DAY <= start <= after + _DAY:
+            yield f"{path} starts more than a day away from those beside it by name"
+            return
+
+
+def _shift(channel: ChannelLayout, lag: float | None, stated: float | None) -> str:
+    """Return the question on the place of the bins of a channel; empty where there is none."""
+    words = f"the header states a bin shift of {stated:g}" if stated else ""
+    if lag is None:
+        return f"; ? range_offset: {words}" if words else ""
+    words = f"it lags photon counting by {lag:.1f} bins" + (f", {words}" if words else "")
+    return f"; ? range_offset: {-lag * channel.bin_width:.0f} m, {words}"
 
 
 def _full_overlap(look: FirstLook | None) -> Iterator[str]:
@@ -375,6 +392,8 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
     rest = [path for path in contents.other if path not in (*tables, *packed)]
     endings = Counter(PurePosixPath(path).suffix or "no ending" for path in rest)
     formats = ", ".join(f"{ending} {count}" for ending, count in endings.most_common(_SHOWN))
+    taken = any(group.purpose is Purpose.MEASUREMENT for group in contents.groups)
+    fate = "left out of `files`" if taken else "in `files`, as there are no others"
     named = "? soundings, lidar ratios or overlap? Name them in the facts, as molecular_profile"
     if archive.startswith(("/", "..")):
         # A campaign reads no file outside of its folder.
@@ -383,8 +402,8 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
         ("copies of the last record of the acquisition, left out", contents.copies),
         *(
             (
-                f"? {purpose} by path or counts, left out of `files`",
-                [p for group in contents.groups if group.purpose is purpose for p in group.files],
+                f"? {purpose} by path or counts, {fate}",
+                _one_by_one(g.files for g in contents.groups if g.purpose is purpose),
             )
             for purpose in Purpose
             if purpose not in _USED
@@ -398,6 +417,11 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
         if paths:
             yield f"# {len(paths)} file{'s' * (len(paths) > 1)}, {title}:"
             yield from (f"#   {json.dumps(path)}" for path in paths[:_SHOWN])
+
+
+def _one_by_one(groups: Iterable[Sequence[str]]) -> list[str]:
+    """Return the files of groups, the first ones of all groups first."""
+    return [path for _, path in sorted((n, p) for files in groups for n, p in enumerate(files))]
 
 
 def _packed(contents: FolderContents) -> list[str]:

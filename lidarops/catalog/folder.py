@@ -7,9 +7,10 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
+from operator import itemgetter
 from typing import Final
 
 from lidarops.catalog.raw_files import (
@@ -22,7 +23,13 @@ from lidarops.catalog.raw_files import (
 from lidarops.constants import FIXED, STEEPEST
 from lidarops.errors import RawFormatError
 from lidarops.raw.formats import parse_raw_header, time_in_path
-from lidarops.raw.header import HeaderPointing, RawHeader, named_layout, recorder_names
+from lidarops.raw.header import (
+    TIME_REMEDY,
+    HeaderPointing,
+    RawHeader,
+    named_layout,
+    recorder_names,
+)
 from lidarops.records import FEWEST_ALIKE, UNKNOWN_FORMAT, ChannelLayout, DetectionMode
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 from lidarops.system.stores import Stored
@@ -56,9 +63,11 @@ _WORDS: Final = {
     Purpose.DARK: r"dc|darks?|dark ?current|dark ?files?",
     Purpose.TELECOVER: r"tc|tele ?cover",
     Purpose.POLARISATION: r"dp|(depol|pol) ?cal|calibration|cal|plus ?45|minus ?45|[pm]45|45[pm]",
-    Purpose.BACKGROUND: r"background|bkg",
+    Purpose.BACKGROUND: r"background|bkg|bg",
 }
 """Words that state a purpose: in folders, and in the letters of file names if longer than two."""
+_SECTORS: Final = ({"n", "e", "s", "w"}, {"north", "east", "south", "west"})
+"""Folders of the parts of a telescope."""
 _TURNED: Final = re.compile(r"(?<!\d)[+-]45(?!\d)")
 """Angle of a polariser or plate, as in ``DP+45``."""
 
@@ -122,16 +131,22 @@ class FirstLook:
     """What some files of an instrument give, processed as a campaign would."""
 
     files: int
-    shares: Mapping[str, float]
+    shares: Mapping[str, float] = field(default_factory=dict)
     """Elastic channel, or glued one -> share of usable values in the lowest 8 km."""
-    reasons: Mapping[str, str]
+    reasons: Mapping[str, str] = field(default_factory=dict)
     """Channel without a usable value -> its most frequent flags, or why no product is made."""
-    raman: frozenset[str]
+    raman: frozenset[str] = frozenset()
     """Elastic channels of which a Raman product has usable values."""
-    full_overlap: float | None
+    full_overlap: float | None = None
     """m; None where signals do not show it."""
-    late_light: float | None = None
-    """m, where the light of all channels begins if that is farther than of any telescope."""
+    begins: float | None = None
+    """m, where the light of all channels begins if that is not at once."""
+    lags: Mapping[str, float] = field(default_factory=dict)
+    """Analog channel -> bins by which it lags the photon-counting one."""
+    unlit: tuple[str, ...] = ()
+    """Paths of files without light of the laser."""
+    clock: tuple[float, float] | None = None
+    """h, least and greatest clock minus UTC that the light of the sky fits; None where UTC does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,13 +256,20 @@ class InstrumentHeaders:
 
     @property
     def nitrogen_channels(self) -> dict[str, str]:
-        """Elastic channels -> channels of their nitrogen Raman lines."""
+        """Elastic channels -> channels of their nitrogen Raman lines, of the nearest recorder.
+
+        Each telescope of a lidar has its own, whose recorders follow each other.
+        """
         pairs: dict[str, str] = {}
         for elastic in self._elastic:
-            for raman in self._by_mode:
-                near = is_raman_line(raman.wavelength, elastic.wavelength, NITROGEN_SHIFT)
-                if near and raman.bin_width == elastic.bin_width:
-                    pairs.setdefault(elastic.name, raman.name)
+            lines = (
+                (raman.mode is DetectionMode.ANALOG, abs(_number(raman) - _number(elastic)), raman)
+                for raman in self._by_mode
+                if is_raman_line(raman.wavelength, elastic.wavelength, NITROGEN_SHIFT)
+                and raman.bin_width == elastic.bin_width
+            )
+            if nearest := min(lines, key=itemgetter(0, 1), default=None):
+                pairs[elastic.name] = nearest[-1].name
         return pairs
 
     @property
@@ -304,13 +326,18 @@ def read_folder(root: str, *, guess_pointing: bool = False) -> FolderContents:
             if UNKNOWN_FORMAT in str(error):
                 other.append(printable(file.path))
             else:
-                refused.append((printable(file.path), str(error)))
+                reason = str(error).removeprefix(f"{file.path}: ")
+                refused.append((printable(file.path), reason))
         else:
             headers[_likeness(file.path, header)].append((file.path, header))
     for key, members in list(headers.items()):
         if not _names_tell_nothing(members):
             headers[key] = [(path, header) for path, header in members if not header.time_doubt]
-            refused += [(printable(path), h.time_doubt) for path, h in members if h.time_doubt]
+            refused += [
+                (printable(path), f"start: {header.time_doubt} ({TIME_REMEDY})")
+                for path, header in members
+                if header.time_doubt
+            ]
     headers = {key: members for key, members in headers.items() if members}
     lidars: dict[tuple[object, ...], list[RawHeader]] = defaultdict(list)
     for members in headers.values():
@@ -318,7 +345,7 @@ def read_folder(root: str, *, guess_pointing: bool = False) -> FolderContents:
     guesses = {key: _pointing(own) if guess_pointing else "stated" for key, own in lidars.items()}
     groups = [_group(members, guesses[_lidar(members[0][1])]) for members in headers.values()]
     return FolderContents(
-        tuple(sorted(_named(groups), key=lambda group: group.files)),
+        tuple(sorted(_named(_with_sectors(groups)), key=lambda group: group.files)),
         tuple(refused),
         tuple(other),
         tuple(printable(file.path) for file in copies),
@@ -339,6 +366,20 @@ def _named(groups: Sequence[FileGroup]) -> Iterator[FileGroup]:
     for own in _by_instrument(groups):
         names = recorder_names((group.layout, len(group.files), group.start) for group in own)
         yield from (replace(group, layout=named_layout(group.layout, names)) for group in own)
+
+
+def _with_sectors(groups: Iterable[FileGroup]) -> list[FileGroup]:
+    """Return groups, those of four sectors beside each other as tests of the telescope."""
+    places = [(*group.folder.lower().strip("/").rpartition("/")[::2], group) for group in groups]
+    beside: dict[str, set[str]] = defaultdict(set)
+    for parent, name, _ in places:
+        beside[parent].add(name)
+    return [
+        replace(group, purpose=Purpose.TELECOVER)
+        if any(name in sectors <= beside[parent] for sectors in _SECTORS)
+        else group
+        for parent, name, group in places
+    ]
 
 
 def _is_copy(source: Source, file: Stored, files: Sequence[Stored]) -> bool:
@@ -367,6 +408,11 @@ def _header(source: Source, file: Stored) -> RawHeader:
 def _label(channel: str) -> str:
     """Return wavelength and polarisation of a channel, such as 532p."""
     return channel.partition("_")[2]
+
+
+def _number(channel: ChannelLayout) -> int:
+    """Return the number of a recorder, such as 12 of BC12."""
+    return int(re.sub(r"\D", "", channel.recorder) or 0)
 
 
 def _undotted(channel: ChannelLayout) -> float:

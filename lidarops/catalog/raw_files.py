@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from lidarops.errors import RawFormatError, UnavailableError
-from lidarops.raw.formats import parse_raw_header, read_start
-from lidarops.raw.header import RawHeader
+from lidarops.raw.formats import parse_raw_header, read_start, time_in_path
+from lidarops.raw.header import TIME_REMEDY, RawHeader
 from lidarops.records import (
     INVALID,
     UNKNOWN_FORMAT,
@@ -287,10 +287,13 @@ def _accepted(
 
 def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument, role: Role) -> str:
     """Return why no product is made of a file by its time; else empty."""
-    if header.start > datetime.now(UTC) + _CLOCKS_DIFFER:
+    now = datetime.now(UTC)
+    if header.start > now + _CLOCKS_DIFFER:
+        named = time_in_path(header.path, header.format)
+        told = f", its name {named:%Y-%m-%d %H:%M}" if named else ""
         return (
-            f"{_FUTURE}: {header.start:%Y-%m-%d %H:%M} (leave the file out, or correct its header;"
-            " clock_offset is at most a day)"
+            f"{_FUTURE}: {header.start:%Y-%m-%d %H:%M}, today is {now:%Y-%m-%d}{told}"
+            f" ({TIME_REMEDY}; clock_offset is at most a day)"
         )
     # Dark files are judged by the scenes that use them.
     if role is Role.SIGNAL and facts.invalid:

@@ -177,31 +177,49 @@ def progress_bar(name: str) -> Iterator[Bar]:
         yield Bar(grow, lambda done: bar.advance(task, done))
 
 
-def show_rows(
-    title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]], most: int | None = None
-) -> None:
-    """Print a table of plain text, of at most so many rows, unless it has none.
+def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Print a table as `show_tables` does."""
+    show_tables([(title, columns, rows)])
 
-    On a terminal, cells fold between words only, so that names can be read and copied. Where the
-    words are too long for columns, each row is a paragraph.
+
+def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0) -> int:
+    """Print tables of plain text, but those without rows, and return the number of lines.
+
+    With `most`, so many rows of each, or fewer where they would fill more than so many lines. On a
+    terminal, cells fold between words only, so that names can be read and copied. Where the words
+    are too long for columns, each row is a paragraph.
     """
-    names = list(columns)
     # A file name may hold what moves the cursor of a terminal.
-    cells = [[visible(str(cell)) for cell in row] for row in rows]
-    if not cells:
-        return
-    if most is not None and len(cells) > most:
-        title += f", the first {most} of {len(cells)} (--all)"
-        del cells[most:]
+    whole = [
+        (title, list(columns), [[visible(str(cell)) for cell in row] for row in rows])
+        for title, columns, rows in tables
+    ]
+    shown = [line for table in whole for line in _table(*table, most)]
+    while most and len(shown) > lines:
+        most -= 1
+        shown = [line for table in whole for line in _table(*table, most)]
+    for line in shown:
+        typer.echo(line)
+    return len(shown)
+
+
+def _table(title: str, names: list[str], cells: list[list[str]], most: int | None) -> list[str]:
+    """Return the lines of a table of at most so many rows; none of one without rows."""
+    kept = cells[:most]
+    if len(kept) < len(cells):
+        title += f", the first {len(kept)} of {len(cells)} (--all)"
     # As the title of the table it would fold at the width of the table.
-    say_wrapped(title, "")
-    widths = _column_widths(names, cells, terminal_width())
+    head = wrapped(title, "") if cells else []
+    if not kept:
+        return head
+    widths = _column_widths(names, kept, terminal_width())
     if widths is None:
-        for row in cells:
-            for name, cell in zip(names, row, strict=True):
-                say_wrapped(f"{name}: {cell}" if name else cell, "  ")
-            say("")
-        return
+        paragraphs = [
+            wrapped(f"{name}: {cell}" if name else cell, "  ") or [""]
+            for row in kept
+            for name, cell in zip((*names, ""), (*row, ""), strict=True)
+        ]
+        return [*head, *(line for paragraph in paragraphs for line in paragraph)]
     from rich.console import Console
     from rich.table import Table as RichTable
     from rich.text import Text
@@ -209,16 +227,13 @@ def show_rows(
     table = RichTable()
     for name, width in zip(names, widths, strict=True):
         table.add_column(name, width=width, overflow="fold")
-    for row in cells:
+    for row in kept:
         # Text, because rich would read brackets in a path or reason as markup.
         table.add_row(*(Text(cell) for cell in row))
-    Console(width=terminal_width()).print(table)
-
-
-def show_tables(tables: Iterable[Table], most: int | None = None) -> None:
-    """Print tables as `show_rows` does each."""
-    for title, columns, rows in tables:
-        show_rows(title, columns, rows, most)
+    console = Console(width=terminal_width())
+    with console.capture() as drawn:
+        console.print(table)
+    return [*head, *drawn.get().splitlines()]
 
 
 def terminal_width() -> int:
@@ -242,10 +257,12 @@ def wrapped(text: str, indent: str) -> list[str]:
     )
 
 
-def say_wrapped(text: str, indent: str) -> None:
-    """Print a text whose lines fold between words only."""
-    for line in wrapped(text, indent):
+def say_wrapped(text: str, indent: str) -> int:
+    """Print a text whose lines fold between words only, and return their number."""
+    lines = wrapped(text, indent)
+    for line in lines:
         say(line)
+    return len(lines)
 
 
 def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list[int] | None:

@@ -52,6 +52,8 @@ _MANY_PRODUCTS = 12
 """More products are summed by kind and channel, unless --all is given."""
 _FEW_ROWS = 3
 """Most rows of other tables, without --all."""
+_LINES = 45
+"""Lines about products and in tables, without --all."""
 _FEW_FLAGS = 4
 """Flags that a sum of products names."""
 _LEAST_MEMORY = 2**20
@@ -267,7 +269,7 @@ def reprocess(
                 say(f"report of an earlier run: {made}")
     if removed is not None and not as_json:
         most = None if everything else _FEW_ROWS
-        show_tables([_orphan_table(result, f"{removed} removed")], most)
+        show_tables([_orphan_table(result, f"{removed} removed")], most, _LINES)
     if result.signal:
         raise typer.Exit(128 + result.signal)
     if result.status is RunStatus.STOPPED:
@@ -377,8 +379,8 @@ def _print_result(
     campaign: Campaign, result: Result, *, no_scene: bool, removing: bool, everything: bool
 ) -> None:
     scenes, most = result.scenes, None if everything else _FEW_ROWS
-    _show_products(scenes, everything=everything)
-    show_tables(_tables(campaign, result, removing=removing), most)
+    left = _LINES - _show_products(scenes, everything=everything)
+    show_tables(_tables(campaign, result, removing=removing), most, left)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
@@ -454,24 +456,29 @@ def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str
     return list(rejection_rows(scenes))
 
 
-def _show_products(scenes: Sequence[SceneOutcome], *, everything: bool) -> None:
-    """Print what was made; of many products, the sums of each kind and channel."""
+def _show_products(scenes: Sequence[SceneOutcome], *, everything: bool) -> int:
+    """Print what was made; of many products, the sums of each kind and channel: so many lines."""
+    from lidarops.figures.wording import counted
+
     numbers = "values", "good", "care", "reject"
     made = [product for scene in scenes for product in scene.products]
     if everything or len(made) <= _MANY_PRODUCTS:
         single = "scene", "kind", "channel", *numbers, "flags"
-        show_rows("Products", single, (row for scene in scenes for row in _product_rows(scene)))
-        return
+        rows = (row for scene in scenes for row in _product_rows(scene))
+        most = None if everything else _MANY_PRODUCTS
+        return show_tables([("Products", single, rows)], most, _LINES)
     alike: dict[tuple[str, str, str], list[ProductRecord]] = defaultdict(list)
     for scene in scenes:
         for product in scene.products:
             alike[scene.instrument, product.kind, product.channel].append(product)
-    say(f"{len(made)} products, summed (--all lists them)")
+    said = say_wrapped(f"{len(made)} products, summed (--all lists them)", "")
     for (instrument, kind, channel), products in sorted(alike.items())[:_MANY_PRODUCTS]:
-        words = f"{instrument} {kind} {channel}: {len(products)} products, {_summed(products)}"
-        say_wrapped(words, "  ")
+        words = f"{instrument} {kind} {channel}: {counted(len(products), 'product')}"
+        said += say_wrapped(f"{words}, {_summed(products)}", "  ")
+    if len(alike) > _MANY_PRODUCTS:
+        said += say_wrapped(f"and {len(alike) - _MANY_PRODUCTS} further sums (--all)", "  ")
     errors = [(scene.scene, scene.error) for scene in scenes if scene.error]
-    show_rows("Failed", ("scene", "error"), errors, _FEW_ROWS)
+    return said + show_tables([("Failed", ("scene", "error"), errors)], _FEW_ROWS, _LINES)
 
 
 def _summed(products: Sequence[ProductRecord]) -> str:

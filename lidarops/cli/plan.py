@@ -17,6 +17,7 @@ import typer
 from lidarops.cli import options
 from lidarops.cli.app import (
     NO_SCENE,
+    Table,
     command,
     exit_with_status,
     finding_tables,
@@ -41,10 +42,12 @@ if TYPE_CHECKING:
 
 _REASONS: Final = 3
 """Reasons of refused files that fit on the screen."""
-_SCREEN: Final = 40
+_SCREEN: Final = 25
 """Lines about scenes, without --all."""
 _FEW: Final = 5
 """Rows of a table of findings, without --all."""
+_LINES: Final = 45
+"""Lines about scenes, refused files and in tables, without --all."""
 
 
 @command("plan")
@@ -72,8 +75,8 @@ def show_plan(
     """Show scenes, their steps, what is left out and what is stale, and why. Keeps nothing.
 
     Makes no folder: without an output folder the catalog is made for the moment. Of each instrument
-    with something to be made, the first file is processed: what has no usable value there is named
-    with the setting.
+    with something to be made, the first files are processed: what has no usable value in them is
+    named with the setting.
 
     Shows a screen of summaries, one for all scenes that are alike, with the memory that a process
     needs for a scene; with --all every step of each scene with its settings and reasons. Exit code
@@ -146,15 +149,16 @@ def _plan(
         }
         typer.echo(json.dumps(document, indent=2))
     else:
-        _show_alike(alike, stale=stale)
+        printed = _show_alike(alike, stale=stale)
         if no_scene:
             say(NO_SCENE)
-        _show_refused([granule.reason for granule in refused])
-        most = None if everything else _FEW
+        printed += _show_refused([granule.reason for granule in refused])
         columns = "product", "flag", "values", "settings"
-        show_rows("Without a usable value in the first file", columns, empty, most)
-        show_tables(finding_tables(findings), most)
-        _show_rest(lacking, *earlier, most)
+        first_files = "Without a usable value in the first files", columns, empty
+        tables = first_files, *finding_tables(findings), *_earlier(*earlier)
+        show_tables(tables, None if everything else _FEW, _LINES - printed)
+        words = f"metadata of the campaign: products will lack {', '.join(lacking)}"
+        say_wrapped(words if lacking else "", "")
         # With --stale, fresh scenes are not judged.
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
@@ -171,20 +175,11 @@ def _empty(campaign: Campaign, scenes: Collection[Scene]) -> list[tuple[str, str
     return list(empty_in_first_files(campaign, scenes))
 
 
-def _show_rest(
-    lacking: Sequence[str],
-    failed: Mapping[str, str],
-    unusable: Mapping[str, str],
-    most: int | None,
-) -> None:
-    """Print the metadata that are lacking, and the scenes that are not tried again."""
-    if lacking:
-        names = ", ".join(lacking)
-        say_wrapped(f"metadata of the campaign: products will lack {names}", "")
+def _earlier(failed: Mapping[str, str], unusable: Mapping[str, str]) -> Iterator[Table]:
+    """Yield the scenes that are not tried again."""
     unchanged = "not tried again, because nothing has changed"
-    show_rows(f"Failed before; {unchanged}", ("scene", "error"), failed.items(), most)
-    title = f"Without a usable value; {unchanged}"
-    show_rows(title, ("scene", "problem"), unusable.items(), most)
+    yield f"Failed before; {unchanged}", ("scene", "error"), failed.items()
+    yield f"Without a usable value; {unchanged}", ("scene", "problem"), unusable.items()
 
 
 def _memory(judged: Judgement) -> dict[str, float]:
@@ -309,23 +304,21 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     }
 
 
-def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: bool) -> None:
-    """Print scenes, those with equal lines together, until the screen is full."""
+def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: bool) -> int:
+    """Print scenes, those with equal lines together, until the screen is full: so many lines."""
     printed = 0
     for place, (lines, group) in enumerate(alike.items()):
         height = 2 + sum(len(wrapped(line, "")) for line in lines[1:])
         if printed and printed + height > _SCREEN:
             left = sum(len(more) for more in list(alike.values())[place:])
             say_wrapped(f"{counted(left, 'further scene')} with other lines (--all)", "")
-            return
+            break
         printed += height
         first, last = group[0].scene, group[-1].scene
         several = f"{first.id} to {last.id}: {counted(len(group), 'scene')}, "
         title = several if len(group) > 1 else f"{first.id}: "
-        granules, dark = (
-            sum(map(len, files))
-            for files in zip(*((j.scene.granules, j.scene.dark) for j in group), strict=True)
-        )
+        files = zip(*((j.scene.granules, j.scene.dark) for j in group), strict=True)
+        granules, dark = (sum(map(len, part)) for part in files)
         title += f"{granules} granules, {dark} dark"
         if len(group) == 1:
             title += f", plan {group[0].requested.hash[:12]}"
@@ -336,6 +329,7 @@ def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: 
         for line in lines[1:]:
             words = line.lstrip()
             say_wrapped(words, line[: len(line) - len(words)])
+    return printed
 
 
 def _scene_lines(judged: Judgement, *, plan: bool) -> Iterator[str]:
@@ -355,11 +349,15 @@ def _scene_lines(judged: Judgement, *, plan: bool) -> Iterator[str]:
 
 
 def _step_lines(plan: Plan) -> Iterator[str]:
+    from lidarops.reports.rejections import settings_in_words
     from lidarops.scene.case import READ_STEP, REQUEST
 
     names = dict.fromkeys(step.name for step in plan.steps)
     if names:
         yield f"  steps: {', '.join(names)}"
+    near = (step for step in plan.steps if step.name == "overlap")
+    states = (", ".join((*settings_in_words(step), step.reason)) for step in near)
+    yield from dict.fromkeys(f"  overlap: {each}" for each in states)
     requested = [left for left in plan.left_out if left.rule != REQUEST]
     missed = [left for left in requested if left.name in kinds()]
     told = {left.channel for left in missed}
@@ -379,17 +377,18 @@ def _step_lines(plan: Plan) -> Iterator[str]:
         yield f"  skipped for some channels: {', '.join(others)}"
 
 
-def _show_refused(reasons: Sequence[str]) -> None:
-    """Print the number of refused files, and of each reason."""
+def _show_refused(reasons: Sequence[str]) -> int:
+    """Print the number of refused files, and of each reason, in so many lines."""
     if not reasons:
-        return
-    say_wrapped(f"{counted(len(reasons), 'file')} refused (lidarops catalog names them):", "")
+        return 0
+    said = say_wrapped(
+        f"{counted(len(reasons), 'file')} refused (lidarops catalog names them):", ""
+    )
     frequent = Counter(reasons).most_common(_REASONS)
     for reason, count in frequent:
-        say_wrapped(f"{counted(count, 'file')}: {reason}", "  ")
+        said += say_wrapped(f"{counted(count, 'file')}: {reason}", "  ")
     rest = len(reasons) - sum(count for _, count in frequent)
-    if rest:
-        say_wrapped(f"{counted(rest, 'file')}: other reasons", "  ")
+    return said + (say_wrapped(f"{counted(rest, 'file')}: other reasons", "  ") if rest else 0)
 
 
 def _grouped(lines: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:

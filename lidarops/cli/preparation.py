@@ -77,7 +77,6 @@ def init(
         contents,
         archive=Path(os.path.relpath(root, base)).as_posix(),
         output=_free_output(campaign),
-        name=root.name,
         schema=_SCHEMA,
     )
     text = draft()

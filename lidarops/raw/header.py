@@ -41,6 +41,8 @@ HeaderPointing = Literal["stated", "elevation", "zenith_angle"]
 POINTING_NOTE: Final = "taken as"
 """Words of the notes on headers that tell how their pointing is read."""
 
+TIME_REMEDY: Final = "leave the file out, or correct its header"
+
 Stretches = tuple[tuple[int, int], ...]
 """Stretches of bins of a channel, ascending: first bin, and the one past the last."""
 
@@ -165,8 +167,8 @@ class RawHeader(Header):
                 self.time_doubt,
                 file=self.path,
                 field="start",
-                remedy="leave the file out, or correct its header: one of them is wrong; or set"
-                " name_times: ignored, if names tell no time",
+                remedy=f"{TIME_REMEDY}: one of them is wrong; or set name_times: ignored, if names"
+                " tell no time",
             )
 
     @property

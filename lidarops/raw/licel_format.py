@@ -22,7 +22,7 @@ Counts = NDArray[np.int32]
 
 COUNTS: Final = np.dtype("<i4")
 _FIRST_LINES: Final = re.compile(
-    rb"[^\r\n]{0,1022}\r?\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d"
+    rb"[^\0\r\n]{0,1022}\r?\n[^\r\n]{0,1022}?\d/\d{4} +\d{1,2}:\d\d:\d\d"
 )
 
 _WRONG_IN_THEMSELVES: Final = 1

@@ -27,7 +27,13 @@ from typing import Any, Final, NamedTuple
 
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
-from lidarops.raw.header import IncompleteHeaderError, RawChannel, RawHeader, holds_text
+from lidarops.raw.header import (
+    TIME_REMEDY,
+    IncompleteHeaderError,
+    RawChannel,
+    RawHeader,
+    holds_text,
+)
 from lidarops.records import DetectionMode
 
 FORMAT: Final = "licel"
@@ -93,10 +99,9 @@ _MODES = {
 }
 _SIGNAL_DEVICES = ("BT", "BC")
 """Begins of the device of analog and of photon datasets (`licel2023`)."""
-_OLD_LETTERS: Final = frozenset("ls")
 _NEW_LETTERS: Final = frozenset("pr")
-"""Older Licel software wrote l for parallel beside s for perpendicular; in newer one l is left
-circular, beside r."""
+"""Older Licel software wrote l for parallel; in newer one that is p, and l is left circular, beside
+r."""
 _ANALOG = frozenset({DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED})
 _PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
 
@@ -221,7 +226,12 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
         raise RawFormatError(
             "holds no start and stop date: this is not a Licel file", field="header line 2"
         )
-    start, stop = _moments(dates)
+    try:
+        start, stop = _moments(dates)
+    except RawFormatError as error:
+        error.problem += _by_name(first.strip())
+        error.remedy = error.remedy or TIME_REMEDY
+        raise
     place, notes = _parse_place(second[dates.end() :].rstrip())
     lasers, number, timestamp, unknown = _parse_lasers(third)
     block_end = _dataset_lines_end(buffer, block_start, number)
@@ -398,10 +408,15 @@ def _time_doubt(name: str, start: datetime) -> str:
     named = named_time(name)
     if named is None or abs(start - named) <= _LONGEST:
         return ""
-    return (
-        f"states {start:%Y-%m-%d %H:%M}, the name of the file in its first line ({name})"
-        f" {named:%Y-%m-%d %H:%M}"
-    )
+    return f"states {start:%Y-%m-%d %H:%M}{_by_name(name)}"
+
+
+def _by_name(name: str) -> str:
+    """Return what the name of a file tells of its time, in words; empty where it tells none."""
+    named = named_time(name)
+    if named is None:
+        return ""
+    return f", the name of the file in its first line ({name}) {named:%Y-%m-%d %H:%M}"
 
 
 def _refuse_export(data: bytes) -> None:
@@ -626,7 +641,7 @@ def _parse_datasets(
         if d.active and d.kind is DatasetKind.OTHER
     ]
     notes += [
-        f"polarisation l of {d.name} is taken as parallel, as older files have it beside s"
+        f"polarisation l of {d.name} is taken as parallel, as older files have it"
         for d in datasets
         if d.active and d.polarisation == "p" and d.wavelength_label.endswith("l")
     ]
@@ -667,7 +682,7 @@ def _parse_lines(block: bytes) -> list[Dataset]:
         letters[dataset.wavelength_label[:-1]].add(dataset.polarisation)
     for place, dataset in enumerate(datasets):
         beside = letters[dataset.wavelength_label[:-1]]
-        if dataset.polarisation == "l" and beside >= _OLD_LETTERS and not beside & _NEW_LETTERS:
+        if dataset.polarisation == "l" and not beside & _NEW_LETTERS:
             name = f"{dataset.name[:-1]}p"
             datasets[place] = replace(dataset, polarisation="p", name=name)
     uses: Counter[str] = Counter()

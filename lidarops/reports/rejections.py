@@ -20,9 +20,11 @@ _STAGES: Final = {
     "incomplete_overlap": "overlap", "saturated": "dead_time",
     "negative_backscatter": "overlap", "poor_stratification": "dead_time",
     "no_gluing": "lag", "no_reference": "reference", "unstable_inversion": "reference",
-    "low_signal": "average", "not_homogeneous": "homogeneous", "no_signal": "read",
+    "low_signal": "average", "not_homogeneous": "homogeneous",
 }  # fmt: skip
 """Rejecting flags, and the entry of a plan whose settings they follow from."""
+_OF_ANALOG: Final = _STAGES | {"poor_stratification": "dark", "saturated": ""}
+_UNLIT: Final = "none: the laser was off; leave these files out, or name them as dark_files"
 
 
 def settings_in_words(step: PlannedStep) -> Iterator[str]:
@@ -36,10 +38,14 @@ def settings_in_words(step: PlannedStep) -> Iterator[str]:
 
 def decided_by(plan: Plan, product: ProductRecord, flag: str) -> str:
     """Return which settings of a plan a flag of a product follows from; empty if from none."""
+    if flag == "no_signal":
+        return _UNLIT
+    analog = file_channels(product.channel)[-1].startswith("analog_")
+    stage = (_OF_ANALOG if analog else _STAGES).get(flag)
     channels = (product.channel, *file_channels(product.channel))
     entries: tuple[PlannedStep | LeftOut, ...] = (*plan.steps, *plan.left_out)
     for entry in entries:
-        if entry.name == _STAGES.get(flag) and entry.channel in channels:
+        if entry.name == stage and entry.channel in channels:
             stated = settings_in_words(entry) if isinstance(entry, PlannedStep) else ()
             return f"{entry.name}: {', '.join((*stated, entry.reason))}"
     return ""

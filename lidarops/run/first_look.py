@@ -8,12 +8,14 @@ from __future__ import annotations
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 import yaml
 from numpy.typing import NDArray
 
@@ -27,39 +29,38 @@ from lidarops.catalog.folder import (
     InstrumentHeaders,
     Purpose,
 )
-from lidarops.errors import LidarOpsError, SceneError
+from lidarops.errors import LidarOpsError, RawFormatError, SceneError
 from lidarops.netcdf.read import open_product
-from lidarops.raw.archive import open_archive
+from lidarops.raw.archive import open_archive, open_counts
+from lidarops.raw.formats import RawFile, read_all_counts
+from lidarops.raw.header import RawHeader
 from lidarops.records import Scene, SceneOutcome, file_channels, is_glued
 from lidarops.reports.rejections import rejection_rows
-from lidarops.retrieve.signal.light import FEWEST, MEDIAN_OF_NORMAL
+from lidarops.retrieve.signal.light import FEWEST, light_begins, rise_ends
 from lidarops.run.archive import bring_up_to_date
+from lidarops.scene.dependence import scene_facts
 from lidarops.scene.job import Job
 from lidarops.scene.plan import plan_scene
 from lidarops.scene.processing import process_scene
-from lidarops.scene.profiles import lightless_profiles
+from lidarops.scene.profiles import bin_ranges, lightless_profiles
+from lidarops.simulate.atmosphere import clock_of_sky
 
 _MOST_FILES: Final = 96
 """Files of a look: all of half an hour of minutes, or four of each hour of a day."""
 _MOST_DARK: Final = 20
 _HIGHEST: Final = 8000.0
 """m; usable values count below."""
-_NEAREST: Final = 60.0
-_FARTHEST: Final = 3000.0
-"""m; signals are expected to stop rising between these."""
-_SMOOTH: Final = 60.0
-"""m; length of the running mean."""
-_FALL: Final = 200.0
-"""m; a signal that no longer rises stays below its maximum so long."""
 _STEP: Final = 10.0
 """m; multiples of which a full overlap is given as."""
 _LATEST: Final = 1000.0
 """m; light of the nearest telescope begins before, unless a record begins before the pulse. Of one
 that sees only far air it begins at 750 m."""
-_LIGHT: Final = 10.0
-"""Standard errors of a bin by which three bins in a row show light."""
-
-_OF_ONE_PROFILE: Final = ("overlap:", "dead_time:", "lag:", "read:")
+_AT_ONCE: Final = 100.0
+"""m; light of one channel at least begins before, unless the record begins before the pulse, or no
+telescope sees near air."""
+_FEW_COUNTS: Final = 100.0
+"""Counts of a file that tell nothing of the sky."""
+_OF_ONE_PROFILE: Final = ("overlap:", "dead_time:", "lag:", "none:")
 """Entries of a plan whose flags a longer average does not change."""
 
 Floats = NDArray[np.float64]
@@ -114,7 +115,8 @@ class _Look:
         folder: Path,
     ) -> None:
         self.drafted, self.key, self.headers, self.folder = drafted, key, headers, folder
-        self.files = _sample(headers)
+        sample = _sample(headers)
+        self.files = [path for path, header in sample if _is_readable(root / path, header)]
         dark = [path for group in headers.groups if group.dark for path in group.files]
         for place, paths in (("raw", self.files), ("dark", dark[:_MOST_DARK])):
             for path in paths:
@@ -123,28 +125,60 @@ class _Look:
                 link.symlink_to((root / path).resolve())
 
     def result(self) -> FirstLook:
-        full_overlap, begins = self._ranges()
         candidates = [name for names in self.headers.candidates for name in names]
         nitrogen = self.headers.nitrogen_channels
-        if begins is not None and begins > _LATEST:
-            reason = f"light begins at {begins:.0f} m"
-            reasons = dict.fromkeys(candidates, reason)
-            return FirstLook(len(self.files), {}, reasons, frozenset(), None, begins)
+        seen = self._seen()
+        if seen.begins is not None and seen.begins > _LATEST:
+            reasons = dict.fromkeys(candidates, f"light begins at {seen.begins:.0f} m")
+            return replace(seen, reasons=reasons, full_overlap=None)
         products: dict[str, Any] = {
             "elastic": {**self.drafted["instruments"][self.key]["products"]["elastic"]}
         }
         products["elastic"]["channels"] = candidates
         if nitrogen:
             products["raman"] = {"channels": list(nitrogen), "nitrogen": nitrogen}
-        scenes = self._processed(products, full_overlap or 0.0)
-        shares = {
-            channel: share
-            for channel, path in self._made(scenes, "elastic")
-            if (share := _usable_share(path)) > 0.0
-        }
+        scenes = self._processed(products, seen.full_overlap or 0.0)
+        elastic = list(self._made(scenes, "elastic"))
+        shares = {name: share for name, path in elastic if (share := _usable_share(path)) > 0.0}
         raman = (name for name, path in self._made(scenes, "raman") if _usable_share(path) > 0.0)
-        reasons = {name: self._reason(scenes, name) for name in candidates if name not in shares}
-        return FirstLook(len(self.files), shares, reasons, frozenset(raman), full_overlap)
+        return replace(
+            seen,
+            shares=shares,
+            reasons={name: self._reason(scenes, name) for name in candidates if name not in shares},
+            raman=frozenset(raman),
+            lags=dict(_lags(elastic)),
+        )
+
+    def _seen(self) -> FirstLook:
+        """Return what raw counts show of the laser, of the telescope and of the sky."""
+        files = [self.folder / "raw" / path for path in self.files]
+        archive = open_archive(files, mask_and_scale=False, header_position="ignore")
+        unlit = _unlit(archive)
+        lit = archive.isel(time=~unlit if not unlit.all() else unlit)
+        names = dict(zip((c.name for c in self.headers.layout), _channels(archive), strict=True))
+        # The last one is analog where there is such a record, which counts no pile-up.
+        ends = (rise_ends(*_mean(lit, names[own[-1]])) for own in self.headers.candidates)
+        farthest = max(filter(None, ends), default=None)
+        return FirstLook(
+            files=len(files),
+            full_overlap=farthest and float(np.ceil(farthest / _STEP) * _STEP),
+            begins=_late_light(lit),
+            unlit=tuple(path for path, dark in zip(self.files, unlit, strict=True) if dark),
+            clock=self._clock(archive),
+        )
+
+    def _clock(self, archive: xr.Dataset) -> tuple[float, float] | None:
+        """Return the clocks minus UTC that the light of the sky fits, h; None where it tells none.
+
+        Of the photon-counting channel with the greatest contrast.
+        """
+        counts = (archive[name] for name in _channels(archive) if name.startswith("photon"))
+        far = (every[:, -every.shape[1] // 8 :] for every in counts)
+        skies = [_FEW_COUNTS + part.sum("range").to_numpy() for part in far]
+        sky = max(skies, key=lambda light: light.max() / light.min(), default=np.ones(1))
+        station = self.drafted["stations"][self.drafted["instruments"][self.key]["station"]]
+        moments = archive["time"].values.astype("datetime64[s]").tolist()
+        return clock_of_sky(sky, moments, float(station["latitude"]), float(station["longitude"]))
 
     def _processed(self, products: Mapping[str, Any], full_overlap: float) -> Scenes:
         """Process the sample with these products, and dead times that are estimated."""
@@ -193,42 +227,19 @@ class _Look:
         frequent = [name.lower() for name, _ in flags.most_common(2)]
         return ", ".join(frequent) or next(iter(left_out), "no product")
 
-    def _ranges(self) -> tuple[float | None, float | None]:
-        """Return from where no signal rises any more, and where light begins, m.
-
-        None where signals do not show it.
-        """
-        # The last one is analog where there is such a record, which counts no pile-up.
-        channels = [names[-1] for names in self.headers.candidates]
-        scenes = self._processed({"signal": {"channels": channels}}, 0.0)
-        ends: dict[str, list[float]] = defaultdict(list)
-        begins: list[float] = []
-        for channel, path in self._made(scenes, "signal"):
-            with open_product(path, ("signal", "range")) as product:
-                known = np.isfinite(product["signal"].values)
-                total = np.where(known, product["signal"].values, 0.0).sum(axis=0)
-                mean = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
-                ranges = np.asarray(product["range"].values, float)
-            if (end := rise_ends(ranges, mean)) is not None:
-                ends[channel].append(end)
-            if (begin := light_begins(ranges, mean)) is not None:
-                begins.append(begin)
-        earliest = min(begins, default=None)
-        if not ends:
-            return None, earliest
-        farthest = max(float(np.median(found)) for found in ends.values())
-        return float(np.ceil(farthest / _STEP) * _STEP), earliest
-
 
 def empty_in_first_files(
     campaign: Campaign, scenes: Iterable[Scene]
 ) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the products of scenes that their first file leaves without a usable value, and why.
+    """Yield what the first files of scenes leave without a usable value, and why.
 
-    Product, flag, share of the values and settings, but not what a longer average may change.
+    Product, flag, share of the values and settings, but not what a longer average may change. With
+    that, ranges without light.
     """
     for scene in scenes:
-        first = replace(scene, granules=scene.granules[:1])
+        first = replace(scene, granules=scene.granules[:FEWEST])
+        if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
+            yield from _without_near_light(campaign, first)
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
             own = campaign.model_copy(update={"output": folder})
             outcome = process_scene(Job(own, first, plan_scene(first, own)))
@@ -236,6 +247,33 @@ def empty_in_first_files(
         for row in rejection_rows([replace(outcome, products=empty)]):
             if row[-1].startswith(_OF_ONE_PROFILE):
                 yield row
+
+
+def _without_near_light(campaign: Campaign, scene: Scene) -> Iterator[tuple[str, str, str, str]]:
+    """Yield that all channels show light late, if they do; not of files that cannot be read."""
+    names = [channel.name for channel in scene.layout]
+    with suppress(LidarOpsError):
+        archive = open_counts(scene.granules, root=Path(campaign.archive), channels=names)
+        if late := _late_light(archive):
+            words = "pre_trigger: none is stated; 0 where the pulse leaves as the record begins"
+            yield f"all of {scene.instrument}", "no light", f"below {late:.0f} m", words
+
+
+def _channels(archive: xr.Dataset) -> list[str]:
+    return [name for name in map(str, archive) if f"{name}_shots" in archive]
+
+
+def _mean(archive: xr.Dataset, channel: str) -> tuple[Floats, Floats]:
+    """Return ranges and the range-corrected mean of raw counts above the far range, (range,)."""
+    ranges, counts = bin_ranges(archive, channel, 0.0), archive[channel].to_numpy().mean(axis=0)
+    return ranges, np.square(ranges) * (counts - np.median(counts[-counts.size // 4 :]))
+
+
+def _late_light(archive: xr.Dataset) -> float | None:
+    """Return where light begins, m; None where it begins at once or is not seen."""
+    begins = (light_begins(*_mean(archive, name)) for name in _channels(archive))
+    earliest = min(filter(None, begins), default=0.0)
+    return earliest if earliest > _AT_ONCE else None
 
 
 def without_light(contents: FolderContents, root: Path) -> FolderContents:
@@ -256,73 +294,52 @@ def _is_unlit(group: FileGroup, root: Path) -> bool:
     paths = [root / path for path in group.files[:: len(group.files) // FEWEST]]
     try:
         archive = open_archive(paths, mask_and_scale=False, header_position="ignore")
-        dark = lightless_profiles(archive, None).values()
+        return bool(_unlit(archive).all())
     except LidarOpsError:
         # What cannot be read is refused with its reason when it is processed.
         return False
-    return bool(dark) and all(bool(rows.all()) for rows in dark)
 
 
-def _sample(headers: InstrumentHeaders) -> list[str]:
+def _unlit(archive: xr.Dataset) -> NDArray[np.bool_]:
+    """Return which profiles show no light in all channels that tell, (time,)."""
+    dark = list(lightless_profiles(archive, None).values())
+    unlit: NDArray[np.bool_] = np.all(dark or [np.zeros(archive.sizes["time"], bool)], axis=0)
+    return unlit
+
+
+def _lags(elastic: Iterable[tuple[str, Path]]) -> Iterator[tuple[str, float]]:
+    """Yield analog channels, and bins by which they lag in the products of their glued channels."""
+    for name, path in elastic:
+        if is_glued(name):
+            with open_product(path, ("glue_lag",)) as product:
+                lags = product["glue_lag"].values
+            known = lags[np.isfinite(lags) & (lags != 0.0)]
+            if known.size:
+                yield file_channels(name)[0], float(np.median(known))
+
+
+def _sample(headers: InstrumentHeaders) -> list[tuple[str, RawHeader]]:
     """Return some signal files of the day with most hours, equally many of each hour."""
-    hours: dict[datetime, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
+    hours: dict[datetime, dict[int, list[tuple[str, RawHeader]]]]
+    hours = defaultdict(lambda: defaultdict(list))
     group = headers.main
     files = zip(group.files, group.headers, strict=True)
-    for path, header in sorted(files, key=lambda one: one[1].start):
+    for path, header in sorted(files, key=lambda one: (one[1].start, one[0])):
         midnight = header.start.replace(hour=0, minute=0, second=0, microsecond=0)
-        hours[midnight][header.start.hour].append(path)
+        hours[midnight][header.start.hour].append((path, header))
     of_day = max(hours.values(), key=lambda day: (len(day), sum(map(len, day.values()))))
     each = max(_MOST_FILES // len(of_day), 1)
-    return [path for paths in of_day.values() for path in paths[:each]]
+    return [one for files in of_day.values() for one in files[:each]]
 
 
-def rise_ends(ranges: Floats, signal: Floats) -> float | None:
-    """Return where a range-corrected signal stops rising, m; None where it does not by 3 km.
-
-    Below full overlap a signal rises, and in any air beyond it falls on the mean. It is the first
-    place whose running mean no place in the next 200 m exceeds.
-
-    Parameters
-    ----------
-    ranges : (range,) float
-        m.
-    signal : (range,) float
-        NaN where missing or saturated.
-    """
-    step = ranges[1] - ranges[0]
-    width, ahead = (max(round(float(length / step)), 1) for length in (_SMOOTH, _FALL))
-    near = ranges < _FARTHEST + _SMOOTH + _FALL
-    values, place = signal[near], ranges[near]
-    known = np.isfinite(values)
-    weight = np.convolve(known, np.ones(width), "same")
-    smooth = np.convolve(np.where(known, values, 0.0), np.ones(width), "same")
-    smooth = np.where(weight > 0.5 * width, smooth / np.maximum(weight, 1.0), -np.inf)
-    for k in np.flatnonzero((place >= _NEAREST) & (place <= _FARTHEST)):
-        beyond = smooth[k + 1 : k + 1 + ahead]
-        if np.isfinite(smooth[k]) and smooth[k] > 0.0 and beyond.size and smooth[k] >= beyond.max():
-            return float(place[k])
-    return None
-
-
-def light_begins(ranges: Floats, signal: Floats) -> float | None:
-    """Return from where a range-corrected signal shows light, m; None where it shows none.
-
-    Parameters
-    ----------
-    ranges : (range,) float
-        m.
-    signal : (range,) float
-        NaN where missing or saturated, which is light.
-    """
-    power = signal / np.square(ranges)
-    far = power[-power.size // 4 :]
-    far = far[np.isfinite(far)]
-    if not far.size:
-        return None
-    noise = np.median(np.abs(np.diff(far))) / (MEDIAN_OF_NORMAL * np.sqrt(2.0))
-    light = ~(power <= np.median(far) + _LIGHT * noise)
-    first = np.flatnonzero(light[:-2] & light[1:-1] & light[2:])
-    return float(ranges[first[0]]) if first.size else None
+def _is_readable(path: Path, header: RawHeader) -> bool:
+    """Return whether the counts of a file can be read; others are refused with their reason."""
+    try:
+        with RawFile(path) as file:
+            read_all_counts(file, header)
+    except RawFormatError:
+        return False
+    return True
 
 
 def _usable_share(path: Path) -> float:

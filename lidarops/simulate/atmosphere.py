@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -54,6 +54,10 @@ _TWILIGHT_AT_HORIZON: Final = 0.02
 """Brightness with the sun at the horizon, relative to the zenith."""
 _DEGREES_PER_DECADE: Final = 3.0
 """Depression of the sun in which the sky darkens tenfold."""
+_CONTRAST: Final = 10.0
+"""Least light of the brightest sky over that of the darkest one that are day and night."""
+_DUSK: Final = -5.0
+"""degree; elevation of the sun at which the sky has the middle of the light of day and night."""
 
 
 class Beam(NamedTuple):
@@ -357,3 +361,34 @@ def sky_brightness(elevation: float) -> float:
     day = math.sin(math.radians(max(elevation, 0.0))) + _TWILIGHT_AT_HORIZON
     night: float = 10.0 ** (min(elevation, 0.0) / _DEGREES_PER_DECADE)
     return day / (1.0 + _TWILIGHT_AT_HORIZON) * night
+
+
+def clock_of_sky(
+    sky: Array, moments: Sequence[datetime], latitude: float, longitude: float
+) -> tuple[float, float] | None:
+    """Return the clocks minus UTC that the light of the sky fits, h; None where UTC fits, or none.
+
+    The sky is bright where the sun stands above -5 degree. Files that are on the other side of the
+    middle between the brightest and the darkest contradict a clock. One may be an error.
+
+    Parameters
+    ----------
+    sky : (time,) float
+        Light without that of the laser, above 0, in any unit.
+    moments : sequence of datetime
+        By the clock of the files.
+    latitude, longitude : float
+        degree.
+    """
+    if sky.max() < _CONTRAST * sky.min():
+        return None
+    bright = sky > math.sqrt(sky.max() * sky.min())
+    utc = [moment.replace(tzinfo=UTC) for moment in moments]
+    wrong = {}
+    for half in range(-24, 25):
+        back = timedelta(hours=half / 2.0)
+        day = [solar_elevation(moment - back, latitude, longitude) > _DUSK for moment in utc]
+        wrong[half / 2.0] = int(np.sum(bright != np.array(day)))
+    fewest = min(wrong.values())
+    fit = [hours for hours, files in wrong.items() if files == fewest]
+    return (min(fit), max(fit)) if wrong[0.0] > fewest + 1 else None

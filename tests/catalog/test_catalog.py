@@ -164,11 +164,12 @@ def test_a_file_of_the_future_is_refused_until_it_is_past(
     root = _fill(campaign)
     ahead = datetime.now(UTC).replace(microsecond=0) + timedelta(days=10) - factories.DAY
     late = raw_archives.content(ahead / timedelta(minutes=1))
-    raw_archives.write(root / "coast" / "h9", late)
+    raw_archives.write(root / "coast" / "h2630110.000000", late)
     assert scan_archive(campaign, store).refused == 1
     (granule,) = store.refused()
-    assert granule.path == "coast/h9"
+    assert granule.path == "coast/h2630110.000000"
     assert granule.reason.startswith("starts in the future")
+    assert f"today is {datetime.now(UTC):%Y-%m-%d}, its name 2026-03-01 10:00 (" in granule.reason
     # By a wrong clock of this machine, too: it is tried again.
     monkeypatch.setattr(raw_files, "_CLOCKS_DIFFER", timedelta(days=20))
     assert scan_archive(campaign, store).refused == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 import yaml
@@ -11,6 +12,8 @@ from support.archives.raw_archives import content, write
 from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.catalog.draft import drafted_instruments
+from lidarops.catalog.folder import read_folder
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
@@ -336,6 +339,7 @@ def test_the_draft_of_a_real_scan_gives_usable_values(data_root: Path, tmp_path:
         ("pol-cal", None),
         ("20170928-DC", Role.DARK),
         ("bkg1", None),
+        ("20260301/bg", None),
         ("0755bACKGROUND", None),
         # Words that are parts of other ones.
         ("adcp", Role.SIGNAL),
@@ -362,8 +366,74 @@ def test_files_of_tests_and_calibrations_are_a_question_and_no_measurements(
 
 def test_only_files_of_a_calibration_are_drafted_as_they_are(tmp_path: Path) -> None:
     write(tmp_path / "raw/calibration/h0", content(0.0))
-    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert [granule.path for granule in granules(campaign)] == ["calibration/h0"]
+    assert "by path or counts, in `files`, as there are no others:" in text
+    assert "left out" not in text
+
+
+@pytest.mark.parametrize(
+    ("folders", "left_out"),
+    [(["N", "E", "S", "W"], True), (["day/north", "day/east", "day/south", "day/west"], True),
+     (["N", "S"], False), (["a/north", "a/east", "b/south", "b/west"], False)],
+)  # fmt: skip
+def test_folders_of_four_sectors_are_tests_of_the_telescope(
+    tmp_path: Path, folders: list[str], left_out: bool
+) -> None:
+    """Two may be lidars of two places."""
+    for number, folder in enumerate([*folders, "evening"]):
+        write(tmp_path / f"raw/{folder}/h{number}", content(number, seed=number))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    found = {granule.path.rpartition("/")[0] for granule in granules(campaign)}
+    assert found == {"evening"} | (set() if left_out else set(folders))
+    assert (f"# {len(folders)} files, ? test of the telescope" in text) == left_out
+
+
+def test_a_campaign_is_named_after_its_stations(raw: Path, tmp_path: Path) -> None:
+    campaign, _ = drafted(raw, tmp_path / "campaign.yaml")
+    assert campaign.name == "coast-hill"
+    assert campaign.title == "Lidar measurements at Coast, Hill"
+
+
+def test_the_altitude_of_a_station_is_that_of_most_headers(tmp_path: Path) -> None:
+    for number, altitude in enumerate((906.0, 20.0, 20.0)):
+        write(tmp_path / f"raw/h{number}", content(number, altitude=altitude))
+    campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert campaign.stations["coast"].altitude == 20.0
+
+
+def test_a_clock_hour_that_is_there_twice_is_a_question(tmp_path: Path) -> None:
+    """Local time at the end of summer time; a second of rounding is none."""
+    for number, minutes in enumerate([0.0, 59.0 / 60.0, 30.0, 30.5]):
+        write(tmp_path / f"raw/h{number}", content(minutes, seed=number))
+    _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert "; files that start before another one stops: 1; is a clock hour there twice?" in text
+
+
+def test_each_telescope_has_the_nitrogen_channel_of_the_nearest_recorder(data_root: Path) -> None:
+    """IPRAL: BC0 to BC5 of the far telescope, BC10 to BC12 of the near one."""
+    contents = read_folder(str(data_root / "cases/telescope_off"))
+    (headers,) = drafted_instruments(contents).values()
+    found = {name: headers.nitrogen_channels[name] for name in ("photon_355p", "photon_355o")}
+    assert found == {"photon_355p": "photon_387o", "photon_355o": "photon_387o_2"}
+
+
+def test_a_bin_shift_of_a_channel_without_photon_counting_is_a_question(
+    data_root: Path, tmp_path: Path
+) -> None:
+    _, text = drafted(data_root / "cases/telescope_off", tmp_path / "campaign.yaml")
+    shifted = [line for line in text.splitlines() if "states a bin shift of 9" in line]
+    assert [line.split()[0] for line in shifted] == ["analog_1064o:"]
+
+
+def test_files_in_an_archive_without_compression_are_packed_ones(tmp_path: Path) -> None:
+    """Their headers can be read in it, as those of a raw file."""
+    for number in range(2):
+        write(tmp_path / f"raw/h{number}", content(number))
+    with ZipFile(tmp_path / "raw/night.zip", "w") as archive:
+        archive.write(tmp_path / "raw/h0", "h0")
+    _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert "# 1 file, ? packed and not read: unpack them, and run init again:" in text
 
 
 def test_the_session_folders_of_a_night_are_told_apart(data_root: Path, tmp_path: Path) -> None:
@@ -373,6 +443,8 @@ def test_the_session_folders_of_a_night_are_told_apart(data_root: Path, tmp_path
              for path in [granule.path]}  # fmt: skip
     assert known == {("RS", Role.SIGNAL), ("DC", Role.DARK)}
     assert "10 files, ? calibration of the polarisation" in text
+    assert "/+45/" in text
+    assert "/-45/" in text
 
 
 @pytest.mark.parametrize(
@@ -411,6 +483,7 @@ def test_names_that_tell_no_time_are_a_question_and_a_clock_far_from_them_is_non
     if not free:
         shown = CliRunner().invoke(app, ["init", str(tmp_path / "raw"), str(tmp_path / "c.yaml")])
         assert "states 2026-03-01 10:00, the name of the file in its first line" in shown.output
+        assert "(leave the file out, or correct its header)" in " ".join(shown.output.split())
         return
     campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert "name_times: ignored  # ? states 2026-03-01 10:00, the name of the file" in text

@@ -281,6 +281,11 @@ def test_years_before_the_first_recorders_are_refused():
     with pytest.raises(RawFormatError, match="1970 is not within 1990") as error:
         parse(line_2=" LidarPi  01/01/1970 00:00:00 01/01/1970 00:00:10 0411 -064.1 -031.2 00")
     assert error.value.field == "start"
+    line = " LidarPi  01/01/1970 00:00:00 01/01/1970 00:00:10 0411 -064.1 -031.2 00"
+    with pytest.raises(
+        RawFormatError, match=r"a24A0217.301035\) 2024-10-02 17:30 \(leave the file"
+    ):
+        parse(line_1=" a24A0217.301035", line_2=line)
 
 
 def test_values_without_shots_are_nan(tmp_path):
@@ -343,7 +348,8 @@ def test_a_dataset_that_cannot_be_a_signal_costs_itself_alone(tmp_path, line):
     assert any("no signal by its type" in note for note in header.notes) == (device == "BT0")
 
 
-def test_the_letter_of_older_files_is_parallel_beside_perpendicular():
+def test_the_letter_of_older_files_is_parallel_but_beside_letters_of_newer_ones():
+    """Whether the detector of the other polarisation is on does not matter: names stay."""
     lines = [line.replace("532.p", f"532.{letter}") for letter in "ls" for line in (ANALOG, PHOTON)]
     header = parse(datasets=tuple(lines))
     names = ["analog_532p", "photon_532p", "analog_532s", "photon_532s"]
@@ -352,12 +358,12 @@ def test_the_letter_of_older_files_is_parallel_beside_perpendicular():
     circular = parse(datasets=tuple(line.replace("532.s", "532.r") for line in lines))
     assert circular.channels[0].name == "analog_532l"
     # Letters of another wavelength tell nothing.
-    of_355 = [line.replace("532.l", "355.l") for line in lines]
-    assert parse(datasets=tuple(of_355)).channels[0].name == "analog_355l"
+    of_355 = [line.replace("532.s", "355.r") for line in lines]
+    assert parse(datasets=tuple(of_355)).channels[0].name == "analog_532p"
     beside = (*lines, ANALOG.replace("532", "355"))
     assert parse(datasets=beside).channels[0].name == "analog_532p"
     alone = parse(datasets=tuple(lines[:2]))
-    assert alone.channels[0].name == "analog_532l"
+    assert alone.channels[0].name == "analog_532p"
 
 
 @pytest.mark.parametrize("lines", [slice(None), slice(1, 3)])

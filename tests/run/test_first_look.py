@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from typer.testing import CliRunner
 
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.cli import app
+from lidarops.raw import licel
+from lidarops.retrieve.signal.light import light_begins, rise_ends
 from lidarops.run.archive import reprocess
-from lidarops.run.first_look import light_begins, rise_ends
+from lidarops.simulate.atmosphere import clock_of_sky, sky_brightness, solar_elevation
 
 RANGES = np.arange(3.75, 12_000.0, 7.5)
 """m."""
@@ -74,6 +77,43 @@ def test_light_begins_after_the_pulse_and_the_blind_range(
     assert light_begins(RANGES, RANGES**2 * noise) is None
 
 
+MANAUS = -3.1, -60.0
+"""degree; latitude and longitude."""
+
+
+@given(
+    clock=st.integers(-22, 22),
+    day=st.integers(0, 360),
+    noise=st.floats(0.0, 0.3),
+    saturated=st.floats(1e-2, 1.0),
+)
+def test_the_clock_that_the_light_of_the_sky_fits_is_the_true_one(
+    clock: int, day: int, noise: float, saturated: float
+) -> None:
+    """A file each half hour of a day, by a counter that is blind in bright light."""
+    start = datetime(2024, 1, 1, tzinfo=UTC) + timedelta(days=day)
+    utc = [start + timedelta(minutes=30 * number + 15) for number in range(48)]
+    sun = [solar_elevation(moment, *MANAUS) for moment in utc]
+    sky = np.minimum([sky_brightness(elevation) for elevation in sun], saturated) + 1e-4
+    sky *= np.random.default_rng(day).lognormal(sigma=noise, size=48)
+    by_clock = [moment + timedelta(hours=clock / 2.0) for moment in utc]
+    found = clock_of_sky(sky, by_clock, *MANAUS)
+    if abs(clock) <= 1:
+        assert found is None or found[0] <= clock / 2.0 <= found[1]
+    else:
+        assert found is not None
+        # Of the day before, too.
+        assert min(abs(hours - clock / 2.0) % 24.0 for hours in found) <= 0.5
+
+
+@pytest.mark.parametrize("hours", [range(12, 16), range(1, 5)])
+def test_a_sky_that_stays_as_it_is_tells_no_clock(hours: range) -> None:
+    utc = [datetime(2024, 3, 1, hour, tzinfo=UTC) for hour in hours]
+    sky = np.array([1e-3 + sky_brightness(solar_elevation(moment, *MANAUS)) for moment in utc])
+    later = [moment + timedelta(hours=12) for moment in utc]
+    assert clock_of_sky(sky, later, *MANAUS) is None
+
+
 def test_nothing_is_proposed_of_records_that_begin_before_the_pulse(
     data_root: Path, tmp_path: Path
 ) -> None:
@@ -86,6 +126,33 @@ def test_nothing_is_proposed_of_records_that_begin_before_the_pulse(
     assert lidar.products.model_dump(exclude_none=True).keys() == {"signal"}
     question = "# pre_trigger: 1967 m  # ? light begins there, in bin 524 of 3.75 m: at which range"
     assert question in text
+    # Nobody answers: the plan tells.
+    path = tmp_path / "campaign.yaml"
+    row = ["all of city-lidar", "no light", "below 1967 m"]
+    assert [one[:3] for one in told("plan", path)["empty_in_first_file"]] == [row]
+    path.write_text(text.replace("# pre_trigger: 1967 m", "pre_trigger: 0"))
+    assert told("plan", path)["empty_in_first_file"] == []
+
+
+def told(command: str, path: Path) -> Any:
+    return json.loads(CliRunner().invoke(app, [command, str(path), "--json"]).output)
+
+
+def test_light_that_begins_late_is_a_question_beside_proposals(tmp_path: Path) -> None:
+    """A telescope that sees far air only, or a record that begins before the pulse."""
+    ranges = 7.5 * (np.arange(2000) + 0.5)
+    air = np.where(ranges > 600.0, np.exp(-ranges / 4000.0) * np.square(600.0 / ranges), 0.0)
+    for number in range(3):
+        rng = np.random.default_rng(number)
+        data = raw_archives.content(number, bins=2000, zenith_angle=0.0)
+        header = licel.parse_header(data)
+        counts = {name: rng.poisson(1000.0 + 3e5 * air).astype(np.int32)
+                  for name in ("analog_532o", "photon_532o")}  # fmt: skip
+        raw_archives.write(tmp_path / f"raw/h26{number}", licel.encode(header, counts))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert "elastic" in lidar.products.requested
+    assert "# pre_trigger: 604 m  # ? light begins there, in bin 80 of 7.5 m" in text
 
 
 def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> None:
@@ -97,6 +164,13 @@ def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> No
     (lidar,) = campaign.instruments.values()
     assert set(lidar.products.requested) == {"signal"}
     assert "# glued_532o: no usable value in 3 files" in text
+
+
+QUESTIONS = {
+    "saopaulo": ["BT1; ? range_offset: -64 m, it lags photon counting by 8.5 bins"],
+    "public/manaus_20111017_day": ["; the light of the sky fits -4.5 to -4 h"],
+}
+"""Manaus has the time of UTC-4, by which this day was recorded."""
 
 
 @pytest.mark.parametrize(
@@ -117,7 +191,9 @@ def test_what_is_proposed_of_real_archives_is_usable(
     tmp_path: Path,
 ) -> None:
     """By day but for the third; nobody answered a question."""
-    campaign, _ = drafted(data_root / name, tmp_path / "campaign.yaml")
+    campaign, text = drafted(data_root / name, tmp_path / "campaign.yaml")
+    assert all(question in text for question in QUESTIONS.get(name, ()))
+    assert ("the light of the sky fits" in text) == (name == "public/manaus_20111017_day")
     (lidar,) = campaign.instruments.values()
     proposed = lidar.products.requested["elastic"].channels
     assert {channel.partition("_")[2] for channel in proposed} == set(elastic)
@@ -145,15 +221,14 @@ def test_what_the_first_file_leaves_empty_is_named_with_its_setting(tmp_path: Pa
     path = tmp_path / "campaign.yaml"
     path.write_text(yaml.safe_dump(settings.model_dump(mode="json", exclude={"simulation"})))
 
-    def told(*words: str) -> Any:
-        return json.loads(CliRunner().invoke(app, [*words, str(path), "--json"]).output)
-
     words = "bins nearer than full overlap, which is assumed, are flagged and excluded"
     setting = f"overlap: full_overlap_range 100000 m, {words}"
     row = ["signal photon_532o of lidar", "incomplete_overlap", "100 %", setting]
-    assert row in told("plan")["empty_in_first_file"]
-    assert row in told("reprocess")["rejections"]
-    assert told("plan")["empty_in_first_file"] == []
+    assert row in told("plan", path)["empty_in_first_file"]
+    assert row in told("reprocess", path)["rejections"]
+    assert told("plan", path)["empty_in_first_file"] == []
+    shown = CliRunner().invoke(app, ["plan", str(path)], env={"COLUMNS": "300"})
+    assert f"  {setting}\n" in shown.output
 
 
 def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_path: Path) -> None:
@@ -161,7 +236,7 @@ def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_
     if not case.is_dir():
         pytest.skip("no case of a laser that was off")
     (tmp_path / "raw/night").mkdir(parents=True)
-    for path in (*sorted((case / "raw").glob("h*"))[:20], *sorted((case / "rawoff").glob("h*"))):
+    for path in (*sorted((case / "raw").glob("h*"))[:30], *sorted((case / "rawoff").glob("h*"))):
         target = tmp_path / "raw" / ("night" if path.parent.name == "rawoff" else "") / path.name
         target.symlink_to(path)
     for name in ("session.ZIP", "notes.txt", "log.txt"):
@@ -169,9 +244,22 @@ def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_
     campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     assert [lidar.files for lidar in campaign.instruments.values()] == [["h*"]]
     assert "# 30 files, ? without light of the laser by path or counts, left out" in text
+    some = '# ? 10 of 30 files show no light of the laser, such as "h2141610.200000": dark files?'
+    assert some in text
     assert "# 1 file, ? packed and not read: unpack them, and run init again:" in text
     assert "# 2 files, of no raw format and not read (.txt 2):" in text
     (tmp_path / "raw/alone").mkdir()
     (tmp_path / "raw/alone/session.zip").touch()
     shown = CliRunner().invoke(app, ["init", str(tmp_path / "raw/alone"), str(tmp_path / "b.yaml")])
     assert "unpack session.zip" in shown.output
+
+
+def test_a_plan_tells_that_a_laser_was_off(data_root: Path, tmp_path: Path) -> None:
+    case = data_root / "cases/laser_off/rawoff"
+    if not case.is_dir():
+        pytest.skip("no case of a laser that was off")
+    path = tmp_path / "campaign.yaml"
+    CliRunner().invoke(app, ["init", "--headers-only", str(case), str(path)])
+    words = "none: the laser was off; leave these files out, or name them as dark_files"
+    rows = told("plan", path)["empty_in_first_file"]
+    assert ["signal analog_532o of harbour-lidar", "no_signal", "100 %", words] in rows

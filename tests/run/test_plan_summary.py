@@ -96,6 +96,31 @@ def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
     assert len(whole.output.splitlines()) > 150
 
 
+@pytest.mark.usefixtures("quickly")
+@pytest.mark.parametrize("width", [80, 300])
+def test_scenes_that_all_differ_fill_a_screen_or_two(tmp_path: Path, width: int) -> None:
+    """Each day lacks another channel, or states another altitude; files are cut at random."""
+    products = {"signal": {"channels": "all"}, "elastic": {"channels": ["glued_532o"]}}
+    for day in range(24):
+        data = raw_archives.content(1440.0 * day, bins=1000, altitude=1000.0 + day)
+        # Of the analog record another wavelength each day, which the campaign does not name.
+        data = data.replace(b"00532.o 0 0 00 000 12", f"00{400 + day}.o 0 0 00 000 12".encode())
+        raw_archives.write(tmp_path / f"raw/coast/h{day:02}", data)
+        raw_archives.write(tmp_path / f"raw/coast/h{day:02}b", data[: -100 - day])
+    facts = [{"full_overlap_range": 1e4, "channels": {"analog_532o": {"lag": 1.0}}}]
+    settings = factories.campaign(products=products, facts=facts)
+    file = tmp_path / "campaign.yaml"
+    file.write_text(yaml.safe_dump(settings.model_dump(mode="json", exclude={"simulation"})))
+    lines = planned(file, width=width)
+    assert len(lines) <= MOST_LINES
+    text = " ".join(lines)
+    assert re.search(r"[0-9]+ further scenes with other lines \(--all\)", text)
+    assert re.search(r"The archive is not what .*, the first [0-5] of [0-9]+ \(--all\)", text)
+    run = CliRunner().invoke(app, ["reprocess", str(file)], env=terminal(width))
+    assert len(run.output.splitlines()) <= MOST_LINES
+    assert len(planned(file, "--all", width=width)) > MOST_LINES
+
+
 PATH = {"channels": ["photon_532o"], "sections": [[750, 4500]]}
 CUBIC = {"background": "cubic", "background_range": [750, 4500]}
 

@@ -37,6 +37,15 @@ _PICK_UP: Final = 2.0
 """Largest such excess over `shows_light`. Dark files of Sao Paulo show up to 1.3."""
 FEWEST: Final = 5
 """Profiles; fewer tell nothing."""
+_NEAREST: Final = 60.0
+_FARTHEST: Final = 3000.0
+"""m; signals are expected to stop rising between these."""
+_SMOOTH: Final = 60.0
+"""m; length of the running mean."""
+_FALL: Final = 200.0
+"""m; a signal that no longer rises stays below its maximum so long."""
+_LIGHT: Final = 10.0
+"""Standard errors of a bin by which three bins in a row show light."""
 
 
 class Light(NamedTuple):
@@ -173,3 +182,52 @@ def _dark_of_their_own(
             faint = dark
         own[name] = dark | (found[name].measured & faint & np.logical_and.reduce([faint, *others]))
     return own
+
+
+def rise_ends(ranges: Array, signal: Array) -> float | None:
+    """Return where a range-corrected signal stops rising, m; None where it does not by 3 km.
+
+    Below full overlap a signal rises, and in any air beyond it falls on the mean. It is the first
+    place whose running mean no place in the next 200 m exceeds.
+
+    Parameters
+    ----------
+    ranges : (range,) float
+        m.
+    signal : (range,) float
+        NaN where missing or saturated.
+    """
+    step = ranges[1] - ranges[0]
+    width, ahead = (max(round(float(length / step)), 1) for length in (_SMOOTH, _FALL))
+    near = ranges < _FARTHEST + _SMOOTH + _FALL
+    values, place = signal[near], ranges[near]
+    known = np.isfinite(values)
+    weight = np.convolve(known, np.ones(width), "same")
+    smooth = np.convolve(np.where(known, values, 0.0), np.ones(width), "same")
+    smooth = np.where(weight > 0.5 * width, smooth / np.maximum(weight, 1.0), -np.inf)
+    for k in np.flatnonzero((place >= _NEAREST) & (place <= _FARTHEST)):
+        beyond = smooth[k + 1 : k + 1 + ahead]
+        if np.isfinite(smooth[k]) and smooth[k] > 0.0 and beyond.size and smooth[k] >= beyond.max():
+            return float(place[k])
+    return None
+
+
+def light_begins(ranges: Array, signal: Array) -> float | None:
+    """Return from where a range-corrected signal shows light, m; None where it shows none.
+
+    Parameters
+    ----------
+    ranges : (range,) float
+        m.
+    signal : (range,) float
+        NaN where missing or saturated, which is light.
+    """
+    power = signal / np.square(ranges)
+    far = power[-power.size // 4 :]
+    far = far[np.isfinite(far)]
+    if not far.size:
+        return None
+    noise = np.median(np.abs(np.diff(far))) / (MEDIAN_OF_NORMAL * np.sqrt(2.0))
+    light = ~(power <= np.median(far) + _LIGHT * noise)
+    first = np.flatnonzero(light[:-2] & light[1:-1] & light[2:])
+    return float(ranges[first[0]]) if first.size else None
