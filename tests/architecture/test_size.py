@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_687,
-    "lines of code alone": 44_013,
-    "modules": 265,
-    "dataclasses": 220,
-    "lines of dataclasses": 6_153,
+    "lines": 67_771,
+    "lines of code alone": 44_059,
+    "modules": 264,
+    "dataclasses": 219,
+    "lines of dataclasses": 6_098,
     "tuning numbers": 214,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_802,
+    "lines of the largest package": 5_819,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 59, "functions": 567, "changes": 215},
