@@ -7,7 +7,8 @@ read in one process or several; figures and their order do not depend on the num
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, groupby
@@ -19,11 +20,12 @@ import xarray as xr
 from lidarops.errors import ProductError
 from lidarops.figures.kind_figures import View, views_of
 from lidarops.figures.panels import Figure
+from lidarops.figures.product_names import attribute, light_in_words
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.wording import counted, named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
-from lidarops.netcdf.read import open_product
+from lidarops.netcdf.read import open_product, opened_product
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.records import ProductRecord, RunRecord
 from lidarops.system.processes import CRASHED, Processes
@@ -130,7 +132,8 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
             for view in views_of(group.kind):
                 contents = list(_read(processes, group, view, gallery.problems))
                 if contents:
-                    gallery.pictures += [_picture(one, group) for one in view.draw(contents)]
+                    title = _title(group, gallery.problems)
+                    gallery.pictures += [_picture(one, group, title) for one in view.draw(contents)]
     return gallery
 
 
@@ -187,10 +190,19 @@ def _reason(path: Path, error: BaseException) -> str:
     return words or type(error).__name__
 
 
-def _picture(drawn: Figure, group: Group) -> Picture:
+def _picture(drawn: Figure, group: Group, title: str) -> Picture:
     words = f"{counted(len(group.products), 'scene')}. {drawn.words}."
-    caption = f"{drawn.caption}: {group.label}"
-    return Picture(drawn, group.instrument, caption, group.lacking, words)
+    return Picture(drawn, group.instrument, f"{drawn.caption}: {title}", group.lacking, words)
+
+
+def _title(group: Group, unreadable: Collection[str]) -> str:
+    """Return channel and instrument as people call them, by the first product that can be read."""
+    # What crashed another process would crash this one.
+    for path in (one.path for one in group.products if one.path not in unreadable):
+        with suppress(ProductError), opened_product(group.root / path) as opened:
+            name = attribute(opened, "instrument", group.instrument)
+            return f"{light_in_words(opened) or group.channel}, {name}"
+    return group.label
 
 
 def _groups(record: RunRecord) -> list[Group]:

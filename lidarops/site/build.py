@@ -23,6 +23,7 @@ from lidarops.errors import CatalogError, ProductError, UnavailableError
 from lidarops.figures import browser
 from lidarops.figures.kind_figures import View, figures_of, view_of
 from lidarops.figures.panels import Figure
+from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
@@ -39,7 +40,6 @@ from lidarops.site.paths import (
     product_folder,
     year_page,
 )
-from lidarops.site.product_contents import attribute, light_in_words, scalar
 from lidarops.site.product_entry import Entry, Problem, with_neighbours
 from lidarops.site.quality import Quality, read_quality
 from lidarops.system.code_version import pages_version

@@ -14,12 +14,13 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from lidarops.figures.panels import Figure
+from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment
 from lidarops.figures.wording import SEVERITIES, counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.paths import Links, day_page, href, month_list, slug, year_page
-from lidarops.site.product_contents import UNKNOWN, citation, contact, variables
+from lidarops.site.product_contents import citation, contact, variables
 from lidarops.site.product_entry import (
     GRADES,
     Entry,

@@ -1,4 +1,4 @@
-"""The content of a product for its page: names, times, position, provenance, citation."""
+"""The content of a product for its page: times, position, provenance, variables, citation."""
 
 from __future__ import annotations
 
@@ -9,40 +9,12 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from lidarops.records import GLUED, is_glued
+from lidarops.figures.product_names import attribute
 
-UNKNOWN: Final = "unknown"
-_DETECTION: Final = {
-    "photon": "photon counting",
-    "analog": "analog",
-    GLUED: "analog glued to photon counting",
-}
 PROVENANCE: Final = "provenance"
 _PLACES: Final = "range", "altitude", "latitude", "longitude", "station_altitude", "wavelength"
 USED: Final = PROVENANCE, *_PLACES
 """Variables that the page of any product reads."""
-
-
-def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
-    """Return a global attribute as text."""
-    return str(product.attrs.get(name, "")).strip() or default
-
-
-def light_in_words(product: xr.Dataset) -> str:
-    """Return wavelength and detection of the channel in words; empty if unknown."""
-    wavelength = scalar(product, "wavelength")
-    words = "" if wavelength is None else f"{wavelength:g} {product['wavelength'].attrs['units']}"
-    glued = is_glued(attribute(product, "lidarops_channel"))
-    mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
-    return ", ".join(filter(None, (words, mode)))
-
-
-def scalar(product: xr.Dataset, name: str) -> float | None:
-    """Return a variable that is one finite number; None without it."""
-    if name not in product.variables or product[name].ndim or "units" not in product[name].attrs:
-        return None
-    value = product[name].values.astype(np.float64).item()
-    return float(value) if np.isfinite(value) else None
 
 
 def span(product: xr.Dataset) -> tuple[str, str]:

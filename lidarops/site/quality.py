@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.figures.panels import Axis, Band, Figure, Panel, time_axis
+from lidarops.figures.product_names import scalar
 from lidarops.figures.time_axis import column_edges, column_starts, days, profile_bounds
 from lidarops.figures.wording import named_shares, percent
 from lidarops.netcdf.stored_flags import (
@@ -25,7 +26,6 @@ from lidarops.netcdf.stored_flags import (
 from lidarops.netcdf.variables import QUALITY_FLAG
 from lidarops.records import Verdicts
 from lidarops.site.paths import CALENDAR_HEIGHT
-from lidarops.site.product_contents import scalar
 
 Floats = NDArray[np.float64]
 

@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_771,
-    "lines of code alone": 44_059,
-    "modules": 264,
+    "lines": 67_797,
+    "lines of code alone": 44_073,
+    "modules": 265,
     "dataclasses": 219,
     "lines of dataclasses": 6_098,
     "tuning numbers": 214,

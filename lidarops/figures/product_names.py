@@ -1,0 +1,41 @@
+"""What people call a product: by its attributes and the channel that it states."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from lidarops.records import GLUED, is_glued
+
+UNKNOWN: Final = "unknown"
+
+
+def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
+    """Return a global attribute as text."""
+    return str(product.attrs.get(name, "")).strip() or default
+
+
+def light_in_words(product: xr.Dataset) -> str:
+    """Return wavelength and detection of the channel in words; empty if unknown."""
+    wavelength = scalar(product, "wavelength")
+    words = "" if wavelength is None else f"{wavelength:g} {product['wavelength'].attrs['units']}"
+    glued = is_glued(attribute(product, "lidarops_channel"))
+    mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
+    return ", ".join(filter(None, (words, mode)))
+
+
+_DETECTION: Final = {
+    "photon": "photon counting",
+    "analog": "analog",
+    GLUED: "analog glued to photon counting",
+}
+
+
+def scalar(product: xr.Dataset, name: str) -> float | None:
+    """Return a variable that is one finite number; None without it."""
+    if name not in product.variables or product[name].ndim or "units" not in product[name].attrs:
+        return None
+    value = product[name].values.astype(np.float64).item()
+    return float(value) if np.isfinite(value) else None
