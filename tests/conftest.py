@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lidarops.cli import app
+from lidarops.system import processes
 
 pytest_plugins = ["support.products.report_fixtures", "support.servers.s3_fixtures"]
 
@@ -22,6 +23,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Products state when they were written; equal inputs shall give equal bytes in tests.
 os.environ.setdefault("SOURCE_DATE_EPOCH", "1700000000")
+
+# pytest states the name of each test in the environment. Workers would take it for another one, and
+# load all modules instead of being forked from a process that has loaded them.
+processes._LIBRARY_VARIABLES |= {"PYTEST_CURRENT_TEST"}
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -47,6 +52,17 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip("no real data here: set LIDAROPS_TEST_DATA")
     return root
+
+
+@pytest.fixture(scope="session")
+def server() -> None:
+    """A process with the modules of workers, from which they are forked as in a run.
+
+    Otherwise each of them loads the modules for a second.
+    """
+    from lidarops.run.processing import _WORKER_MODULES
+
+    processes.preload_modules(_WORKER_MODULES)
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -94,6 +95,7 @@ def offered() -> str:
     return "\n".join(table(("module", "what it holds"), rows))
 
 
+@cache
 def every_function() -> str:
     """Return a section for each package, and within it the public functions of each module."""
     lines: list[str] = []

@@ -319,6 +319,7 @@ def test_a_name_that_is_no_text_is_refused_and_the_rest_goes_on(
     assert scan_archive(campaign, store) == ScanSummary(7, 0, 0, 7, 0, 1)
 
 
+@pytest.mark.usefixtures("server")
 class TestManyFiles:
     """The catalog does not depend on the process that reads the headers."""
 

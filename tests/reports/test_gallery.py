@@ -53,6 +53,7 @@ def files(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.usefixtures("server")
 class TestFigures:
     def test_do_not_depend_on_the_number_of_processes(self, many, tmp_path, monkeypatch):
         filled = []

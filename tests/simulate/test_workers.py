@@ -30,6 +30,7 @@ def _scenery(tree):
         instrument["random_damage"] = {"fraction": 0.3, "kinds": ["garbage", "duplicate", "glitch"]}
 
 
+@pytest.mark.usefixtures("server")
 def test_two_processes_write_what_one_writes(small, monkeypatch):
     alone = small(_scenery, archive="alone")
     first = simulate_campaign(alone)
@@ -74,6 +75,7 @@ def test_the_number_of_files_is_told_before_the_first(small):
         simulate_campaign(small(lambda tree: tree.pop("simulation")))
 
 
+@pytest.mark.usefixtures("server")
 def test_the_command_line_writes_the_same_with_workers(small, tmp_path):
     campaign = small(_scenery, archive="called")
     expected = _contents(simulate_campaign(campaign).archive)

@@ -24,6 +24,7 @@ class Copy:
         self.root = folder / "lidarops"
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(repository / "lidarops", self.root, ignore=ignored)
+        self._last: dict[str, str] | None = None
 
     def sources(self) -> Sources:
         """Return the sources as they are now."""
@@ -34,11 +35,21 @@ class Copy:
         sources = self.sources()
         return {name: version_of(kind, sources) for name, kind in kinds().items()}
 
+    def changed(self, *modules: str) -> set[str]:
+        """Return the kinds whose version changes with a statement more in some modules."""
+        before = self._last or self.versions()
+        for module in modules:
+            self.change(module)
+        self._last = self.versions()
+        return {kind for kind, version in self._last.items() if version != before[kind]}
+
     def write(self, module: str, text: str) -> None:
         """Write a module, or another file of the package."""
+        self._last = None
         (self.root / module).write_text(text, encoding="utf-8")
 
     def change(self, module: str, statement: str = "_UNHEARD_OF = 1") -> None:
         """Append a statement to a module."""
+        self._last = None
         with (self.root / module).open("a", encoding="utf-8") as file:
             file.write(f"\n{statement}\n")

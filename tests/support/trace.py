@@ -1,15 +1,16 @@
-"""What is called of lidarops in one run: ``python -m support.trace CAMPAIGN``.
+"""What is called of lidarops in one run: ``python -m support.trace CAMPAIGN...``.
 
-Makes the stale products of a campaign, and prints as JSON how many modules of lidarops
+Makes the stale products of each campaign, and prints as a line of JSON how many modules of lidarops
 were entered, how many functions called, and how often a function called one of another package.
-Code that numba has compiled is not seen. Each run needs a new process: what an earlier one cached
-is not called again.
+Code that numba has compiled is not seen. Each run is a process of its own: what an earlier one
+cached is not called again.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
+import os
 import pkgutil
 import sys
 from pathlib import Path
@@ -62,20 +63,29 @@ class Trace:
         }
 
 
-def main(path: Path) -> None:
-    """Trace a run over a campaign, and print the figures."""
+def main(paths: list[Path]) -> None:
+    """Trace a run over each campaign, and print the figures."""
     # What is imported late would count as called.
     for module in pkgutil.walk_packages(lidarops.__path__, "lidarops."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
+    for path in paths:
+        if os.fork() == 0:
+            _print_figures(path)
+            return
+        if os.wait()[1]:
+            raise SystemExit(1)
+
+
+def _print_figures(path: Path) -> None:
     campaign = load_campaign(path)
     trace = Trace()
     sys.setprofile(trace)
     record = reprocess(campaign)
     sys.setprofile(None)
     made = [product.kind for scene in record.scenes for product in scene.products] if record else []
-    sys.stdout.write(json.dumps({**trace.figures(), "products": made}))
+    sys.stdout.write(json.dumps({**trace.figures(), "products": made}) + "\n")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main([Path(name) for name in sys.argv[1:]])

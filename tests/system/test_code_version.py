@@ -37,15 +37,6 @@ def growing(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Copy:
     return Copy(repository, tmp_path_factory.mktemp("growing"))
 
 
-def changed(copy: Copy, *modules: str) -> set[str]:
-    """Return the kinds whose version changes with some modules."""
-    before = copy.versions()
-    for module in modules:
-        copy.change(module)
-    after = copy.versions()
-    return {kind for kind in after if after[kind] != before[kind]}
-
-
 def test_a_copy_has_the_versions_of_the_installation(copy: Copy):
     assert copy.versions() == {kind: code_version(kind) for kind in ALL}
     assert len(set(copy.versions().values())) == len(ALL)
@@ -99,7 +90,7 @@ def test_a_change_of_what_pages_are_made_of_changes_their_version(
     ],
 )
 def test_a_change_of_a_kind_changes_its_version_and_no_other(growing: Copy, module: str, kind: str):
-    assert changed(growing, module) == {kind}
+    assert growing.changed(module) == {kind}
 
 
 @pytest.mark.parametrize(
@@ -112,7 +103,7 @@ def test_what_makes_no_product_changes_no_version(growing: Copy, package: str):
         str(path.relative_to(growing.root)) for path in (growing.root / package).rglob("*.py")
     ]
     assert modules
-    assert changed(growing, *modules) == set()
+    assert growing.changed(*modules) == set()
 
 
 @pytest.mark.parametrize(
@@ -121,7 +112,7 @@ def test_what_makes_no_product_changes_no_version(growing: Copy, package: str):
      "site/templates/day.html"],
 )  # fmt: skip
 def test_neighbours_of_what_makes_products_change_no_version(growing: Copy, module: str):
-    assert changed(growing, module) == set()
+    assert growing.changed(module) == set()
 
 
 @pytest.mark.parametrize(
@@ -131,7 +122,7 @@ def test_neighbours_of_what_makes_products_change_no_version(growing: Copy, modu
      "records.py", "flags.py", "__init__.py"],
 )  # fmt: skip
 def test_what_every_product_passes_through_changes_all_versions(growing: Copy, module: str):
-    assert changed(growing, module) == ALL
+    assert growing.changed(module) == ALL
 
 
 def test_a_new_module_counts_as_soon_as_it_is_imported(copy: Copy):

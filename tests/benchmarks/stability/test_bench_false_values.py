@@ -162,7 +162,7 @@ KNOWN = verdicts.above_target()
         pytest.param(homogeneous_paths.score_homogeneous, 1000, 30, 0.0, id="homogeneous"),
         pytest.param(homogeneous_paths.score_short_sections, 600, 300, 0.0, id="short sections"),
         pytest.param(recorded_signals.score_signals, 200, 50, 0.0, id="signal chain"),
-        pytest.param(elastic_skies.score_elastic, 400, 20, 0.0, id="elastic"),
+        pytest.param(elastic_skies.score_elastic, 100, 20, 0.0, id="elastic"),
         pytest.param(scans.score_scans, 1000, 4, 0.0, id="multi-angle"),
         pytest.param(
             partial(scans.score_short_scans, length=1),
@@ -174,13 +174,17 @@ KNOWN = verdicts.above_target()
         pytest.param(
             partial(scans.score_short_scans, length=2), 400, 4, 0.0, id="scans, blocks of 2"
         ),
-        pytest.param(raman_skies.score_raman, 1000, 4, 0.0, id="Raman"),
+        pytest.param(raman_skies.score_raman, 300, 4, 0.0, id="Raman"),
         pytest.param(networks, 1500, 50, CONFINED, id="network"),
     ],
 )
 def test_where_the_model_holds_few_values_of_each_class_are_false(
     score, clusters, profiles, confined
 ):
+    """Judged classes count as 5,000 independent values and more, which most of these need.
+
+    Twice the target is then found as often as `FOUND` says, and a third of it is not.
+    """
     counts = counts_of(where_the_model_holds(score, clusters, profiles))
     # Most profiles have no lidar ratio: `test_raman_coverage.py` draws more light.
     judged = {
