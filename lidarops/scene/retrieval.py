@@ -37,8 +37,6 @@ from lidarops.scene.pipe import Stages
 from lidarops.scene.profiles import BEFORE, ChannelSignal, Chunk, ProductStream
 from lidarops.settings import ReferenceSettings, SettingsModel, quantity
 
-FEWEST_BINS: Final = BACKGROUND.fewest_bins
-"""Fewest bins of a section, and of the range of a background."""
 ANALOG_NOISE: Final = "the noise of an analog record is estimated from all its bins"
 WINDOW: Final = "range_window"
 """Name of the entry of a plan by which a product states the bins that it needs."""
@@ -259,7 +257,7 @@ def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:
         return 0
     # Those in which the pulse leaves, by the offset of the channel, hold light.
     bins = channel.before - max(math.ceil(range_offset(channel, facts) / channel.bin_width), 0)
-    return bins if bins >= max(BACKGROUND.tail_share * channel.bins, FEWEST_BINS) else 0
+    return bins if bins >= max(BACKGROUND.tail_share * channel.bins, BACKGROUND.fewest_bins) else 0
 
 
 def before_pulse(case: ChannelCase[Any]) -> str:

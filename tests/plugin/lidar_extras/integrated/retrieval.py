@@ -10,10 +10,11 @@ import xarray as xr
 
 from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
+from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, channel_ranges
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
-from lidarops.scene.retrieval import FEWEST_BINS, BackgroundSettings, Retrieval, background, tail
+from lidarops.scene.retrieval import BackgroundSettings, Retrieval, background, tail
 from lidarops.settings import SettingsModel
 
 
@@ -38,8 +39,10 @@ def needs(case: ChannelCase[IntegratedSettings]) -> Entries:
     limits = case.request.background_range
     start, stop = tail(case, limits)
     bins = (stop - start) / case.channel.bin_width
-    if bins < FEWEST_BINS:
-        reason = f"background_range {start:g}-{stop:g} m holds fewer than {FEWEST_BINS} bins"
+    if bins < BACKGROUND.fewest_bins:
+        reason = (
+            f"background_range {start:g}-{stop:g} m holds fewer than {BACKGROUND.fewest_bins} bins"
+        )
         yield case.leave("integrated", reason, number=bins)
         return
     centres = channel_ranges(case.channel, case.facts_of_channel)
