@@ -80,7 +80,7 @@ def test_a_header_that_contradicts_the_station_fails_until_it_is_acknowledged(
     record, page = last_run(archive)
     assert record.failed
     assert words in page
-    assert 'class="bad"' in page
+    assert 'class="verdict bad"' in page
     for instrument in archive.tree["instruments"].values():
         instrument["header_position"] = "ignore"
     for command in COMMANDS:
