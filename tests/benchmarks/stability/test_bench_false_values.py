@@ -11,7 +11,7 @@ import verdicts
 from scipy import stats
 
 from benchmarks.harness.figure import design_effect
-from benchmarks.harness.rates import COVERED, FALSE, SATISFIED
+from benchmarks.harness.rates import COVERED, FALSE, SATISFIED, collect
 from benchmarks.scenes import (
     elastic_skies,
     homogeneous_paths,
@@ -195,3 +195,23 @@ def test_where_the_model_holds_few_values_of_each_class_are_false(
     assert judged
     for name, rows in with_few_together(judged, confined):
         assert not is_found(*rows, confined), name
+
+
+@pytest.mark.parametrize(
+    ("score", "clusters", "violation"),
+    [
+        pytest.param(raman_skies.score_raman, 25, "overlap 5 percent off", id="full overlap"),
+        pytest.param(
+            lidar_networks.score_lidar_ratios,
+            60,
+            "lidar ratio varies by 7 %, the default declared",
+            id="lidar ratio of networks",
+        ),
+    ],
+)
+def test_what_products_declare_by_default_covers_what_archives_have(score, clusters, violation):
+    counted = collect(partial(score, profiles=4), clusters)
+    of_extinctions = counted["quantity"] == "extinction"
+    rows = counted[of_extinctions & (counted["class"] == violation)]
+    assert rows["plain"].sum() > 1000
+    assert rows["false plain"].sum() <= 0.01 * rows["plain"].sum()
