@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate.facts import UNSHARED, Header, coordinate_names
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
-from lidarops.netcdf.read import stored_values
+from lidarops.netcdf.stored import stored_values
 from lidarops.netcdf.variables import attributes
 
 _PER_PRODUCT: Final = (

@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops.aggregate.facts import Weights
 from lidarops.aggregate.means_variables import (
-    Weights,
     averaged,
     budget_of,
     share_names,

@@ -19,11 +19,13 @@ from lidarops.aggregate.facts import (
     FOLDER,
     PERIOD,
     Facts,
+    Period,
     Refused,
+    Weights,
     coordinate_names,
     refuse_duplicates,
 )
-from lidarops.aggregate.means_variables import Period, Weights, layout
+from lidarops.aggregate.means_variables import layout
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.context import (

@@ -32,7 +32,7 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
-from lidarops.netcdf.read import stored_values
+from lidarops.netcdf.stored import stored_values
 from lidarops.system.files import only_one, within
 
 FOLDER: Final = "stores"

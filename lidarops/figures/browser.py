@@ -9,7 +9,7 @@ import base64
 import io
 import json
 import zlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -44,6 +44,7 @@ _MOST: Final = 65534
 _BEYOND: Final = 1.0
 """Positions are clipped at this many axis lengths outside the ends."""
 _NO_AXIS: Final = Axis("", 0.0, 1.0)
+_OF_AXIS: Final = tuple(item.name for item in fields(Axis))
 THUMBNAIL: Final = (240, 84)
 """Width and height of a thumbnail in pixels."""
 _PEN: Final = 110
@@ -123,7 +124,7 @@ def _panel(panel: Panel, packed: _Packed) -> dict[str, Any]:
 def _axis(axis: Axis | None) -> dict[str, Any] | None:
     if axis is None:
         return None
-    return asdict(axis) | {"label": visible(axis.label)}
+    return {name: getattr(axis, name) for name in _OF_AXIS} | {"label": visible(axis.label)}
 
 
 def _layer(layer: Layer, panel: Panel, packed: _Packed) -> dict[str, Any]:

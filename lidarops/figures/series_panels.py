@@ -82,12 +82,14 @@ def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> P
     layers: list[Layer] = []
     for place, one in enumerate(series):
         layers += _values(one, quantity, place)
-    parts = [(days(one.time), factor * one.values(name), one.flag, one.rejected) for one in series]
+    parts = [
+        (days(one.time), factor * one.quantities[name], one.flag, one.rejected) for one in series
+    ]
     at, value, flag, rejected = (np.concatenate(part) for part in zip(*parts, strict=True))
     layers += flag_marks(at, value, (flag != 0) & ~rejected, rejected, _FLAGGED)
     good = [factor * _usable(one, name) for one in series]
     if not finite(good).size:
-        good = [factor * one.values(name) for one in series]
+        good = [factor * one.quantities[name] for one in series]
     return Panel(x, percentile_axis(quantity.label, good), tuple(layers))
 
 
@@ -98,7 +100,9 @@ def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
     means = f", means of {profiles} profiles" if profiles > 1 else ""
     few = drawn.time.size <= _BARS
     names = quantity.name, f"{quantity.name}_standard_error"
-    x, y, wide = _with_gaps(drawn.time, *(quantity.factor * drawn.values(name) for name in names))
+    x, y, wide = _with_gaps(
+        drawn.time, *(quantity.factor * drawn.quantities[name] for name in names)
+    )
     style, mark = f"c{place} d{place}" if place else "c0", SERIES_MARKS[place] if few else None
     label = f"{one.label}{means}".removeprefix(", ")
     band = Band(x, y - wide, y + wide, style, bars=few)
@@ -106,7 +110,7 @@ def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
 
 
 def _usable(one: TimeSeries, name: str) -> Floats:
-    return np.asarray(one.values(name)[one.flag == 0])
+    return np.asarray(one.quantities[name][one.flag == 0])
 
 
 def _with_gaps(time: Times, *values: Floats) -> tuple[Floats, ...]:

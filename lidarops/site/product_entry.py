@@ -63,8 +63,6 @@ class Entry:
     """Relative to the folder of the products."""
     sha256: str
     size: int
-    digests: tuple[str, ...]
-    """sha256 of the files of the page, in the order of `files`."""
     campaign: str
     """Title of the campaign."""
     station: str

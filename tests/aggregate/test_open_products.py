@@ -20,7 +20,7 @@ from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.read import opened_stored
+from lidarops.netcdf.stored import opened_stored
 from lidarops.netcdf.variables import summarize_flags
 
 
