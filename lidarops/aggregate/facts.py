@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -12,21 +12,24 @@ from functools import cache
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.kinds import kinds
-from lidarops.netcdf.stored import StoredProduct, changed, opened_stored
+from lidarops.netcdf.stored import (
+    StoredProduct,
+    changed,
+    opened_stored,
+    reading,
+    stored_product,
+)
 from lidarops.netcdf.stored_flags import FlagCounter, all_bits, flags_names, rejecting_mask
 from lidarops.netcdf.variables import PROVENANCE, RECORDERS, layout_of
 from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 NAMES: Final = ("kind", "station", "instrument", "channel")
 
@@ -179,19 +182,20 @@ class Header:
         return Group(*(getattr(self, name) for name in Group._fields))
 
     @contextmanager
-    def opened(self, root: Path) -> Iterator[xr.Dataset]:
-        """Open the product of this header, of a root, without decoding.
+    def opened(self, root: Path) -> Iterator[StoredProduct]:
+        """Open the product of this header, of a root; what else is raised meanwhile passes.
 
         Raises
         ------
         ProductError
             If it cannot be read, or is another product now.
         """
-        from lidarops.netcdf.read import opened_product  # noqa: PLC0415 - the index needs no xarray
-
-        with opened_product(within(root, self.path), decode_cf=False) as product:
-            if product.attrs.get("id") != self.id:
-                raise changed(self.path)
+        file = within(root, self.path)
+        with ExitStack() as until_closed:
+            with reading(file):
+                product = until_closed.enter_context(stored_product(file))
+                if product.attrs.get("id") != self.id:
+                    raise changed(self.path)
             yield product
 
 

@@ -7,7 +7,7 @@ products are replaced. Products are copied, because a reference to a replaced fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -32,8 +32,8 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
-from lidarops.netcdf.stored import stored_values
-from lidarops.system.files import only_one, within
+from lidarops.netcdf.stored import reading
+from lidarops.system.files import only_one
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
@@ -241,8 +241,8 @@ def _write_group(
     attributes, pattern = {}, None
     for at in read:
         try:
-            with products[at].opened(root) as product:
-                attributes[at], times[at] = product.attrs, product["time"].values
+            with products[at].opened(root) as product, reading(products[at].path):
+                attributes[at], times[at] = product.attrs.whole(), product["time"][...]
                 if at == 0:
                     pattern = pattern_of(product, products[at])
         except ProductError as error:
@@ -281,57 +281,71 @@ def _held(store: Any, name: str) -> _Held:
     return _Held(group.attrs.asdict(), group["time"][:], places)
 
 
-def _write_rows(
-    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
-) -> None:
-    """Write the rows of some products to the arrays of a group."""
-    length = {"time": starts[-1], PRODUCT.name: len(products)}
-    for name, array in group.arrays():
-        dims = array.metadata.dimension_names or ()
-        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
-        if not {"time", PRODUCT.name} & set(dims):
-            continue
-        firsts = starts if "time" in dims else range(len(products) + 1)
-        for pieces in _pieces(lacking, firsts, array.chunks[0]):
-            values = []
-            for at, low, high in pieces:
-                rows = slice(low - firsts[at], high - firsts[at]) if "time" in dims else None
-                values.append(_rows(root, products[at], at, name, rows))
-            array[pieces[0][1] : pieces[-1][2]] = np.concatenate(values)
-
-
-def _rows(root: Path, facts: Facts, number: int, name: str, rows: slice | None) -> NDArray[Any]:
-    """Return some rows of a variable of a product; its only one where `rows` is None."""
-    if name == PRODUCT.name:
-        return np.array([facts.id])
-    if name == PRODUCT_INDEX.name:
-        return np.full(facts.profiles, number, np.int32)[rows]
-    try:
-        values = stored_values(within(root, facts.path), facts.id, name, rows or slice(None))
-        return values[None] if rows is None else values
-    except ProductError as error:
-        raise UnreadableProductError(facts, error.problem) from error
-
-
-def _pieces(
-    lacking: Sequence[int], firsts: Sequence[int], chunk: int
-) -> Iterator[list[tuple[int, int, int]]]:
-    """Yield what is written at once: number of a product, first row, and the one past the last.
+@dataclass(slots=True)
+class _Rows:
+    """Rows of an array that are written at once.
 
     Neighbours in one chunk are together, because each write keeps a copy of its chunk, and chunks
     are apart, so that memory holds few rows.
     """
-    together: list[tuple[int, int, int]] = []
-    for at in lacking:
-        start, stop = firsts[at], firsts[at + 1]
+
+    array: Any
+    first: int = 0
+    parts: list[NDArray[Any]] = field(default_factory=list)
+
+    @property
+    def stop(self) -> int:
+        """The row past the last."""
+        return self.first + sum(map(len, self.parts))
+
+    def add(self, start: int, stop: int, read: Callable[[slice], NDArray[Any]]) -> None:
+        """Add the rows of a product, which `read` returns for rows counted from `start`."""
+        chunk = self.array.chunks[0]
         edges = (start, *range((start // chunk + 1) * chunk, stop, chunk), stop)
         for low, high in pairwise(edges):
-            if together and (low % chunk == 0 or low != together[-1][2]):
-                yield together
-                together = []
-            together.append((at, low, high))
-    if together:
-        yield together
+            if low % chunk == 0 or low != self.stop:
+                self.write()
+                self.first = low
+            self.parts.append(read(slice(low - start, high - start)))
+
+    def write(self) -> None:
+        """Write what was added."""
+        if self.parts:
+            self.array[self.first : self.stop] = np.concatenate(self.parts)
+            self.parts = []
+
+
+def _write_rows(
+    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
+) -> None:
+    """Write the rows of some products to the arrays of a group; each product is opened once."""
+    length = {"time": starts[-1], PRODUCT.name: len(products)}
+    of_time, of_product = {}, {}
+    for name, array in group.arrays():
+        dims = array.metadata.dimension_names or ()
+        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
+        if "time" in dims:
+            of_time[name] = _Rows(array)
+        elif PRODUCT.name in dims:
+            of_product[name] = _Rows(array)
+    for at in lacking:
+        facts = products[at]
+        own = {
+            PRODUCT.name: np.array([facts.id]),
+            PRODUCT_INDEX.name: np.full(facts.profiles, at, np.int32),
+        }
+        try:
+            with facts.opened(root) as product:
+                for name, rows in of_time.items():
+                    read = (own if name in own else product)[name].__getitem__
+                    rows.add(starts[at], starts[at + 1], read)
+                for name, rows in of_product.items():
+                    values = own[name] if name in own else product[name][...][None]
+                    rows.add(at, at + 1, values.__getitem__)
+        except ProductError as error:
+            raise UnreadableProductError(facts, error.problem) from error
+    for rows in (*of_time.values(), *of_product.values()):
+        rows.write()
 
 
 def _create(store: Any, name: str, pattern: xr.Dataset) -> None:

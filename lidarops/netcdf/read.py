@@ -56,7 +56,7 @@ def dataset_of(product: StoredProduct) -> xr.Dataset:
     xr.Dataset
         Variables of 16 KiB and more are lazy: only indexed values are read.
     """
-    variables = {name: _as_variable(stored) for name, stored in product.variables.items()}
+    variables = {name: as_variable(stored) for name, stored in product.variables.items()}
     return xr.Dataset(variables, attrs=product.attrs.whole())
 
 
@@ -74,7 +74,7 @@ def decoded(product: StoredProduct, names: Iterable[str]) -> xr.Dataset:
     xr.Dataset
         As from `open_product`.
     """
-    stored = {name: _as_variable(product[name]) for name in names if name in product}
+    stored = {name: as_variable(product[name]) for name in names if name in product}
     variables, attributes, _ = xr.conventions.decode_cf_variables(
         stored, product.attrs.whole(), decode_coords=False, decode_timedelta=False
     )
@@ -83,7 +83,8 @@ def decoded(product: StoredProduct, names: Iterable[str]) -> xr.Dataset:
     return xr.Dataset(others, xr.Coordinates(own, indexes={}), attributes)
 
 
-def _as_variable(stored: StoredVariable) -> xr.Variable:
+def as_variable(stored: StoredVariable) -> xr.Variable:
+    """Return a variable that is not decoded, lazy if it has 16 KiB or more."""
     small = stored.stated < LAZY_BYTES
     values = stored[...] if small else indexing.LazilyIndexedArray(_Lazy(stored))
     return xr.Variable(stored.dims, values, stored.attrs.whole())

@@ -197,7 +197,7 @@ class FlagCounter:
                 self.carried[mask] += int(np.count_nonzero(values & mask))
 
 
-def refuse_moved_flags(product: xr.Dataset) -> None:
+def refuse_moved_flags(product: xr.Dataset | StoredProduct) -> None:
     """Refuse a product of a known kind whose flags have bits at other places than now.
 
     Raises

@@ -170,7 +170,8 @@ def build_site(
             outcomes[path] = known, False
         else:
             tasks.append((path, known))
-    progress(len(outcomes))
+    if outcomes:
+        progress(len(outcomes))
     with Processes(workers, (products, site, below)) as processes:
         for task, outcome in processes.map_items(_page, tasks, at_a_time=1, lost=_crashed):
             outcomes[task[0]] = outcome

@@ -86,13 +86,13 @@ def read_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Quality
         for block in blocks(product.variables[name], READ_VALUES):
             counts.add(quality_bits(block))
     over_time = np.concatenate(shares, axis=1)
-    has_times = flags.dims[:1] == ("time",) and product.variables["time"].dtype.kind == "M"
+    time = product.variables.get("time") if flags.dims[:1] == ("time",) else None
     return Quality(
         counts.verdicts,
         over_time.shape[1],
         available,
         tuple((bit, counts.carried[bit.mask]) for bit in bits if bit.mask in counts.carried),
-        _figure(product, over_time) if has_times else None,
+        _figure(product, over_time) if time is not None and time.dtype.kind == "M" else None,
     )
 
 

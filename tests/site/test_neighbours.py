@@ -10,7 +10,7 @@ from lidarops.site.neighbours import with_neighbours
 from lidarops.site.product_entry import Entry
 
 ENTRY = Entry(
-    path="", sha256="", size=1, digests=(), campaign="c", station="s",
+    path="", sha256="", size=1, campaign="c", station="s",
     place="S", instrument="i", name="I", kind="signal", channel="a", light="", latitude=None,
     longitude=None, altitude=None, license="", start="", stop="", values=0, usable=0,
     unflagged=0, profiles=1, available=1, lacking="", alt="", problem="",
