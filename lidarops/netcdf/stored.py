@@ -194,9 +194,9 @@ class StoredVariable:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the values as stored."""
+        """Type of the values in memory."""
         stated: np.dtype[Any] = self._type.dtype
-        return stated
+        return stated.newbyteorder("=")
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -213,7 +213,7 @@ class StoredVariable:
         """
         with reading(self._path):
             if key is not ...:
-                return np.asarray(h5py.Dataset(self._stored)[key])
+                return np.asarray(h5py.Dataset(self._stored)[key], self.dtype)
             values = np.empty(self.shape, self.dtype)
             self._stored.read(h5s.ALL, h5s.ALL, values)
             return values
