@@ -466,7 +466,7 @@ def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> No
     ProductError
         If a time occurs twice.
     """
-    paths, parts = zip(*profiles, strict=True)
+    paths, parts = zip(("", np.empty(0)), *profiles, strict=True)
     times = np.concatenate(parts)
     owners = np.repeat(np.arange(len(paths)), [part.size for part in parts])
     order = np.argsort(times, kind="stable")
