@@ -9,7 +9,6 @@ from datetime import date
 from functools import cache, partial
 from typing import Any, Final
 
-import xarray as xr
 from jinja2 import Environment
 from markupsafe import Markup
 
@@ -17,6 +16,7 @@ from lidarops.figures.panels import Figure
 from lidarops.figures.templates import environment
 from lidarops.figures.wording import SEVERITIES, counted, percent, size
 from lidarops.kinds import kinds, rank_of
+from lidarops.netcdf.stored import StoredProduct
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.paths import Links, day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import UNKNOWN, citation, contact, variables
@@ -78,7 +78,7 @@ def _render(template: str, page: str, **context: Any) -> bytes:
 
 def product(
     entry: Entry,
-    opened: xr.Dataset,
+    opened: StoredProduct,
     quality: Quality,
     origin: Mapping[str, Any],
     figures: Sequence[tuple[Figure, Markup]],
