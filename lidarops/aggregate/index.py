@@ -166,10 +166,10 @@ class KnownFacts:
         file = self._root / path
         # A file may vanish meanwhile.
         with suppress(OSError):
-            if row is None or (state := file.lstat()).st_size != row["size"]:
+            if row is None or file.lstat().st_size != row["size"]:
                 return None
             stated = row["sha256_prefix"].hex()
-            settled = last_change(state) < self._written
+            settled = last_change(file) < self._written
             sha256 = stated if settled and not self._hashed else sha256_of(file)
             if sha256.startswith(stated):
                 self._given += 1

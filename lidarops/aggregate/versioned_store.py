@@ -307,7 +307,6 @@ def _held(store: Any, name: str) -> _Held:
     return _Held(group.attrs.asdict(), places)
 
 
-@dataclass(slots=True)
 class _Rows:
     """Rows of an array that are written at once.
 
@@ -315,16 +314,12 @@ class _Rows:
     are apart, so that memory holds few rows.
     """
 
-    array: Any
-    of_profiles: bool
-    """Whether a row is of a profile, not of a whole product."""
-    first: int = 0
-    parts: list[NDArray[Any]] = field(default_factory=list)
-
-    @property
-    def stop(self) -> int:
-        """The row past the last."""
-        return self.first + sum(map(len, self.parts))
+    def __init__(self, array: Any, *, of_profiles: bool) -> None:
+        self.array = array
+        self.of_profiles = of_profiles
+        """Whether a row is of a profile, not of a whole product."""
+        self.first, self.stop = 0, 0
+        self.parts: list[NDArray[Any]] = []
 
     def add(self, start: int, stop: int, values: StoredVariable | NDArray[Any]) -> None:
         """Add the rows of a product, of which as many as belong to a chunk are read at a time."""
@@ -335,6 +330,7 @@ class _Rows:
                 self.write()
                 self.first = low
             self.parts.append(values[low - start : high - start])
+            self.stop = high
 
     def write(self) -> None:
         """Write what was added."""

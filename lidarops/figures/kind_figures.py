@@ -51,7 +51,7 @@ class KindFigures:
     """Figures of a kind of product."""
 
     views: tuple[View[Any], ...]
-    """The first figure of the first view is the thumbnail of a product."""
+    """In the order of the page."""
     preferred: str
     """Variable for an overview of any product that has it."""
 

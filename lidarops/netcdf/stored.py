@@ -101,7 +101,8 @@ class Attributes(Mapping[str, Any]):
 
     def whole(self) -> dict[str, Any]:
         """Return all attributes."""
-        return {name: self._read(name) for name in self}
+        self._known = {name: self._read(name) for name in self}
+        return dict(self._known)
 
     def _read(self, name: str) -> Any:
         stored = h5a.open(self._owner, name.encode())

@@ -6,16 +6,13 @@ Pages of unchanged products are kept.
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from operator import itemgetter
 from pathlib import Path
-from stat import S_ISREG
 from typing import Any, Final, NamedTuple
 
 import xarray as xr
@@ -164,7 +161,7 @@ def build_site(
     tasks: list[_Task] = []
     for path in product_paths(products):
         known = before.entries.get(path)
-        if known is not None and _is_settled(products / path, known, before.as_of):
+        if known is not None and last_change(products / path) < before.as_of:
             outcomes[path] = known, False
         else:
             tasks.append((path, known))
@@ -199,15 +196,6 @@ def _collected(outcomes: Mapping[str, _Outcome]) -> tuple[list[Entry], list[Prob
             if outcome.problem:
                 problems.append(Problem(outcome.path, outcome.problem))
     return entries, problems, made
-
-
-def _is_settled(file: Path, known: Entry, as_of: float) -> bool:
-    """Return whether a product is the one of an entry, by its size and times."""
-    try:
-        state = file.lstat()
-    except OSError:
-        return False
-    return state.st_size == known.size and last_change(state) < as_of
 
 
 def _page(kept: _Kept, task: _Task) -> _Outcome:
@@ -342,22 +330,18 @@ def _figures(
     return [(figure, browser.inline(figure)) for figure in _with_quality(figures, quality)]
 
 
-def _write(site: Path, name: str, content: bytes, *, sync: bool = True) -> None:
-    """Write a file of the site atomically; one that holds the same stays as it is.
+def _write(
+    site: Path, name: str, content: bytes, *, sync: bool = True, as_of: float | None = None
+) -> None:
+    """Write a file of the site atomically; one that holds the same stays, if its time may be any.
 
-    All files but the manifest are written here.
+    All files are written here.
     """
     target = within(site, name)
-    with _writing(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if not target.is_file() or target.read_bytes() != content:
-            write_atomically(target, content, sync=sync)
-
-
-@contextmanager
-def _writing(target: Path) -> Iterator[None]:
     try:
-        yield
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if as_of is not None or not target.is_file() or target.read_bytes() != content:
+            write_atomically(target, content, as_of, sync=sync)
     except OSError as error:
         raise UnavailableError(
             f"cannot be written: {error}",
@@ -369,7 +353,7 @@ def _writing(target: Path) -> Iterator[None]:
 def _link(site: Path, entries: Sequence[Entry], links: Links) -> None:
     """Write what leads to and from each product into its page."""
     for entry, neighbours in with_neighbours(entries):
-        page = within(site, entry.page).read_bytes()
+        page = (site / entry.page).read_bytes()
         linked = pages.with_navigation(page, pages.navigation(entry, neighbours, links))
         _write(site, entry.page, linked)
 
@@ -445,10 +429,7 @@ def _write_manifest(
     listed = [{name: getattr(entry, name) for name in _FIELDS} for entry in entries]
     document = {**stated, "products": listed}
     text = json.dumps(document, sort_keys=True, separators=(",\n", ": "))
-    target = within(site, MANIFEST)
-    with _writing(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, f"{text}\n".encode("ascii"), as_of)
+    _write(site, MANIFEST, f"{text}\n".encode("ascii"), as_of=as_of)
 
 
 def _existing(site: Path, links: Links, below: float) -> _Before:
@@ -465,36 +446,21 @@ def _existing(site: Path, links: Links, below: float) -> _Before:
         _write_manifest(site, [], _stated([], links, below), 0.0)
         return _NOTHING
     try:
-        state, stated = file.stat(), json.loads(file.read_bytes())
+        as_of, finished = file.stat().st_mtime, last_change(file)
+        stated = json.loads(file.read_bytes())
         listed = [Entry(**item) for item in stated.pop("products")]
         if not _of_all_pages(below).items() <= stated.items():
             return _NOTHING
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return _NOTHING
-    finished = last_change(state)
-    whole = {entry.path: entry for entry in listed if _has_page(site, entry, finished)}
-    return _Before(listed, whole, stated, state.st_mtime, finished)
-
-
-def _has_page(site: Path, entry: Entry, finished: float) -> bool:
-    """Return whether the page of a product is that of the last build that ended."""
-    try:
-        state = (site / entry.page).lstat()
-    except OSError:
-        return False
-    return S_ISREG(state.st_mode) and last_change(state) <= finished
+    whole = {one.path: one for one in listed if last_change(site / one.page) <= finished}
+    return _Before(listed, whole, stated, as_of, finished)
 
 
 def _is_touched(site: Path, links: Links, before: _Before) -> bool:
     """Return whether a file of the site, or what its pages link, changed after the last build."""
-    if links.changed(before.as_of) or not all((site / name).is_file() for name in _IN_SITE):
-        return True
-    folders = [os.fspath(site)]
-    while folders:
-        with os.scandir(folders.pop()) as items:
-            for item in items:
-                if last_change(item.stat(follow_symlinks=False)) > before.finished:
-                    return True
-                if item.is_dir(follow_symlinks=False):
-                    folders.append(item.path)
-    return False
+    inside = chain.from_iterable((site / folder).rglob("*") for folder in _OURS)
+    own = (site / name for name in (*_IN_SITE, *_OURS))
+    return links.changed(before.as_of) or any(
+        last_change(place) > before.finished for place in chain(own, inside)
+    )

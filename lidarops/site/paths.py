@@ -149,7 +149,7 @@ class Links:
     def changed(self, since: float) -> bool:
         """Return whether the STAC catalog may be another one than at a time, s since 1970."""
         folder = self.output / "aggregates"
-        return folder.is_dir() and last_change(folder.stat()) >= since
+        return folder.is_dir() and last_change(folder) >= since
 
     def _stac(self, name: str, page: str) -> str:
         place = self.stac_at or (STAC_BESIDE if self.beside else "")

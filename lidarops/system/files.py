@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import math
 import os
 import stat
 import tempfile
@@ -118,10 +119,17 @@ def settled_before() -> float:
     return time.time() - _COARSE
 
 
-def last_change(file: os.stat_result) -> float:
-    """Return the time at which a file was last written or put in its place, s since 1970."""
+def last_change(file: Path) -> float:
+    """Return when a file, or a link to it, was last written or put there, s since 1970.
+
+    Infinite without one.
+    """
+    try:
+        states = (file.lstat(), file.stat())
+    except OSError:
+        return math.inf
     # A copy may keep the time of its content.
-    return max(file.st_mtime, file.st_ctime)
+    return max(moment for state in states for moment in (state.st_mtime, state.st_ctime))
 
 
 def write_atomically(
