@@ -366,8 +366,7 @@ def test_dead_times_are_estimated_against_analog(data_root, tmp_path):
         assert (found["usable"] < 2).mean() >= 0.95
         deviations = deviation(found, product.channel)
         assert np.all(deviations[:, 1:] < 1.0)
-        # The cycles are independent; near the lidar one of them is 2.0 errors away.
-    assert np.sqrt(np.mean(deviations[:, 0] ** 2)) < 1.6
+        assert np.all(deviations[:, 0] < 2.0)
         part = at_heights(found).isel(altitude=0)
         depth = REFERENCE[product.channel][0][0]
         assert (np.abs(part["vertical_optical_depth"] - depth) < 0.016).all()
