@@ -713,7 +713,11 @@ def load_campaign(
             remedy="see catalogs/demo.yaml for an example",
         )
     try:
-        campaign = Campaign.model_validate(with_plain_numbers(raw, campaign_schema))
+        try:
+            campaign = Campaign.model_validate(raw)
+        except ValidationError:
+            # The schema takes as long as all the rest, and few files hold quantities with units.
+            campaign = Campaign.model_validate(with_plain_numbers(raw, campaign_schema))
     except ValidationError as error:
         nodes = yaml.compose(text, Loader=yaml.SafeLoader)
         lines = explain_yaml_error(error, nodes, campaign_schema())

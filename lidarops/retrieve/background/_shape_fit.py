@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import HUGE, Array
+from lidarops.retrieve.common.arrays import HUGE, Array, Booleans
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 
 BLOCKS: Final = 14
@@ -36,11 +36,13 @@ ROW: Final = np.dtype(
         for name in (
             "background", "background_variance", "amplitude", "amplitude_variance", "chi2",
             "bins", "condition", "curvature", "waves", "window", "constant", "first", "past",
+            "allowed",
         )
     ]
 )  # fmt: skip
 """Fit of a window: fields of `known_shape.KnownShapeResult`; number of the window, whether all
-powers are equal, first bin and first one past the window."""
+powers are equal, first bin and first one past the window, bins from the first on that may be used.
+"""
 
 
 class Limits(NamedTuple):
@@ -65,59 +67,69 @@ class _Weights(NamedTuple):
     amplitude: float
 
 
+class _Scratch(NamedTuple):
+    """Arrays of the profiles of a call."""
+
+    weights: Array
+    """(bin,) by variance and air, 0 where either is not usable."""
+    sums: Array
+    """(8, block)."""
+    factors: Array
+    """(block,) on the sums of a block."""
+
+
+@summing
+def _weigh(variance: Array, shape: Array, weights: Array) -> None:
+    for i in range(weights.size):
+        good = (variance[i] > 1.0 / HUGE) & (variance[i] < math.inf) & (shape[i] > 0.0)
+        weights[i] = 1.0 / variance[i] if good & (shape[i] < HUGE) else 0.0
+
+
 @summing
 def _sum_block(
-    power: Array, shape: Array, weights: Array, reference: float, block: int, sums: Array
-) -> None:
-    bins = weight = of_shape = of_shape2 = of_shape3 = of_power = product = of_power2 = 0.0
-    for i in range(power.size):
-        good = (abs(power[i]) < HUGE) & (weights[i] > 0.0)
-        w = weights[i] if good else 0.0
-        value = power[i] - reference if good else 0.0
-        shaped = w * shape[i]
-        bins += 1.0 if good else 0.0
-        weight += w
-        of_shape += shaped
-        of_shape2 += shaped * shape[i]
-        of_shape3 += shaped * shape[i] * shape[i]
-        of_power += w * value
-        product += shaped * value
-        of_power2 += w * value * value
-    sums[BINS, block], sums[WEIGHT, block] = bins, weight
-    sums[SHAPE, block], sums[SHAPE2, block], sums[SHAPE3, block] = of_shape, of_shape2, of_shape3
-    sums[POWER, block], sums[PRODUCT, block], sums[POWER2, block] = of_power, product, of_power2
-
-
-@inlined
-def _sum_blocks(
     power: Array,
     shape: Array,
     weights: Array,
-    first: int,
-    past: int,
+    mask: Booleans,
     reference: float,
+    k: int,
     sums: Array,
 ) -> None:
-    bins = past - first
-    for block in range(BLOCKS):
-        span = slice(first + block * bins // BLOCKS, first + (block + 1) * bins // BLOCKS)
-        _sum_block(power[span], shape[span], weights[span], reference, block, sums)
+    bins = weight = of_shape = of_shape2 = of_shape3 = of_power = product = of_power2 = 0.0
+    for i in range(power.size):
+        good = (abs(power[i]) < HUGE) & mask[i] & (weights[i] > 0.0)
+        w = weights[i] if good else 0.0
+        value, air = (power[i] - reference, shape[i]) if good else (0.0, 0.0)
+        shaped = w * air
+        bins += 1.0 if good else 0.0
+        weight += w
+        of_shape += shaped
+        of_shape2 += shaped * air
+        of_shape3 += shaped * air * air
+        of_power += w * value
+        product += shaped * value
+        of_power2 += w * value * value
+    sums[BINS, k], sums[WEIGHT, k] = bins, weight
+    sums[SHAPE, k], sums[SHAPE2, k], sums[SHAPE3, k] = of_shape, of_shape2, of_shape3
+    sums[POWER, k], sums[PRODUCT, k], sums[POWER2, k] = of_power, product, of_power2
 
 
 @summing
-def _weight(sums: Array, by: _Weights, k: int) -> float:
-    """Return the factor on the sums of a block."""
-    bins = sums[WEIGHT, k]
-    counted = by.exposure * bins / (by.background * bins + by.amplitude * sums[SHAPE, k])
-    return (counted if bins > 0.0 else 0.0) if by.exposure > 0.0 else 1.0
+def _fill_factors(s: _Scratch, by: _Weights, first: int) -> None:
+    """Fill the factors on the sums of blocks."""
+    for k in range(first, BLOCKS):
+        bins = s.sums[WEIGHT, k]
+        counted = by.exposure * bins / (by.background * bins + by.amplitude * s.sums[SHAPE, k])
+        s.factors[k] = counted if bins > 0.0 else 0.0
 
 
 @summing
-def _solve(sums: Array, by: _Weights, first: int) -> tuple[float, float, float, float, float]:
+def _solve(s: _Scratch, first: int) -> tuple[float, float, float, float, float]:
     """Return weight, mean shape and power, squared deviation of the shape, and amplitude."""
+    sums = s.sums
     weight = of_shape = of_shape2 = of_power = product = 0.0
     for k in range(first, BLOCKS):
-        factor = _weight(sums, by, k)
+        factor = s.factors[k]
         weight += factor * sums[WEIGHT, k]
         of_shape += factor * sums[SHAPE, k]
         of_shape2 += factor * sums[SHAPE2, k]
@@ -130,18 +142,19 @@ def _solve(sums: Array, by: _Weights, first: int) -> tuple[float, float, float, 
 
 
 @inlined
-def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) -> None:
+def _fit(s: _Scratch, exposure: float, reference: float, window: int, row: Any) -> None:
     """Fit and test a window, of which 0 is the longest."""
     first, size = STEP * window, 0.0
     row.window, row.bins = window, 0.0
     for k in range(first, BLOCKS):
-        row.bins += sums[BINS, k]
-        size += sums[POWER2, k]
+        row.bins += s.sums[BINS, k]
+        size += s.sums[POWER2, k]
+        s.factors[k] = 1.0
     row.constant = size == 0.0
     if row.bins == 0.0:
         return
     by = _Weights(0.0, 1.0, 0.0)
-    weight, mean_shape, mean_power, square, amplitude = _solve(sums, by, first)
+    weight, mean_shape, mean_power, square, amplitude = _solve(s, first)
     for _ in range(_PASSES if exposure > 0.0 else 0):
         one = 1.0 / (row.bins * exposure)
         mean = reference + mean_power
@@ -149,7 +162,8 @@ def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) 
         # A zero background is known to its standard error only, and to one count at best.
         least = math.sqrt(max(mean, 0.0) * one) + one
         by = _Weights(exposure, max(mean - amplitude * mean_shape, least), amplitude)
-        weight, mean_shape, mean_power, square, amplitude = _solve(sums, by, first)
+        _fill_factors(s, by, first)
+        weight, mean_shape, mean_power, square, amplitude = _solve(s, first)
     if square == 0.0:
         row.condition = np.inf
         return
@@ -157,12 +171,10 @@ def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) 
     row.background, row.amplitude = reference + level, amplitude
     row.amplitude_variance = 1.0 / square
     if exposure > 0.0:
-        row.amplitude_variance = _scatter(sums, by, first, mean_shape) / (square * square)
+        row.amplitude_variance = _scatter(s, by, first, mean_shape) / (square * square)
     row.background_variance = 1.0 / weight + mean_shape * mean_shape / square
     row.condition = math.sqrt(row.background_variance * weight)
-    chi2, row.waves, score, norm, with_level, with_shape = _residuals(
-        sums, by, first, level, amplitude
-    )
+    chi2, row.waves, score, norm, with_level, with_shape = _residuals(s, first, level, amplitude)
     # Rounding of a fit without noise.
     row.chi2 = max(chi2, 0.0)
     with_shape -= mean_shape * with_level
@@ -172,14 +184,14 @@ def _fit(sums: Array, exposure: float, reference: float, window: int, row: Any) 
 
 
 @summing
-def _scatter(sums: Array, by: _Weights, first: int, mean: float) -> float:
+def _scatter(s: _Scratch, by: _Weights, first: int, mean: float) -> float:
     """Return the variance of the weighted sum of counts times the deviation of their shape.
 
     Bins of a block share a weight, though near ones hold more counts.
     """
-    total = 0.0
+    total, sums = 0.0, s.sums
     for k in range(first, BLOCKS):
-        factor = _weight(sums, by, k)
+        factor = s.factors[k]
         level = sums[SHAPE2, k] - 2.0 * mean * sums[SHAPE, k] + mean * mean * sums[WEIGHT, k]
         shaped = sums[SHAPE3, k] - 2.0 * mean * sums[SHAPE2, k] + mean * mean * sums[SHAPE, k]
         total += factor * factor * (by.background * level + by.amplitude * shaped)
@@ -188,15 +200,16 @@ def _scatter(sums: Array, by: _Weights, first: int, mean: float) -> float:
 
 @summing
 def _residuals(
-    sums: Array, by: _Weights, first: int, level: float, amplitude: float
+    s: _Scratch, first: int, level: float, amplitude: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return chi-square, that of block means, and products with the shape times range.
 
     These are of the residuals, of itself, of a constant, and of the shape.
     """
+    sums = s.sums
     chi2 = waves = score = norm = with_level = with_shape = 0.0
     for k in range(first, BLOCKS):
-        factor = _weight(sums, by, k)
+        factor = s.factors[k]
         weight, of_shape = factor * sums[WEIGHT, k], factor * sums[SHAPE, k]
         residual = factor * sums[POWER, k] - level * weight - amplitude * of_shape
         inverse = 1.0 / weight if weight > 0.0 else 0.0
@@ -261,11 +274,12 @@ def _variance_with_choice(rows: Any, chosen: int, limits: Limits) -> float:
 
 @inlined
 def _span(
-    power: Array, weights: Array, range_: Array, nearest: float, start: float, stop: float
+    power: Array, weights: Array, mask: Booleans, range_: Array, edges: tuple[float, float, float]
 ) -> tuple[int, int]:
     """Return the first bin of the longest window and the one past its last usable bin."""
+    nearest, start, stop = edges
     past = int(np.searchsorted(range_, stop, side="right"))
-    while past > 0 and not (abs(power[past - 1]) < HUGE and weights[past - 1] > 0.0):
+    while past > 0 and not (abs(power[past - 1]) < HUGE and mask[past - 1] and weights[past - 1]):
         past -= 1
     if math.isnan(start):
         start = nearest * range_[max(past - 1, 0)]
@@ -275,39 +289,41 @@ def _span(
 @inlined
 def _fit_profiles(
     power: Array,
-    shape: Array,
-    weights: Array,
-    exposure: Array,
+    given: tuple[Array, Array, Booleans, Array],
     range_: Array,
     edges: tuple[Array, Array],
     limits: Limits,
-    sums: Array,
+    s: _Scratch,
     rows: Any,
     out: Any,
 ) -> None:
+    shapes, variances, masks, exposure = given
     starts, stops = edges
     for k in range(power.shape[0]):
-        row, air, weight = power[k], shape[k % shape.shape[0]], weights[k % weights.shape[0]]
-        start, stop = starts[k % starts.size], stops[k % stops.size]
-        first, past = _span(row, weight, range_, limits.nearest, start, stop)
+        row, shape, mask = power[k], shapes[k % shapes.shape[0]], masks[k % masks.shape[0]]
+        if k < max(variances.shape[0], shapes.shape[0]):
+            _weigh(variances[k % variances.shape[0]], shape, s.weights)
+        ends = (limits.nearest, starts[k % starts.size], stops[k % stops.size])
+        first, past = _span(row, s.weights, mask, range_, ends)
         reference = row[past - 1] if past > 0 else 0.0
-        _sum_blocks(row, air, weight, first, past, reference, sums)
+        bins = past - first
+        for j in range(BLOCKS):
+            span = slice(first + j * bins // BLOCKS, first + (j + 1) * bins // BLOCKS)
+            _sum_block(row[span], shape[span], s.weights[span], mask[span], reference, j, s.sums)
         for j in range(rows.size):
             rows[j] = out[k]
-            _fit(sums, exposure[k % exposure.size], reference, j, rows[j])
+            _fit(s, exposure[k % exposure.size], reference, j, rows[j])
         chosen = _choose(rows, limits)
         out[k] = rows[chosen]
         out[k].background_variance = _variance_with_choice(rows, chosen, limits)
-        out[k].first = first + STEP * chosen * (past - first) // BLOCKS
-        out[k].past = past
+        first += STEP * chosen * (past - first) // BLOCKS
+        out[k].first, out[k].past, out[k].allowed = first, past, mask[first:].sum()
 
 
 @compiled
 def fit_shape(
     power: Array,
-    shape: Array,
-    weights: Array,
-    exposure: Array,
+    given: tuple[Array, Array, Booleans, Array],
     range_: Array,
     edges: tuple[Array, Array],
     limits: Limits,
@@ -318,10 +334,10 @@ def fit_shape(
     Parameters
     ----------
     power : (profile, bin) float64
-    shape, weights : (profile or 1, bin) float64
-        The weight is 0 where a bin is left out, 1 elsewhere for counts; the shape is finite.
-    exposure : (profile or 1,) float64
-        Counts per unit of power; 0 where the weights are inverse variances.
+    given : ((profile or 1, bin) float64, (profile or 1, bin) float64, (profile or 1, bin) bool, \
+(profile or 1,) float64)
+        Shapes and variances, of which a bin is left out where they are not positive and finite;
+        True for bins that may be used; counts per unit of power, whose variances are 1, or 0.
     range_ : (bin,) float64
         m, ascending.
     edges : ((profile or 1,) float64, (profile or 1,) float64)
@@ -331,5 +347,6 @@ def fit_shape(
     out : (profile,) `ROW`
         NaN before.
     """
-    sums, rows = np.empty((8, BLOCKS)), np.empty(limits.waves.size, ROW)
-    _fit_profiles(power, shape, weights, exposure, range_, edges, limits, sums, rows, out)
+    s = _Scratch(np.empty(range_.size), np.empty((8, BLOCKS)), np.empty(BLOCKS))
+    rows = np.empty(limits.waves.size, ROW)
+    _fit_profiles(power, given, range_, edges, limits, s, rows, out)

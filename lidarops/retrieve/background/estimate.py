@@ -145,10 +145,7 @@ def from_known_shape(
     noise = {"variance": variance} if exposure is None else {"exposure": exposure}
     fit = known_shape.fit_known_shape(power, range, shape, mask=mask, **noise)
     usable = ~fit.singular & np.isfinite(fit.background)
-    fitted = range >= fit.start[..., np.newaxis]
-    fitted = fitted if mask is None else fitted & mask
-    known = (fitted & np.isfinite(power) & np.isfinite(variance)).sum(axis=-1)
-    bins = fitted.sum(axis=-1)
+    known, bins = np.minimum(fit.degrees_of_freedom + 2, fit.allowed), fit.allowed
     usable &= known >= THRESHOLDS.least_known * bins
     doubtful = fit.poor_fit | _selected(known, bins)
     fitted_sky = Background(

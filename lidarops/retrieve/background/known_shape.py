@@ -38,6 +38,8 @@ class KnownShapeResult:
     """Sum of the squared residuals over their variances."""
     degrees_of_freedom: Integers
     """Bins less 2, at least 0."""
+    allowed: Integers
+    """Bins from the first one of the window on that may be used, if their power is known."""
     condition: Array
     """Standard error of the background over that of the mean of the same bins: 1 where the shape
     dies away in the window, infinite where it cannot be distinguished from a constant."""
@@ -175,7 +177,10 @@ def fit_known_shape(
     rows = frozen(rows.astype(np.float64, copy=False))
     air = inputs.noise_rows(shape, "shape", grid, leading)
     counts = _exposures(variance, exposure, leading)
-    weights = _weights(variance, mask, air, grid, leading)
+    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
+    usable = np.ones((1, grid.size), dtype=np.bool_)
+    if mask is not None:
+        usable = inputs.broadcast(mask, (*leading, grid.size), "mask").reshape(-1, grid.size)
     edges = (
         _UNKNOWN if start is None else frozen(inputs.profile_values(start, "start", leading)),
         _ENDLESS if stop is None else frozen(inputs.profile_values(stop, "stop", leading)),
@@ -186,13 +191,11 @@ def fit_known_shape(
         )
     limits = _limits(THRESHOLDS.rejection, _shape_fit.WINDOWS if start is None else 1)
     out = np.full(len(rows), np.nan, _shape_fit.ROW)
-    usable_air = np.where(weights > 0, air, 0.0)
     # Squares of shapes and of powers must stay in the range of floats together.
-    unit = np.max(usable_air, axis=-1, keepdims=True, initial=0.0)
+    unit = np.max(air, axis=-1, keepdims=True, initial=0.0, where=(air > 0.0) & (air < HUGE))
     unit = np.where(unit > 0.0, unit, 1.0)
-    _shape_fit.fit_shape(
-        rows, frozen(usable_air / unit), weights, counts, frozen(grid), edges, limits, out
-    )
+    given = frozen(air / unit), frozen(noise), frozen(usable), counts
+    _shape_fit.fit_shape(rows, given, frozen(grid), edges, limits, out)
     if exposure is not None:
         # In the dark, a whole window may be without a count.
         out["constant"] = 0.0
@@ -217,23 +220,6 @@ def _exposures(
             "is not positive", field="exposure", remedy="mask profiles without shots"
         )
     return frozen(counts)
-
-
-def _weights(
-    variance: npt.ArrayLike | None,
-    mask: Booleans | None,
-    air: Array,
-    grid: Array,
-    leading: tuple[int, ...],
-) -> Array:
-    """Return inverse variances, or ones for counts, (profile or 1, bin); 0 in unusable bins."""
-    noise = inputs.noise_rows(variance, "variance", grid, leading, negative=False)
-    with np.errstate(divide="ignore"):
-        weights = 1.0 / noise
-    usable = (weights > 0) & (weights < HUGE) & (air > 0) & (air < HUGE)
-    if mask is not None:
-        usable = usable & (inputs.noise_rows(mask.astype(float), "mask", grid, leading) > 0)
-    return frozen(np.where(usable, weights, 0.0))
 
 
 @cache
@@ -276,6 +262,7 @@ def _result(out: npt.NDArray[np.void], grid: Array, unit: Array) -> KnownShapeRe
         amplitude_standard_error=amplitude_error,
         chi2=fit["chi2"],
         degrees_of_freedom=np.maximum(bins - 2, 0).astype(np.int64),
+        allowed=fit["allowed"].astype(np.int64),
         condition=condition,
         curvature=fit["curvature"],
         waves=fit["waves"],

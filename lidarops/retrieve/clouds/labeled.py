@@ -374,8 +374,10 @@ def _signal_beyond_clouds(means: MeanProfiles, *, known_shape: bool) -> tuple[Me
 def with_margin(mask: Booleans, distance: Array) -> Booleans:
     """Return the bins of layers, (..., range), and those in which their thin edges may be."""
     bins = round(THRESHOLDS.cloud_margin / float(np.median(np.diff(distance))))
-    near = np.cumsum(np.pad(mask, [(0, 0)] * (mask.ndim - 1) + [(bins + 1, bins)]), axis=-1)
-    return np.asarray(near[..., 2 * bins + 1 :] > near[..., : mask.shape[-1]])
+    out, some = np.zeros_like(mask), mask.any(axis=-1)
+    near = np.cumsum(np.pad(mask[some], ((0, 0), (bins + 1, bins))), axis=-1)
+    out[some] = near[:, 2 * bins + 1 :] > near[:, : mask.shape[-1]]
+    return out
 
 
 def _less_than_air(

@@ -155,30 +155,21 @@ def find_visible_air(
     bins = max(round(THRESHOLDS.visible_depth / tests.step), 2)
     of_depth = int(np.searchsorted(tests.lengths, bins))
     marked = np.reshape(cloudy, tests.power.shape)
-    known = np.isfinite(tests.power) & np.isfinite(tests.variance) & ~marked
-    signal, air, noise = (
-        _moving_sums(np.where(known, values, 0.0), bins)
-        for values in (tests.power, tests.shape, tests.variance)
-    )
-    error = np.sqrt(noise)
-    limit, margin = (values[:, of_depth, np.newaxis] for values in (tests.limits, tests.margins))
     excess = THRESHOLDS.visible_excess * (contrast - 1.0)
-    rises = excess * signal - margin >= limit * math.sqrt(2.0) * error
-    exceeds = (excess + 1.0 - contrast) * signal - margin >= (
-        tests.certainty * limit * math.hypot(1.0, contrast) * error
+    visible = np.zeros(tests.power.shape, dtype=np.bool_)
+    _mark_visible(
+        (
+            frozen(np.where(marked, np.nan, tests.power)),
+            frozen(tests.variance),
+            frozen(tests.shape),
+        ),
+        bins,
+        (frozen(tests.limits[:, of_depth]), frozen(tests.margins[:, of_depth])),
+        (excess, math.sqrt(2.0)),
+        (excess + 1.0 - contrast, tests.certainty * math.hypot(1.0, contrast)),
+        visible,
     )
-    visible = (air > 0.0) & (signal > 0.0) & rises & exceeds
     return visible.reshape(*tests.leading, -1)
-
-
-def _moving_sums(values: Array, bins: int) -> Array:
-    """Return sums over a number of bins around each, from the far end, so that they keep digits."""
-    size = values.shape[-1]
-    beyond = np.zeros((values.shape[0], size + 1))
-    beyond[:, :size] = np.cumsum(values[:, ::-1], axis=-1)[:, ::-1]
-    first = np.maximum(np.arange(size) - bins // 2, 0)
-    past = np.minimum(np.arange(size) - bins // 2 + bins, size)
-    return np.asarray(beyond[:, first] - beyond[:, past])
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,6 +248,41 @@ def _accumulate(power: Array, variance: Array, shape: Array, sums: Array) -> Non
             noise,
             count,
         )
+
+
+@compiled
+def _mark_visible(
+    signals: tuple[Array, Array, Array],
+    bins: int,
+    tests: tuple[Array, Array],
+    rise: tuple[float, float],
+    excess: tuple[float, float],
+    visible: Booleans,
+) -> None:
+    """Mark the bins around which a layer, of a number of bins, would pass both tests.
+
+    `signals` are powers, variances and shapes of air, as for `_mark_layers`, `tests` the standard
+    errors of the rise and the sums of power that are subtracted, (profile,), and `rise` and
+    `excess` of both tests the excess over the ratio to air, and errors over those of the sum.
+    """
+    powers, variances, shapes = signals
+    size = int(powers.shape[1])
+    sums = np.empty((4, size + 1))
+    for k in range(powers.shape[0]):
+        variance, shape = variances[k % variances.shape[0]], shapes[k % shapes.shape[0]]
+        _accumulate(powers[k], variance, shape, sums)
+        limit, margin = tests[0][k], tests[1][k]
+        for i in range(size):
+            first = max(i - bins // 2, 0)
+            past = min(i - bins // 2 + bins, size)
+            signal = sums[POWER, first] - sums[POWER, past]
+            error = limit * math.sqrt(sums[VARIANCE, first] - sums[VARIANCE, past])
+            visible[k, i] = (
+                signal > 0.0
+                and sums[SHAPE, first] - sums[SHAPE, past] > 0.0
+                and rise[0] * signal - margin >= rise[1] * error
+                and excess[0] * signal - margin >= excess[1] * error
+            )
 
 
 @compiled

@@ -156,7 +156,7 @@ def noise_rows(
     shared = array.size == 1 or all(length == 1 for length in array.shape[:-1])
     target = (*((1,) * len(leading) if shared else leading), grid.size)
     rows = broadcast(array.reshape(array.shape[-1:]) if shared else array, target, name)
-    if not negative and np.any(rows < 0):
+    if not negative and np.fmin.reduce(rows, axis=None, initial=0.0) < 0:
         raise RetrievalInputError("is negative", field=name)
     count = 1 if shared else int(np.prod(leading, dtype=np.int64))
     return np.ascontiguousarray(rows.reshape(count, grid.size))

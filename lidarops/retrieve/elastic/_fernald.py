@@ -31,6 +31,11 @@ BACKSCATTER, ATTENUATED, ATTENUATED_ERROR = 0, 1, 2
 NOISE, BACKGROUND, REFERENCE, LIDAR_RATIO, MOLECULAR = 3, 4, 5, 6, 7
 FIELDS: Final = 8
 CONSTANT, CONSTANT_ERROR = 0, 1
+DERIVED: Final = (
+    "backscatter_standard_error", "extinction", "extinction_standard_error", "scattering_ratio",
+    "scattering_ratio_standard_error",
+)  # fmt: skip
+"""Values that `derive` writes for each bin."""
 SCALARS: Final = 2
 
 # Rows of the work array. For the denominator of each bin: its value, its derivative with respect
@@ -416,3 +421,29 @@ def invert_fernald(
             relative = scale[1] ** 2 + scale[2] ** 2 + scale[3] ** 2
             scalars[k, CONSTANT_ERROR] = scale[0] * math.sqrt(relative)
         _withhold(power[k], noise, nearest >= 0, state[k], k, out)
+
+
+@compiled
+def derive(given: Given, out: Array, dead_time: Array, baseline: Array, derived: Array) -> None:
+    """Write (`DERIVED`, profile, bin) values from those of `invert_fernald`.
+
+    Dead time and baseline stand for (profile or 1, bin) errors of the backscatter by them.
+    """
+    (airs, _, ratios), (ratio_errors, air_errors) = given.air, given.errors
+    for k in range(out.shape[1]):
+        air, ratio = airs[k % len(airs)], ratios[k % len(ratios)]
+        own_ratio, own_air = ratio_errors[k % len(ratio_errors)], air_errors[k % len(air_errors)]
+        by_dead_time, by_baseline = dead_time[k % len(dead_time)], baseline[k % len(baseline)]
+        for i in range(out.shape[2]):
+            value = out[BACKSCATTER, k, i]
+            by_ratio, by_air = out[LIDAR_RATIO, k, i], out[MOLECULAR, k, i]
+            others = out[NOISE, k, i] ** 2 + out[BACKGROUND, k, i] ** 2
+            others += out[REFERENCE, k, i] ** 2 + by_dead_time[i] ** 2 + by_baseline[i] ** 2
+            inverse = 1.0 / air[i] if air[i] > 0.0 else math.nan
+            derived[0, k, i] = math.sqrt(others + by_ratio**2 + by_air**2)
+            derived[1, k, i] = ratio[i] * value
+            own = ratio[i] * by_ratio + own_ratio[i] * value
+            derived[2, k, i] = math.sqrt(ratio[i] * ratio[i] * (others + by_air**2) + own**2)
+            derived[3, k, i] = 1.0 + inverse * value
+            own = by_air - own_air[i] * value
+            derived[4, k, i] = inverse * math.sqrt(others + by_ratio**2 + own**2)

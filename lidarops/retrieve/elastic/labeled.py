@@ -29,7 +29,7 @@ from lidarops.retrieve.clouds.labeled import (
     window_variables,
     with_margin,
 )
-from lidarops.retrieve.common.arrays import Array, Booleans, Flags, root_sum_square
+from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.inversion import THRESHOLDS
@@ -137,13 +137,12 @@ def invert_elastic(
         noise_correlation_length=means.correlation_length,
     )
     quality = means.quality | _flags(solution, window, signal, means, clouds)
-    profiles = {
-        name: np.where(solution.valid, values, np.nan)
-        for name, values in _profile_variables(solution).items()
-    }
     product = xr.Dataset(
         {
-            **{name: (("time", "range"), values) for name, values in profiles.items()},
+            **{
+                name: (("time", "range"), values)
+                for name, values in _profile_variables(solution).items()
+            },
             "molecular_backscatter": ("range", air.backscatter),
             "molecular_extinction": ("range", air.extinction),
             "lidar_ratio": ("range", ratio.value),
@@ -192,9 +191,12 @@ def _flags(
 
     def with_beyond(mask: Booleans) -> Booleans:
         """Return the bins of a mask, and those beyond one as seen from the reference window."""
-        above = np.logical_or.accumulate(mask & ~near, axis=-1)
-        below = np.logical_or.accumulate((mask & near)[:, ::-1], axis=-1)[:, ::-1]
-        return np.asarray(above | below)
+        out, rows = np.zeros_like(mask), np.flatnonzero(mask.any(axis=-1))
+        mask, before = mask[rows], near[rows]
+        above = np.logical_or.accumulate(mask & ~before, axis=-1)
+        below = np.logical_or.accumulate((mask & before)[:, ::-1], axis=-1)[:, ::-1]
+        out[rows] = above | below
+        return out
 
     chosen = window.chosen[:, np.newaxis]
     cloudy = with_beyond(with_margin(clouds.mask, means.distance))
@@ -218,22 +220,33 @@ def _flags(
 
 def _negative(solution: _elastic.ElasticResult) -> Booleans:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
-    error = solution.backscatter_standard_error
-    low = solution.valid & (solution.backscatter < -THRESHOLDS.negative * error)
-    return np.asarray(ndimage.binary_opening(low, np.ones((1, THRESHOLDS.negative_bins))))
+    # Neither is known where there is no value.
+    low = solution.backscatter < -THRESHOLDS.negative * solution.backscatter_standard_error
+    rows = np.flatnonzero(low.sum(axis=-1) >= THRESHOLDS.negative_bins)
+    out = np.zeros_like(low)
+    out[rows] = ndimage.binary_opening(low[rows], np.ones((1, THRESHOLDS.negative_bins)))
+    return out
 
 
 def _profile_variables(solution: _elastic.ElasticResult) -> dict[str, Array]:
+    """Return the variables of bins, NaN where there is no value."""
+
+    def valid(values: Array) -> Array:
+        return np.where(solution.valid, values, np.nan)
+
+    # The others have no value there.
+    shifts = {cause: valid(solution.budget[cause]) for cause in ("dead_time", "baseline")}
+    budget = solution.budget | shifts
     return {
         "aerosol_backscatter": solution.backscatter,
         "aerosol_backscatter_standard_error": solution.backscatter_standard_error,
-        **{f"aerosol_backscatter_error_{cause}": error for cause, error in solution.budget.items()},
+        **{f"aerosol_backscatter_error_{cause}": error for cause, error in budget.items()},
         "aerosol_extinction": solution.extinction,
-        "aerosol_extinction_standard_error": root_sum_square(solution.extinction_budget.values()),
+        "aerosol_extinction_standard_error": solution.extinction_standard_error,
         "scattering_ratio": solution.scattering_ratio,
-        "scattering_ratio_standard_error": root_sum_square(
-            solution.scattering_ratio_budget.values()
+        "scattering_ratio_standard_error": solution.scattering_ratio_standard_error,
+        "attenuated_backscatter": valid(solution.attenuated_backscatter),
+        "attenuated_backscatter_standard_error": valid(
+            solution.attenuated_backscatter_standard_error
         ),
-        "attenuated_backscatter": solution.attenuated_backscatter,
-        "attenuated_backscatter_standard_error": solution.attenuated_backscatter_standard_error,
     }

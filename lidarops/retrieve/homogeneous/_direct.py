@@ -1,10 +1,11 @@
 """Compiled least squares of the homogeneous path, one profile at a time.
 
 The objective of `lidarops.retrieve.homogeneous._projection`, a function of extinction alone, is
-compared at fixed nodes, on sums over blocks of bins. Two Newton steps over all bins improve the
-best node; a test of the last one gives a few profiles more. Every sum runs over the bins of one
-profile in a fixed order: a result does not depend on the rest of the batch. From a given extinction
-there is no search.
+compared at fixed nodes, on sums over runs of bins. From the best one, two passes over all bins give
+a Newton step each; the second sums the residuals about what the first predicts, for errors, tests
+and the last step. A test of this step gives a few profiles more. Every sum runs over the bins of
+one profile in a fixed order: a result does not depend on the rest of the batch. From a given
+extinction there is no search.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Integers
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
-from lidarops.retrieve.homogeneous._fit_quality import Left, judge_residuals
+from lidarops.retrieve.homogeneous._fit_quality import judge_residuals
 from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT
 from lidarops.retrieve.homogeneous._projection import (
     BLOCK,
@@ -25,14 +26,17 @@ from lidarops.retrieve.homogeneous._projection import (
     Point,
     Scratch,
     Sums,
-    at,
     evaluate,
+    fill_shape,
+    fit_linear,
     largest_energy,
     load,
     make_scratch,
     power_of_two,
-    rescale,
+    sum_points,
+    sum_shape,
     weigh,
+    weigh_squares,
 )
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 
@@ -40,9 +44,11 @@ _MOST_STEPS: Final = 12
 """Newton steps; most profiles need two."""
 _SMALL: Final = 1e-7
 """Step over extinction after which the search ends."""
-_NEGLIGIBLE: Final = 1e-5
+_NEGLIGIBLE: Final = 1e-4
 """Standard errors of the extinction that the last step may leave, and step over extinction by which
 stated errors, which are those before it, may be off."""
+_SEEN: Final = 0.1
+"""Energy of the last step over the variance of a bin: tests see residuals before it."""
 _ROUNDING: Final = float(np.finfo(np.float64).eps)
 """Rounding of a sum of squares, over the sum."""
 _DETERMINED: Final = 0.3
@@ -51,6 +57,8 @@ twice the limit of `POORLY_DETERMINED`."""
 BACKGROUND, EXTINCTION, PRIOR = 0, 1, 2
 """What is given to a fit."""
 TINY: Final = 1e-280
+_SCALED: Final = 1e60
+"""Mean absolute value above which, or below whose inverse, profiles are scaled."""
 _FLAT: Final = 1e-13
 """Squared share of a shape besides its mean, below which it is flat within rounding."""
 
@@ -58,7 +66,7 @@ _FLAT: Final = 1e-13
 @summing
 def _products(weights: Array, values: Array, shape: Array, square: Array) -> Any:
     of_shape = of_value = of_square = 0.0
-    for k in range(shape.size):
+    for k in range(weights.size):
         of_shape += weights[k] * shape[k]
         of_value += values[k] * shape[k]
         of_square += weights[k] * square[k]
@@ -123,9 +131,9 @@ def _start(g: Grid, s: Scratch, sums: Sums) -> float:
     Among the nodes, and interpolated between the best one and its neighbours.
     """
     explained = s.explained
-    # Opaque shapes differ in their first valid bins only, which blocks would not resolve.
+    # Opaque shapes differ in their first valid bins only, which runs of bins would not resolve.
     if s.w[:BLOCK].any():
-        best, middle = _best_node(s.points[0], s.points[1], g.block_shapes, sums, explained)
+        best, middle = _best_node(s.points[0], s.points[1], g.point_shapes, sums, explained)
     else:
         for i in range(s.w.size):
             s.residual[i] = s.w[i] * s.z[i]
@@ -138,10 +146,14 @@ def _start(g: Grid, s: Scratch, sums: Sums) -> float:
 
 
 @inlined
+def _is_curved(p: Point) -> bool:
+    return p.curvature > THRESHOLDS.least_curvature * p.gauss
+
+
+@inlined
 def _newton(p: Point, g: Grid) -> float:
     """Return tau after one Newton step, of at most the distance to the next node."""
-    curved = p.curvature > THRESHOLDS.least_curvature * p.gauss
-    step = p.gradient / (p.curvature if curved else p.gauss)
+    step = p.gradient / (p.curvature if _is_curved(p) else p.gauss)
     reach = g.spacing * math.sqrt(p.tau * p.tau + g.scale * g.scale)
     moved = p.tau + min(max(step, -reach), reach)
     return float(min(max(moved, g.nodes[0]), g.nodes[-1])) if math.isfinite(step) else p.tau
@@ -149,36 +161,38 @@ def _newton(p: Point, g: Grid) -> float:
 
 @inlined
 def _is_last(step: float, p: Point, g: Grid, sums: Sums) -> bool:
-    """Return whether what a linear step leaves is negligible.
+    """Return whether what a Newton step leaves is negligible.
 
-    It leaves about its square, and what the residuals add to the curvature. A small step says
-    little where the noise is large, or where the curvature is that of Gauss-Newton.
+    It leaves about its square. A small step says little where the noise is large, or where the
+    curvature is that of Gauss-Newton.
     """
-    size = abs(p.tau) + g.scale
-    variance = max(p.energy, _ROUNDING * sums.square) / ((sums.bins - 3.0) * p.gauss)
-    # The tests see the residuals before the last step.
-    if abs(step) > _NEGLIGIBLE * size or step * step > _NEGLIGIBLE * variance:
+    size, energy = abs(p.tau) + g.scale, max(p.residuals.energy, _ROUNDING * sums.square)
+    noise = energy / (sums.bins - 3.0)
+    if abs(step) > _NEGLIGIBLE * size or not p.explained <= _SEEN * noise:
         return False
     if abs(step) <= _SMALL * size:
         return True
-    if not (
-        p.curvature > THRESHOLDS.least_curvature * p.gauss and variance < (_DETERMINED * size) ** 2
-    ):
-        return False
-    left = step * max(abs(step) / size, abs(1.0 - p.curvature / p.gauss))
-    return left * left <= _NEGLIGIBLE * _NEGLIGIBLE * variance
+    variance, left = noise / p.gauss, step * step / size
+    determined = _is_curved(p) and variance < (_DETERMINED * size) ** 2
+    return determined and left * left <= _NEGLIGIBLE * _NEGLIGIBLE * variance
 
 
 @inlined
-def find_extinction(g: Grid, s: Scratch, sums: Sums) -> Point:
-    """Return the linear fit of a loaded profile from where one linear step leads to the best."""
+def find_extinction(g: Grid, s: Scratch, sums: Sums) -> tuple[Point, float]:
+    """Return the linear fit of a loaded profile and tau, to which one Newton step leads from it."""
     tau = _start(g, s, sums)
+    fill_shape(tau, g, s.phi)
+    shapes, values = sum_shape(g, s, sums)
+    p: Point = fit_linear(tau, 0.0, 0.0, shapes, values, sums)
+    tau = _newton(p, g)
     for _ in range(_MOST_STEPS):
-        p: Point = evaluate(tau, g, s, sums)
+        step = tau - p.tau
+        level = p.level - sums.free * p.b * step * p.mean_slope
+        p = evaluate(tau, level, p.b * math.exp(2.0 * step * p.centroid), g, s, sums)
         tau = _newton(p, g)
         if _is_last(tau - p.tau, p, g, sums):
             break
-    return p
+    return p, tau
 
 
 @inlined
@@ -239,23 +253,22 @@ def _take_step(g: Grid, p: Point, row: Any) -> float:
 
 
 @inlined
-def _polish(g: Grid, p: Point, left: Left, sums: Sums, row: Any) -> None:
-    """Take the linear step that the residuals leave."""
-    level, shape, slope = left.level / sums.weight, left.shape / p.norm, left.slope / p.slope_norm
-    row.background += sums.free * (level - shape * p.mean_phi - slope * p.mean_slope)
-    row.amplitude += shape + 2.0 * p.centroid * slope
-    row.extinction = min(max(p.tau + slope / p.b, g.nodes[0]), g.nodes[-1])
-    row.misfit -= sums.free * left.level * level + left.shape * shape + left.slope * slope
+def _polish(p: Point, tau: float, free: float, row: Any) -> None:
+    """Take the last step."""
+    step = tau - p.tau
+    row.background -= free * p.b * step * p.mean_slope
+    row.amplitude += 2.0 * p.centroid * p.b * step
+    row.extinction = tau
+    row.misfit -= step * (2.0 * p.gradient - p.curvature * step)
 
 
 @inlined
-def _note_shift(g: Grid, p: Point, left: Left, weight: float, row: Any) -> None:
+def _note_shift(g: Grid, p: Point, level: float, b: float, row: Any) -> None:
     """Write by how much another linear step would change the parameters."""
-    shape, slope = left.shape / p.norm, left.slope / p.slope_norm
-    row.background_shift = left.level / weight - shape * p.mean_phi - slope * p.mean_slope
-    row.extinction_shift = slope / p.b
+    row.extinction_shift = p.gradient / p.gauss
+    row.background_shift = p.level - level - p.b * row.extinction_shift * p.mean_slope
     lever = 2.0 * (g.start / g.length + p.centroid)
-    row.amplitude_shift = shape / p.b + lever * row.extinction_shift
+    row.amplitude_shift = (p.b - b) / p.b + lever * row.extinction_shift
 
 
 @inlined
@@ -311,8 +324,8 @@ def _begin(
     unit, rounding, background = mode
     last = _last_usable(power, s)
     reference = np.float64(power[last]) if math.isnan(background) else background
-    bins, total, size = load(power, reference, s)
-    free = 1.0 if math.isnan(background) else 0.0
+    scale, free = 1.0, 1.0 if math.isnan(background) else 0.0
+    bins, size, total, place, value, square = load(power, reference, 1.0, g, s)
     row.bins = bins
     if bins < THRESHOLDS.fewest_solved_bins:
         row.status = EMPTY if last < 0 else TOO_SHORT
@@ -323,11 +336,13 @@ def _begin(
         row.background_variance = 1.0 / (total * unit)
         return reference, 1.0, Sums(bins, total, 0.0, 0.0, 0.0, free)
     row.status = FITTED
-    scale = power_of_two(size / bins)
-    place, value, square = rescale(1.0 / scale, g, s)
+    if not 1.0 / _SCALED < size / bins < _SCALED:
+        scale = power_of_two(size / bins)
+        bins, size, total, place, value, square = load(power, reference, 1.0 / scale, g, s)
     if rounding > 0.0:
         levels = reference * reference * total / bins
-        energy = levels + scale * scale * largest_energy(s.z, s)
+        weigh_squares(s)
+        energy = levels + scale * scale * largest_energy(s)
         row.rounding = 2.0 * rounding * rounding * unit * energy
     return reference, scale, Sums(bins, total, place, value, square, free)
 
@@ -335,17 +350,27 @@ def _begin(
 @inlined
 def _fit(g: Grid, s: Scratch, sums: Sums, kind: int, given: float, spacing: int, row: Any) -> None:
     """Fit a loaded profile."""
-    p = find_extinction(g, s, sums) if kind == BACKGROUND else evaluate(given, g, s, sums)
+    if kind == BACKGROUND:
+        sum_points(g, s)
+        p, tau = find_extinction(g, s, sums)
+        _describe(g, p, sums, row)
+        judge_residuals(s, p, sums, spacing, row)
+        if row.bounded == 0.0:
+            _polish(p, tau, sums.free, row)
+        return
+    p = evaluate(given, 0.0, 0.0, g, s, sums)
     _describe(g, p, sums, row)
+    level, b, tau = p.level, p.b, given
     if kind == PRIOR:
-        p = at(evaluate(_take_step(g, p, row), g, s, sums), row.background, row.amplitude)
-    left = judge_residuals(g, s, p, sums, spacing, row)
+        tau = _take_step(g, p, row)
+        level, b = row.background, row.amplitude
+    p = evaluate(tau, level, b, g, s, sums)
+    judge_residuals(s, p, sums, spacing, row)
     if kind == PRIOR:
-        _note_shift(g, p, left, sums.weight, row)
-    elif kind == EXTINCTION:
+        row.misfit += p.explained
+        _note_shift(g, p, level, b, row)
+    else:
         _describe_given(p, sums.weight, row)
-    elif row.bounded == 0.0:
-        _polish(g, p, left, sums, row)
 
 
 @inlined

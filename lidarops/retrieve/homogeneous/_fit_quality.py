@@ -25,11 +25,11 @@ from lidarops.retrieve.homogeneous._problem import (
     PathProblem,
 )
 from lidarops.retrieve.homogeneous._projection import (
-    Grid,
     Point,
+    Residuals,
     Scratch,
     Sums,
-    evaluate,
+    fit_linear,
     largest_energy,
 )
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
@@ -252,14 +252,6 @@ def _estimated_limits(
 _Triple = tuple[float, float, float]
 
 
-class Left(NamedTuple):
-    """Products of the residuals with level, shape and slope of the model."""
-
-    level: float
-    shape: float
-    slope: float
-
-
 class _TestShapes(NamedTuple):
     """Weighted products of two shapes that the model lacks with its orthogonal shapes.
 
@@ -275,21 +267,10 @@ class _TestShapes(NamedTuple):
     square_norm: float
 
 
-class _Residuals(NamedTuple):
-    """Weighted sums of the residuals, times powers of phi and of x."""
-
-    energy: float
-    level: float
-    shape: float
-    lever: float
-    bend: float
-    square: float
-
-
 @inlined
 def _test_shapes(p: Point, free: float) -> _TestShapes:
-    c, (q0, q1, q2), (p0, p1, p2, p3, p4) = p.centroid, p.sums_of_shape.phi, p.sums_of_shape.square
-    c0, c1, c2 = p.sums_of_shape.cube
+    c, (q0, q1, q2), (p0, p1, p2, p3, p4) = p.centroid, p.shapes.phi, p.shapes.square
+    c0, c1, c2 = p.shapes.cube
     mean_phi, mean_slope = free * p.mean_phi, free * p.mean_slope
     b0 = q2 - c * (2.0 * q1 - c * q0)
     b1 = p2 - c * (2.0 * p1 - c * p0)
@@ -299,35 +280,7 @@ def _test_shapes(p: Point, free: float) -> _TestShapes:
         (p0, c0 - mean_phi * p0, -2.0 * (c1 - c * c0) - mean_slope * p0),
         p4 - c * (4.0 * p3 - c * (6.0 * p2 - c * (4.0 * p1 - c * p0))),
         c2 - c * (2.0 * c1 - c * c0),
-        p.sums_of_shape.fourth,
-    )
-
-
-@summing
-def _sum_residuals(g: Grid, s: Scratch, p: Point) -> _Residuals:
-    """Fill the residuals, and return their sums."""
-    energy = level = shape = lever = bend = square = 0.0
-    for i in range(s.z.size):
-        phi, x = s.phi[i], g.x[i]
-        residual = s.z[i] - p.level - p.b * phi
-        s.residual[i] = residual
-        pull = s.w[i] * residual
-        energy += pull * residual
-        level += pull
-        pull *= phi
-        shape += pull
-        square += pull * phi
-        lever += pull * x
-        bend += pull * x * x
-    return _Residuals(energy, level, shape, lever, bend, square)
-
-
-@inlined
-def _left(r: _Residuals, p: Point, free: float) -> Left:
-    return Left(
-        r.level,
-        r.shape - free * p.mean_phi * r.level,
-        -2.0 * (r.lever - p.centroid * r.shape) - free * p.mean_slope * r.level,
+        p.shapes.fourth,
     )
 
 
@@ -361,14 +314,14 @@ def _remainder(product: float, a: _Triple, b: _Triple, per: _Triple) -> float:
 
 
 @inlined
-def _trend(t: _TestShapes, r: _Residuals, p: Point, w0: float) -> tuple[float, float]:
-    """Return the energy of the residuals in the two test shapes, and their number.
+def _trend(t: _TestShapes, p: Point, r: Residuals, w0: float) -> tuple[float, float]:
+    """Return the energy of residuals in the two test shapes, and their number.
 
     Both are orthogonalised against the model, and the square against the bent signal.
     """
     energy = count = shared = 0.0
-    left = _left(r, p, 1.0)
-    model = (left.level, left.shape, left.slope)
+    slope = -2.0 * (r.lever - p.centroid * r.shape) - p.mean_slope * r.level
+    model = (r.level, r.shape - p.mean_phi * r.level, slope)
     per = (1.0 / w0, 1.0 / p.norm, 1.0 / p.slope_norm)
     norm = _remainder(t.bent_norm, t.bent, t.bent, per)
     bent = r.bend - p.centroid * (2.0 * r.lever - p.centroid * r.shape)
@@ -399,28 +352,21 @@ def _describe_bend(t: _TestShapes, p: Point, w0: float, free: float, row: Any) -
 
 
 @inlined
-def judge_residuals(
-    g: Grid, s: Scratch, p: Point, sums: Sums, noise_spacing: int, row: Any
-) -> Left:
+def judge_residuals(s: Scratch, p: Point, sums: Sums, noise_spacing: int, row: Any) -> None:
     """Write the tests of the fit in units of the scaled noise, and the effect of a bent signal.
 
     A spacing of 0 stands for a known variance.
     """
     w0, free = sums.weight, sums.free
-    shapes = _test_shapes(p, free)
-    _describe_bend(shapes, p, w0, free, row)
-    residuals = _sum_residuals(g, s, p)
-    row.misfit = residuals.energy
-    row.largest = math.sqrt(largest_energy(s.residual, s))
-    if free > 0.0:
-        row.trend, row.trend_count = _trend(shapes, residuals, p, w0)
-    else:
-        # The test shapes are orthogonal to the background even where it is given.
-        full = evaluate(p.tau, g, s, Sums(sums.bins, w0, sums.place, sums.value, sums.square, 1.0))
-        shapes = _test_shapes(full, 1.0)
-        row.trend, row.trend_count = _trend(shapes, residuals, full, w0)
+    _describe_bend(_test_shapes(p, free), p, w0, free, row)
+    row.misfit = p.residuals.energy
+    row.largest = math.sqrt(largest_energy(s))
+    # The test shapes are orthogonal to the background even where it is given.
+    full = fit_linear(
+        p.tau, p.level, p.b, p.shapes, p.residuals,
+        Sums(sums.bins, w0, sums.place, sums.value, sums.square, 1.0),
+    )  # fmt: skip
+    row.trend, row.trend_count = _trend(_test_shapes(full, 1.0), full, p.residuals, w0)
     row.second_differences, row.difference_count = 0.0, 0.0
     if noise_spacing > 0:
         row.second_differences, row.difference_count = _second_differences(s, noise_spacing)
-    left: Left = _left(residuals, p, free)
-    return left

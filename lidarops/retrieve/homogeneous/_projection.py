@@ -24,8 +24,10 @@ NODES: Final = 24
 """Extinctions of the search."""
 _WIDEST_SCALE: Final = 0.3
 BLOCK: Final = 8
-"""Profiles are padded with unused bins to whole blocks, so that loops have no remainder. The search
-runs on the bins of the first block and on the sums of each block beyond."""
+"""Profiles are padded with unused bins to whole blocks, so that loops have no remainder."""
+_RUNS: Final = 16
+"""The search runs on the bins of the first block, and on sums over so many runs of blocks beyond.
+"""
 
 
 class Grid(NamedTuple):
@@ -43,9 +45,10 @@ class Grid(NamedTuple):
     scale: float
     shapes: Array
     """(2, node, bin): phi of every node, and its square."""
-    block_shapes: Array
-    """(2, node, point): phi of the bins of the first block and averaged over each block beyond, and
-    its square."""
+    point_shapes: Array
+    """(2, node, point): phi at the points of the search, and its square."""
+    width: int
+    """Bins of a run."""
     start: float
     """R_0, m."""
     length: float
@@ -96,8 +99,17 @@ class ShapeSums(NamedTuple):
     cube: tuple[float, float, float]
     fourth: float
     """Of phi^4."""
-    value: tuple[float, float, float]
-    """Of phi z."""
+
+
+class Residuals(NamedTuple):
+    """Weighted sums of residuals, times powers of phi and of x."""
+
+    energy: float
+    level: float
+    shape: float
+    lever: float
+    bend: float
+    square: float
 
 
 class Point(NamedTuple):
@@ -122,9 +134,11 @@ class Point(NamedTuple):
     gauss: float
     """The curvature but for what the residuals add."""
     curvature: float
-    energy: float
-    """Of the residuals, by differences: no better than the rounding of the squared values."""
-    sums_of_shape: ShapeSums
+    explained: float
+    """Energy by which the fit changed residuals about a former one."""
+    shapes: ShapeSums
+    residuals: Residuals
+    """Of the fit."""
 
 
 @lru_cache(maxsize=8)
@@ -155,11 +169,13 @@ def make_grid(ranges: bytes, bounds: tuple[float, float]) -> Grid:
     nodes = scale * np.sinh(np.linspace(first, last, NODES))
     nodes[0], nodes[-1] = lowest, highest
     envelope = (range_[0] / (range_[0] + length * x)) ** 2
-    firsts = [*range(BLOCK), *range(BLOCK, x.size, BLOCK)]
+    width = BLOCK * max(-(-(x.size - BLOCK) // (BLOCK * _RUNS)), 1)
+    firsts = [*range(BLOCK), *range(BLOCK, x.size, width)]
     real = (np.arange(x.size) < bins)[:, np.newaxis]
     shapes = np.exp(-2.0 * nodes * x[:, np.newaxis]) * envelope[:, np.newaxis] * real
     widths = np.maximum(np.add.reduceat(1.0 * real, firsts), 1.0)
-    block_shapes = np.add.reduceat(shapes, firsts) / widths
+    points = np.add.reduceat(shapes, firsts) / widths
+    points = np.pad(points, ((0, -len(points) % BLOCK), (0, 0)))
     return Grid(
         x=x,
         envelope=envelope,
@@ -169,7 +185,8 @@ def make_grid(ranges: bytes, bounds: tuple[float, float]) -> Grid:
         spacing=(last - first) / (NODES - 1),
         scale=scale,
         shapes=np.ascontiguousarray([shapes.T, shapes.T**2]),
-        block_shapes=np.ascontiguousarray([block_shapes.T, block_shapes.T**2]),
+        point_shapes=np.ascontiguousarray([points.T, points.T**2]),
+        width=width,
         start=float(range_[0]),
         length=length,
     )
@@ -181,7 +198,7 @@ def make_scratch(g: Grid) -> Scratch:
     n = g.x.size
     given, w, z, phi = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     residual, energy = np.zeros(n), np.zeros(n)
-    points, explained = np.zeros((2, g.block_shapes.shape[2])), np.zeros(NODES)
+    points, explained = np.zeros((2, g.point_shapes.shape[2])), np.zeros(NODES)
     return Scratch(
         given, w, z, phi, residual, energy, energy.view(np.int64), points, explained
     )  # fmt: skip
@@ -212,63 +229,69 @@ def weigh(variance: Array, s: Scratch) -> float:
 
 
 @summing
-def load(power: Any, reference: float, s: Scratch) -> tuple[float, float, float]:
-    """Copy a profile less its reference, 0 where not usable.
+def load(
+    power: Any, reference: float, factor: float, g: Grid, s: Scratch
+) -> tuple[float, float, float, float, float, float]:
+    """Copy a profile less its reference times a factor, 0 where not usable.
 
-    Returns the number of usable bins, their weight and the sum of their absolute values.
+    Returns the number of usable bins, the sum of their absolute values, their weight, and the
+    weighted sums of x, of the values and of their squares.
     """
-    count = total = size = 0.0
+    count = size = total = place = values = squares = 0.0
     for i in range(power.size):
         value = np.float64(power[i])
         usable = (abs(value) < HUGE) & (s.given[i] > 0.0)
-        s.w[i] = s.given[i] if usable else 0.0
-        s.z[i] = value - reference if usable else 0.0
+        w = s.given[i] if usable else 0.0
+        z = (value - reference) * factor if usable else 0.0
+        s.w[i], s.z[i] = w, z
         count += 1.0 if usable else 0.0
-        total += s.w[i]
-        size += abs(s.z[i])
-    return count, total, size
+        size += abs(z)
+        total += w
+        place += w * g.x[i]
+        values += w * z
+        squares += w * z * z
+    return count, size, total, place, values, squares
 
 
 @summing
-def rescale(factor: float, g: Grid, s: Scratch) -> tuple[float, float, float]:
-    """Scale a profile, and fill the points of the search.
+def _sum_run(w: Array, z: Array) -> tuple[float, float]:
+    weight = value = 0.0
+    for i in range(w.size):
+        weight += w[i]
+        value += w[i] * z[i]
+    return weight, value
 
-    Returns the weighted sums of x, of the values and of their squares.
-    """
-    place = total = squares = 0.0
-    for i in range(s.z.size):
-        s.z[i] *= factor
-        weighted = s.w[i] * s.z[i]
-        place += s.w[i] * g.x[i]
-        total += weighted
-        squares += weighted * s.z[i]
-    for i in range(BLOCK):
-        s.points[0, i], s.points[1, i] = s.w[i], s.w[i] * s.z[i]
+
+@inlined
+def sum_points(g: Grid, s: Scratch) -> None:
+    """Fill the points of the search."""
+    for k in range(BLOCK):
+        s.points[0, k], s.points[1, k] = s.w[k], s.w[k] * s.z[k]
     for k in range(BLOCK, s.points.shape[1]):
-        first = BLOCK * (k - BLOCK + 1)
-        weight = value = 0.0
-        for i in range(first, first + BLOCK):
-            weight += s.w[i]
-            value += s.w[i] * s.z[i]
-        s.points[0, k], s.points[1, k] = weight, value
-    return place, total, squares
+        run = slice(BLOCK + (k - BLOCK) * g.width, BLOCK + (k - BLOCK + 1) * g.width)
+        s.points[0, k], s.points[1, k] = _sum_run(s.w[run], s.z[run])
 
 
 @summing
-def largest_energy(values: Array, s: Scratch) -> float:
-    """Return the largest weighted square of an array."""
-    for i in range(values.size):
-        s.energy[i] = s.w[i] * values[i] * values[i]
+def weigh_squares(s: Scratch) -> None:
+    """Fill the weighted squares of the values."""
+    for i in range(s.z.size):
+        s.energy[i] = s.w[i] * s.z[i] * s.z[i]
+
+
+@summing
+def largest_energy(s: Scratch) -> float:
+    """Return the largest weighted square."""
     most = np.int64(0)
     # Floats that are not negative are ordered as their bits, whose maximum vectorises.
-    for i in range(values.size):
+    for i in range(s.energy.size):
         most = max(most, s.energy_bits[i])
     s.energy_bits[0] = most
     return float(s.energy[0])
 
 
 @inlined
-def _fill_shape(tau: float, g: Grid, phi: Array) -> None:
+def fill_shape(tau: float, g: Grid, phi: Array) -> None:
     """Fill the shape of a tau, over blocks of an even spacing by the decay within a block."""
     if g.step == 0.0:
         for i in range(phi.size):
@@ -286,11 +309,38 @@ def _fill_shape(tau: float, g: Grid, phi: Array) -> None:
 
 
 @summing
-def _sum_shape(g: Grid, s: Scratch) -> ShapeSums:
-    """Return the sums of the shape over all bins."""
-    q0 = q1 = q2 = p0 = p1 = p2 = p3 = p4 = c0 = c1 = c2 = f0 = y0 = y1 = y2 = 0.0
+def sum_shape(g: Grid, s: Scratch, sums: Sums) -> tuple[ShapeSums, Residuals]:
+    """Return what the first step needs of `_sum_bins` about zero."""
+    q0 = q1 = q2 = p0 = p1 = p2 = y0 = y1 = y2 = 0.0
     for i in range(s.phi.size):
-        x, phi, z = g.x[i], s.phi[i], s.z[i]
+        x, phi = g.x[i], s.phi[i]
+        xx, shape = x * x, s.w[i] * phi
+        square, pull = shape * phi, shape * s.z[i]
+        q0 += shape
+        q1 += shape * x
+        q2 += shape * xx
+        p0 += square
+        p1 += square * x
+        p2 += square * xx
+        y0 += pull
+        y1 += pull * x
+        y2 += pull * xx
+    shapes = ShapeSums((q0, q1, q2), (p0, p1, p2, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+    return shapes, Residuals(sums.square, sums.value, y0, y1, y2, 0.0)
+
+
+@summing
+def _sum_bins(level: float, b: float, g: Grid, s: Scratch) -> tuple[ShapeSums, Residuals]:
+    """Fill residuals and their weighted squares; return their sums and those of the shape."""
+    q0 = q1 = q2 = p0 = p1 = p2 = p3 = p4 = c0 = c1 = c2 = f0 = 0.0
+    energy = r0 = r1 = y0 = y1 = y2 = 0.0
+    for i in range(s.phi.size):
+        x, phi = g.x[i], s.phi[i]
+        residual = s.z[i] - level - b * phi
+        weighted = s.w[i] * residual
+        s.residual[i], s.energy[i] = residual, weighted * residual
+        energy += weighted * residual
+        r0 += weighted
         shape = s.w[i] * phi
         square = shape * phi
         cube = square * phi
@@ -308,47 +358,57 @@ def _sum_shape(g: Grid, s: Scratch) -> ShapeSums:
         c1 += cube * x
         c2 += cube * xx
         f0 += cube * phi
-        pull = shape * z
+        pull = shape * residual
+        r1 += pull * phi
         y0 += pull
         y1 += pull * x
         y2 += pull * xx
-    return ShapeSums((q0, q1, q2), (p0, p1, p2, p3, p4), (c0, c1, c2), f0, (y0, y1, y2))
+    shapes = ShapeSums((q0, q1, q2), (p0, p1, p2, p3, p4), (c0, c1, c2), f0)
+    return shapes, Residuals(energy, r0, y0, y1, y2, r1)
 
 
 @inlined
-def evaluate(tau: float, g: Grid, s: Scratch, sums: Sums) -> Point:
-    """Return the linear fit at one extinction, from one pass over the bins."""
+def evaluate(tau: float, level: float, b: float, g: Grid, s: Scratch, sums: Sums) -> Point:
+    """Return the linear fit at one extinction, from one pass over the bins.
+
+    The residuals are those about a given background and amplitude, of which the fit is a change.
+    """
+    fill_shape(tau, g, s.phi)
+    shapes, residuals = _sum_bins(level, b, g, s)
+    p: Point = fit_linear(tau, level, b, shapes, residuals, sums)
+    return p
+
+
+@inlined
+def fit_linear(
+    tau: float, level: float, b: float, shapes: ShapeSums, r: Residuals, sums: Sums
+) -> Point:
+    """Return the linear fit by the sums of residuals about a given background and amplitude."""
     w0, free = sums.weight, sums.free
-    _fill_shape(tau, g, s.phi)
-    of_shape = _sum_shape(g, s)
-    q0, q1, _ = of_shape.phi
-    p0, p1, p2, _, _ = of_shape.square
-    y0, y1, y2 = of_shape.value
-    mean_phi, mean_z = q0 / w0, free * sums.value / w0
+    q0, q1, q2 = shapes.phi
+    p0, p1, p2, _, _ = shapes.square
+    mean_phi, mean = q0 / w0, free * r.level / w0
     norm = p0 - free * q0 * mean_phi
     centroid = (p1 - free * mean_phi * q1) / norm
     mean_slope = -2.0 * (q1 - centroid * q0) / w0
-    along = y0 - mean_z * q0
-    b = along / norm
-    # Residuals have no product with level and shape.
-    level = mean_z - free * b * mean_phi
-    first = y1 - level * q1 - b * p1
-    second = y2 - level * of_shape.phi[2] - b * p2
-    rt, rh = -2.0 * first, 4.0 * (second - 2.0 * centroid * first)
+    along = r.shape - mean * q0
+    step = along / norm
+    rise = mean - free * step * mean_phi
+    left = Residuals(
+        r.energy - mean * r.level - step * along,
+        r.level - rise * w0 - step * q0,
+        r.shape - rise * q0 - step * p0,
+        r.lever - rise * q1 - step * p1,
+        r.bend - rise * q2 - step * p2,
+        r.square - rise * p0 - step * shapes.cube[0],
+    )
+    b += step
+    # The residuals of the fit have no product with level and shape.
+    rt, rh = -2.0 * left.lever, 4.0 * (left.bend - 2.0 * centroid * left.lever)
     tt = 4.0 * (p2 - centroid * (2.0 * p1 - centroid * p0)) - free * w0 * mean_slope * mean_slope
-    energy = sums.square - mean_z * sums.value - b * along
     gauss = b * b * tt
     curvature = gauss - rt * rt / norm - b * rh
     return Point(
-        tau, level, b, mean_phi, mean_slope, centroid, norm, tt,
-        b * rt, gauss, curvature, energy, of_shape,
-    )  # fmt: skip
-
-
-@inlined
-def at(p: Point, level: float, b: float) -> Point:
-    """Return a point with another background and amplitude."""
-    return Point(
-        p.tau, level, b, p.mean_phi, p.mean_slope, p.centroid, p.norm, p.slope_norm,
-        p.gradient, p.gauss, p.curvature, p.energy, p.sums_of_shape,
+        tau, level + rise, b, mean_phi, mean_slope, centroid, norm, tt,
+        b * rt, gauss, curvature, r.energy - left.energy, shapes, left,
     )  # fmt: skip
