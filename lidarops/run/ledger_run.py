@@ -10,7 +10,7 @@ import secrets
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
@@ -116,7 +116,7 @@ class LedgerRun:
         self._campaign, self._store, self._lock = campaign, store, lock
         self._output = Path(campaign.output)
         self._journals = journal
-        self._keeps = campaign.superseded == "keep"
+        self._keeps = campaign.superseded != "remove"
         """Whether replaced versions of products are kept."""
         self._journal: Journal | None = None
         self._run: Run | None = None
@@ -248,6 +248,8 @@ class LedgerRun:
                 error = f"{judged.failure.error} (not tried again, because nothing has changed)"
                 outcome = judged.failure.outcome(judged.scene, judged.plan)
                 self._outcomes[judged.scene.id] = replace(outcome, error=error)
+        if isinstance(self._campaign.superseded, timedelta):
+            product_files.remove_kept(self._output, self._campaign.superseded)
         aside = acknowledged(self._campaign, (*self._store.refused(), *told.set_aside.values()))
         stated = {file.path for outcome in self._outcomes.values() for file in outcome.refused}
         listed = dict(islice(told.empty_scenes.items(), MOST_EMPTY_SCENES))
