@@ -22,6 +22,7 @@ from flows.start import (
 )
 from lidarops.campaign.model import load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
+from lidarops.catalog.raw_files import acknowledged
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import Store
 from lidarops.cli import options
@@ -57,7 +58,7 @@ def catalog(
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     summary = update_catalog(settings, wait=wait, workers=workers)
     with Store(settings.catalog_url, settings.name) as store:
-        refused = store.refused()
+        refused = acknowledged(settings, store.refused())
     get_run_logger().info("catalog of %s: %s", settings.name, asdict(summary))
     create_table_artifact(
         key=f"{settings.name.lower()}-refused",

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated
 from uuid import UUID
 
@@ -136,6 +137,9 @@ def main(
     start: Annotated[
         float, typer.Option(min=60, help="Seconds that a claimed run may take to start.")
     ] = 600.0,
+    sign_of_life: Annotated[
+        Path | None, typer.Option(help="File that is touched after each check, for a probe.")
+    ] = None,
 ) -> None:
     """End runs whose process is dead, once or repeatedly."""
     while True:
@@ -148,6 +152,8 @@ def main(
             # It may be restarting; repeated maintenance must survive that.
             if every is None:
                 raise typer.Exit(UNAVAILABLE) from error
+        if sign_of_life is not None:
+            sign_of_life.touch()
         if every is None:
             return
         time.sleep(every)

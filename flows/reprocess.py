@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import base64
 import time
+from collections import Counter
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -52,8 +53,9 @@ from lidarops.catalog.product_files import publish_products
 from lidarops.catalog.store import RunStatus
 from lidarops.cli import options
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
+from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
-from lidarops.records import RunRecord, SceneOutcome
+from lidarops.records import ACKNOWLEDGED, RunRecord, SceneOutcome
 from lidarops.reports import run_tables
 from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
@@ -317,10 +319,14 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
         "files refused": {
             granule.path: granule.reason
             for granule in refused_files(campaign, result)
-            if granule.path not in result.set_aside
+            if granule.path not in result.set_aside and not granule.is_expected
         },
         "scenes without product": result.empty_scenes,
-        "good files in no scene": result.set_aside,
+        "good files in no scene": {
+            path: reason
+            for path, reason in result.set_aside.items()
+            if not reason.startswith(ACKNOWLEDGED)
+        },
         "requested channels in no file": {
             f"{request.channel} of {request.instrument}, for {request.requested_by}": request.reason
             for request in result.findings.unmet
@@ -398,6 +404,11 @@ def main(
     if result.record is None:
         typer.echo("nothing to do")
     else:
+        made = counted(sum(len(scene.products) for scene in result.scenes), "product")
+        typer.echo(f"made:     {made} of {counted(len(result.scenes), 'scene')}")
+        known = [file.reason for file in refused_files(settings, result) if file.is_expected]
+        for why, files in Counter(reason.partition(":")[0] for reason in known).items():
+            typer.echo(f"not used: {counted(files, 'file')}, {why}")
         typer.echo(f"products: {result.record.products}\nreport:   {built}")
     raise typer.Exit(1 if result.has_failures else 0)
 

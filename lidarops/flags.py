@@ -6,7 +6,7 @@ places are the same in all kinds. A retrieval has an enum of its own bits beside
 `FIRST_OWN` on, which the retrievals of other kinds use for other bits. `Flags` states which bits a
 kind of product can carry (``products/KIND/variables.py``). The CF flag attributes follow from that.
 
-Readers of files go by the ``flag_masks`` and ``flag_meanings`` of the file
+Readers of files go by ``flag_masks``, ``flag_meanings`` and ``flag_assessments`` of the file
 (`lidarops.netcdf.stored_flags`).
 """
 
@@ -31,6 +31,11 @@ class Severity(IntEnum):
     as the value."""
     REJECT = 2
     """Do not use: the value does not represent the named quantity."""
+
+    @property
+    def assessment(self) -> str:
+        """Word in ``flag_assessments`` of a file, by the data standard of ARM."""
+        return "Bad" if self is Severity.REJECT else "Indeterminate"
 
 
 class Meaning(NamedTuple):

@@ -119,6 +119,8 @@ UNKNOWN_FORMAT: Final = "is of no known raw format"
 """Start of the reason if no installed format recognises a file."""
 INVALID: Final = "is of a period that the facts declare invalid"
 """Start of the reason if a campaign wants no product of a file."""
+ACKNOWLEDGED: Final = "acknowledged"
+"""Start of the reason if a campaign knows that a file is refused, or belongs to no scene."""
 FEWEST_ALIKE: Final = 3
 """Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 LONGEST_REASON: Final = 300
@@ -177,6 +179,11 @@ class Granule(Header):
     def is_declared_invalid(self) -> bool:
         """Whether the campaign refuses the file, not its content."""
         return self.reason.startswith(INVALID)
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the campaign says that the file is not used."""
+        return self.reason.startswith((INVALID, ACKNOWLEDGED))
 
 
 # An archive has few layouts.
@@ -750,11 +757,12 @@ class RunRecord:
     def failed(self) -> bool:
         """Whether a file was refused, a scene failed or is unusable, or the findings failed.
 
-        Files that the campaign declares invalid do not count.
+        Files that the campaign declares invalid or acknowledges do not count.
         """
         return (
             bool(self.empty_scenes or self.cut_short)
-            or not all(granule.is_declared_invalid for granule in self.refused)
+            or not all(granule.is_expected for granule in self.refused)
             or self.findings.failed
-            or any(scene.error or scene.refused or scene.unusable for scene in self.scenes)
+            or any(scene.error or scene.unusable for scene in self.scenes)
+            or not all(granule.is_expected for scene in self.scenes for granule in scene.refused)
         )

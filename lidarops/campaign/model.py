@@ -572,8 +572,10 @@ class Campaign(SettingsModel):
         default=None,
         description="SQLAlchemy URL of catalog and ledger; by default a file in the output folder",
     )
-    superseded: Literal["keep", "remove"] = Field(
-        default="remove", description="whether products that a rerun replaces are kept or removed"
+    superseded: Interval | Literal["keep", "remove"] = Field(
+        default=timedelta(days=30),
+        description="how long products that a rerun replaces are kept for `lidarops compare`;"
+        " 'keep': for ever; 'remove': not at all",
     )
     all_steps: bool = Field(
         default=False,

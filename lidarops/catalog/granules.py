@@ -17,7 +17,6 @@ from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
 from lidarops.catalog.raw_files import NO_NOTES, GranuleRow
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
-    INVALID,
     ChannelLayout,
     DetectionMode,
     FileNote,
@@ -200,11 +199,6 @@ class Granules(Database):
         """Return the number of granules."""
         query = sa.select(sa.func.count()).where(_C.campaign == self.campaign, *conditions)
         return int(self.read(query, tuple)[0][0])
-
-    def count_refused(self) -> int:
-        """Return the number of refused granules that the campaign does not declare invalid."""
-        refused = _C.status == Status.REFUSED.value
-        return self.count(refused, _C.reason.not_like(f"{INVALID}%"))
 
     def day_sums(self) -> list[DaySum]:
         """Return the sums of the stamps of good granules by day and role."""

@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import timedelta
+from glob import escape
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +22,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.lock import Lock, process_start
 from lidarops.catalog.raw_files import Source
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError, UnavailableError
+from lidarops.errors import CatalogError, ProductError, UnavailableError
 from lidarops.records import Role
 from lidarops.system.files import MANIFEST, SITE, product_paths, sha256_of
 from lidarops.system.stores import Published, RemoteStore
@@ -98,6 +100,38 @@ def drop(output: Path, product: str, sha256: str) -> None:
     """Remove a kept version that was not replaced after all."""
     with suppress(OSError):
         _kept(output, product, sha256).unlink(missing_ok=True)
+
+
+def remove_kept(output: Path, after: timedelta) -> None:
+    """Remove the kept versions that were replaced longer ago than `after`."""
+    for path in (output / FOLDER).rglob("*.nc"):
+        with suppress(OSError):
+            # The status of the file changed when its other name was given to the new version.
+            if time.time() - path.stat().st_ctime > after.total_seconds():
+                path.unlink()
+
+
+def last_kept(product: Path) -> Path:
+    """Return the file of the version of a product that was replaced last.
+
+    Raises
+    ------
+    ProductError
+        If none is kept.
+    """
+    path = product.resolve()
+    root = next((folder for folder in path.parents if folder.name == "products"), path.parent)
+    folder = root.parent / FOLDER / path.parent.relative_to(root)
+    kept = folder.glob(f"{escape(path.stem)}.{'[0-9a-f]' * 12}.nc")
+    found = max(kept, key=lambda file: file.stat().st_ctime_ns, default=None)
+    if found is None:
+        raise ProductError(
+            "was not replaced, or the version before is not kept",
+            file=product,
+            remedy="name two files, or set superseded in the campaign file before a rerun",
+            wrong_use=True,
+        )
+    return found
 
 
 def sweep(output: Path, store: Store) -> bool:

@@ -11,8 +11,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +22,7 @@ from lidarops.errors import RawFormatError, UnavailableError
 from lidarops.raw.formats import parse_raw_header, read_start, time_in_path
 from lidarops.raw.header import TIME_REMEDY, RawHeader
 from lidarops.records import (
+    ACKNOWLEDGED,
     INVALID,
     UNKNOWN_FORMAT,
     UNREADABLE,
@@ -63,6 +64,32 @@ _ROUNDING_OF_ANGLES: Final = 1.0
 def printable(path: str) -> str:
     """Return a path that can be stored and shown: names may hold bytes that are not UTF-8."""
     return path if path.isascii() else path.encode("utf-8", "backslashreplace").decode()
+
+
+def acknowledged(campaign: Campaign, granules: Iterable[Granule]) -> list[Granule]:
+    """Return granules that are not used; where the campaign acknowledges it, the reason says so."""
+    unused = [*granules]
+    reasons = acknowledged_reasons(campaign, {granule.path: granule.reason for granule in unused})
+    return [replace(granule, reason=reasons[granule.path]) for granule in unused]
+
+
+def acknowledged_reasons(campaign: Campaign, reasons: Mapping[str, str]) -> dict[str, str]:
+    """Return path -> why the file is not used, after what the campaign acknowledges of it."""
+    entries = [
+        (path_matcher(entry.what), f"{ACKNOWLEDGED} ({entry.reason}): ")
+        for entry in campaign.acknowledged
+        if entry.holds
+    ]
+    return {
+        path: next((words for matches, words in entries if matches(path)), "") + reason
+        for path, reason in reasons.items()
+    }
+
+
+def path_matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
+    """Return a function that tells whether a path matches one of some patterns."""
+    expressions = [path_pattern(pattern) for pattern in patterns]
+    return lambda path: any(expression.match(path) for expression in expressions)
 
 
 def path_pattern(pattern: str) -> re.Pattern[str]:

@@ -20,6 +20,7 @@ from lidarops.catalog.raw_files import (
     RemoteSource,
     Source,
     UnreadFile,
+    acknowledged,
     path_pattern,
     printable,
     read_row,
@@ -161,6 +162,7 @@ class _Scan:
         before_write: Callable[[], object] | None,
     ) -> None:
         self.source = Source.of(campaign.archive)
+        self._campaign = campaign
         self._archive = campaign.archive
         self._store = store
         self._progress = progress or (lambda _: None)
@@ -300,7 +302,10 @@ class _Scan:
             changed=self._changed,
             unchanged=self._files - added - self._changed - len(moved),
             vanished=len(self._gone) - len(moved),
-            refused=self._store.count_refused(),
+            refused=sum(
+                not granule.is_expected
+                for granule in acknowledged(self._campaign, self._store.refused())
+            ),
             moved=len(moved),
             idle_patterns=tuple(
                 IdlePattern(

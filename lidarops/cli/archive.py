@@ -100,6 +100,7 @@ def catalog(
 
     Example: lidarops catalog catalogs/demo.yaml --rebuild
     """
+    from lidarops.catalog.raw_files import acknowledged
     from lidarops.catalog.store import Store
     from lidarops.records import Findings
     from lidarops.run.archive import update_catalog
@@ -114,7 +115,7 @@ def catalog(
 
             rebuilt = rebuild_ledger(settings, wait=wait, progress=bar.advance)
     with Store(settings.catalog_url, settings.name) as store:
-        refused = store.refused()
+        refused = acknowledged(settings, store.refused())
         own = settings.instruments
         notes = (*store.file_notes(own), *ChannelNames(settings, store).notes(own))
     findings = Findings(file_notes=notes, idle_patterns=summary.idle_patterns)
@@ -128,11 +129,12 @@ def catalog(
         typer.echo(json.dumps(document, indent=2))
     else:
         show_tables([_refused_table(refused), *finding_tables(findings)])
-        declared = sum(granule.is_declared_invalid for granule in refused)
+        declared = sum(granule.is_expected for granule in refused)
         say(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
             f" {summary.moved} moved, {summary.unchanged} unchanged, {summary.vanished} vanished,"
-            f" {summary.refused} refused" + (f", {declared} declared invalid" if declared else "")
+            f" {summary.refused} refused"
+            + (f", {declared} declared invalid or acknowledged" if declared else "")
         )
         if rebuilt is not None:
             show_rows("Not entered in the ledger", ("file", "reason"), rebuilt.problems.items())

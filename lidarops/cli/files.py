@@ -14,6 +14,7 @@ from lidarops.cli import options
 from lidarops.cli.app import (
     command,
     exit_with_status,
+    from_here,
     progress_bar,
     say,
     show_rows,
@@ -23,6 +24,7 @@ from lidarops.errors import LidarOpsError
 
 if TYPE_CHECKING:
     from lidarops.catalog.store import Run
+    from lidarops.figures.panels import Figure
 
 
 @command()
@@ -87,19 +89,24 @@ def plot(
     Example: lidarops plot demo/raw/coast/h2492106.010000 -o h2492106.svg
     """
     from lidarops.reports import plotting
+
+    figures = plotting.draw_file(file, plotting.selection(variable, time, range_, altitude))
+    _write_figures(figures, out or Path(f"{file.name.removesuffix('.nc')}.png"))
+
+
+def _write_figures(figures: tuple[Figure, ...], out: Path, *, quiet: bool = False) -> None:
+    from lidarops.figures.stills import still
+    from lidarops.reports import plotting
     from lidarops.system.files import write_atomically
 
-    if out is not None and out.suffix not in plotting.TYPES:
+    if out.suffix not in plotting.TYPES:
         raise LidarOpsError(f"is none of {', '.join(plotting.TYPES)}", file=out, wrong_use=True)
-    figures = plotting.draw_file(file, plotting.selection(variable, time, range_, altitude))
-    from lidarops.figures.stills import still
-
-    out = out or Path(f"{file.name.removesuffix('.nc')}.png")
     out.parent.mkdir(parents=True, exist_ok=True)
     for number, figure in enumerate(figures, 1):
         target = out if len(figures) == 1 else out.with_stem(f"{out.stem}_{number}")
         write_atomically(target, still(figure, out.suffix))
-        say(f"{target}: {figure.caption}")
+        if not quiet:
+            say(f"{target}: {figure.caption}")
 
 
 @command()
@@ -137,28 +144,47 @@ def reproduce(
 
 @command()
 def compare(
-    old: Annotated[Path, typer.Argument(help="A product.", metavar="OLD")],
-    new: Annotated[Path, typer.Argument(help="Another version of it.", metavar="NEW")],
+    old: Annotated[Path, typer.Argument(help="A product.", metavar="PRODUCT")],
+    new: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Another version of it; else the one that it replaced is compared with it.",
+            metavar="NEW",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="PNG, SVG or PDF file of mean profiles.")
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Show how a product differs from another version of it, and why. Exit code 0 if it does not.
 
     none: the same values and texts. minor: other texts or flags, or values within a tenth of their
-    stated errors. major: all else.
+    stated errors. major: all else. Quantities differ by what is listed, where both are usable.
 
-    Example: lidarops compare OLD.nc NEW.nc
+    Example: lidarops compare PRODUCT.nc -o change.png
     """
+    from lidarops.catalog.product_files import last_kept
     from lidarops.figures.wording import change_in_words
-    from lidarops.netcdf.comparison import compare_products
+    from lidarops.netcdf.comparison import compare_products, quantity_changes
     from lidarops.records import Grade
 
-    change = compare_products(old, new)
+    old, new = (last_kept(old), old) if new is None else (old, new)
+    change, quantities = compare_products(old, new), quantity_changes(old, new)
     if as_json:
-        typer.echo(json.dumps(change.as_dict(), indent=2))
+        listed = [row._asdict() for row in quantities]
+        typer.echo(json.dumps({**change.as_dict(), "quantities": listed}, indent=2))
     else:
         say(f"{change.grade.value}: {change_in_words(change)}")
         for cause in change.causes:
             say(f"  {cause}")
+        columns = ("quantity", "unit", "values", "mean before", "mean change", "largest change")
+        rows = ((*row[:3], *(f"{number:.3g}" for number in row[3:])) for row in quantities)
+        show_rows(f"{new.name}, against {from_here(old)}", columns, rows)
+    if out is not None:
+        from lidarops.reports import plotting
+
+        _write_figures(plotting.draw_change(old, new), out, quiet=as_json)
     exit_with_status(failed=change.grade is not Grade.NONE)
 
 

@@ -102,14 +102,15 @@ def _plan(
     wait: float,
     as_json: bool,
 ) -> None:
+    from lidarops.catalog.raw_files import acknowledged
     from lidarops.catalog.store import Store
     from lidarops.run.archive import assess, earlier_problems, survey
     from lidarops.run.options import selects_no_scene
 
     findings = survey(settings, selection=selection, wait=wait)
     with Store(settings.catalog_url, settings.name) as store:
-        refused = store.refused()
-    unexpected = not all(granule.is_declared_invalid for granule in refused)
+        refused = acknowledged(settings, store.refused())
+    unexpected = not all(granule.is_expected for granule in refused)
     judgements = assess(settings, selection=selection, everything=not stale, update=False)
     earlier = earlier_problems(settings, selection)
     scenes = []

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -126,6 +126,49 @@ def compare_products(old: Path, new: Path) -> Change:
         flags=sum(d.flags for d in differences),
         moved=moved,
     )
+
+
+class QuantityChange(NamedTuple):
+    """How a quantity differs where both versions have a usable value, in its unit."""
+
+    quantity: str
+    unit: str
+    values: int
+    before: float
+    """Mean."""
+    change: float
+    """Mean of the differences, new less old."""
+    largest: float
+    """Difference of the largest size."""
+
+
+def quantity_changes(old: Path, new: Path) -> list[QuantityChange]:
+    """Return how each quantity with a standard error differs from that of an older product.
+
+    Raises
+    ------
+    ProductError
+        If a file cannot be read.
+    """
+    found = []
+    with _opened(old) as before, _opened(new) as after:
+        names = [name for name in _measured(before) if f"{name}{_ERROR}" in before]
+        for name in (name for name in names if name in after and "time" in before[name].dims):
+            pair = before[name].variable, after[name].variable
+            if pair[0].shape != pair[1].shape or not pair[0].size:
+                continue
+            values, total, moved, largest = 0, 0.0, 0.0, 0.0
+            for part in parts(pair[0], _BLOCK):
+                both = _stated(before, name, part) & _stated(after, name, part)
+                then, now = (_numbers(variable, part)[both] for variable in pair)
+                change = now - then
+                values += then.size
+                total, moved = total + float(then.sum()), moved + float(change.sum())
+                ends = float(change.min(initial=0.0)), float(change.max(initial=0.0))
+                largest = max(largest, *ends, key=abs)
+            unit, of = str(pair[0].attrs.get("units", "")), max(values, 1)
+            found.append(QuantityChange(name, unit, values, total / of, moved / of, largest))
+    return found
 
 
 def _opened(file: Path) -> AbstractContextManager[xr.Dataset]:

@@ -1,4 +1,4 @@
-"""Quality bits of a file, by the ``flag_masks`` and ``flag_meanings`` that the file states.
+"""Quality bits of a file, by the flag attributes that the file states: places, words, assessments.
 
 Files written by other versions may have a bit at another place than its kind has now, so a number
 alone has no meaning. Who goes by the places of now refuses such a file.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Flags, Quality, Severity
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.variables import QUALITY_FLAG, judging, summary_of
+from lidarops.netcdf.variables import QUALITY_FLAG, judging
 from lidarops.records import Verdicts
 
 Values = NDArray[Any]
@@ -34,7 +34,7 @@ class StoredBit:
     word: str
     """As in ``flag_meanings``; such as ``bit_20`` where the file does not name it."""
     severity: Severity | None
-    """None where this version does not know the bit."""
+    """None where neither the file states it nor this version knows the bit."""
     description: str
 
     @property
@@ -51,41 +51,26 @@ def stored_bits(attributes: Mapping[str, Any], kind: str | None) -> tuple[Stored
     attributes : mapping
         Of ``quality_flag``. Without ``flag_masks``, the places are those of now.
     kind : str or None
-        Kind of product. Without a known kind, severity is known of shared bits only.
+        Kind of product. Without a known kind, severity is known of shared bits, and of those that
+        the file assesses.
     """
     flags = _flags_of_known_kind(kind)
     meanings = _meanings(attributes)
     if meanings is None:
         meanings = {bit.word: int(bit) for bit in flags or Quality}
-    named = [_bit(word, mask, flags) for word, mask in meanings.items()]
+    words = str(attributes.get("flag_assessments", "")).split()
+    if len(words) not in {0, len(meanings)}:
+        raise ProductError("has not one flag_assessments for each bit", field=QUALITY_FLAG)
+    assessments = dict(zip(meanings, words, strict=False))
+    named = [_bit(word, mask, flags, assessments.get(word)) for word, mask in meanings.items()]
     stated = sum({bit.mask for bit in named})
     unnamed = (1 << place for place in range(PLACES) if not stated >> place & 1)
     return (*named, *(_bit(f"bit_{places(mask)}", mask, None) for mask in unnamed))
 
 
 def bits_of(product: xr.Dataset, name: str = QUALITY_FLAG) -> tuple[StoredBit, ...]:
-    """Return all bits of a variable of flags of a product, as `stored_bits`.
-
-    Of a kind that is not known, a bit that a value with another ``usable`` than the worst carries
-    does not reject.
-    """
-    kind = product.attrs.get("lidarops_kind")
-    bits, summary = stored_bits(product[name].attrs, kind), summary_of(name)
-    # A usable of other dimensions says nothing of single flags.
-    if summary not in product or product[summary].dims != product[name].dims:
-        return bits
-    if kind in set(kinds()):
-        return bits
-    kept = 0
-    for flags, usable in zip(
-        *(blocks(product[one], READ_VALUES) for one in (name, summary)), strict=True
-    ):
-        accepted = quality_bits(flags)[usable.values < Severity.REJECT]
-        kept |= int(np.bitwise_or.reduce(accepted, axis=None))
-    return tuple(
-        replace(bit, severity=Severity.CARE) if bit.severity is None and bit.mask & kept else bit
-        for bit in bits
-    )
+    """Return all bits of a variable of flags of a product, as `stored_bits`."""
+    return stored_bits(product[name].attrs, product.attrs.get("lidarops_kind"))
 
 
 def flags_names(product: xr.Dataset) -> list[str]:
@@ -227,10 +212,10 @@ def _meanings(attributes: Mapping[str, Any]) -> dict[str, int] | None:
     return dict(zip(words, masks, strict=True))
 
 
-def _bit(word: str, mask: int, flags: Flags | None) -> StoredBit:
-    bit = next(
-        (bit for bit in (Quality if flags is None else flags.bits) if bit.word == word), None
-    )
+def _bit(word: str, mask: int, flags: Flags | None, assessment: str | None = None) -> StoredBit:
+    stated = next((found for found in Severity if found.assessment == assessment), None)
+    known = Quality if flags is None else flags.bits
+    bit = next((bit for bit in known if bit.word == word), None)
     if bit is None:
-        return StoredBit(mask, word, None, "bit unknown to this version of lidarops")
-    return StoredBit(mask, word, bit.severity, bit.description)
+        return StoredBit(mask, word, stated, "bit unknown to this version of lidarops")
+    return StoredBit(mask, word, stated or bit.severity, bit.description)

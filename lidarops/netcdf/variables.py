@@ -357,9 +357,8 @@ def _usable(flags: Row) -> Row:
     return Row(
         summary_of(flags.name),
         f"usability of the value, from the bits of {flags.name}",
-        f"do_not_use: {flags.name} has a bit of severity reject. use_with_care: it has bits of"
-        f" severity care only. good: no test failed. The comment of {flags.name} states the"
-        " severity of each bit.",
+        f"do_not_use: {flags.name} has a bit that its flag_assessments call Bad. use_with_care: it"
+        " has Indeterminate bits only. good: no test failed.",
         dims=flags.dims,
         coverage=Coverage.QUALITY,
         dtype="i1",
@@ -431,13 +430,15 @@ def attributes(
     comment = row.comment
     if row.flags is not None:
         bits = row.flags.bits
-        texts = (f"{bit.word} ({bit.severity.name.lower()}): {bit.description}" for bit in bits)
+        texts = (f"{bit.word}: {bit.description}" for bit in bits)
         attrs[FLAG_LAYOUT] = row.flags.layout
         attrs["flag_masks"] = np.array(bits, dtype=stored)
         attrs["flag_meanings"] = " ".join(bit.word for bit in bits)
+        attrs["flag_assessments"] = " ".join(bit.severity.assessment for bit in bits)
         comment = (
-            f"0: no test failed. {'; '.join(texts)}. reject: do not use the value; care: the value"
-            " is valid, but its stated uncertainty may be too small, or as large as the value."
+            f"0: no test failed. {'; '.join(texts)}. Bad: do not use the value; Indeterminate:"
+            " the value is valid, but its stated uncertainty may be too small, or as large as the"
+            " value."
             f" {row.comment or ''}"
         ).strip()
     if row.reasons is not None:

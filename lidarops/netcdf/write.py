@@ -28,10 +28,10 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import h5py
-import netCDF4
 import numpy as np
 import xarray as xr
 from deflate import zlib_compress
+from netCDF4 import default_fillvals
 from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
@@ -45,11 +45,22 @@ COMPRESSION_LEVEL: Final = 4
 CHUNK_BYTES: Final = 1 << 20
 """Largest chunk: a chunk is the whole variable, or as many whole rows as fit."""
 CONTIGUOUS_BYTES: Final = 2048
-"""Up to this size, a variable without rows is stored as it is: the index of a chunk takes 2.1 kB.
-"""
+"""Up to this size, a variable without rows is stored as it is."""
 
 _OTHER_DIMENSION: Final = "_nc4_non_coord_"
 """Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
+_EMPTY: Final = bytes.fromhex(
+    "894844460d0a1a0a020808000000000000000000300000000000000028010000000000006100000000000000"
+    "d66e27994f48445202208d070e6b8d070e6b8d070e6b8d070e6b161307000500020010000400000700000000"
+    "00000000000324d95f4f484452021c00100000b802220000000000030000000000000000ffffffffffffffff"
+    "ffffffffffffffffffffffffffffffff0a0600010000000100100000007e"
+).ljust(292, b"\0") + bytes.fromhex("f80a5cda")
+"""A file of HDF5 without content, made with properties that h5py cannot set: indexes of chunks hold
+4 chunks in a node (`H5Pset_istore_k` 2, not 32), and the root group keeps its links and attributes
+in its header (`H5Pset_link_phase_change` and `H5Pset_attr_phase_change` 4096, not 8)."""
+_MOST_ATTRIBUTES: Final = 4096
+"""Most attributes of a variable in its header; HDF5 has 8 by default."""
+_SCALAR: Final = h5py.h5s.create(h5py.h5s.SCALAR)
 _Array = NDArray[Any]
 
 _LEVEL: Final = 1
@@ -174,6 +185,10 @@ class Skeleton:
             if unlimited in variable.dims or large:
                 self.chunks[name] = chunk_sizes(variable.shape, variable.dtype.itemsize)
 
+    def is_scale(self, name: str) -> bool:
+        """Return whether HDF5 may know a variable by its name: no other dimension has it."""
+        return name not in self.sizes or self.variables[name].dims == (name,)
+
 
 class QuietFile(io.FileIO):
     """A local file for HDF5, which may crash where it cannot write.
@@ -183,16 +198,16 @@ class QuietFile(io.FileIO):
     Parameters
     ----------
     path : Path
-        An existing file.
+        Where no file exists.
 
     Raises
     ------
     OSError
-        If the file cannot be opened.
+        If the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, "r+")
+        super().__init__(path, "x+")
         self.error: OSError | None = None
 
     def write(self, data: ReadableBuffer, /) -> int:
@@ -247,15 +262,11 @@ def create_file(
     try:
         with _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with NETCDF4_PYTHON_LOCK:
-                _store(skeleton, temporary)
             stream = QuietFile(temporary)
         with stream:
             file = RowFile(skeleton, path, stream)
             try:
-                for name, variable in skeleton.variables.items():
-                    if name in skeleton.chunks and name not in skeleton.with_rows:
-                        file.write(name, 0, variable.values)
+                file.define(skeleton)
                 yield file
                 file.complete()
             finally:
@@ -289,16 +300,18 @@ class RowFile:
         self._held: dict[str, list[_Array]] = {name: [] for name in skeleton.with_rows}
         """The last rows of each variable, whose chunk is incomplete."""
         self._total = skeleton.sizes[str(skeleton.unlimited)] if self._held else 0
-        self._targets = {}
+        self._targets: dict[str, Any] = {}
+        stream.write(_EMPTY)
         with _disk_errors(path), NETCDF4_PYTHON_LOCK:
-            self._file = h5py.File(stream, "r+")
-            for name in self._chunks:
-                variable = self._variables[name]
-                other = name in skeleton.sizes and variable.dims[0] != name
-                inside = unicodedata.normalize("NFC", f"{_OTHER_DIMENSION if other else ''}{name}")
-                self._targets[name] = h5py.h5d.open(self._file.id, inside.encode())
-                # Its final length.
-                self._targets[name].set_extent(variable.shape)
+            self._file = h5py.File(stream, "r+", libver=("v108", "v108"))
+
+    def define(self, skeleton: Skeleton) -> None:
+        """Write all definitions, and the variables without rows."""
+        with _disk_errors(self._path), NETCDF4_PYTHON_LOCK:
+            self._targets = _define(skeleton, self._file.id)
+        for name, variable in skeleton.variables.items():
+            if name not in skeleton.with_rows:
+                self.write(name, 0, variable.values)
 
     def add(self, rows: Mapping[str, _Array]) -> None:
         """Write the next rows.
@@ -342,11 +355,14 @@ class RowFile:
             first += size
 
     def write(self, name: str, begin: int, values: _Array) -> None:
-        """Write whole chunks of a variable, from a row on."""
+        """Write a whole variable, or whole chunks from a row on."""
         variable = self._variables[name]
-        native = variable.dtype.newbyteorder("=")
-        fill = variable.attrs.get("_FillValue", netCDF4.default_fillvals[native.str[1:]])
-        chunks = deflate_chunks(values.astype(native, copy=False), self._chunks[name], fill)
+        native = values.astype(_native(variable), copy=False)
+        if name not in self._chunks:
+            with _disk_errors(self._path), NETCDF4_PYTHON_LOCK:
+                self._targets[name].write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(native))
+            return
+        chunks = deflate_chunks(native, self._chunks[name], _fill_value(variable))
         with _disk_errors(self._path):
             # Deflated without the lock, so that other threads go on.
             for (first, *others), data in chunks:
@@ -393,50 +409,103 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-class _DefinedAtOnce(netCDF4.Dataset):
-    """A file whose dimensions, variables and attributes are written together.
+def _define(skeleton: Skeleton, root: Any) -> dict[str, Any]:
+    """Define a file after the NetCDF-4 classic model; return its HDF5 datasets by variable.
 
-    In the classic model, netCDF4 rewrites all definitions after each new one, which takes as long
-    as the rest of a small product.
+    netCDF-C would write attributes from the ninth of a variable on, and the index of its chunks,
+    in blocks of some kB each: most of a small product.
     """
+    inside = {
+        name: name if skeleton.is_scale(name) else f"{_OTHER_DIMENSION}{name}"
+        for name in skeleton.variables
+    }
+    found = {
+        name: _dataset(root, inside[name], variable, skeleton.chunks.get(name), skeleton.unlimited)
+        for name, variable in skeleton.variables.items()
+    }
+    scales: dict[str, Any] = {}
+    uses: dict[str, list[tuple[Any, int]]] = {}
+    for number, (dim, size) in enumerate(skeleton.sizes.items()):
+        if inside.get(dim) == dim:
+            scales[dim], label = found[dim], dim
+        else:
+            unused = xr.Variable(dim, np.broadcast_to(np.float32(0), size))
+            chunk = (1,) if dim == skeleton.unlimited else None
+            scales[dim] = _dataset(root, dim, unused, chunk, skeleton.unlimited)
+            label = f"This is a netCDF dimension but not a netCDF variable. {size:10d}"
+        h5py.h5ds.set_scale(scales[dim], label.encode())
+        _write_attributes(scales[dim], {"_Netcdf4Dimid": np.int32(number)})
+        uses[dim] = []
+    for name, variable in skeleton.variables.items():
+        attributes = dict(variable.attrs)
+        if "_FillValue" in attributes:
+            # As netCDF-C does: first, and in the type of the variable.
+            fill = np.array(attributes.pop("_FillValue"), _native(variable))
+            attributes = {"_FillValue": fill, **attributes}
+        if variable.dims and inside[name] not in scales:
+            axes = np.empty(variable.ndim, h5py.vlen_dtype(h5py.ref_dtype))
+            for axis, dim in enumerate(map(str, variable.dims)):
+                axes[axis] = np.array([_reference(scales[dim])], h5py.ref_dtype)
+                uses[dim].append((_reference(found[name]), axis))
+            attributes["DIMENSION_LIST"] = axes
+        _write_attributes(found[name], attributes)
+    use = np.dtype([("dataset", h5py.ref_dtype), ("dimension", np.uint32)])
+    for dim, used in uses.items():
+        if used:
+            _write_attributes(scales[dim], {"REFERENCE_LIST": np.array(used, use)})
+    _write_attributes(root, {**skeleton.attributes, "_nc3_strict": np.int32(1)})
+    return found
 
-    def _enddef(self) -> None:
-        """Stay in define mode; netCDF4 calls this after each definition."""
 
-    def end_definitions(self) -> None:
-        """Write the definitions, and leave define mode."""
-        super()._enddef()  # type: ignore[misc]  # not in its stubs
+def _reference(dataset: Any) -> Any:
+    return h5py.h5r.create(dataset, b".", h5py.h5r.OBJECT)
 
 
-def _store(skeleton: Skeleton, path: Path) -> None:
-    """Write all definitions and the variables without chunks."""
-    # In memory until the end, because HDF5 may crash on a full disk.
-    with _DefinedAtOnce(
-        path, "w", format="NETCDF4_CLASSIC", clobber=False, diskless=True, persist=True
-    ) as file:
-        file.setncatts(skeleton.attributes)
-        for name, size in skeleton.sizes.items():
-            file.createDimension(name, None if name == skeleton.unlimited else size)
-        targets: dict[str, Any] = {}
-        for name, variable in skeleton.variables.items():
-            attributes, chunk = dict(variable.attrs), skeleton.chunks.get(name)
-            targets[name] = file.createVariable(
-                name,
-                variable.dtype.newbyteorder("="),
-                [str(dim) for dim in variable.dims],
-                fill_value=attributes.pop("_FillValue", None),
-                compression="zlib" if chunk else None,
-                complevel=COMPRESSION_LEVEL,
-                shuffle=True,
-                chunksizes=chunk,
-            )
-            targets[name].set_auto_maskandscale(False)
-            targets[name].set_auto_chartostring(False)
-            targets[name].setncatts(attributes)
-        file.end_definitions()
-        for name, target in targets.items():
-            if name not in skeleton.chunks:
-                target[...] = skeleton.variables[name].values
+def _dataset(
+    root: Any,
+    name: str,
+    variable: xr.Variable,
+    chunk: tuple[int, ...] | None,
+    unlimited: str | None,
+) -> Any:
+    """Return a new dataset of HDF5, without values."""
+    storage = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    storage.set_obj_track_times(track_times=False)
+    storage.set_attr_creation_order(h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED)
+    storage.set_attr_phase_change(_MOST_ATTRIBUTES, 0)
+    storage.set_fill_value(np.array(_fill_value(variable), _native(variable)))
+    if chunk:
+        storage.set_chunk(chunk)
+        storage.set_shuffle()
+        storage.set_deflate(COMPRESSION_LEVEL)
+    limits = tuple(
+        h5py.h5s.UNLIMITED if dim == unlimited else size for dim, size in variable.sizes.items()
+    )
+    space = h5py.h5s.create_simple(variable.shape, limits) if limits else _SCALAR
+    link = h5py.h5p.create(h5py.h5p.LINK_CREATE)
+    link.set_char_encoding(h5py.h5t.CSET_UTF8)
+    inside = unicodedata.normalize("NFC", name).encode()
+    sort = h5py.h5t.py_create(_native(variable))
+    return h5py.h5d.create(root, inside, sort, space, storage, link)
+
+
+def _write_attributes(owner: Any, attributes: Mapping[str, Any]) -> None:
+    """Write attributes of a file or a variable as netCDF-C does: numbers as vectors."""
+    for name, value in attributes.items():
+        data = np.array(value.encode()) if isinstance(value, str) else np.atleast_1d(value)
+        space = h5py.h5s.create_simple(data.shape) if data.ndim else _SCALAR
+        sort = h5py.h5t.py_create(data.dtype, logical=True)
+        h5py.h5a.create(owner, name.encode(), sort, space).write(data)
+
+
+def _native(variable: xr.Variable) -> np.dtype[Any]:
+    native: np.dtype[Any] = variable.dtype.newbyteorder("=")
+    return native
+
+
+def _fill_value(variable: xr.Variable) -> Any:
+    """Return what values that are not written have, as netCDF-C sets it."""
+    return variable.attrs.get("_FillValue", default_fillvals[_native(variable).str[1:]])
 
 
 def deflate_chunks(

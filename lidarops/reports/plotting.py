@@ -16,7 +16,9 @@ from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import View, image_view, view_of, views_of
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.figures.raster import COLUMNS
+from lidarops.flags import Severity
 from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading
+from lidarops.netcdf.variables import judging, summary_of
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
 
@@ -154,6 +156,41 @@ def _raw_figure(title: str, channels: list[xr.DataArray]) -> Figure:
     panel = Panel(Axis("range (km)", 0.0, farthest), signals, curves, height=360.0)
     words = "; ".join(f"{curve.label} {span_in_words(curve.y, unit)}" for curve in curves)
     return Figure(f"{title[:1].upper()}{title[1:]}", words, (panel,))
+
+
+def draw_change(old: Path, new: Path) -> tuple[Figure, ...]:
+    """Return the mean profiles of the first quantity of two versions of a product.
+
+    Raises
+    ------
+    ProductError
+        If a file cannot be read, or holds no quantity with an error over range or altitude.
+    """
+    with opened_product(old) as before, opened_product(new) as after:
+        profiles = (
+            str(name)
+            for name, values in before.data_vars.items()
+            if values.dims[1:] in (("range",), ("altitude",))
+            if f"{name}_standard_error" in before
+        )
+        quantity = next(profiles, "")
+        if quantity not in after:
+            raise ProductError("holds no profiles that can be compared", file=new)
+        judge = summary_of(judging(quantity, map(str, before.variables)))
+        usable = (before[judge] < Severity.REJECT) & (after[judge] < Severity.REJECT)
+        pair = (before[quantity].where(usable), after[quantity].where(usable))
+        curves = tuple(
+            _curve(number, version.rename(word))
+            for number, (word, version) in enumerate(zip(("before", "now"), pair, strict=True))
+        )
+        unit = units(str(pair[0].attrs["units"]))
+        across = Axis(f"{pair[0].dims[1]} (km)", 0.0, max(float(curve.x[-1]) for curve in curves))
+    ends = [curve.y[np.isfinite(curve.y)] for curve in curves]
+    low, high = (float(end(np.concatenate(ends), initial=0.0)) for end in (np.min, np.max))
+    values = Axis(f"{quantity.replace('_', ' ')} ({unit})", low, high)
+    words = "; ".join(f"{curve.label} {span_in_words(curve.y, unit)}" for curve in curves)
+    title = f"Mean {quantity.replace('_', ' ')} of {new.name}, where both are usable"
+    return (Figure(title, words, (Panel(across, values, curves, height=360.0),)),)
 
 
 def _curve(number: int, channel: xr.DataArray) -> Curve:

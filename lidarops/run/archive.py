@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock, OvertakenError
+from lidarops.catalog.raw_files import acknowledged
 from lidarops.catalog.scan import ScanSummary, scan_archive
 from lidarops.catalog.store import RunStatus, Store, Verdict
 from lidarops.errors import LidarOpsError
@@ -278,7 +279,7 @@ def refused_files(campaign: Campaign, result: Result) -> list[Granule]:
     """Return the files refused by the catalog or by a scene, and of a run those in no scene."""
     if result.record is None:
         with Store(campaign.catalog_url, campaign.name) as store:
-            return store.refused()
+            return acknowledged(campaign, store.refused())
     late = (granule for scene in result.scenes for granule in scene.refused)
     return list({granule.path: granule for granule in (*result.record.refused, *late)}.values())
 

@@ -10,7 +10,7 @@ import secrets
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import groupby, islice
 from pathlib import Path, PurePosixPath
@@ -20,6 +20,7 @@ from lidarops import __version__
 from lidarops.campaign.model import Campaign
 from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.raw_files import acknowledged
 from lidarops.catalog.store import Dependence, LastTry, NewProduct, Run, RunStatus, Store, Verdict
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
 from lidarops.kinds import kinds
@@ -115,7 +116,7 @@ class LedgerRun:
         self._campaign, self._store, self._lock = campaign, store, lock
         self._output = Path(campaign.output)
         self._journals = journal
-        self._keeps = campaign.superseded == "keep"
+        self._keeps = campaign.superseded != "remove"
         """Whether replaced versions of products are kept."""
         self._journal: Journal | None = None
         self._run: Run | None = None
@@ -233,6 +234,11 @@ class LedgerRun:
             if product_files.sweep(self._output, self._store):
                 self._store.close_runs(self._lock.token)
 
+    def _stated(self, outcome: SceneOutcome) -> SceneOutcome:
+        """Return what a record states of a scene."""
+        refused = acknowledged(self._campaign, outcome.refused)
+        return replace(outcome, refused=tuple(refused)) if refused else outcome
+
     def conclude(self, status: RunStatus, findings: Findings, told: JudgedDays) -> RunRecord | None:
         """Close the run in the ledger and return its record; None if it has not begun."""
         if self._run is None:
@@ -242,14 +248,16 @@ class LedgerRun:
                 error = f"{judged.failure.error} (not tried again, because nothing has changed)"
                 outcome = judged.failure.outcome(judged.scene, judged.plan)
                 self._outcomes[judged.scene.id] = replace(outcome, error=error)
-        aside = (*self._store.refused(), *told.set_aside.values())
+        if isinstance(self._campaign.superseded, timedelta):
+            product_files.remove_kept(self._output, self._campaign.superseded)
+        aside = acknowledged(self._campaign, (*self._store.refused(), *told.set_aside.values()))
         stated = {file.path for outcome in self._outcomes.values() for file in outcome.refused}
         listed = dict(islice(told.empty_scenes.items(), MOST_EMPTY_SCENES))
         record = replace(
             self._record(self._run),
             refused=tuple(granule for granule in aside if granule.path not in stated),
             findings=findings,
-            scenes=tuple(self._outcomes[scene] for scene in sorted(self._outcomes)),
+            scenes=tuple(self._stated(self._outcomes[scene]) for scene in sorted(self._outcomes)),
             empty_scenes=listed,
             more_empty_scenes=len(told.empty_scenes) - len(listed),
             frozen=dict(told.frozen),

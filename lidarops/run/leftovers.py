@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.raw_files import path_pattern
+from lidarops.catalog.raw_files import path_matcher
 from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import product_path
 from lidarops.records import (
@@ -37,8 +37,10 @@ from lidarops.scene.dependence import ProductKey
 from lidarops.scene.job import nothing_to_do
 
 _NAMES_SHOWN: Final = 3
-_IDLE: Final = "matches no raw file that has vanished: take the entry out, or correct it"
-_OVER: Final = "has expired: its files count as lost again; take the entry out, or set until later"
+_IDLE: Final = (
+    "matches no file that is lost, refused or in no scene: take the entry out, or correct it"
+)
+_OVER: Final = "has expired: its files count again; take the entry out, or set until later"
 
 Planned = tuple[Scene, Plan]
 """A scene, and the plan of all its requested products."""
@@ -263,19 +265,22 @@ def find_lost(campaign: Campaign, store: Store) -> Lost:
     claims any more, are not lost.
     """
     claims = {
-        name: _matcher((*instrument.files, *instrument.dark_files))
+        name: path_matcher((*instrument.files, *instrument.dark_files))
         for name, instrument in campaign.instruments.items()
     }
     inputs = store.lost_inputs()
     owners = {path: name for _, path in inputs for name, has in claims.items() if has(path)}
-    known, idle = _acknowledged(campaign, owners)
+    unused_paths = {granule.path for granule in store.refused()}
+    for verdict in store.verdicts().values():
+        unused_paths.update(verdict.set_aside)
+    known, idle = _acknowledged(campaign, owners, unused_paths)
     if not owners:
         return Lost(idle=idle)
     sets = store.raw_sets()
     size, lost, gone = Counter[str](), Counter[str](), Counter[str]()
     excused, products_of = set[str](), defaultdict[str, set[str]](set)
     unused = defaultdict[str, set[UnusedFile]](set)
-    is_dark = {name: _matcher(each.dark_files) for name, each in campaign.instruments.items()}
+    is_dark = {name: path_matcher(each.dark_files) for name, each in campaign.instruments.items()}
     for raw in sets.values():
         size.update(dict.fromkeys(raw.products, raw.files))
     for name, path in inputs:
@@ -318,21 +323,19 @@ def find_lost(campaign: Campaign, store: Store) -> Lost:
 
 
 def _acknowledged(
-    campaign: Campaign, lost: Iterable[str]
+    campaign: Campaign, lost: Iterable[str], unused: Iterable[str]
 ) -> tuple[set[str], tuple[FactsNote, ...]]:
-    """Return the lost files that the campaign acknowledges, and its entries that match none."""
+    """Return the lost files that the campaign acknowledges, and its entries that match nothing.
+
+    They may match files that are refused or belong to no scene (`unused`), too.
+    """
     known: set[str] = set()
     idle = []
     for entry in campaign.acknowledged:
-        matched = set(filter(_matcher(entry.what), lost)) if entry.holds else set()
-        known |= matched
-        if not matched:
+        matches = path_matcher(entry.what)
+        if entry.holds:
+            known.update(filter(matches, lost))
+        if not entry.holds or not any(map(matches, (*lost, *unused))):
             reason = _IDLE if entry.holds else _OVER
             idle.append(FactsNote("all", f"acknowledged: {', '.join(entry.what)}", reason))
     return known, tuple(idle)
-
-
-def _matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
-    """Return a function that tells whether a path matches one of some patterns."""
-    expressions = [path_pattern(pattern) for pattern in patterns]
-    return lambda path: any(expression.match(path) for expression in expressions)

@@ -13,7 +13,7 @@ from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import RecordedProduct, RunStatus, Store, Verdict
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
-from lidarops.records import Findings, RunRecord, SceneOutcome, day_of
+from lidarops.records import ACKNOWLEDGED, Findings, RunRecord, SceneOutcome, day_of
 from lidarops.run.scenes import parse_scene_id, scene_stop
 
 if TYPE_CHECKING:
@@ -174,13 +174,16 @@ class Result:
 
     @property
     def has_failures(self) -> bool:
-        """Whether anything is refused, failed, empty or lost, now or since an earlier run."""
+        """Whether anything is refused, failed, empty or lost, now or since an earlier run.
+
+        What the campaign acknowledges does not count.
+        """
         return bool(
             self.summary.refused
             or self.failures
             or self.unusable
             or self.empty_scenes
-            or self.set_aside
+            or not all(reason.startswith(ACKNOWLEDGED) for reason in self.set_aside.values())
             or self.findings.failed
             or self.lost
             or self.status is not RunStatus.FINISHED

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.lock import Lock
+from lidarops.catalog.raw_files import acknowledged_reasons
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import RunStatus, Verdict
 from lidarops.records import FileNote
@@ -126,7 +127,7 @@ class Pass:
         file_notes = (*findings.file_notes, *joined_notes(self.file_notes))
         findings = replace(findings, file_notes=file_notes)
         record = self.run.conclude(status, findings, told)
-        set_aside = {path: granule.reason for path, granule in told.set_aside.items()}
+        set_aside = {path: granule.reason for path, granule in told.set_aside.items()} | clean[1]
         return Result(
             record=record,
             status=status,
@@ -137,7 +138,7 @@ class Pass:
             # Orphans are never made again, so they would be reported for ever.
             unusable=tuple(self.store.unusable_scenes(without=told.orphans.keys())),
             empty_scenes=told.empty_scenes | clean[0],
-            set_aside=set_aside | clean[1],
+            set_aside=acknowledged_reasons(self.campaign, set_aside),
             frozen=told.frozen,
             findings=findings,
             signal=self.stop.signal,

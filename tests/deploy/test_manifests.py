@@ -10,10 +10,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import httpx
 import jsonschema
 import pytest
 import yaml
 
+from flows import maintenance
 from lidarops.run import clusters
 
 TEXT = {"type": "string"}
@@ -51,6 +53,13 @@ CONTAINER = exactly(
     envFrom=listed(exactly(configMapRef=source(), secretRef=source(optional={"type": "boolean"}))),
     ports=listed(exactly("containerPort", containerPort=COUNT)),
     readinessProbe=exactly("tcpSocket", tcpSocket=exactly("port", port=COUNT), periodSeconds=COUNT),
+    livenessProbe=exactly(
+        "periodSeconds failureThreshold",
+        httpGet=exactly("path port", path=TEXT, port=COUNT),
+        exec=exactly("command", command=listed(TEXT)),
+        periodSeconds=COUNT,
+        failureThreshold=COUNT,
+    ),
     resources=exactly("requests limits", requests=QUANTITIES, limits=QUANTITIES),
     securityContext=exactly(
         "allowPrivilegeEscalation readOnlyRootFilesystem capabilities",
@@ -121,6 +130,37 @@ def test_what_reads_the_archive_on_kubernetes_has_the_keys_of_its_store() -> Non
         if "data" in {mount["name"] for mount in container["volumeMounts"]}
     }
     assert reading == {"lidarops-worker": True, "lidarops-prefect-worker": True}
+
+
+def test_worker_and_reaper_are_started_again_if_they_hang() -> None:
+    folder = Path(__file__).parents[2] / "deploy"
+    services = yaml.safe_load((folder / "compose.yaml").read_text())["services"]
+    found = list(yaml.safe_load_all((folder / "kubernetes" / "prefect.yaml").read_text()))
+    for name, service in (("lidarops-prefect-worker", "worker"), ("lidarops-reaper", "reaper")):
+        (container,) = of_kind(found, "Deployment")[name]["spec"]["template"]["spec"]["containers"]
+        checks = json.dumps([container["livenessProbe"], services[service]["healthcheck"]])
+        for arguments in (container["args"], services[service]["command"]):
+            if service == "worker":
+                assert "--with-healthcheck" in arguments
+                assert checks.count("/health") == checks.count("8080") == 2
+            else:
+                assert checks.count(arguments[arguments.index("--sign-of-life") + 1]) == 2
+
+
+def test_the_reaper_shows_that_it_checks_though_the_server_is_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(**_: object) -> None:
+        raise httpx.ConnectError("away")
+
+    def stop(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(maintenance, "get_client", away)
+    monkeypatch.setattr(maintenance.time, "sleep", stop)
+    with pytest.raises(KeyboardInterrupt):
+        maintenance.main(every=15.0, sign_of_life=tmp_path / "checked")
+    assert (tmp_path / "checked").exists()
 
 
 def of_kind(rendered: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
@@ -266,3 +306,6 @@ def test_slurm_files(repository: Path) -> None:
     assert shipped.kind == "slurm"
     script = repository / "deploy" / "slurm" / "reprocess.sbatch"
     subprocess.run(["bash", "-n", str(script)], check=True)
+    # Slurm makes no folder for it, and a job without it fails without a word.
+    (output,) = re.findall(r"^#SBATCH --output=(.*)$", script.read_text(), re.MULTILINE)
+    assert "/" not in output

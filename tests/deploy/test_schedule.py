@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import http.server
+import os
+import re
 import subprocess
 import threading
 import time
@@ -14,7 +16,9 @@ import pytest
 import yaml
 from support import factories
 from support.archives import raw_archives
+from support.pages import blocks
 from support.servers import loopback
+from support.servers.ports import free_port
 
 from flows import WITH_FAILURES, notifications
 
@@ -160,6 +164,36 @@ def scheduled_run_starts_and_dead_run_is_ended(
     assert list((site.folder / "out" / "products").rglob("*.nc"))
     record_testsuite_property(f"{site.folder.name} reaped_after", round(reaped))
     record_testsuite_property(f"{site.folder.name} next_run_completed_after", round(completed))
+
+
+def test_the_block_of_the_page_starts_a_schedule(tmp_path: Path) -> None:
+    """As pasted, on a machine without profile of Prefect; only the port is another one."""
+    page = loopback.REPOSITORY / "docs" / "howto" / "schedule.md"
+    block = next(blocks(page)).text.replace("4200", str(free_port()))
+    # What stays goes on in the background, as in a terminal of its own.
+    block = re.sub(r"#\s+stays", "> ${PREFECT_HOME}/$((++n)).log 2>&1 & pids+=($!)", block)
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    script = f"""set -euo pipefail
+    n=0 pids=()
+    trap 'kill "${{pids[@]}}"; .venv/bin/prefect server stop' EXIT
+    {block}
+    for try in {{1..120}}; do
+        .venv/bin/prefect work-pool inspect lidarops | grep -q READY && break
+        sleep 1
+    done
+    .venv/bin/prefect deployment inspect lidarops-reprocess/demo-nightly > /dev/null
+    test "$(jobs -r | wc -l)" = 2
+    .venv/bin/prefect work-pool inspect lidarops | grep READY"""
+    done = subprocess.run(
+        ["bash", "-c", script],
+        cwd=loopback.REPOSITORY,
+        env=kept | {"PREFECT_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_on_sqlite(tmp_path: Path, record_testsuite_property: Any) -> None:

@@ -106,7 +106,7 @@ def test_every_key_is_listed_with_unit_bounds_and_default(repository) -> None:
     (dead_time,) = re.findall(r"^\| `dead_time` \|.*\|$", page, re.MULTILINE)
     assert "number in s, ≥ 1e-10, ≤ 2e-07" in dead_time
     assert "| `latitude` | number in degree, ≥ -90, ≤ 90 | required |" in page
-    assert "| `superseded` | `keep`, `remove` | `remove` |" in page
+    assert "or number in s or `keep`, `remove` | `30d` | how long products" in page
     # Units once, and intervals as campaign files write them.
     assert "range of every bin |" in page
     assert "| `lidar_ratio` | number in sr, ≥ 5, ≤ 150 | `50.0` | extinction over" in page

@@ -129,7 +129,8 @@ def test_every_damaged_file_is_refused_and_no_other(demo: tuple[Campaign, RunRec
     }
     assert damaged
     assert {granule.path for granule in record.refused} == damaged
-    assert all(granule.reason for granule in record.refused)
+    assert all(granule.is_expected for granule in record.refused)
+    assert not record.failed
     assert not any(scene.error or scene.refused for scene in record.scenes)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,14 +16,18 @@ import xarray as xr
 from support.products.damaged_products import damage_values
 from support.products.encoded_products import build_product
 from support.products.made_products import context, elastic, homogeneous, provenance, visibility
+from typer.testing import CliRunner
 
+from lidarops.catalog import product_files
+from lidarops.cli import app
 from lidarops.errors import ProductError
 from lidarops.figures.wording import change_in_words
 from lidarops.flags import Quality
 from lidarops.netcdf import read
-from lidarops.netcdf.comparison import compare_products
+from lidarops.netcdf.comparison import compare_products, quantity_changes
 from lidarops.netcdf.write import write_product
 from lidarops.records import Change, Grade, InputRecord, Measure, Role, Stamp
+from lidarops.system.files import sha256_of
 
 NAME = "total_extinction"
 
@@ -55,6 +60,44 @@ def test_another_version_code_and_date_are_no_difference(tmp_path: Path):
     change = compared(tmp_path, stamp=later, provenance=code)
     assert (change.grade, change.largest, change.share) == (Grade.NONE, 0.0, 0.0)
     assert change.causes == ("software code: 0123456789abcdef -> fedcba9876543210",)
+
+
+def test_the_change_of_a_quantity_is_stated_in_its_unit_where_both_are_usable(tmp_path: Path):
+    old = homogeneous()
+    new = old.copy(deep=True)
+    new[NAME][:] -= 2e-6
+    new[NAME][2] += 1e-4
+    new["quality_flag"][2] = int(Quality.SATURATED)
+    files = written(tmp_path / "old.nc", old), written(tmp_path / "new.nc", new)
+    (change,) = [found for found in quantity_changes(*files) if found.quantity == NAME]
+    with xr.open_dataset(files[1]) as now:
+        kept = old[NAME].values[now["usable"].values < 2]
+    assert (change.unit, change.values) == ("m-1", kept.size)
+    assert change.before == pytest.approx(kept.mean(), rel=1e-3)
+    assert (change.change, change.largest) == pytest.approx((-2e-6, -2e-6), abs=1e-7)
+
+
+def test_a_product_is_compared_with_the_one_that_it_replaced(tmp_path: Path):
+    product, picture = tmp_path / "products" / "elastic.nc", tmp_path / "change.png"
+    compare = ["compare", str(product), "--json", "-o", str(picture)]
+    data = elastic(zenith=0.0)
+    for sign in (0, 1):
+        data["aerosol_backscatter"] = data["aerosol_backscatter"] + sign * 1e-6
+        written(tmp_path / "new.nc", data, kind="elastic")
+        product.parent.mkdir(exist_ok=True)
+        if sign:
+            assert CliRunner().invoke(app, compare).exit_code == 2
+            product_files.keep(tmp_path, product.name, sha256_of(product))
+        (tmp_path / "new.nc").replace(product)
+    found = CliRunner().invoke(app, compare)
+    assert isinstance(found.exception, SystemExit)
+    assert found.exit_code == 1
+    rows = {row["quantity"]: row for row in json.loads(found.stdout)["quantities"]}
+    assert rows["aerosol_backscatter"]["unit"] == "m-1 sr-1"
+    assert rows["aerosol_backscatter"]["change"] == pytest.approx(1e-6, rel=0.05)
+    assert picture.stat().st_size > 1000
+    shown = CliRunner().invoke(app, compare[:2])
+    assert "aerosol_backscatter" in shown.stdout
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from lidarops.kinds import flags_of
 from lidarops.netcdf.read import open_product
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
-    bits_of,
     refuse_moved_flags,
     rejecting_mask,
     stored_bits,
@@ -109,13 +108,14 @@ def test_masks_and_meanings_must_agree():
         stored_bits({"flag_masks": np.array([1, 2]), "flag_meanings": "saturated"}, "signal")
 
 
-def test_a_usable_of_other_dimensions_says_nothing_of_bits():
-    flags = xr.DataArray(np.full((4, 5), 1 << 20, np.int32), dims=("time", "range"))
-    product = xr.Dataset({"quality_flag": flags, "usable": ("time", np.zeros(4, np.int8))})
-    product.attrs["lidarops_kind"] = "of another package"
-    assert rejecting_mask(bits_of(product)) & 1 << 20
-    product["usable"] = flags.dims, np.zeros((4, 5), np.int8)
-    assert not rejecting_mask(bits_of(product)) & 1 << 20
+@pytest.mark.parametrize("kind", ["signal", "of another package"])
+def test_the_file_tells_what_its_bits_mean_for_values(kind: str):
+    stated = {"flag_masks": np.int32([1, 1 << 20]), "flag_meanings": "input_missing breezy"}
+    for words, rejecting in (("Bad Indeterminate", 1), ("Indeterminate Bad", 1 << 20)):
+        bits = stored_bits({**stated, "flag_assessments": words}, kind)
+        assert rejecting_mask(bits[:2]) == rejecting
+    with pytest.raises(ProductError, match="flag_assessments"):
+        stored_bits({**stated, "flag_assessments": "Bad"}, kind)
 
 
 @pytest.mark.parametrize("kind", [None, "of another package"])

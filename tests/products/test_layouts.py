@@ -11,6 +11,7 @@ import pytest
 from compliance_checker.cfunits import Unit
 from support.cases import each
 
+from lidarops.flags import Severity
 from lidarops.kinds import kinds
 from lidarops.netcdf.variables import (
     PROVENANCE,
@@ -296,7 +297,10 @@ def test_flag_masks_are_powers_of_two_in_the_type_of_the_flag(layout):
         for mask, meaning in zip(masks.tolist(), meanings, strict=True):
             bit = layout.flags.named(meaning)
             assert bit == mask
-            assert f"{meaning} ({bit.severity.name.lower()}): {bit.description}" in found["comment"]
+            assert f"{meaning}: {bit.description}" in found["comment"]
+        rejecting = [bit.severity is Severity.REJECT for bit in row.flags]
+        words = ["Bad" if rejects else "Indeterminate" for rejects in rejecting]
+        assert found["flag_assessments"].split() == words
 
 
 @pytest.mark.parametrize("layout", map(layout_of, kinds()), ids=list(kinds()))

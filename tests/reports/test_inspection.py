@@ -98,16 +98,17 @@ def test_foreign_netcdf_is_shown_too(tmp_path: Path):
     assert CliRunner().invoke(app, ["inspect", str(path)]).exit_code == 0
 
 
-def test_of_an_unknown_kind_usable_tells_what_its_bits_mean(tmp_path: Path):
+def test_of_an_unknown_kind_the_file_tells_what_its_bits_mean(tmp_path: Path):
     whole = (("time", "range"), np.array([[0, 1 << 20], [1 << 21, 3 << 20]], np.int32))
     masks = {"flag_masks": np.int32([1 << 20, 1 << 21]), "flag_meanings": "breezy stormy"}
+    masks["flag_assessments"] = "Indeterminate Bad"
     product = xr.Dataset({"quality_flag": (*whole, masks)}, attrs={"lidarops_kind": "wind"})
     product["usable"] = ("time", "range"), np.array([[0, 1], [2, 2]], np.int8)
     product.to_netcdf(tmp_path / "wind.nc")
     counts = {row["name"]: row for row in describe(tmp_path / "wind.nc")["quality"]}
     verdicts = ("good", "use_with_care", "do_not_use")
     assert [counts[name]["values"] for name in verdicts] == [1, 1, 2]
-    assert [counts[name]["severity"] for name in ("breezy", "stormy")] == ["care", "unknown"]
+    assert [counts[name]["severity"] for name in ("breezy", "stormy")] == ["care", "reject"]
 
 
 def test_other_files_are_refused(tmp_path: Path):

@@ -21,6 +21,7 @@ from support import quick
 from support.archives.small_archive import DAY, SOUNDING, Archive, made
 from typer.testing import CliRunner
 
+from lidarops.catalog import product_files
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.scan import scan_archive
@@ -38,6 +39,7 @@ from lidarops.run.archive import (
 )
 from lidarops.run.staleness import DaysJudged, Judge
 from lidarops.scene.job import Job
+from lidarops.system.files import sha256_of
 
 RICH = ("signal analog", "signal photon", "homogeneous photon", "elastic analog")
 
@@ -510,6 +512,25 @@ def test_replaced_versions_are_kept_if_the_campaign_says_so(archive: Archive) ->
     # A forced run gives the same bytes, so no further version is kept.
     reprocess(campaign, options=Options(force=True))
     assert archive.contents("out/superseded") == kept
+
+
+def test_replaced_versions_are_kept_for_a_month(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = archive.contents("out/products")
+    _lidar_ratio(archive)
+    reprocess(archive.write())
+    (name, *_) = [name for name in before if "elastic" in name]
+    kept = product_files.last_kept(archive.folder / "out" / "products" / name)
+    assert before[name] == sha256_of(kept)
+    of_elastic = sum("elastic" in name for name in before)
+    for days, left in ((29, of_elastic), (31, 0)):
+        later = time.time() + days * 86400.0
+        with monkeypatch.context() as patch:
+            patch.setattr(product_files.time, "time", lambda later=later: later)
+            archive.raw(f"rich/h9{days}", days * DAY, seed=3)
+            reprocess(archive.write())
+        assert len(archive.contents("out/superseded")) == left
 
 
 def test_a_new_day_is_processed_alone(archive: Archive) -> None:

@@ -85,6 +85,30 @@ def test_a_third_of_the_files_gone_worsens_no_product_until_it_is_acknowledged(
     assert _run(archive)[1]["run"] is None
 
 
+def test_a_damaged_file_that_is_acknowledged_fails_no_run_and_a_new_one_does(
+    archive: Archive,
+) -> None:
+    damaged = archive.folder / "raw" / "poor" / "h98"
+    damaged.write_bytes(b"")
+    assert _run(archive)[0] == 1
+    archive.tree["acknowledged"] = [{"what": "poor/h98", "reason": "the disk was full"}]
+    for command in ("reprocess", "catalog", "plan", "reprocess"):
+        code, summary = _run(archive, command=command)
+        assert code == 0, command
+        reasons = summary["refused_files"]
+        (reason,) = [one["reason"] for one in reasons] if command == "catalog" else reasons.values()
+        assert reason.startswith("acknowledged (the disk was full): ")
+        assert not summary.get("idle_facts")
+    code, summary = _run(archive, "--force")
+    assert (code, bool(summary["products"])) == (0, True)
+    (archive.folder / "raw" / "poor" / "h99").write_bytes(b"")
+    code, summary = _run(archive)
+    assert code == 1
+    assert [path for path, why in summary["refused_files"].items() if "acknow" not in why] == [
+        "poor/h99"
+    ]
+
+
 def test_files_that_come_back_leave_products_as_they_were(archive: Archive) -> None:
     before = archive.contents("out/products")
     content = _remove(archive, THIRD)
