@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
+from lidarops.netcdf.stored import OTHER_DIMENSION
 from lidarops.system.files import sha256_of, write_atomically
 
 if TYPE_CHECKING:
@@ -48,8 +49,6 @@ CONTIGUOUS_BYTES: Final = 2048
 """Up to this size, a variable without rows is stored as it is: the index of a chunk takes 2.1 kB.
 """
 
-_OTHER_DIMENSION: Final = "_nc4_non_coord_"
-"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 _Array = NDArray[Any]
 
 _LEVEL: Final = 1
@@ -295,7 +294,7 @@ class RowFile:
             for name in self._chunks:
                 variable = self._variables[name]
                 other = name in skeleton.sizes and variable.dims[0] != name
-                inside = unicodedata.normalize("NFC", f"{_OTHER_DIMENSION if other else ''}{name}")
+                inside = unicodedata.normalize("NFC", f"{OTHER_DIMENSION if other else ''}{name}")
                 self._targets[name] = h5py.h5d.open(self._file.id, inside.encode())
                 # Its final length.
                 self._targets[name].set_extent(variable.shape)

@@ -16,7 +16,8 @@ from lidarops.figures.image_panels import ImageQuantity
 from lidarops.figures.kind_figures import View, image_view, view_of, views_of
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.figures.raster import COLUMNS
-from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading
+from lidarops.netcdf.read import is_netcdf, open_product, opened_product
+from lidarops.netcdf.stored import reading
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode
 
