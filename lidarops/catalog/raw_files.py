@@ -23,7 +23,6 @@ from lidarops.raw.formats import parse_raw_header, read_start, time_in_path
 from lidarops.raw.header import TIME_REMEDY, RawHeader
 from lidarops.records import (
     INVALID,
-    UNKNOWN_FORMAT,
     UNREADABLE,
     ChannelLayout,
     Granule,
@@ -48,9 +47,9 @@ _FIELDS: Final = tuple(item.name for item in fields(Granule))
 _STATED: Final = tuple(item.name for item in fields(Header))
 _HALF: Final = (1 << 31) - 1
 _FUTURE: Final = "starts in the future"
-_TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT, _FUTURE)
-"""Starts of the reason if a refused file may be readable another time, its format be added, or the
-clock of this machine be set."""
+_TRY_AGAIN: Final = (UNREADABLE, _FUTURE)
+"""Starts of the reason if a refused file may be readable another time, or the clock of this machine
+be set."""
 
 HEADER_BYTES: Final = 16384
 """Bytes that hold the header of any format."""
