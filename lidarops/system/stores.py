@@ -20,7 +20,7 @@ from functools import cache
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, NamedTuple
-from urllib.parse import unquote
+from urllib.parse import unquote, urlsplit
 
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, UnavailableError
 from lidarops.system.files import sha256_of
@@ -36,7 +36,7 @@ _CODES_OF_STORE: Final = frozenset(
 )  # fmt: skip
 """Errors of S3 that concern the whole store though its answer is of another 4xx."""
 _STAMPS: Final = (
-    "mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag", "Last-Modified"
+    "mtime", "ETag", "etag", "LastModified", "last_modified", "updated", "created", "Last-Modified"
 )  # fmt: skip
 """What drivers call the time or tag by which a file of the same size shows that it has changed."""
 _NO_SUCH_RANGE: Final = 416
@@ -156,14 +156,16 @@ class RemoteStore:
         try:
             # Some drivers connect here.
             with self._unavailable("cannot be reached"):
+                # Raises an error for a port or address of no server, which the driver meets later.
+                _ = self._scheme in _READ_ONLY and urlsplit(url).port
                 self._fs, prefix = fsspec.core.url_to_fs(url)
-        except (ValueError, ImportError) as error:
+        except (ValueError, ImportError, TypeError, AttributeError) as error:
             raise CatalogError(
                 f"the URL cannot be opened: {without_keys(str(error))}",
                 file=self.url,
                 remedy="use a URL that fsspec knows and install its driver: lidarops[s3] for s3://",
                 # An ImportError means that only the driver is missing.
-                wrong_use=isinstance(error, ValueError),
+                wrong_use=not isinstance(error, ImportError),
             ) from error
         self._prefix = prefix.rstrip("/")
         self._given = ""
@@ -360,21 +362,30 @@ class RemoteStore:
                 remedy="publish to s3://, gs:// or a mounted folder",
                 wrong_use=True,
             )
-        sizes = {stored.path: stored.size for stored in self._existing()}
+        held = {stored.path: stored for stored in self._existing()}
         sent = _read_journal(journal)
         due = [
             path
             for path, sha256 in sorted(products.items())
-            if sent.get(path) != sha256 or sizes.get(path) != _size(root / path)
+            if path not in held
+            or held[path].size != _size(root / path)
+            or sent.get(path) not in {sha256, _as_held(sha256, held[path])}
         ]
         for first in range(0, len(due), _BATCH):
             batch = {path: products[path] for path in due[first : first + _BATCH]}
             with self._unavailable("cannot be written"):
                 self._upload(root, batch)
             _append_journal(journal, batch)
+        if due:
+            # As a listing states it: an answer about one object may state its time otherwise.
+            made = {one.path: one for one in self._existing()}
+            _append_journal(
+                journal,
+                {path: _as_held(products[path], made[path]) for path in due if path in made},
+            )
         others = [
             path
-            for path in sizes.keys() - products.keys()
+            for path in held.keys() - products.keys()
             if not (beside and path.startswith(f"{beside}/"))
         ]
         return Published(tuple(due), len(products) - len(due), len(others))
@@ -522,6 +533,11 @@ def _size(product: Path) -> int:
         return product.stat().st_size
 
 
+def _as_held(sha256: str, stored: Stored) -> str:
+    """Return the digest of a product with what changes if its copy in a store does."""
+    return f"{sha256} {stored.mtime_ns}"
+
+
 def _read_journal(journal: Path) -> dict[str, str]:
     """Read lines in the format of sha256sum; the last line of a path counts."""
     try:
@@ -545,6 +561,7 @@ def _failures() -> tuple[type[Exception], ...]:
     return (
         OSError,
         EOFError,
+        NotImplementedError,
         *(getattr(module, name) for module, name in loaded if module is not None),
     )
 
