@@ -13,13 +13,14 @@ import logging
 import re
 import secrets
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 from urllib.parse import unquote, urlsplit
 
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, UnavailableError
@@ -56,9 +57,14 @@ _LONGEST_SILENCE: Final = 30.0
 """s after which a web server that sends nothing counts as unreachable; s3fs takes 5 and 15 s."""
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
+_AT_ONCE: Final = 16
+"""Files whose begin or size a store is asked for at the same time."""
 _NAMES_SHOWN: Final = 3
 
 _LOG = logging.getLogger(__name__)
+
+_Item = TypeVar("_Item")
+_Read = TypeVar("_Read")
 
 # Exceptions of drivers besides OSError and EOFError; only loaded drivers can raise them.
 _DRIVER_ERRORS: Final = (
@@ -210,20 +216,34 @@ class RemoteStore:
         self, listing: dict[str, Any], is_used: Callable[[str], bool]
     ) -> Iterator[tuple[str, Any]]:
         """Yield names with their sizes, which the index of a web server lacks."""
+        lacking = []
         for name, info in listing.items():
             path = self._path(name)
-            if info.get("size") is not None or not is_confined(path) or not is_used(path):
+            if info.get("size") is None and is_confined(path) and is_used(path):
+                lacking.append((name, info))
+            else:
                 yield name, info
-                continue
-            try:
-                yield name, self._fs.info(name)
-            except FileNotFoundError as error:
-                # Drivers of the web raise this whatever the server answers.
-                if not self._is_of_one_object(error, name):
-                    problem = f"the size of {path} is not given: {error.__cause__!r}"
-                    raise OSError(errno.EIO, problem) from error
-                # Whoever reads the file learns of it.
-                yield name, info
+        yield from self.map(self._asked, lacking)
+
+    def _asked(self, listed: tuple[str, Any]) -> tuple[str, Any]:
+        """Return a name with what the store says of it alone."""
+        name, info = listed
+        try:
+            return name, self._fs.info(name)
+        except FileNotFoundError as error:
+            # Drivers of the web raise this whatever the server answers.
+            if not self._is_of_one_object(error, name):
+                problem = f"the size of {self._path(name)} is not given: {error.__cause__!r}"
+                raise OSError(errno.EIO, problem) from error
+            # Whoever reads the file learns of it.
+            return name, info
+
+    def map(self, read: Callable[[_Item], _Read], items: Iterable[_Item]) -> Iterator[_Read]:
+        """Yield what is read of each item, in order; some at once, where the driver can."""
+        rest = iter(items)
+        with ThreadPoolExecutor(_AT_ONCE if self._fs.async_impl else 1) as threads:
+            while batch := list(islice(rest, _BATCH)):
+                yield from threads.map(read, batch)
 
     def _path(self, name: str) -> str:
         return name.removeprefix(self._prefix).removeprefix("/")
