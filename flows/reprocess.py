@@ -318,7 +318,7 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
         "scenes without a usable value": dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE),
         "files refused": {
             granule.path: granule.reason
-            for granule in refused_files(campaign, result)
+            for granule in refused_files(result)
             if granule.path not in result.set_aside and not granule.is_expected
         },
         "scenes without product": result.empty_scenes,

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from lidarops.aggregate.facts import UNSHARED, Header, coordinate_names
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
-from lidarops.netcdf.read import stored_values
+from lidarops.netcdf.read import as_variable
+from lidarops.netcdf.stored import StoredProduct, stored_values
 from lidarops.netcdf.variables import attributes
 
 _PER_PRODUCT: Final = (
@@ -47,13 +48,12 @@ class Part(NamedTuple):
     """s since 1970, of each profile."""
 
 
-def pattern_of(product: xr.Dataset, header: Header) -> xr.Dataset:
+def pattern_of(product: StoredProduct, header: Header) -> xr.Dataset:
     """Return the variables of joined products, by the first of them.
 
     Parameters
     ----------
-    product : xr.Dataset
-        Open, not decoded.
+    product : StoredProduct
     header : Header
 
     Returns
@@ -69,13 +69,13 @@ def pattern_of(product: xr.Dataset, header: Header) -> xr.Dataset:
         if name in UNSHARED:
             continue
         if name in static and "time" not in variable.dims:
-            variables[name] = variable.load()
+            variables[name] = as_variable(variable).load()
             continue
         whole = "time" not in variable.dims
         dims = (PRODUCT.name, *variable.dims) if whole else variable.dims
         shape = (1, *variable.shape) if whole else variable.shape
         hollow = np.broadcast_to(np.zeros((), variable.dtype), shape)
-        variables[name] = xr.Variable(dims, hollow, variable.attrs, variable.encoding)
+        variables[name] = xr.Variable(dims, hollow, variable.attrs.whole())
     about = {row.name: attributes(row, mode=header.counting) for row in (PRODUCT, PRODUCT_INDEX)}
     about[PRODUCT.name].pop("_Encoding")
     index = np.zeros(header.profiles, np.int32)
@@ -83,7 +83,7 @@ def pattern_of(product: xr.Dataset, header: Header) -> xr.Dataset:
         PRODUCT.name: (PRODUCT.dims, np.array([header.id]), about[PRODUCT.name]),
         PRODUCT_INDEX.name: (PRODUCT_INDEX.dims, index, about[PRODUCT_INDEX.name]),
     }
-    return xr.Dataset(variables, coords=own, attrs=product.attrs)
+    return xr.Dataset(variables, coords=own, attrs=product.attrs.whole())
 
 
 def join(parts: Sequence[Part], pattern: xr.Dataset) -> xr.Dataset:
@@ -109,7 +109,7 @@ def join(parts: Sequence[Part], pattern: xr.Dataset) -> xr.Dataset:
     rows = {"time": tuple(lengths), PRODUCT.name: (1,) * len(parts)}
     sources = tuple((part.file, part.header.id) for part in parts)
     variables = {
-        name: xr.Variable(variable.dims, known[name], variable.attrs, variable.encoding)
+        name: xr.Variable(variable.dims, known[name], variable.attrs)
         if name in known
         else _on_dask(str(name), variable, rows, sources)
         for name, variable in pattern.variables.items()
@@ -147,7 +147,7 @@ def _on_dask(
         dtype=variable.dtype,
         meta=np.empty((0,) * variable.ndim, variable.dtype),
     )
-    return xr.Variable(variable.dims, data, variable.attrs, variable.encoding)
+    return xr.Variable(variable.dims, data, variable.attrs)
 
 
 def _read_block(

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from lidarops.aggregate.facts import Weights
 from lidarops.aggregate.means_variables import (
-    Weights,
     averaged,
     budget_of,
     share_names,
@@ -19,6 +18,7 @@ from lidarops.aggregate.means_variables import (
 )
 from lidarops.flags import Quality
 from lidarops.netcdf.quantities import CLOUD_FRACTION, CLOUD_MASK
+from lidarops.netcdf.stored import StoredProduct
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, Layout, Row, judging, whole_error
 
@@ -167,13 +167,12 @@ class Profiles:
     """Share of cloudy profiles of each value. None for kinds that seek no clouds."""
 
 
-def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
+def read_profiles(product: StoredProduct, layout: Layout) -> Profiles:
     """Read what means need from a product, completely, so that a damaged product affects no sum.
 
     Parameters
     ----------
-    product : xr.Dataset
-        Not decoded.
+    product : StoredProduct
     layout : Layout
         Of its kind.
 
@@ -183,7 +182,7 @@ def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
         If it has bits of flags at other places than its kind has now.
     """
     refuse_moved_flags(product)
-    flags = {name: product[name].values for name in flags_names(product)}
+    flags = {name: product[name][...] for name in flags_names(product)}
     usable = {name: (bits & np.int32(layout.flags.rejecting)) == 0 for name, bits in flags.items()}
     return Profiles(
         {
@@ -192,12 +191,12 @@ def read_profiles(product: xr.Dataset, layout: Layout) -> Profiles:
             if row.name in product
         },
         flags,
-        product["shots"].values.astype(np.float64),
+        product["shots"][...].astype(np.float64),
         _clouds(product, layout, usable[QUALITY_FLAG]),
     )
 
 
-def _clouds(product: xr.Dataset, layout: Layout, usable: NDArray[np.bool_]) -> Sample | None:
+def _clouds(product: StoredProduct, layout: Layout, usable: NDArray[np.bool_]) -> Sample | None:
     """Return the share of cloudy profiles: 1 also where only the mean shows a cloud."""
     if CLOUD_FRACTION not in layout.rows:
         return None
@@ -205,12 +204,12 @@ def _clouds(product: xr.Dataset, layout: Layout, usable: NDArray[np.bool_]) -> S
     fraction = np.full(usable.shape, np.nan)
     if CLOUD_FRACTION in product:
         fraction = _numbers(product, CLOUD_FRACTION)
-        cloudy = product[CLOUD_MASK].values == layout.rows[CLOUD_MASK].code("cloudy")
+        cloudy = product[CLOUD_MASK][...] == layout.rows[CLOUD_MASK].code("cloudy")
         fraction = np.where(cloudy & np.isnan(fraction), 1.0, fraction)
     return Sample(fraction, exact, exact, (), {}, usable)
 
 
-def _sample(product: xr.Dataset, row: Row, usable: NDArray[np.bool_]) -> Sample:
+def _sample(product: StoredProduct, row: Row, usable: NDArray[np.bool_]) -> Sample:
     values = _numbers(product, row.name)
     errors = _numbers(product, f"{row.name}_standard_error")
     has_flags = row.dims == product[judging(row.name, flags_names(product))].dims
@@ -224,7 +223,7 @@ def _sample(product: xr.Dataset, row: Row, usable: NDArray[np.bool_]) -> Sample:
 
 
 def _systematic_errors(
-    product: xr.Dataset, row: Row, values: Array, errors: Array
+    product: StoredProduct, row: Row, values: Array, errors: Array
 ) -> dict[str, Array]:
     """Return the systematic errors that are not part of the standard error, by variable."""
     names = systematic(row)
@@ -237,7 +236,7 @@ def _systematic_errors(
     return {name: _numbers(product, name) for name in names if name in product}
 
 
-def _divided(product: xr.Dataset, row: Row, errors: Array) -> tuple[Array, tuple[Array, ...]]:
+def _divided(product: StoredProduct, row: Row, errors: Array) -> tuple[Array, tuple[Array, ...]]:
     """Divide a standard error into a part independent between profiles and shared parts."""
     budget = budget_of(row)
     if budget is None:
@@ -256,12 +255,12 @@ def _divided(product: xr.Dataset, row: Row, errors: Array) -> tuple[Array, tuple
     return random, (np.sqrt(np.maximum(errors**2 - random**2, 0.0)),)
 
 
-def _numbers(product: xr.Dataset, name: str) -> Array:
-    """Return a variable of an undecoded product in double precision; missing values are NaN."""
-    variable = product[name]
-    values: Array = variable.values.astype(np.float64)
-    fill = variable.attrs.get("_FillValue")
-    return values if fill is None else np.where(variable.values == fill, np.nan, values)
+def _numbers(product: StoredProduct, name: str) -> Array:
+    """Return a variable of a product in double precision; missing values are NaN."""
+    stored = product[name][...]
+    values: Array = stored.astype(np.float64)
+    fill = product[name].attrs.get("_FillValue")
+    return values if fill is None else np.where(stored == fill, np.nan, values)
 
 
 @dataclass(slots=True)

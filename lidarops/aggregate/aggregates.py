@@ -7,23 +7,28 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from lidarops.aggregate.facts import (
     EVERYTHING,
+    FOLDER,
     Facts,
+    Period,
     ProductSelection,
     Refused,
+    Weights,
     grid_notes,
     groups,
     list_products,
     read_product_facts,
 )
-from lidarops.aggregate.index import KnownFacts, write_index
-from lidarops.aggregate.means import MeansFile, write_means
-from lidarops.aggregate.means_variables import Period, Weights
-from lidarops.aggregate.stac import write_stac
-from lidarops.aggregate.versioned_store import StoreUpdate, stored_kinds, update_store
+from lidarops.aggregate.index import INDEX, KnownFacts, write_index
 from lidarops.errors import ProductError
+from lidarops.system.files import settled_before
+
+if TYPE_CHECKING:
+    from lidarops.aggregate.means import MeansFile
+    from lidarops.aggregate.versioned_store import StoreUpdate
 
 Progress = Callable[[int], None]
 
@@ -92,8 +97,9 @@ def make_aggregates(
     OSError
         If a file cannot be written.
     """
-    made = AggregateResult(root)
-    products = _products(root, selection, made, progress)
+    made, as_of = AggregateResult(root), settled_before()
+    known = KnownFacts(root, hashed=stac or period is not None)
+    products = _products(root, selection, made, known, progress)
     if not products:
         _refuse_unknown(root, selection)
         raise ProductError("no product found", file=root, remedy=_remedy(made))
@@ -101,10 +107,13 @@ def make_aggregates(
     by_group = groups(products)
     made.notes += grid_notes(by_group)
     if selection == EVERYTHING:
-        made.index = write_index(root, products)
+        kept = known.are(products)
+        made.index = f"{FOLDER}/{INDEX}" if kept else write_index(root, products, as_of)
     else:
         made.notes.append("the index lists all products; run without a selection to update it")
     if period is not None:
+        from lidarops.aggregate.means import write_means  # noqa: PLC0415 - the index is without xarray
+
         for alike in by_group.values():
             with _failures(made):
                 done = write_means(root, alike, period, weights=weights)
@@ -115,6 +124,8 @@ def make_aggregates(
         with _failures(made):
             _update_stores(made, products, selection, runs)
     if stac:
+        from lidarops.aggregate.stac import write_stac  # noqa: PLC0415
+
         with _failures(made):
             if selection != EVERYTHING:
                 remedy = "run without a selection"
@@ -124,9 +135,13 @@ def make_aggregates(
 
 
 def _products(
-    root: Path, selection: ProductSelection, made: AggregateResult, progress: Progress
+    root: Path,
+    selection: ProductSelection,
+    made: AggregateResult,
+    known: KnownFacts,
+    progress: Progress,
 ) -> list[Facts]:
-    products, known = [], KnownFacts(root)
+    products = []
     for path in list_products(root):
         facts = known.of(path) or read_product_facts(root, path, selection)
         if isinstance(facts, Refused):
@@ -139,7 +154,8 @@ def _products(
 
 def _refuse_unknown(root: Path, selection: ProductSelection) -> None:
     """Refuse a selected channel, station or instrument that no product has."""
-    products = _products(root, EVERYTHING, AggregateResult(root), lambda _done: None)
+    unread = AggregateResult(root)
+    products = _products(root, EVERYTHING, unread, KnownFacts(root), lambda _done: None)
     for name in ("channel", "station", "instrument"):
         selected = getattr(selection, name)
         known = sorted({getattr(product, name) for product in products})
@@ -177,6 +193,11 @@ def _update_stores(
     selection: ProductSelection,
     runs: Mapping[str, str],
 ) -> None:
+    from lidarops.aggregate.versioned_store import (  # noqa: PLC0415
+        stored_kinds,
+        update_store,
+    )
+
     if selection.since is not None or selection.until is not None:
         raise ProductError("a store holds all times", remedy="run without --since and --until")
     for kind in sorted({product.kind for product in products} | set(stored_kinds(made.root))):

@@ -1,31 +1,69 @@
-"""Facts of a product that aggregates need, from its file; selections and groups of products."""
+"""Facts of a product that aggregates need, from its file; what users choose; groups of products."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
+from enum import StrEnum
+from functools import cache
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.kinds import kinds
-from lidarops.netcdf.context import RECORDERS
-from lidarops.netcdf.read import changed, opened_product, opened_stored
-from lidarops.netcdf.stored_flags import FlagCounter, all_bits, rejecting_mask
-from lidarops.netcdf.variables import PROVENANCE, QUALITY_FLAG, layout_of
+from lidarops.netcdf.stored import (
+    StoredProduct,
+    changed,
+    opened_stored,
+    reading,
+    stored_product,
+)
+from lidarops.netcdf.stored_flags import FlagCounter, all_bits, flags_names, rejecting_mask
+from lidarops.netcdf.variables import PROVENANCE, RECORDERS, layout_of
 from lidarops.records import DetectionMode, Verdicts, mode_of_signal
 from lidarops.system.files import product_paths, sha256_of, within
 
 NAMES: Final = ("kind", "station", "instrument", "channel")
+
+
+class Period(StrEnum):
+    """Period of a mean: a calendar day or month, UTC."""
+
+    DAY = "day"
+    MONTH = "month"
+
+    @property
+    def unit(self) -> str:
+        """Unit of numpy and of durations in ISO 8601."""
+        return self.value[0].upper()
+
+
+class Weights(StrEnum):
+    """Weights of profiles in a mean."""
+
+    SHOTS = "shots"
+    """Number of laser shots: a profile of a few shots counts less than a whole one."""
+    PLAIN = "plain"
+    """Equal weights."""
+    INVERSE_VARIANCE = "inverse-variance"
+    """Inverse squares of the standard errors."""
+
+    @property
+    def description(self) -> str:
+        """Description for the attributes of a file."""
+        return {
+            "shots": "usable profiles are weighted by their number of laser shots",
+            "plain": "usable profiles have equal weights",
+            "inverse-variance": "usable profiles have the weights 1 / standard_error^2",
+        }[self.value]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,17 +182,20 @@ class Header:
         return Group(*(getattr(self, name) for name in Group._fields))
 
     @contextmanager
-    def opened(self, root: Path) -> Iterator[xr.Dataset]:
-        """Open the product of this header, of a root, without decoding.
+    def opened(self, root: Path) -> Iterator[StoredProduct]:
+        """Open the product of this header, of a root; what else is raised meanwhile passes.
 
         Raises
         ------
         ProductError
             If it cannot be read, or is another product now.
         """
-        with opened_product(within(root, self.path), decode_cf=False) as product:
-            if product.attrs.get("id") != self.id:
-                raise changed(self.path)
+        file = within(root, self.path)
+        with ExitStack() as until_closed:
+            with reading(file):
+                product = until_closed.enter_context(stored_product(file))
+                if product.attrs.get("id") != self.id:
+                    raise changed(self.path)
             yield product
 
 
@@ -260,13 +301,12 @@ def read_product_facts(
         return Refused(path, error.problem)
 
 
-def read_header(product: Any, path: str, selection: ProductSelection) -> Header | None:
+def read_header(product: StoredProduct, path: str, selection: ProductSelection) -> Header | None:
     """Return what an open product states of itself; None where it is not selected.
 
     Parameters
     ----------
-    product : netCDF4.Dataset
-        From `opened_stored`.
+    product : StoredProduct
     path : str
     selection : ProductSelection
 
@@ -275,7 +315,7 @@ def read_header(product: Any, path: str, selection: ProductSelection) -> Header 
     ProductError
         If it is not a product of lidarops, or of an unknown kind.
     """
-    attributes = vars(product)
+    attributes = product.attrs
     kind = attributes.get("lidarops_kind")
     if kind not in set(kinds()):
         problem = "is not a product of lidarops" if kind is None else f"has an unknown kind: {kind}"
@@ -294,7 +334,7 @@ def read_header(product: Any, path: str, selection: ProductSelection) -> Header 
             mode=attributes["lidarops_detection_mode"],
             start=start,
             stop=stop,
-            profiles=product.dimensions["time"].size,
+            profiles=product.sizes["time"],
             grid=_grid_digest(product, kind),
             recorder=attributes.get(RECORDERS, ""),
             **names,
@@ -304,21 +344,15 @@ def read_header(product: Any, path: str, selection: ProductSelection) -> Header 
         raise ProductError(problem, file=path) from error
 
 
-def _facts(product: Any, file: Path, header: Header) -> Facts:
-    attributes = vars(product)
-    flags = {
-        name: xr.Variable(variable.dimensions, variable[...], vars(variable))
-        for name, variable in product.variables.items()
-        if name.endswith(QUALITY_FLAG)
-    }
-    bits = all_bits(xr.Dataset(flags, attrs=attributes))
+def _facts(product: StoredProduct, file: Path, header: Header) -> Facts:
+    bits = all_bits(product)
     counts = FlagCounter(rejecting_mask(bits))
-    for variable in flags.values():
-        counts.add(variable.values)
-    height = "station_altitude" if "station_altitude" in product.variables else "altitude"
+    for name in flags_names(product):
+        counts.add(product[name][...])
+    height = "station_altitude" if "station_altitude" in product else "altitude"
     return Facts(
         **{stated.name: getattr(header, stated.name) for stated in fields(header)},
-        campaign=attributes["lidarops_campaign"],
+        campaign=product.attrs["lidarops_campaign"],
         wavelength=_middle(product, "wavelength") * 1e-9,
         latitude=_middle(product, "latitude"),
         longitude=_middle(product, "longitude"),
@@ -326,13 +360,14 @@ def _facts(product: Any, file: Path, header: Header) -> Facts:
         sha256=sha256_of(file),
         size=file.stat().st_size,
         verdicts=counts.verdicts,
-        code_version=attributes["lidarops_code_version"],
+        code_version=product.attrs["lidarops_code_version"],
         flagged={
             bit.word.upper(): counts.carried[bit.mask] for bit in bits if bit.mask in counts.carried
         },
     )
 
 
+@cache
 def coordinate_names(kind: str) -> frozenset[str]:
     """Return the names of the coordinates of a product kind, including bounds."""
     rows = layout_of(kind).coordinates
@@ -340,20 +375,20 @@ def coordinate_names(kind: str) -> frozenset[str]:
     return frozenset({*(row.name for row in rows), *bounds})
 
 
-def _grid_digest(product: Any, kind: str) -> str:
+def _grid_digest(product: StoredProduct, kind: str) -> str:
     """Return a digest of what must be equal in products that are joined along time.
 
     These are names, types, dimensions, units and flags of the variables, the recorders, and the
     values of all coordinates that do not change with time, including the position of the station.
     """
-    digest = hashlib.sha256(f"{kind}{getattr(product, RECORDERS, '')}".encode())
+    digest = hashlib.sha256(f"{kind}{product.attrs.get(RECORDERS, '')}".encode())
     coordinates = coordinate_names(kind)
     for name, variable in sorted(product.variables.items()):
         if name in UNSHARED:
             continue
-        dims = variable.dimensions
-        sizes = [(dim, n) for dim, n in zip(dims, variable.shape, strict=True) if dim != "time"]
-        schema = [plain(getattr(variable, key, None)) for key in _SCHEMA_ATTRIBUTES]
+        dims = variable.dims
+        sizes = [(dim, n) for dim, n in variable.sizes.items() if dim != "time"]
+        schema = [plain(variable.attrs.get(key)) for key in _SCHEMA_ATTRIBUTES]
         digest.update(repr((name, variable.dtype.str, dims, sizes, schema)).encode())
         if name in coordinates and "time" not in dims:
             digest.update(np.ascontiguousarray(variable[...]).tobytes())
@@ -431,7 +466,7 @@ def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> No
     ProductError
         If a time occurs twice.
     """
-    paths, parts = zip(*profiles, strict=True)
+    paths, parts = zip(("", np.empty(0)), *profiles, strict=True)
     times = np.concatenate(parts)
     owners = np.repeat(np.arange(len(paths)), [part.size for part in parts])
     order = np.argsort(times, kind="stable")
@@ -446,7 +481,6 @@ def refuse_duplicates(profiles: Iterable[tuple[str, NDArray[np.float64]]]) -> No
         )
 
 
-def _middle(product: Any, name: str) -> float:
+def _middle(product: StoredProduct, name: str) -> float:
     """Return a coordinate of the station, or its mean over a network; NaN if missing."""
-    known = name in product.variables
-    return float(product[name][...].mean()) if known else float("nan")
+    return float(product[name][...].mean()) if name in product else float("nan")

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from uuid import UUID
-
-import pandas as pd
 
 from lidarops.aggregate import need
 from lidarops.aggregate.facts import EVERYTHING, FOLDER, Facts, ProductSelection, parse_selection
@@ -24,7 +22,10 @@ from lidarops.errors import NO_FILE, LidarOpsError, ProductError
 from lidarops.kinds import flags_of, kinds
 from lidarops.records import Verdicts
 from lidarops.system.code_version import module_version
-from lidarops.system.files import sha256_of, write_atomically
+from lidarops.system.files import last_change, sha256_of, write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 INDEX: Final = "products.parquet"
 FORMAT: Final = b"3"
@@ -62,7 +63,7 @@ _COLUMNS: Final = (
 """Type and names of columns, in their order."""
 
 
-def write_index(root: Path, products: Iterable[Facts]) -> str:
+def write_index(root: Path, products: Iterable[Facts], as_of: float | None = None) -> str:
     """Write the index of products.
 
     Parameters
@@ -70,6 +71,8 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     root : path
         Folder that product paths are relative to; the index is written to its ``aggregates``.
     products : iterable of Facts
+    as_of : float, optional
+        Time before which the products were as in `products`, s since 1970; by default now.
 
     Returns
     -------
@@ -110,7 +113,7 @@ def write_index(root: Path, products: Iterable[Facts]) -> str:
     )
     target = root / FOLDER / INDEX
     target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(target, stream.getvalue())
+    write_atomically(target, stream.getvalue(), as_of)
     return target.relative_to(root).as_posix()
 
 
@@ -127,7 +130,8 @@ def _cells(facts: Facts) -> dict[str, Any]:
 
 
 def _facts_version() -> bytes:
-    return module_version(Facts.__module__).encode()
+    """Return the version of the code that reads facts, with the kinds whose bits have columns."""
+    return " ".join((module_version(Facts.__module__), *kinds())).encode()
 
 
 class KnownFacts:
@@ -137,15 +141,21 @@ class KnownFacts:
     ----------
     root : path
         Nothing is known where it has no index, or one that other code wrote.
+    hashed : bool
+        Whether `Facts.sha256` is needed as a whole; else it may be what the index states of it.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, hashed: bool = True) -> None:
         index = root / FOLDER / INDEX
-        self._root = root
+        self._root, self._hashed = root, hashed
+        self._written = 0.0
         self._rows: dict[str, dict[str, Any]] = {}
+        self._given = 0
         with suppress(*NO_FILE, LidarOpsError):
+            written = index.stat().st_mtime
             table = _read(index, EVERYTHING, None)
             if table.schema.metadata.get(_READ_BY) == _facts_version():
+                self._written = written
                 # A package that adds a kind may have gone.
                 rows = (row for row in table.to_pylist() if row["kind"] in kinds())
                 self._rows = {row["path"]: row for row in rows}
@@ -158,10 +168,17 @@ class KnownFacts:
         with suppress(OSError):
             if row is None or file.lstat().st_size != row["size"]:
                 return None
-            sha256 = sha256_of(file)
-            if bytes.fromhex(sha256).startswith(row["sha256_prefix"]):
+            stated = row["sha256_prefix"].hex()
+            settled = last_change(file) < self._written
+            sha256 = stated if settled and not self._hashed else sha256_of(file)
+            if sha256.startswith(stated):
+                self._given += 1
                 return _facts(row, sha256)
         return None
+
+    def are(self, products: Sequence[Facts]) -> bool:
+        """Return whether products are those of the index, and all came from it."""
+        return 0 < len(self._rows) == self._given == len(products)
 
 
 def _facts(row: dict[str, Any], sha256: str) -> Facts:

@@ -19,11 +19,13 @@ from lidarops.aggregate.facts import (
     FOLDER,
     PERIOD,
     Facts,
+    Period,
     Refused,
+    Weights,
     coordinate_names,
     refuse_duplicates,
 )
-from lidarops.aggregate.means_variables import Period, Weights, layout
+from lidarops.aggregate.means_variables import layout
 from lidarops.errors import ProductError
 from lidarops.netcdf import variables as rows
 from lidarops.netcdf.context import (
@@ -36,6 +38,8 @@ from lidarops.netcdf.context import (
 )
 from lidarops.netcdf.coordinates import auxiliary_names
 from lidarops.netcdf.encoding import as_stored, as_text
+from lidarops.netcdf.read import as_variable
+from lidarops.netcdf.stored import StoredProduct, reading
 from lidarops.netcdf.variables import QUANTIZATION, Layout, attributes, layout_of
 from lidarops.netcdf.write import write_product
 from lidarops.system.code_version import code_version
@@ -92,14 +96,14 @@ def write_means(
     refused: list[Refused] = []
     for facts in products:
         try:
-            with facts.opened(root) as product:
+            with facts.opened(root) as product, reading(facts.path):
                 source = layout_of(facts.kind)
-                profiles, times = read_profiles(product, source), product["time"].values
+                profiles, times = read_profiles(product, source), product["time"][...]
                 if any(product[name].dims for name in _MOVING if name in product):
                     note = f"no means of {facts.kind}: profiles of several directions have none"
                     return MeansResult((), tuple(refused), f"{note} ({facts.path})")
                 averaging.frame = averaging.frame or _frame(product, facts.kind)
-                stated = dict(product.attrs)
+                stated = product.attrs.whole()
         except ProductError as error:
             refused.append(Refused(facts.path, error.problem))
         else:
@@ -242,11 +246,11 @@ class _Averaging:
             yield MeansFile(year.path, done.sha256, done.size, len(year.keys), len(year.inputs))
 
 
-def _frame(product: xr.Dataset, kind: str) -> dict[str, xr.Variable]:
+def _frame(product: StoredProduct, kind: str) -> dict[str, xr.Variable]:
     """Read the coordinates of a product that do not change with time, and its station."""
     static = coordinate_names(kind)
     return {
-        str(name): variable.load()
+        name: as_variable(variable).load()
         for name, variable in product.variables.items()
         if (name in static and "time" not in variable.dims)
         or name in ("station", QUANTIZATION.name)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from enum import StrEnum
 from typing import Any, Final
 
+from lidarops.aggregate.facts import Period, Weights
 from lidarops.netcdf.quantities import CLOUD_FRACTION
 from lidarops.netcdf.variables import (
     QUALITY_FLAG,
@@ -41,38 +41,6 @@ PRODUCT_INDEX: Final = Row(
     coverage=Coverage.REFERENCE,
     dtype="i4",
 )
-
-
-class Period(StrEnum):
-    """Period of a mean: a calendar day or month, UTC."""
-
-    DAY = "day"
-    MONTH = "month"
-
-    @property
-    def unit(self) -> str:
-        """Unit of numpy and of durations in ISO 8601."""
-        return self.value[0].upper()
-
-
-class Weights(StrEnum):
-    """Weights of profiles in a mean."""
-
-    SHOTS = "shots"
-    """Number of laser shots: a profile of a few shots counts less than a whole one."""
-    PLAIN = "plain"
-    """Equal weights."""
-    INVERSE_VARIANCE = "inverse-variance"
-    """Inverse squares of the standard errors."""
-
-    @property
-    def description(self) -> str:
-        """Description for the attributes of a file."""
-        return {
-            "shots": "usable profiles are weighted by their number of laser shots",
-            "plain": "usable profiles have equal weights",
-            "inverse-variance": "usable profiles have the weights 1 / standard_error^2",
-        }[self.value]
 
 
 _INDEPENDENT: Final = (

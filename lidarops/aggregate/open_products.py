@@ -25,7 +25,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
-from lidarops.netcdf.read import opened_stored
+from lidarops.netcdf.stored import opened_stored, reading
 from lidarops.netcdf.variables import judging, summary_of
 from lidarops.system.files import within
 
@@ -113,7 +113,7 @@ def open_products(
     (headers,) = by_group.values()
     ordered = [parts[header] for header in headers]
     refuse_duplicates((part.header.path, part.times) for part in ordered)
-    with headers[0].opened(root) as product:
+    with headers[0].opened(root) as product, reading(headers[0].path):
         pattern = pattern_of(product, headers[0])
     # Decoded once, which is much faster than decoding each product.
     return _usable_values(xr.decode_cf(join(ordered, pattern)), usable, on_altitude=on_altitude)
@@ -152,7 +152,7 @@ def _read(root: Path, paths: Iterable[str], selection: ProductSelection) -> dict
             with opened_stored(file) as product:
                 header = read_header(product, path, selection)
                 if header is not None:
-                    parts[header] = Part(header, file, vars(product), product["time"][...])
+                    parts[header] = Part(header, file, product.attrs.whole(), product["time"][...])
         except ProductError as error:
             raise ProductError(error.problem, file=path, remedy="leave the file out") from error
     return parts

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -32,8 +33,8 @@ from lidarops.aggregate.facts import (
 )
 from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
-from lidarops.netcdf.read import stored_values
-from lidarops.system.files import only_one, within
+from lidarops.netcdf.stored import StoredProduct, StoredVariable, reading
+from lidarops.system.files import only_one
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
@@ -228,43 +229,68 @@ def _write_group(
     held = _held(store, name)
     ids = [product.id for product in products]
     starts = np.cumsum([0, *(product.profiles for product in products)]).tolist()
-    lacking = [at for at in range(len(ids)) if held.places.get(ids[at]) != (at, starts[at])]
+    lacking = {at for at, key in enumerate(ids) if held.places.get(key) != (at, starts[at])}
     gone = held.places.keys() - set(ids)
     if not lacking and not gone:
         return
     if 0 in lacking:
         # The first product gives the attributes of variables.
-        lacking = list(range(len(ids)))
+        lacking = set(range(len(ids)))
+    refuse_duplicates((product.path, _times(root, product)) for product in _meeting(products))
+    if 0 not in lacking:
+        rows = _resized(_root(store)[name], starts[-1], len(products))
     # What all have in common is known of those that stay, unless others go.
-    read = range(len(ids)) if gone else lacking
-    times = {at: held.times[slice(*rows)] for at, rows in enumerate(pairwise(starts))}
-    attributes, pattern = {}, None
-    for at in read:
-        try:
-            with products[at].opened(root) as product:
-                attributes[at], times[at] = product.attrs, product["time"].values
-                if at == 0:
-                    pattern = pattern_of(product, products[at])
-        except ProductError as error:
-            raise UnreadableProductError(products[at], error.problem) from error
-    refuse_duplicates((products[at].path, part) for at, part in times.items())
-    known = [] if gone or 0 in lacking else [held.attributes]
-    shared = shared_attributes([*known, *attributes.values()])
-    if 0 in lacking and pattern is not None:
-        _create(store, name, pattern)
-    group = _root(store)[name]
-    group.attrs.put({key: plain(value) for key, value in shared.items()})
-    _write_rows(group, root, products, lacking, starts)
-    new = [at for at in lacking if ids[at] not in held.places]
-    changes.added += [(products[at].path, attributes[at]["product_version"]) for at in new]
+    shared = [] if gone or 0 in lacking else [held.attributes]
+    for at in range(len(ids)) if gone else sorted(lacking):
+        facts = products[at]
+        with _unreadable(facts), facts.opened(root) as product:
+            with reading(facts.path):
+                stated = product.attrs.whole()
+                pattern = None if at or 0 not in lacking else pattern_of(product, facts)
+            if pattern is not None:
+                _create(store, name, pattern)
+                rows = _resized(_root(store)[name], starts[-1], len(products))
+            if at in lacking:
+                _add(rows, product, facts, at, starts[at])
+        shared = [shared_attributes([*shared, stated])]
+        if at in lacking and facts.id not in held.places:
+            changes.added.append((facts.path, stated["product_version"]))
+    for parts in rows.values():
+        parts.write()
+    attributes = {key: plain(value) for key, value in shared[0].items()}
+    _root(store)[name].attrs.put(attributes)
     changes.dropped += len(gone)
+
+
+def _meeting(products: Sequence[Facts]) -> list[Facts]:
+    """Return those of some products in order of time that may share a time with another."""
+    found: dict[str, Facts] = {}
+    last = products[0]
+    for product in products[1:]:
+        if product.start < last.stop or product.start == last.start:
+            found |= {last.path: last, product.path: product}
+        last = max(last, product, key=attrgetter("stop"))
+    return list(found.values())
+
+
+def _times(root: Path, facts: Facts) -> NDArray[np.float64]:
+    with _unreadable(facts), facts.opened(root) as product:
+        return product["time"][...]
+
+
+@contextmanager
+def _unreadable(facts: Facts) -> Iterator[None]:
+    """Name the product that cannot be read or has changed."""
+    try:
+        yield
+    except ProductError as error:
+        raise UnreadableProductError(facts, error.problem) from error
 
 
 class _Held(NamedTuple):
     """What a group holds before an update."""
 
     attributes: Mapping[str, Any]
-    times: NDArray[np.float64]
     places: Mapping[str, tuple[int, int]]
     """Id -> number and first row of each product."""
 
@@ -272,66 +298,72 @@ class _Held(NamedTuple):
 def _held(store: Any, name: str) -> _Held:
     root = _root(store)
     if name not in root:
-        return _Held({}, np.empty(0), {})
+        return _Held({}, {})
     group = root[name]
     ids = group[PRODUCT.name][:].tolist()
     lengths = np.bincount(group[PRODUCT_INDEX.name][:], minlength=len(ids))
     starts = np.cumsum([0, *lengths]).tolist()
     places = {product: (at, starts[at]) for at, product in enumerate(ids)}
-    return _Held(group.attrs.asdict(), group["time"][:], places)
+    return _Held(group.attrs.asdict(), places)
 
 
-def _write_rows(
-    group: Any, root: Path, products: Sequence[Facts], lacking: Sequence[int], starts: Sequence[int]
-) -> None:
-    """Write the rows of some products to the arrays of a group."""
-    length = {"time": starts[-1], PRODUCT.name: len(products)}
-    for name, array in group.arrays():
-        dims = array.metadata.dimension_names or ()
-        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
-        if not {"time", PRODUCT.name} & set(dims):
-            continue
-        firsts = starts if "time" in dims else range(len(products) + 1)
-        for pieces in _pieces(lacking, firsts, array.chunks[0]):
-            values = []
-            for at, low, high in pieces:
-                rows = slice(low - firsts[at], high - firsts[at]) if "time" in dims else None
-                values.append(_rows(root, products[at], at, name, rows))
-            array[pieces[0][1] : pieces[-1][2]] = np.concatenate(values)
-
-
-def _rows(root: Path, facts: Facts, number: int, name: str, rows: slice | None) -> NDArray[Any]:
-    """Return some rows of a variable of a product; its only one where `rows` is None."""
-    if name == PRODUCT.name:
-        return np.array([facts.id])
-    if name == PRODUCT_INDEX.name:
-        return np.full(facts.profiles, number, np.int32)[rows]
-    try:
-        values = stored_values(within(root, facts.path), facts.id, name, rows or slice(None))
-        return values[None] if rows is None else values
-    except ProductError as error:
-        raise UnreadableProductError(facts, error.problem) from error
-
-
-def _pieces(
-    lacking: Sequence[int], firsts: Sequence[int], chunk: int
-) -> Iterator[list[tuple[int, int, int]]]:
-    """Yield what is written at once: number of a product, first row, and the one past the last.
+class _Rows:
+    """Rows of an array that are written at once.
 
     Neighbours in one chunk are together, because each write keeps a copy of its chunk, and chunks
     are apart, so that memory holds few rows.
     """
-    together: list[tuple[int, int, int]] = []
-    for at in lacking:
-        start, stop = firsts[at], firsts[at + 1]
+
+    def __init__(self, array: Any, *, of_profiles: bool) -> None:
+        self.array = array
+        self.of_profiles = of_profiles
+        """Whether a row is of a profile, not of a whole product."""
+        self.first, self.stop = 0, 0
+        self.parts: list[NDArray[Any]] = []
+
+    def add(self, start: int, stop: int, values: StoredVariable | NDArray[Any]) -> None:
+        """Add the rows of a product, of which as many as belong to a chunk are read at a time."""
+        chunk = self.array.chunks[0]
         edges = (start, *range((start // chunk + 1) * chunk, stop, chunk), stop)
         for low, high in pairwise(edges):
-            if together and (low % chunk == 0 or low != together[-1][2]):
-                yield together
-                together = []
-            together.append((at, low, high))
-    if together:
-        yield together
+            if low % chunk == 0 or low != self.stop:
+                self.write()
+                self.first = low
+            self.parts.append(values[low - start : high - start])
+            self.stop = high
+
+    def write(self) -> None:
+        """Write what was added."""
+        if self.parts:
+            self.array[self.first : self.stop] = np.concatenate(self.parts)
+            self.parts = []
+
+
+def _resized(group: Any, profiles: int, products: int) -> dict[str, _Rows]:
+    """Make the arrays of a group as long as its products; return those that hold rows."""
+    length, rows = {"time": profiles, PRODUCT.name: products}, {}
+    for name, array in group.arrays():
+        dims = array.metadata.dimension_names or ()
+        array.resize(tuple(length.get(d, n) for d, n in zip(dims, array.shape, strict=True)))
+        if length.keys() & set(dims):
+            rows[name] = _Rows(array, of_profiles="time" in dims)
+    return rows
+
+
+def _add(
+    rows: Mapping[str, _Rows], product: StoredProduct, facts: Facts, at: int, start: int
+) -> None:
+    """Add the rows of a product, with its number among all and its first row."""
+    own = {
+        PRODUCT.name: np.array([facts.id]),
+        PRODUCT_INDEX.name: np.full(facts.profiles, at, np.int32),
+    }
+    for name, parts in rows.items():
+        if parts.of_profiles:
+            values = own[name] if name in own else product[name]
+            parts.add(start, start + facts.profiles, values)
+        else:
+            parts.add(at, at + 1, own[name] if name in own else product[name][...][None])
 
 
 def _create(store: Any, name: str, pattern: xr.Dataset) -> None:

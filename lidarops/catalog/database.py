@@ -234,6 +234,25 @@ _PATIENCE: Final = 30
 """s, for which SQLite waits for another process, and a connection for a server."""
 _PAUSE: Final = 0.02
 """s."""
+_REMEDIES: Final = (
+    (("full", "No space left"), "make space on the disk, then run again: finished scenes are kept"),
+    (
+        ("readonly", "read-only"),
+        "make the folder writable, or choose another with --out or LIDAROPS_CATALOG",
+    ),
+    (
+        ("password", "pg_hba.conf"),
+        "give the password in PGPASSWORD or ~/.pgpass, or ask who runs the server to let you in",
+    ),
+    (("permission denied",), "ask who runs the server for the right to make and change tables"),
+    (("does not exist",), "correct user and name in the URL, or make the database: createdb NAME"),
+    (("too many", "reserved for"), "run again when fewer programs use the server"),
+    (
+        ("terminating connection", "closed the connection", "shutting down", "starting up"),
+        "run again when the server runs: finished scenes are kept",
+    ),
+)
+"""Words in the messages of databases, and what to do."""
 _BROKEN: Final = ("malformed", "not a database", "decode")
 """Words in the messages of SQLite about a damaged file."""
 
@@ -451,18 +470,14 @@ class Database:
 
     def _catalog_error(self, error: sa.exc.SQLAlchemyError) -> CatalogError:
         cause = str(getattr(error, "orig", None) or error).strip()
-        kind: type[CatalogError] = UnavailableError
-        if "full" in cause:
-            remedy = "make space on the disk, then run again: finished scenes are kept"
-        elif "readonly" in cause or "read-only" in cause:
-            remedy = "make the folder writable, or choose another with --out or LIDAROPS_CATALOG"
-        elif not self._sqlite:
-            remedy = "check that the server runs, and host, user, password and name in the URL"
-        elif any(word in cause for word in _BROKEN):
-            kind, remedy = CatalogError, _MOVE_AWAY
-        else:
+        problem = f"the catalog cannot be used: {cause}"
+        if self._sqlite and any(word in cause for word in _BROKEN):
+            return CatalogError(problem, file=self.place, remedy=_MOVE_AWAY)
+        remedy = "check that the server runs, and host, user, password and name in the URL"
+        if self._sqlite:
             remedy = "check that the folder is writable and the file is a lidarops catalog"
-        return kind(f"the catalog cannot be used: {cause}", file=self.place, remedy=remedy)
+        found = (remedy for words, remedy in _REMEDIES if any(word in cause for word in words))
+        return UnavailableError(problem, file=self.place, remedy=next(found, remedy))
 
 
 def check_archive_and_catalog(campaign: Campaign, *, archive: str | None) -> None:

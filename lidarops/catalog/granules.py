@@ -134,7 +134,9 @@ class Granules(Database):
     ) -> list[Granule]:
         """Return the granules of the campaign, ordered by instrument, start time and path."""
         conditions += () if status is None else (_C.status == status.value,)
-        query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
+        query = sa.select(*(_C[name] for name in _GRANULE_NAMES)).where(
+            _C.campaign == self.campaign, *conditions
+        )
         query = query.order_by(_C.instrument, _C.start, _C.path)
         layouts = dict(self.read(sa.select(LAYOUT), lambda row: (row.hash, _layout_from(row[1]))))
         with self.stream(query) as rows:
@@ -316,7 +318,7 @@ class Granules(Database):
         return dict(rows)
 
 
-_GRANULE_COLUMNS: Final = tuple(_C[field.name] for field in fields(Granule))
+_GRANULE_NAMES: Final = tuple(field.name for field in fields(Granule))
 _ROLES: Final = {role.value: role for role in Role}
 _STATUSES: Final = {status.value: status for status in Status}
 
@@ -355,14 +357,10 @@ def _sentences(stored: str) -> tuple[str, ...]:
 
 
 def _granule_from(row: Any, layouts: Layouts) -> Granule:
-    stored = row._asdict()
-    return Granule(
-        **stored
-        | {
-            "role": _ROLES[stored["role"]],
-            "status": _STATUSES[stored["status"]],
-            "notes": _sentences(stored["notes"]),
-            "contradictions": _sentences(stored["contradictions"]),
-            "layout": layouts[stored["layout"]],
-        }
-    )
+    stored = dict(zip(_GRANULE_NAMES, row, strict=True))
+    stored["role"] = _ROLES[stored["role"]]
+    stored["status"] = _STATUSES[stored["status"]]
+    stored["notes"] = _sentences(stored["notes"])
+    stored["contradictions"] = _sentences(stored["contradictions"])
+    stored["layout"] = layouts[stored["layout"]]
+    return Granule(**stored)

@@ -24,7 +24,6 @@ from lidarops.raw.header import TIME_REMEDY, RawHeader
 from lidarops.records import (
     ACKNOWLEDGED,
     INVALID,
-    UNKNOWN_FORMAT,
     UNREADABLE,
     ChannelLayout,
     Granule,
@@ -49,9 +48,9 @@ _FIELDS: Final = tuple(item.name for item in fields(Granule))
 _STATED: Final = tuple(item.name for item in fields(Header))
 _HALF: Final = (1 << 31) - 1
 _FUTURE: Final = "starts in the future"
-_TRY_AGAIN: Final = (UNREADABLE, UNKNOWN_FORMAT, _FUTURE)
-"""Starts of the reason if a refused file may be readable another time, its format be added, or the
-clock of this machine be set."""
+_TRY_AGAIN: Final = (UNREADABLE, _FUTURE)
+"""Starts of the reason if a refused file may be readable another time, or the clock of this machine
+be set."""
 
 HEADER_BYTES: Final = 16384
 """Bytes that hold the header of any format."""
@@ -69,6 +68,8 @@ def printable(path: str) -> str:
 def acknowledged(campaign: Campaign, granules: Iterable[Granule]) -> list[Granule]:
     """Return granules that are not used; where the campaign acknowledges it, the reason says so."""
     unused = [*granules]
+    if not campaign.acknowledged:
+        return unused
     reasons = acknowledged_reasons(campaign, {granule.path: granule.reason for granule in unused})
     return [replace(granule, reason=reasons[granule.path]) for granule in unused]
 

@@ -116,18 +116,23 @@ def scan_archive(
         some; the catalog then stays unchanged.
     """
     work = _Scan(campaign, store, progress, before_write)
-    remote = isinstance(work.source, RemoteSource)
-    processes = 1 if remote else min(workers, _MOST_PROCESSES)
     headers = Headers(work.source, campaign, store.campaign)
     crashed = partial(unread_row, headers, reason=CRASHED)
-    with store.fingerprints() as known, Processes(processes, headers) as readers:
+    with (
+        store.fingerprints() as known,
+        Processes(min(workers, _MOST_PROCESSES), headers) as readers,
+    ):
         # Of no other file is the size requested.
         listed = work.source.files(lambda path: bool(work.owners(path)))
         due = work.due(_joined(listed, known))
-        rows = readers.map_items(
-            read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES, lost=crashed
-        )
-        for _, row in rows:
+        if isinstance(work.source, RemoteSource):
+            rows = work.source.map(partial(read_row, headers), due)
+        else:
+            pairs = readers.map_items(
+                read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES, lost=crashed
+            )
+            rows = (row for _, row in pairs)
+        for row in rows:
             work.enter(row)
     return work.finish()
 

@@ -189,11 +189,7 @@ def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0
     terminal, cells fold between words only, so that names can be read and copied. Where the words
     are too long for columns, each row is a paragraph.
     """
-    # A file name may hold what moves the cursor of a terminal.
-    whole = [
-        (title, list(columns), [[visible(str(cell)) for cell in row] for row in rows])
-        for title, columns, rows in tables
-    ]
+    whole = [(title, list(columns), list(rows)) for title, columns, rows in tables]
     shown = [line for table in whole for line in _table(*table, most)]
     while most and len(shown) > lines:
         most -= 1
@@ -203,13 +199,14 @@ def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0
     return len(shown)
 
 
-def _table(title: str, names: list[str], cells: list[list[str]], most: int | None) -> list[str]:
+def _table(title: str, names: list[str], rows: list[Iterable[Any]], most: int | None) -> list[str]:
     """Return the lines of a table of at most so many rows; none of one without rows."""
-    kept = cells[:most]
-    if len(kept) < len(cells):
-        title += f", the first {len(kept)} of {len(cells)} (--all)"
+    # A file name may hold what moves the cursor of a terminal.
+    kept = [[visible(str(cell)) for cell in row] for row in rows[:most]]
+    if len(kept) < len(rows):
+        title += f", the first {len(kept)} of {len(rows)} (--all)"
     # As the title of the table it would fold at the width of the table.
-    head = wrapped(title, "") if cells else []
+    head = wrapped(title, "") if rows else []
     if not kept:
         return head
     widths = _column_widths(names, kept, terminal_width())

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 _MANY_PRODUCTS = 12
 """More products are summed by kind and channel, unless --all is given."""
+_MANY_FILES = 20
+"""Most rows of each table of a catalog, without --all."""
 _FEW_ROWS = 3
 """Most rows of other tables, without --all."""
 _LINES = 45
@@ -92,6 +94,9 @@ def catalog(
             help="Also enter products that the ledger lacks, from their own provenance.",
         ),
     ] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="List every refused file and finding.")
+    ] = False,
     as_json: options.Json = False,
 ) -> None:
     """Create or update the catalog of the archive; list refused files, notes on files, and why.
@@ -128,7 +133,8 @@ def catalog(
             document["rebuilt"] = asdict(rebuilt)
         typer.echo(json.dumps(document, indent=2))
     else:
-        show_tables([_refused_table(refused), *finding_tables(findings)])
+        most = None if everything else _MANY_FILES
+        show_tables([_refused_table(refused), *finding_tables(findings)], most, _LINES)
         declared = sum(granule.is_expected for granule in refused)
         say(
             f"{summary.files} files: {summary.added} added, {summary.changed} changed,"
@@ -261,7 +267,7 @@ def reprocess(
     finally:
         # The result is printed even if the page or the removal failed.
         if as_json:
-            summary = _run_summary(settings, result, page)
+            summary = _run_summary(result, page)
             summary |= {"no_scene_selected": no_scene, "removed": removed or 0}
             summary |= {"earlier_reports": [str(made) for made in earlier]}
             typer.echo(json.dumps(summary, indent=2))
@@ -320,13 +326,13 @@ def _refused_table(refused: Iterable[Granule]) -> Table:
     return "Refused", ("file", "instrument", "reason"), rows
 
 
-def _run_summary(campaign: Campaign, result: Result, page: Path | None) -> dict[str, Any]:
+def _run_summary(result: Result, page: Path | None) -> dict[str, Any]:
     from lidarops.run.archive import refused_files
 
     record, scenes = result.record, result.scenes
     products = [product for scene in scenes for product in scene.products]
     changes = {product.path: product.change for product in products if product.change is not None}
-    refused = refused_files(campaign, result)
+    refused = refused_files(result)
     return {
         "run": None if record is None else record.id,
         "status": result.status.value,
@@ -382,7 +388,7 @@ def _print_result(
 ) -> None:
     scenes, most = result.scenes, None if everything else _FEW_ROWS
     left = _LINES - _show_products(scenes, everything=everything)
-    show_tables(_tables(campaign, result, removing=removing), most, left)
+    show_tables(_tables(result, removing=removing), most, left)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
@@ -400,7 +406,7 @@ def _print_result(
         say(f"nothing to do: {state}{never_made(result.findings)}")
 
 
-def _tables(campaign: Campaign, result: Result, *, removing: bool) -> Iterator[Table]:
+def _tables(result: Result, *, removing: bool) -> Iterator[Table]:
     """Yield what a run found, but its products: what changed, was not used, or has no value."""
     from lidarops.figures.wording import change_in_words
     from lidarops.reports.findings import disagreement_rows, scene_note_rows
@@ -419,7 +425,7 @@ def _tables(campaign: Campaign, result: Result, *, removing: bool) -> Iterator[T
     yield "Products made again", ("file", "change", "difference", "cause"), changes
     title = "Frozen products that would be replaced (--thaw replaces them)"
     yield title, reason, result.frozen.items()
-    refused = refused_files(campaign, result)
+    refused = refused_files(result)
     yield _refused_table(refused)
     listed = {granule.path for granule in refused}
     set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)

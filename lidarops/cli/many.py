@@ -80,8 +80,7 @@ def aggregate(
     Example: lidarops aggregate demo --kind elastic --means month --weights inverse-variance
     """
     from lidarops.aggregate.aggregates import make_aggregates
-    from lidarops.aggregate.facts import parse_selection
-    from lidarops.aggregate.means_variables import Period, Weights
+    from lidarops.aggregate.facts import Period, Weights, parse_selection
 
     try:
         period, weighting = means if means is None else Period(means), Weights(weights)

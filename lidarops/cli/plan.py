@@ -383,7 +383,7 @@ def _show_refused(reasons: Sequence[str]) -> int:
     if not reasons:
         return 0
     said = say_wrapped(
-        f"{counted(len(reasons), 'file')} refused (lidarops catalog names them):", ""
+        f"{counted(len(reasons), 'file')} refused (lidarops catalog --all names them):", ""
     )
     frequent = Counter(reasons).most_common(_REASONS)
     for reason, count in frequent:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -38,6 +38,7 @@ _MOST: Final = 65534
 """Largest position; the next number stands for none."""
 _BEYOND: Final = 1.0
 """Positions are clipped at this many axis lengths outside the ends."""
+_OF_AXIS: Final = tuple(item.name for item in fields(Axis))
 
 
 @cache
@@ -113,7 +114,7 @@ def _panel(panel: Panel, packed: _Packed) -> dict[str, Any]:
 def _axis(axis: Axis | None) -> dict[str, Any] | None:
     if axis is None:
         return None
-    return asdict(axis) | {"label": visible(axis.label)}
+    return {name: getattr(axis, name) for name in _OF_AXIS} | {"label": visible(axis.label)}
 
 
 def _layer(layer: Layer, panel: Panel, packed: _Packed) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from lidarops.figures.image_panels import ImageQuantity, image_figure
@@ -52,7 +51,7 @@ class KindFigures:
     """Figures of a kind of product."""
 
     views: tuple[View[Any], ...]
-    """The first figure of the first view is the thumbnail of a product."""
+    """In the order of the page."""
     preferred: str
     """Variable for an overview of any product that has it."""
 
@@ -164,10 +163,9 @@ def _read(name: str | None, product: xr.Dataset, _: int) -> AnyContent | None:
     most_values = np.argsort(-np.isfinite(values).sum(axis=0), kind="stable")[:SERIES]
     series = tuple(
         TimeSeries(
-            pd.DataFrame(
-                {"flag": flags[:, k], name: values[:, k], f"{name}_standard_error": errors[:, k]},
-                index=time,
-            ),
+            time,
+            {name: values[:, k], f"{name}_standard_error": errors[:, k]},
+            flags[:, k],
             judged.rejecting,
             label=f"{variable.dims[1]} {k}" if variable.ndim > 1 else "",
             key=(k,),

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import xarray as xr
 
 from lidarops.records import GLUED, is_glued
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from lidarops.netcdf.stored import StoredProduct
 
 UNKNOWN: Final = "unknown"
 
 
-def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
+def attribute(product: xr.Dataset | StoredProduct, name: str, default: str = UNKNOWN) -> str:
     """Return a global attribute as text."""
     return str(product.attrs.get(name, "")).strip() or default
 
@@ -20,7 +24,8 @@ def attribute(product: xr.Dataset, name: str, default: str = UNKNOWN) -> str:
 def light_in_words(product: xr.Dataset) -> str:
     """Return wavelength and detection of the channel in words; empty if unknown."""
     wavelength = scalar(product, "wavelength")
-    words = "" if wavelength is None else f"{wavelength:g} {product['wavelength'].attrs['units']}"
+    units = "" if wavelength is None else product.variables["wavelength"].attrs["units"]
+    words = "" if wavelength is None else f"{wavelength:g} {units}"
     glued = is_glued(attribute(product, "lidarops_channel"))
     mode = _DETECTION.get(GLUED if glued else attribute(product, "lidarops_detection_mode"), "")
     return ", ".join(filter(None, (words, mode)))
@@ -35,7 +40,8 @@ _DETECTION: Final = {
 
 def scalar(product: xr.Dataset, name: str) -> float | None:
     """Return a variable that is one finite number; None without it."""
-    if name not in product.variables or product[name].ndim or "units" not in product[name].attrs:
+    stored = product.variables.get(name)
+    if stored is None or stored.ndim or "units" not in stored.attrs:
         return None
-    value = product[name].values.astype(np.float64).item()
+    value = stored.values.astype(np.float64).item()
     return float(value) if np.isfinite(value) else None

@@ -172,10 +172,10 @@ def read_raster(
     require(product, dims | dict.fromkeys((*_along_both(quantity), judge), ("time", along)))
     if product.sizes["time"] < 1 or product.sizes[along] < 2:
         raise ProductError("holds no profile of at least 2 bins", field=quantity)
-    time = product["time"].values
+    time = product.variables["time"].values
     if np.any(time[1:] < time[:-1]):
         product = product.isel(time=np.argsort(time, kind="stable"))
-    ranges = product[along].values.astype(np.float64)
+    ranges = product.variables[along].values.astype(np.float64)
     starts, stops = profile_bounds(product)
     columns = column_starts(starts, stops, profiles)
     rows = np.arange(0, ranges.size, -(-ranges.size // _READ_ROWS))
@@ -194,7 +194,7 @@ def read_raster(
         profiles=np.diff([*columns, starts.size]),
         length=np.median(stops - starts),
         clouds=_clouds(product, columns),
-        units=str(product[quantity].attrs.get("units", "")),
+        units=str(product.variables[quantity].attrs.get("units", "")),
         altitude=_altitude(product, ranges),
     )
 
@@ -205,7 +205,7 @@ def _reduced(
     """Yield sums over blocks of columns."""
     edges = [*columns, product.sizes["time"]]
     longest = int(np.diff(edges).max())
-    step = max(1, _READ_BYTES // (8 * product[names[0]].shape[1] * longest))
+    step = max(1, _READ_BYTES // (8 * product.variables[names[0]].shape[1] * longest))
     for first in range(0, columns.size, step):
         last = min(first + step, columns.size)
         block = product.isel(time=slice(int(edges[first]), int(edges[last])))
@@ -215,8 +215,8 @@ def _reduced(
 def _sums(
     product: xr.Dataset, names: Names, masks: tuple[int, int], columns: Indices, rows: Indices
 ) -> Sums:
-    signal, error = (product[name].values.astype(np.float64) for name in names[:2])
-    flag = quality_bits(product[names[2]])
+    signal, error = (product.variables[name].values.astype(np.float64) for name in names[:2])
+    flag = quality_bits(product.variables[names[2]])
     rejected, missing = ((flag & mask) != 0 for mask in masks)
     good = np.isfinite(signal) & ~rejected & ~missing
     known = np.where(good, signal, 0.0), np.where(good, error, 0.0) ** 2
@@ -232,9 +232,10 @@ def _sums(
 
 
 def _clouds(product: xr.Dataset, columns: Indices) -> Floats:
-    if "cloud_base_range" not in product:
+    base = product.variables.get("cloud_base_range")
+    if base is None:
         return np.full(columns.size, np.nan)
-    return np.fmin.reduceat(product["cloud_base_range"].values.astype(np.float64), columns)
+    return np.fmin.reduceat(base.values.astype(np.float64), columns)
 
 
 def bin_edges(middles: Floats) -> Floats:
@@ -245,8 +246,9 @@ def bin_edges(middles: Floats) -> Floats:
 
 
 def _altitude(product: xr.Dataset, ranges: Floats) -> tuple[float, float] | None:
-    if "altitude" not in product.variables or product["altitude"].dims != ("range",):
+    altitude = product.variables.get("altitude")
+    if altitude is None or altitude.dims != ("range",):
         return None
-    values = product["altitude"].values.astype(np.float64)
+    values = altitude.values.astype(np.float64)
     slope = (values[-1] - values[0]) / (ranges[-1] - ranges[0])
     return float(values[0] - slope * ranges[0]), float(slope)

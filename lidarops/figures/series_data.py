@@ -1,11 +1,11 @@
-"""Series over time of the quantities of a product, as tables.
+"""Series over time of the quantities of a product.
 
 Also checks and reads variables of any product.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,9 +23,12 @@ Floats = NDArray[np.float64]
 class TimeSeries:
     """The quantities of one series over time."""
 
-    table: pd.DataFrame
-    """Indexed by the middles of profiles, UTC, rising: each quantity, its ``_standard_error``, and
-    ``flag``, bits of the kind."""
+    time: Times
+    """(time,) Middles of profiles, UTC, rising."""
+    quantities: Mapping[str, Floats]
+    """(time,) Each quantity, and its ``_standard_error``."""
+    flag: NDArray[np.int64]
+    """(time,) Bits of the kind."""
     rejecting: int
     """Union of the bits of the kind that reject a value."""
     label: str = ""
@@ -34,23 +37,14 @@ class TimeSeries:
     """Identity and place among the series of a product: bounds in m, or a number."""
 
     @property
-    def time(self) -> Times:
-        """(time,) Middles of profiles, UTC, rising."""
-        return np.asarray(self.table.index)
-
-    @property
-    def flag(self) -> NDArray[np.int64]:
-        """(time,) Bits of the kind."""
-        return np.asarray(self.table["flag"], dtype=np.int64)
-
-    @property
     def rejected(self) -> NDArray[np.bool_]:
         """(time,) Whether a quality bit rejects the value."""
         return np.asarray((self.flag & self.rejecting) != 0)
 
-    def values(self, name: str) -> Floats:
-        """(time,) Values of a quantity, or its standard errors."""
-        return np.asarray(self.table[name], dtype=np.float64)
+    def at(self, places: NDArray[np.intp]) -> TimeSeries:
+        """Return the series at some of its times."""
+        values = {name: value[places] for name, value in self.quantities.items()}
+        return replace(self, time=self.time[places], quantities=values, flag=self.flag[places])
 
 
 def join(series: Iterable[TimeSeries]) -> list[TimeSeries]:
@@ -69,10 +63,23 @@ def join(series: Iterable[TimeSeries]) -> list[TimeSeries]:
     groups: dict[tuple[float, ...], list[TimeSeries]] = {}
     for part in series:
         groups.setdefault(part.key, []).append(part)
-    return [
-        replace(group[0], table=pd.concat([part.table for part in group]).sort_index(kind="stable"))
-        for _, group in sorted(groups.items())
-    ]
+    return [_joined(group) for _, group in sorted(groups.items())]
+
+
+def _joined(group: Sequence[TimeSeries]) -> TimeSeries:
+    first, *others = group
+    if not others:
+        return first
+    whole = replace(
+        first,
+        time=np.concatenate([part.time for part in group]),
+        quantities={
+            name: np.concatenate([part.quantities[name] for part in group])
+            for name in first.quantities
+        },
+        flag=np.concatenate([part.flag for part in group]),
+    )
+    return whole.at(np.argsort(whole.time, kind="stable"))
 
 
 def thin(section: TimeSeries, points: int) -> TimeSeries:
@@ -93,19 +100,22 @@ def thin(section: TimeSeries, points: int) -> TimeSeries:
         Unflagged profiles only; block means if there are more than `points`.
     """
     good = np.flatnonzero(section.flag == 0)
-    table = section.table.iloc[good]
+    known = section.at(good)
     if good.size <= points:
-        return replace(section, table=table)
+        return known
     size = -(-good.size // points)
     edges = np.concatenate([np.arange(s.start, s.stop, size) for s in segments(section.time)])
     block = np.searchsorted(edges, good, side="right")
+    table = pd.DataFrame(dict(known.quantities), index=known.time)
     means = table.groupby(block).mean()
     errors = [name for name in table if str(name).endswith("_standard_error")]
     squares = (table[errors] ** 2).groupby(block)
     # Error of a mean of n independent values: root mean square of their errors / sqrt(n).
     means[errors] = np.sqrt(squares.mean() / squares.count())
-    means.index = pd.DatetimeIndex(table.index.to_series().groupby(block).mean())
-    return replace(section, table=means)
+    middles = pd.DatetimeIndex(table.index.to_series().groupby(block).mean())
+    values = {name: np.asarray(means[name]) for name in known.quantities}
+    flags = np.zeros(len(means), np.int64)
+    return replace(known, time=np.asarray(middles), quantities=values, flag=flags)
 
 
 def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
@@ -119,12 +129,13 @@ def require(product: xr.Dataset, dims: Mapping[str, tuple[str, ...]]) -> None:
     for name, expected in dims.items():
         if name not in product.variables:
             raise ProductError("is missing from the product", field=name)
-        if product[name].dims != expected:
-            raise ProductError(f"has the dims {product[name].dims}, not {expected}", field=name)
-    if not np.issubdtype(product["time"].dtype, np.datetime64):
+        found = product.variables[name].dims
+        if found != expected:
+            raise ProductError(f"has the dims {found}, not {expected}", field=name)
+    if not np.issubdtype(product.variables["time"].dtype, np.datetime64):
         raise ProductError("does not hold CF times", field="time")
 
 
 def float_values(product: xr.Dataset, name: str) -> Floats:
     """Return a variable in double precision."""
-    return np.asarray(product[name].values, dtype=np.float64)
+    return np.asarray(product.variables[name].values, dtype=np.float64)

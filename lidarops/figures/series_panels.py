@@ -69,7 +69,7 @@ def series_figures(
         panels = [series_panel(x, few, quantity) for quantity in quantities]
         words = [series_in_words(few, quantities[0])]
         for quantity, panel in zip(quantities, panels, strict=True):
-            good = finite([one.values(quantity.name)[one.flag == 0] for one in few])
+            good = finite([one.quantities[quantity.name][one.flag == 0] for one in few])
             values = quantity.factor * good
             beyond = np.count_nonzero((values < panel.y.low) | (values > panel.y.high))
             if beyond:
@@ -83,12 +83,14 @@ def series_panel(x: Axis, series: Sequence[TimeSeries], quantity: Quantity) -> P
     layers: list[Layer] = []
     for place, one in enumerate(series):
         layers += _values(one, quantity, place)
-    parts = [(days(one.time), factor * one.values(name), one.flag, one.rejected) for one in series]
+    parts = [
+        (days(one.time), factor * one.quantities[name], one.flag, one.rejected) for one in series
+    ]
     at, value, flag, rejected = (np.concatenate(part) for part in zip(*parts, strict=True))
     layers += flag_marks(at, value, (flag != 0) & ~rejected, rejected, _FLAGGED)
-    good = [factor * one.values(name)[one.flag == 0] for one in series]
+    good = [factor * one.quantities[name][one.flag == 0] for one in series]
     if not finite(good).size:
-        good = [factor * one.values(name) for one in series]
+        good = [factor * one.quantities[name] for one in series]
     return Panel(x, percentile_axis(quantity.label, good), tuple(layers))
 
 
@@ -99,7 +101,9 @@ def _values(one: TimeSeries, quantity: Quantity, place: int) -> list[Layer]:
     means = f", means of {profiles} profiles" if profiles > 1 else ""
     few = drawn.time.size <= _BARS
     names = quantity.name, f"{quantity.name}_standard_error"
-    x, y, wide = _with_gaps(drawn.time, *(quantity.factor * drawn.values(name) for name in names))
+    x, y, wide = _with_gaps(
+        drawn.time, *(quantity.factor * drawn.quantities[name] for name in names)
+    )
     style, mark = f"c{place} d{place}" if place else "c0", SERIES_MARKS[place] if few else None
     label = f"{one.label}{means}".removeprefix(", ")
     band = Band(x, y - wide, y + wide, style, bars=few)
@@ -117,7 +121,7 @@ def series_in_words(series: Sequence[TimeSeries], quantity: Quantity) -> str:
     """Return the span of usable values and the number of flagged values of each series."""
     words = []
     for one in series:
-        usable = one.values(quantity.name)[~one.rejected]
+        usable = one.quantities[quantity.name][~one.rejected]
         span = span_in_words(quantity.factor * usable, quantity.units)
         flagged = counted(int(np.count_nonzero(one.flag)), "flagged value")
         words.append(f"{one.label}: {span}, {flagged}".removeprefix(": "))

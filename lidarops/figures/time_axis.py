@@ -58,9 +58,9 @@ def usual_step(time: Times) -> np.timedelta64:
 def profile_bounds(product: xr.Dataset) -> tuple[Times, Times]:
     """Return start and end of each profile; without bounds half the usual step around its time."""
     if TIME_BOUNDS in product.variables:
-        bounds = product[TIME_BOUNDS].values.astype("datetime64[ns]")
+        bounds = product.variables[TIME_BOUNDS].values.astype("datetime64[ns]")
         return bounds[:, 0], bounds[:, 1]
-    time = product["time"].values.astype("datetime64[ns]")
+    time = product.variables["time"].values.astype("datetime64[ns]")
     half = usual_step(np.sort(time)) / 2
     return np.asarray(time - half), np.asarray(time + half)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import unicodedata
+import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
@@ -23,12 +23,13 @@ SEVERITIES: Final[Mapping[Severity | None, str]] = {
 """What the severity of a quality bit means; None where it is not known."""
 _NAMED: Final = 2
 """Most descriptions that `named_shares` names."""
-_REORDERING: Final = frozenset(
-    "\N{LEFT-TO-RIGHT EMBEDDING}\N{RIGHT-TO-LEFT EMBEDDING}\N{POP DIRECTIONAL FORMATTING}"
-    "\N{LEFT-TO-RIGHT OVERRIDE}\N{RIGHT-TO-LEFT OVERRIDE}"
-    "\N{LEFT-TO-RIGHT ISOLATE}\N{RIGHT-TO-LEFT ISOLATE}"
-    "\N{FIRST STRONG ISOLATE}\N{POP DIRECTIONAL ISOLATE}"
+_HIDDEN: Final = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff"
+    "\N{LEFT-TO-RIGHT EMBEDDING}-\N{RIGHT-TO-LEFT OVERRIDE}"
+    "\N{LEFT-TO-RIGHT ISOLATE}-\N{POP DIRECTIONAL ISOLATE}]"
 )
+"""Control characters but the end of a line and the tabulator, bytes of file names that are not
+UTF-8, and characters that reorder text."""
 
 
 def percent(share: float) -> str:
@@ -128,18 +129,11 @@ def counted(count: int, noun: str) -> str:
 
 def visible(text: str) -> str:
     """Return text with control characters and invalid bytes shown as escapes."""
-    if text.isprintable():
-        return text
-    return "".join(c if c in "\n\t" or not _is_control(c) else _escape(c) for c in text)
+    return text if text.isprintable() else _HIDDEN.sub(_escape, text)
 
 
-def _is_control(character: str) -> bool:
-    # Cc: control. Cs: bytes of file names that are not UTF-8. The others reorder text.
-    return unicodedata.category(character) in {"Cc", "Cs"} or character in _REORDERING
-
-
-def _escape(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
+def _escape(character: re.Match[str]) -> str:
+    return character[0].encode("unicode_escape").decode("ascii")
 
 
 def decided_on(number: float | None) -> str:

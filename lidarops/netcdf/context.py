@@ -24,7 +24,7 @@ import numpy as np
 from lidarops import __version__
 from lidarops.campaign.model import Metadata, Station
 from lidarops.errors import ProductError
-from lidarops.netcdf.variables import CONVENTIONS, STANDARD_NAME_TABLE, Layout
+from lidarops.netcdf.variables import CONVENTIONS, RECORDERS, STANDARD_NAME_TABLE, Layout
 from lidarops.raw.header import POLARISATIONS, label_of
 from lidarops.records import (
     DetectionMode,
@@ -40,7 +40,6 @@ EPOCH_VARIABLE: Final = "SOURCE_DATE_EPOCH"
 NAMESPACE: Final = "urn:lidarops:"
 
 _PACKAGES: Final = ("lidarops", "netCDF4", "numba", "numpy", "scipy", "xarray")
-RECORDERS: Final = "lidarops_recorder"
 UNUSED_INPUTS: Final = "lidarops_unused_inputs"
 MOST_UNUSED: Final = 20
 """Unused files that a product names; its provenance names all."""

@@ -6,13 +6,14 @@ alone has no meaning. Who goes by the places of now refuses such a file.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from lidarops.errors import ProductError
@@ -20,6 +21,11 @@ from lidarops.flags import PLACES, Flags, Quality, Severity
 from lidarops.kinds import flags_of, kinds
 from lidarops.netcdf.variables import QUALITY_FLAG, judging
 from lidarops.records import Verdicts
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from lidarops.netcdf.stored import StoredProduct, StoredVariable
 
 Values = NDArray[Any]
 READ_VALUES: Final = 2_000_000
@@ -54,32 +60,39 @@ def stored_bits(attributes: Mapping[str, Any], kind: str | None) -> tuple[Stored
         Kind of product. Without a known kind, severity is known of shared bits, and of those that
         the file assesses.
     """
-    flags = _flags_of_known_kind(kind)
     meanings = _meanings(attributes)
+    words = tuple(str(attributes.get("flag_assessments", "")).split())
+    return _all_bits(None if meanings is None else tuple(meanings.items()), words, kind)
+
+
+@cache
+def _all_bits(
+    meanings: tuple[tuple[str, int], ...] | None, words: tuple[str, ...], kind: str | None
+) -> tuple[StoredBit, ...]:
+    flags = _flags_of_known_kind(kind)
     if meanings is None:
-        meanings = {bit.word: int(bit) for bit in flags or Quality}
-    words = str(attributes.get("flag_assessments", "")).split()
+        meanings = tuple((bit.word, int(bit)) for bit in flags or Quality)
     if len(words) not in {0, len(meanings)}:
         raise ProductError("has not one flag_assessments for each bit", field=QUALITY_FLAG)
-    assessments = dict(zip(meanings, words, strict=False))
-    named = [_bit(word, mask, flags, assessments.get(word)) for word, mask in meanings.items()]
+    assessments = dict(zip((word for word, _ in meanings), words, strict=False))
+    named = [_bit(word, mask, flags, assessments.get(word)) for word, mask in meanings]
     stated = sum({bit.mask for bit in named})
     unnamed = (1 << place for place in range(PLACES) if not stated >> place & 1)
     return (*named, *(_bit(f"bit_{places(mask)}", mask, None) for mask in unnamed))
 
 
-def bits_of(product: xr.Dataset, name: str = QUALITY_FLAG) -> tuple[StoredBit, ...]:
+def bits_of(product: xr.Dataset | StoredProduct, name: str = QUALITY_FLAG) -> tuple[StoredBit, ...]:
     """Return all bits of a variable of flags of a product, as `stored_bits`."""
-    return stored_bits(product[name].attrs, product.attrs.get("lidarops_kind"))
+    return stored_bits(product.variables[name].attrs, product.attrs.get("lidarops_kind"))
 
 
-def flags_names(product: xr.Dataset) -> list[str]:
+def flags_names(product: xr.Dataset | StoredProduct) -> list[str]:
     """Return the names of the variables of flags of a product, ``quality_flag`` first."""
     names = [str(name) for name in product.variables if str(name).endswith(QUALITY_FLAG)]
     return sorted(names, key=QUALITY_FLAG.__ne__)
 
 
-def all_bits(product: xr.Dataset) -> tuple[StoredBit, ...]:
+def all_bits(product: xr.Dataset | StoredProduct) -> tuple[StoredBit, ...]:
     """Return the bits of all variables of flags of a product, rising."""
     every = [bit for name in flags_names(product) for bit in bits_of(product, name)]
     # A bit that one variable does not name may be of another.
@@ -113,26 +126,27 @@ def judge(product: xr.Dataset, quantity: str) -> Judged:
     return Judged(quality_bits(product[name]), rejecting_mask(bits_of(product, name)))
 
 
-def quality_bits(flags: xr.DataArray) -> NDArray[np.int64]:
+def quality_bits(flags: xr.DataArray | xr.Variable | Values) -> NDArray[np.int64]:
     """Return quality flags as integers; missing flags become `Quality.INPUT_MISSING`."""
-    values = flags.values
+    values = np.asarray(flags)
     if values.dtype.kind == "f":
         # Where there are fill values, xarray decodes integers as floats with NaN.
         values = np.where(np.isfinite(values), values, float(Quality.INPUT_MISSING))
     return np.asarray(values, dtype=np.int64)
 
 
-def blocks(variable: xr.DataArray, most: int) -> Iterator[xr.DataArray]:
+def blocks(variable: xr.DataArray | xr.Variable | StoredVariable, most: int) -> Iterator[Any]:
     """Yield a variable some rows at a time, at most `most` values but at least a row."""
     return (variable[part] for part in parts(variable, most))
 
 
-def parts(variable: xr.DataArray | xr.Variable, most: int) -> Iterator[Any]:
+def parts(variable: xr.DataArray | xr.Variable | StoredVariable, most: int) -> Iterator[Any]:
     """Yield indices of some rows of a variable at a time, of `most` values but at least a row."""
-    if not variable.ndim or not variable.size:
+    size = math.prod(variable.shape)
+    if not variable.shape or not size:
         yield ...
         return
-    step = max(1, most * variable.shape[0] // variable.size)
+    step = max(1, most * variable.shape[0] // size)
     for first in range(0, variable.shape[0], step):
         yield slice(first, first + step)
 
@@ -172,7 +186,7 @@ class FlagCounter:
                 self.carried[mask] += int(np.count_nonzero(values & mask))
 
 
-def refuse_moved_flags(product: xr.Dataset) -> None:
+def refuse_moved_flags(product: xr.Dataset | StoredProduct) -> None:
     """Refuse a product of a known kind whose flags have bits at other places than now.
 
     Raises

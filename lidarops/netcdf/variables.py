@@ -43,6 +43,8 @@ QUALITY_FLAG: Final = "quality_flag"
 USABLE: Final = "usable"
 FLAG_LAYOUT: Final = "lidarops_flag_layout"
 """Attribute of ``quality_flag`` with the name of the places of its bits (`Flags.layout`)."""
+RECORDERS: Final = "lidarops_recorder"
+"""Global attribute with the recorders of the channels."""
 
 
 class ErrorKind(StrEnum):

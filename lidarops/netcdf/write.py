@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
 from lidarops.errors import ProductError
+from lidarops.netcdf.stored import OTHER_DIMENSION
 from lidarops.system.files import sha256_of, write_atomically
 
 if TYPE_CHECKING:
@@ -47,8 +48,6 @@ CHUNK_BYTES: Final = 1 << 20
 CONTIGUOUS_BYTES: Final = 2048
 """Up to this size, a variable without rows is stored as it is."""
 
-_OTHER_DIMENSION: Final = "_nc4_non_coord_"
-"""Prefix in HDF5 of a variable that has the name of a dimension but does not lie along it."""
 _EMPTY: Final = bytes.fromhex(
     "894844460d0a1a0a020808000000000000000000300000000000000028010000000000006100000000000000"
     "d66e27994f48445202208d070e6b8d070e6b8d070e6b8d070e6b161307000500020010000400000700000000"
@@ -416,7 +415,7 @@ def _define(skeleton: Skeleton, root: Any) -> dict[str, Any]:
     in blocks of some kB each: most of a small product.
     """
     inside = {
-        name: name if skeleton.is_scale(name) else f"{_OTHER_DIMENSION}{name}"
+        name: name if skeleton.is_scale(name) else f"{OTHER_DIMENSION}{name}"
         for name in skeleton.variables
     }
     found = {

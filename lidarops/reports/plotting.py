@@ -17,7 +17,8 @@ from lidarops.figures.kind_figures import View, image_view, view_of, views_of
 from lidarops.figures.panels import Axis, Curve, Figure, Panel, decade_axis, span_in_words, units
 from lidarops.figures.raster import COLUMNS
 from lidarops.flags import Severity
-from lidarops.netcdf.read import is_netcdf, open_product, opened_product, reading
+from lidarops.netcdf.read import is_netcdf, open_product, opened_product
+from lidarops.netcdf.stored import reading
 from lidarops.netcdf.variables import judging, summary_of
 from lidarops.raw.archive import open_archive
 from lidarops.records import DetectionMode

@@ -6,7 +6,7 @@ The command line and the Prefect flows call these functions and add no logic of 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -261,6 +261,7 @@ def _pass(states: DayStates, lock: Lock, options: Options) -> Result:
         empty_scenes=empty_scenes,
         set_aside=set_aside,
         findings=find(states, summary.idle_patterns, settled=verdicts),
+        refused=acknowledged(campaign, states.refused_files),
     )
 
 
@@ -275,11 +276,10 @@ def _is_something_left(states: DayStates, signatures: Mapping[int, Signature]) -
     )
 
 
-def refused_files(campaign: Campaign, result: Result) -> list[Granule]:
+def refused_files(result: Result) -> Sequence[Granule]:
     """Return the files refused by the catalog or by a scene, and of a run those in no scene."""
     if result.record is None:
-        with Store(campaign.catalog_url, campaign.name) as store:
-            return acknowledged(campaign, store.refused())
+        return result.refused
     late = (granule for scene in result.scenes for granule in scene.refused)
     return list({granule.path: granule for granule in (*result.record.refused, *late)}.values())
 

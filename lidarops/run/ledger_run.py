@@ -25,7 +25,8 @@ from lidarops.catalog.store import Dependence, LastTry, NewProduct, Run, RunStat
 from lidarops.errors import CatalogError, LidarOpsError, ProductError
 from lidarops.kinds import kinds
 from lidarops.netcdf.context import product_path
-from lidarops.netcdf.read import opened_product, reading
+from lidarops.netcdf.read import opened_product
+from lidarops.netcdf.stored import reading
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
     all_bits,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -13,7 +13,7 @@ from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import RecordedProduct, RunStatus, Store, Verdict
 from lidarops.errors import CampaignError
 from lidarops.kinds import kinds
-from lidarops.records import ACKNOWLEDGED, Findings, RunRecord, SceneOutcome, day_of
+from lidarops.records import ACKNOWLEDGED, Findings, Granule, RunRecord, SceneOutcome, day_of
 from lidarops.run.scenes import parse_scene_id, scene_stop
 
 if TYPE_CHECKING:
@@ -136,6 +136,8 @@ class Result:
     frozen: Mapping[str, str] = field(default_factory=dict)
     """Product of a frozen period that would be replaced -> why."""
     findings: Findings = field(default_factory=Findings)
+    refused: Sequence[Granule] = ()
+    """Files that the catalog refuses, where there was nothing to do."""
     signal: int = 0
     """The signal that stopped the run."""
 

@@ -5,15 +5,15 @@ Pages of unchanged products are kept.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
-from itertools import pairwise
+from itertools import chain, pairwise
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import xarray as xr
 from markupsafe import Markup
@@ -27,7 +27,8 @@ from lidarops.figures.product_names import attribute, light_in_words, scalar
 from lidarops.figures.raster import COLUMNS
 from lidarops.figures.templates import style
 from lidarops.figures.time_axis import TIME_BOUNDS
-from lidarops.netcdf.read import UNREADABLE, opened_product, reading
+from lidarops.netcdf.read import dataset_of, decoded
+from lidarops.netcdf.stored import UNREADABLE, StoredProduct, opened_stored, reading
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
 from lidarops.site import pages, product_contents
@@ -46,7 +47,9 @@ from lidarops.system.code_version import pages_version
 from lidarops.system.files import (
     MANIFEST,
     SITE,
+    last_change,
     product_paths,
+    settled_before,
     sha256_of,
     within,
     write_atomically,
@@ -74,6 +77,24 @@ class Site:
     """Products without a page, or with an incomplete page."""
 
 
+class _Before(NamedTuple):
+    """The existing site; empty if it is unknown or outdated."""
+
+    listed: Sequence[Entry]
+    entries: Mapping[str, Entry]
+    """Those that have their pages, by path."""
+    rest: Mapping[str, Any]
+    """What the manifest states but for the entries."""
+    as_of: float
+    """Products of earlier times are as in the entries, s since 1970."""
+    finished: float
+    """Files of the site of later times are of a build that did not end."""
+
+
+_NOTHING: Final = _Before([], {}, {}, 0.0, 0.0)
+_FIELDS: Final = tuple(item.name for item in fields(Entry))
+_IN_SITE: Final = (pages.INDEX, pages.SHEET, browser.SCRIPT)
+"""Files in the folder of the site itself, whose time the manifest changes."""
 _Kept = tuple[Path, Path, float]
 """Folders of the products and of the site, and the height of the calendar."""
 _Task = tuple[str, Entry | None]
@@ -92,14 +113,15 @@ def build_site(
     stac_at: str = "",
     reports_at: str = "",
     below: float = CALENDAR_HEIGHT,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] = lambda _done: None,
 ) -> Site:
     """Write the site of all products of a campaign's output to its folder ``site``.
 
     Pages need neither server nor network; one script draws their figures. The page of a product
     depends only on the product, except its links, which are written anew in each build. It is kept
-    while the sha256 of the product, the page and lidarops do not change. Equal archives give equal
-    bytes, for any number of workers.
+    while the product, the page and lidarops do not change, by their times, or of a copied product
+    by its sha256; where nothing has changed, nothing is written. Equal archives give equal bytes,
+    for any number of workers.
 
     Parameters
     ----------
@@ -134,24 +156,38 @@ def build_site(
     output = Path(output).resolve()
     links = Links(output, products_at, stac_at, reports_at)
     products, site = product_folder(output), output / SITE
-    before = _manifest(site, links, below)
-    tasks = [(path, before.get(path)) for path in product_paths(products)]
+    as_of, before = settled_before(), _existing(site, links, below)
+    outcomes: dict[str, _Outcome] = {}
+    tasks: list[_Task] = []
+    for path in product_paths(products):
+        known = before.entries.get(path)
+        if known is not None and last_change(products / path) < before.as_of:
+            outcomes[path] = known, False
+        else:
+            tasks.append((path, known))
+    if outcomes:
+        progress(len(outcomes))
     with Processes(workers, (products, site, below)) as processes:
-        done = processes.map_items(_page, tasks, at_a_time=1, lost=_crashed)
-        entries, problems, made = _collected(done, progress)
+        for task, outcome in processes.map_items(_page, tasks, at_a_time=1, lost=_crashed):
+            outcomes[task[0]] = outcome
+            progress(1)
+    entries, problems, made = _collected(outcomes)
     built = Site(site / pages.INDEX, len(entries), made, tuple(problems))
-    entries = list(_linked(site, entries, links))
-    expected = _write_calendar(site, entries, problems, links, below)
-    _write(site, MANIFEST, _stated(entries, problems, links, below))
-    _sweep(site, expected)
+    stated = _stated(problems, links, below)
+    is_same = not made and (entries, stated) == (before.listed, before.rest)
+    if not is_same or _is_touched(site, links, before):
+        _link(site, entries, links)
+        expected = _write_calendar(site, entries, problems, links, below)
+        _sweep(site, expected)
+        # Last, because later files are of a build that did not end.
+        _write_manifest(site, entries, stated, as_of)
     return built
 
 
-def _collected(
-    done: Iterable[tuple[_Task, _Outcome]], progress: Callable[[int], None] | None
-) -> tuple[list[Entry], list[Problem], int]:
+def _collected(outcomes: Mapping[str, _Outcome]) -> tuple[list[Entry], list[Problem], int]:
+    """Return entries and problems in the order of paths, and the number of pages made."""
     entries, problems, made = [], [], 0
-    for _, (outcome, new) in done:
+    for _, (outcome, new) in sorted(outcomes.items(), key=itemgetter(0)):
         if isinstance(outcome, Problem):
             problems.append(outcome)
         else:
@@ -159,8 +195,6 @@ def _collected(
             made += new
             if outcome.problem:
                 problems.append(Problem(outcome.path, outcome.problem))
-        if progress is not None:
-            progress(1)
     return entries, problems, made
 
 
@@ -171,7 +205,7 @@ def _page(kept: _Kept, task: _Task) -> _Outcome:
         file = within(products, path)
         with reading(file):
             sha256 = sha256_of(file)
-        if known is not None and _is_kept(known, sha256, site):
+        if known is not None and known.sha256 == sha256:
             return known, False
         return _make(path, file, sha256, site, below), True
     except ProductError as error:
@@ -184,20 +218,8 @@ def _crashed(task: _Task) -> _Outcome:
     return Problem(task[0], CRASHED), True
 
 
-def _is_kept(known: Entry, sha256: str, site: Path) -> bool:
-    if known.sha256 != sha256:
-        return False
-    # Read only: what is written is held to the folder of the site.
-    page = site / known.page
-    return page.is_file() and _digest(page.read_bytes()) == known.digest
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
 def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry:
-    with opened_product(file, decode_cf=False) as stored:
+    with opened_stored(file) as stored:
         kind = attribute(stored, "lidarops_kind")
         opened = _decoded(stored, kind)
         quality, no_quality = _quality(opened, below)
@@ -212,7 +234,6 @@ def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry
             path=path,
             sha256=sha256,
             size=file.stat().st_size,
-            digest="",
             campaign=product_contents.campaign(opened),
             station=station,
             place=attribute(opened, "platform", station),
@@ -236,11 +257,12 @@ def _make(path: str, file: Path, sha256: str, site: Path, below: float) -> Entry
             problem="; ".join(filter(None, problems)),
         )
         page = pages.product(entry, stored, quality, origin, figures)
-    _write(site, entry.page, page)
-    return replace(entry, digest=_digest(page))
+    # It is written again with its links.
+    _write(site, entry.page, page, sync=False)
+    return entry
 
 
-def _decoded(stored: xr.Dataset, kind: str) -> xr.Dataset:
+def _decoded(stored: StoredProduct, kind: str) -> xr.Dataset:
     """Return the variables of a product that its page shows, decoded.
 
     Of an unknown kind, any variable may be shown. What several parts of the page need is read once,
@@ -249,13 +271,7 @@ def _decoded(stored: xr.Dataset, kind: str) -> xr.Dataset:
     figures = figures_of(kind)
     uses = Counter(name for view in (figures.views if figures else ()) for name in view.variables)
     uses.update((*_ALWAYS, *product_contents.USED, *flags_names(stored)))
-    used = {
-        name: variable
-        for name, variable in stored.variables.items()
-        if figures is None or name in uses
-    }
-    whole = xr.Dataset(used, attrs=stored.attrs)
-    opened = xr.decode_cf(whole, decode_coords=False, decode_timedelta=False)
+    opened = decoded(stored, uses if figures else stored.variables)
     for name, variable in opened.variables.items():
         if uses[str(name)] > 1 and variable.nbytes <= _READ_BYTES:
             variable.load()
@@ -283,7 +299,7 @@ def _with_quality(figures: list[Figure], shown: Figure | None) -> list[Figure]:
 
 
 def _draw(
-    stored: xr.Dataset, opened: xr.Dataset, kind: str, quality: Figure | None
+    stored: StoredProduct, opened: xr.Dataset, kind: str, quality: Figure | None
 ) -> tuple[list[_Drawn], str]:
     """Draw a product; if it does not fit its kind, as a product of unknown kind."""
     figures = figures_of(kind)
@@ -295,7 +311,7 @@ def _draw(
     except UNREADABLE as error:
         problem = f"it cannot be drawn as {kind}: {error}"
     try:
-        whole = xr.decode_cf(stored, decode_timedelta=False)
+        whole = xr.decode_cf(dataset_of(stored), decode_timedelta=False)
         return _figures(whole, [view_of(kind)], quality), problem
     except UNREADABLE as error:
         return [], problem or f"it cannot be drawn: {error}"
@@ -314,16 +330,18 @@ def _figures(
     return [(figure, browser.inline(figure)) for figure in _with_quality(figures, quality)]
 
 
-def _write(site: Path, name: str, content: bytes) -> None:
-    """Write a file of the site atomically; one that holds the same stays as it is.
+def _write(
+    site: Path, name: str, content: bytes, *, sync: bool = True, as_of: float | None = None
+) -> None:
+    """Write a file of the site atomically; one that holds the same stays, if its time may be any.
 
     All files are written here.
     """
     target = within(site, name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if not target.is_file() or target.read_bytes() != content:
-            write_atomically(target, content)
+        if as_of is not None or not target.is_file() or target.read_bytes() != content:
+            write_atomically(target, content, as_of, sync=sync)
     except OSError as error:
         raise UnavailableError(
             f"cannot be written: {error}",
@@ -332,13 +350,12 @@ def _write(site: Path, name: str, content: bytes) -> None:
         ) from error
 
 
-def _linked(site: Path, entries: Sequence[Entry], links: Links) -> Iterator[Entry]:
-    """Write what leads to and from each product into its page; yield entries with new digests."""
+def _link(site: Path, entries: Sequence[Entry], links: Links) -> None:
+    """Write what leads to and from each product into its page."""
     for entry, neighbours in with_neighbours(entries):
-        page = within(site, entry.page).read_bytes()
+        page = (site / entry.page).read_bytes()
         linked = pages.with_navigation(page, pages.navigation(entry, neighbours, links))
         _write(site, entry.page, linked)
-        yield replace(entry, digest=_digest(linked))
 
 
 def _write_calendar(
@@ -389,23 +406,34 @@ def _version() -> str:
     return f"{__version__} {pages_version()}"
 
 
-def _stated(
-    entries: Sequence[Entry], problems: Sequence[Problem], links: Links, below: float
-) -> bytes:
-    """Return the manifest, which states from what pages were made, and what went wrong."""
-    document = {
-        "format": _FORMAT,
+def _stated(problems: Sequence[Problem], links: Links, below: float) -> dict[str, Any]:
+    """Return what the manifest states but for the entries: all that the site follows from."""
+    return {
+        **_of_all_pages(below),
         "products_at": links.products,
-        "below": below,
-        "version": _version(),
-        "products": [asdict(entry) for entry in entries],
+        "catalog": links.catalog(pages.INDEX),
+        "report": links.report(pages.INDEX),
         "problems": [asdict(problem) for problem in problems],
     }
-    return json.dumps(document, indent=0, sort_keys=True).encode("ascii") + b"\n"
 
 
-def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
-    """Return the entries of the existing site by path; empty if they are unknown or outdated."""
+def _of_all_pages(below: float) -> dict[str, Any]:
+    """Return what all pages of products follow from."""
+    return {"format": _FORMAT, "version": _version(), "below": below}
+
+
+def _write_manifest(
+    site: Path, entries: Sequence[Entry], stated: Mapping[str, Any], as_of: float
+) -> None:
+    """Write the manifest, whose times tell what happened before and after a build."""
+    listed = [{name: getattr(entry, name) for name in _FIELDS} for entry in entries]
+    document = {**stated, "products": listed}
+    text = json.dumps(document, sort_keys=True, separators=(",\n", ": "))
+    _write(site, MANIFEST, f"{text}\n".encode("ascii"), as_of=as_of)
+
+
+def _existing(site: Path, links: Links, below: float) -> _Before:
+    """Return the existing site; without entries if they are unknown or outdated."""
     file = site / MANIFEST
     if not file.is_file():
         if site.exists() and (not site.is_dir() or any(site.iterdir())):
@@ -415,16 +443,24 @@ def _manifest(site: Path, links: Links, below: float) -> dict[str, Entry]:
                 remedy="move it away, so that its content is not lost",
             )
         # Written first, so that an interrupted build is recognised as a site.
-        _write(site, MANIFEST, _stated([], [], links, below))
-        return {}
+        _write_manifest(site, [], _stated([], links, below), 0.0)
+        return _NOTHING
     try:
-        document = json.loads(file.read_bytes())
-        if (document["format"], document["version"], document["below"]) != (
-            _FORMAT,
-            _version(),
-            below,
-        ):
-            return {}
-        return {item["path"]: Entry(**item) for item in document["products"]}
-    except (ValueError, KeyError, TypeError):
-        return {}
+        as_of, finished = file.stat().st_mtime, last_change(file)
+        stated = json.loads(file.read_bytes())
+        listed = [Entry(**item) for item in stated.pop("products")]
+        if not _of_all_pages(below).items() <= stated.items():
+            return _NOTHING
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return _NOTHING
+    whole = {one.path: one for one in listed if last_change(site / one.page) <= finished}
+    return _Before(listed, whole, stated, as_of, finished)
+
+
+def _is_touched(site: Path, links: Links, before: _Before) -> bool:
+    """Return whether a file of the site, or what its pages link, changed after the last build."""
+    inside = chain.from_iterable((site / folder).rglob("*") for folder in _OURS)
+    own = (site / name for name in (*_IN_SITE, *_OURS))
+    return links.changed(before.as_of) or any(
+        last_change(place) > before.finished for place in chain(own, inside)
+    )

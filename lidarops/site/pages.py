@@ -9,7 +9,6 @@ from datetime import date
 from functools import cache, partial
 from typing import Any, Final
 
-import xarray as xr
 from jinja2 import Environment
 from markupsafe import Markup
 
@@ -18,6 +17,7 @@ from lidarops.figures.product_names import UNKNOWN
 from lidarops.figures.templates import environment
 from lidarops.figures.wording import SEVERITIES, counted, percent, size
 from lidarops.kinds import kinds, rank_of
+from lidarops.netcdf.stored import StoredProduct
 from lidarops.netcdf.variables import is_retrieved
 from lidarops.site.paths import Links, day_page, href, month_list, slug, year_page
 from lidarops.site.product_contents import citation, contact, variables
@@ -79,7 +79,7 @@ def _render(template: str, page: str, **context: Any) -> bytes:
 
 def product(
     entry: Entry,
-    opened: xr.Dataset,
+    opened: StoredProduct,
     quality: Quality,
     origin: Mapping[str, Any],
     figures: Sequence[tuple[Figure, Markup]],

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
 from lidarops.errors import CatalogError, ProductError
+from lidarops.system.files import last_change
 
 if TYPE_CHECKING:
     from lidarops.site.product_entry import Entry
@@ -144,6 +145,11 @@ class Links:
         if not (reports and place):
             return ""
         return _link(place, f"{reports[-1].parent.name}/index.html", page)
+
+    def changed(self, since: float) -> bool:
+        """Return whether the STAC catalog may be another one than at a time, s since 1970."""
+        folder = self.output / "aggregates"
+        return folder.is_dir() and last_change(folder) >= since
 
     def _stac(self, name: str, page: str) -> str:
         place = self.stac_at or (STAC_BESIDE if self.beside else "")

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.figures.product_names import attribute
+from lidarops.netcdf.stored import StoredProduct
 
 PROVENANCE: Final = "provenance"
 _PLACES: Final = "range", "altitude", "latitude", "longitude", "station_altitude", "wavelength"
@@ -30,7 +31,7 @@ def span(product: xr.Dataset) -> tuple[str, str]:
     names = ("time_coverage_start", "time_coverage_end")
     ends = [str(product.attrs.get(name, "")) for name in names]
     if not all(ends):
-        time = product["time"].values if "time" in product.variables else np.array([])
+        time = product.variables["time"].values if "time" in product.variables else np.array([])
         if time.size == 0 or time.dtype.kind != "M":
             raise ValueError("has no time of measurement, neither as attributes nor as a variable")
         ends = [str(time.min()), str(time.max())]
@@ -45,11 +46,11 @@ def _second(text: str) -> str:
     return str(moment)
 
 
-def variables(product: xr.Dataset) -> list[tuple[str, str, str, str]]:
+def variables(product: StoredProduct) -> list[tuple[str, str, str, str]]:
     """Return name, dimensions, units and meaning of all variables but the provenance."""
     return [
         (
-            str(name),
+            name,
             ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
             str(variable.attrs.get("units", "")),
             str(variable.attrs.get("long_name", "")),
@@ -69,12 +70,12 @@ def middle(product: xr.Dataset, name: str) -> float | None:
     """Return the mean of a coordinate, of the crossings of a network; None without a value."""
     if name not in product.variables:
         return None
-    values = product[name].values.astype(np.float64)
+    values = product.variables[name].values.astype(np.float64)
     values = values[np.isfinite(values)]
     return float(values.mean()) if values.size else None
 
 
-def citation(product: xr.Dataset) -> str:
+def citation(product: StoredProduct) -> str:
     """Return how to cite a product, from its attributes; empty without a title."""
     names = ("creator_name", "title", "product_version", "publisher_name", "naming_authority", "id")
     creator, title, version, publisher, authority, key = (
@@ -93,7 +94,7 @@ def citation(product: xr.Dataset) -> str:
     return " ".join(f"{part.rstrip('.')}." for part in parts if part)
 
 
-def contact(product: xr.Dataset) -> str:
+def contact(product: StoredProduct) -> str:
     """Return whom to ask about a product, by its attributes; empty without an address."""
     for role in ("creator", "publisher"):
         address = attribute(product, f"{role}_email", "")
@@ -104,10 +105,10 @@ def contact(product: xr.Dataset) -> str:
 
 def origin(product: xr.Dataset) -> dict[str, Any]:
     """Return the provenance of a product as its page shows it, or `problem`: why there is none."""
-    if PROVENANCE not in product:
+    if PROVENANCE not in product.variables:
         return {"problem": "the product has no provenance", "inputs": []}
     try:
-        return _origin(json.loads(str(product[PROVENANCE].item())))
+        return _origin(json.loads(str(product.variables[PROVENANCE].values.item())))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return {"problem": f"the provenance cannot be read: {error!r:.200}", "inputs": []}
 

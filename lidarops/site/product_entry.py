@@ -41,8 +41,6 @@ class Entry:
     """Relative to the folder of the products."""
     sha256: str
     size: int
-    digest: str
-    """sha256 of the page."""
     campaign: str
     """Title of the campaign."""
     station: str

@@ -67,9 +67,10 @@ def read_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Quality
     below : float, optional
         Height above the station, m, below which a profile must have a usable value to count.
     """
-    if QUALITY_FLAG not in product or not product[QUALITY_FLAG].size:
+    flags = product.variables.get(QUALITY_FLAG)
+    if flags is None or not flags.size:
         return Quality()
-    flags, bits = product[QUALITY_FLAG], all_bits(product)
+    bits = all_bits(product)
     rejecting = rejecting_mask(bits)
     counts = FlagCounter(rejecting)
     available, shares, low = 0, [], _low(product, below)
@@ -82,16 +83,16 @@ def read_quality(product: xr.Dataset, below: float = CALENDAR_HEIGHT) -> Quality
         parts = (part.reshape(len(values), -1) for part in (values == 0, rejected))
         shares.append([part.mean(axis=1) for part in parts])
     for name in flags_names(product)[1:]:
-        for block in blocks(product[name], READ_VALUES):
+        for block in blocks(product.variables[name], READ_VALUES):
             counts.add(quality_bits(block))
     over_time = np.concatenate(shares, axis=1)
-    has_times = flags.dims[:1] == ("time",) and product["time"].dtype.kind == "M"
+    time = product.variables.get("time") if flags.dims[:1] == ("time",) else None
     return Quality(
         counts.verdicts,
         over_time.shape[1],
         available,
         tuple((bit, counts.carried[bit.mask]) for bit in bits if bit.mask in counts.carried),
-        _figure(product, over_time) if has_times else None,
+        _figure(product, over_time) if time is not None and time.dtype.kind == "M" else None,
     )
 
 
@@ -100,7 +101,8 @@ def _low(product: xr.Dataset, below: float) -> NDArray[np.bool_] | slice:
     ground = {"altitude": scalar(product, "station_altitude"), "range": 0.0}
     for name, start in ground.items():
         along = product.variables.get(name)
-        if start is not None and along is not None and along.dims == product[QUALITY_FLAG].dims[1:]:
+        dims = product.variables[QUALITY_FLAG].dims[1:]
+        if start is not None and along is not None and along.dims == dims:
             return np.asarray(along.values.astype(np.float64) - start <= below)
     return slice(None)
 
@@ -114,7 +116,7 @@ def _figure(product: xr.Dataset, shares: Floats) -> Figure:
     shares : ndarray, shape (2, time)
         Of good values, and of rejected ones.
     """
-    order = np.argsort(product["time"].values, kind="stable")
+    order = np.argsort(product.variables["time"].values, kind="stable")
     start, stop = (edge[order] for edge in profile_bounds(product))
     columns = column_starts(start, stop, -(-order.size // _COLUMNS))
     profiles = np.diff([*columns, order.size])

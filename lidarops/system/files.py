@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import math
 import os
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
@@ -17,6 +19,8 @@ from lidarops.errors import ProductError
 
 SITE: Final = "site"
 """Folder of the site beside the products, also where it is published."""
+_COARSE: Final = 2.0
+"""s, the coarsest step of times of files (FAT)."""
 MANIFEST: Final = "manifest.json"
 """File that lists the products of a site. It also identifies a folder as a site."""
 
@@ -61,7 +65,7 @@ def within(folder: Path, path: str) -> Path:
     if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in path:
         raise ProductError("is not a path inside its folder", file=path)
     file = folder / pure
-    if not file.resolve().is_relative_to(folder.resolve()):
+    if os.path.commonpath([os.path.realpath(file), inside := os.path.realpath(folder)]) != inside:
         raise ProductError(
             "is a link that leads out of its folder", file=path, remedy="put the file in its place"
         )
@@ -76,11 +80,10 @@ def product_paths(folder: Path) -> list[str]:
     paths = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        paths += [
-            (Path(parent) / name).relative_to(folder).as_posix()
-            for name in files
-            if name.endswith(".nc") and not name.startswith(".")
-        ]
+        place = Path(parent).relative_to(folder)
+        inside = "" if place == Path() else f"{place.as_posix()}/"
+        shown = (name for name in files if name.endswith(".nc") and not name.startswith("."))
+        paths += [inside + name for name in shown]
     return sorted(paths)
 
 
@@ -108,7 +111,30 @@ def only_one(lock: Path, *, wait: bool) -> Iterator[None]:
         yield
 
 
-def write_atomically(target: Path, content: bytes) -> None:
+def settled_before() -> float:
+    """Return a time, s since 1970: files of earlier times will not change at these times any more.
+
+    Clocks of file systems have coarse steps, and are behind that of the system.
+    """
+    return time.time() - _COARSE
+
+
+def last_change(file: Path) -> float:
+    """Return when a file, or a link to it, was last written or put there, s since 1970.
+
+    Infinite without one.
+    """
+    try:
+        states = (file.lstat(), file.stat())
+    except OSError:
+        return math.inf
+    # A copy may keep the time of its content.
+    return max(moment for state in states for moment in (state.st_mtime, state.st_ctime))
+
+
+def write_atomically(
+    target: Path, content: bytes, as_of: float | None = None, *, sync: bool = True
+) -> None:
     """Write `content` to a temporary file beside `target`, sync it and rename it.
 
     Parameters
@@ -117,6 +143,10 @@ def write_atomically(target: Path, content: bytes) -> None:
         File to create or replace; its folder must exist.
     content : bytes
         Whole content.
+    as_of : float, optional
+        Time that the file states as that of its change, s since 1970; default now.
+    sync : bool, optional
+        Whether the content must be on the disk before the name is: not where it is soon replaced.
 
     Raises
     ------
@@ -128,10 +158,13 @@ def write_atomically(target: Path, content: bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
+            if sync:
+                stream.flush()
+                os.fsync(stream.fileno())
         # mkstemp makes files that only their owner can read, but reports are shared.
         temporary.chmod(0o644)
+        if as_of is not None:
+            os.utime(temporary, (as_of, as_of))
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)

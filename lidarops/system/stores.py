@@ -13,14 +13,15 @@ import logging
 import re
 import secrets
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, NamedTuple
-from urllib.parse import unquote
+from typing import Any, Final, NamedTuple, TypeVar
+from urllib.parse import unquote, urlsplit
 
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, UnavailableError
 from lidarops.system.files import sha256_of
@@ -36,7 +37,7 @@ _CODES_OF_STORE: Final = frozenset(
 )  # fmt: skip
 """Errors of S3 that concern the whole store though its answer is of another 4xx."""
 _STAMPS: Final = (
-    "mtime", "LastModified", "last_modified", "updated", "created", "ETag", "etag", "Last-Modified"
+    "mtime", "ETag", "etag", "LastModified", "last_modified", "updated", "created", "Last-Modified"
 )  # fmt: skip
 """What drivers call the time or tag by which a file of the same size shows that it has changed."""
 _NO_SUCH_RANGE: Final = 416
@@ -56,9 +57,14 @@ _LONGEST_SILENCE: Final = 30.0
 """s after which a web server that sends nothing counts as unreachable; s3fs takes 5 and 15 s."""
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
+_AT_ONCE: Final = 16
+"""Files whose begin or size a store is asked for at the same time."""
 _NAMES_SHOWN: Final = 3
 
 _LOG = logging.getLogger(__name__)
+
+_Item = TypeVar("_Item")
+_Read = TypeVar("_Read")
 
 # Exceptions of drivers besides OSError and EOFError; only loaded drivers can raise them.
 _DRIVER_ERRORS: Final = (
@@ -156,14 +162,16 @@ class RemoteStore:
         try:
             # Some drivers connect here.
             with self._unavailable("cannot be reached"):
+                # Raises an error for a port or address of no server, which the driver meets later.
+                _ = self._scheme in _READ_ONLY and urlsplit(url).port
                 self._fs, prefix = fsspec.core.url_to_fs(url)
-        except (ValueError, ImportError) as error:
+        except (ValueError, ImportError, TypeError, AttributeError) as error:
             raise CatalogError(
                 f"the URL cannot be opened: {without_keys(str(error))}",
                 file=self.url,
                 remedy="use a URL that fsspec knows and install its driver: lidarops[s3] for s3://",
                 # An ImportError means that only the driver is missing.
-                wrong_use=isinstance(error, ValueError),
+                wrong_use=not isinstance(error, ImportError),
             ) from error
         self._prefix = prefix.rstrip("/")
         self._given = ""
@@ -208,20 +216,34 @@ class RemoteStore:
         self, listing: dict[str, Any], is_used: Callable[[str], bool]
     ) -> Iterator[tuple[str, Any]]:
         """Yield names with their sizes, which the index of a web server lacks."""
+        lacking = []
         for name, info in listing.items():
             path = self._path(name)
-            if info.get("size") is not None or not is_confined(path) or not is_used(path):
+            if info.get("size") is None and is_confined(path) and is_used(path):
+                lacking.append((name, info))
+            else:
                 yield name, info
-                continue
-            try:
-                yield name, self._fs.info(name)
-            except FileNotFoundError as error:
-                # Drivers of the web raise this whatever the server answers.
-                if not self._is_of_one_object(error, name):
-                    problem = f"the size of {path} is not given: {error.__cause__!r}"
-                    raise OSError(errno.EIO, problem) from error
-                # Whoever reads the file learns of it.
-                yield name, info
+        yield from self.map(self._asked, lacking)
+
+    def _asked(self, listed: tuple[str, Any]) -> tuple[str, Any]:
+        """Return a name with what the store says of it alone."""
+        name, info = listed
+        try:
+            return name, self._fs.info(name)
+        except FileNotFoundError as error:
+            # Drivers of the web raise this whatever the server answers.
+            if not self._is_of_one_object(error, name):
+                problem = f"the size of {self._path(name)} is not given: {error.__cause__!r}"
+                raise OSError(errno.EIO, problem) from error
+            # Whoever reads the file learns of it.
+            return name, info
+
+    def map(self, read: Callable[[_Item], _Read], items: Iterable[_Item]) -> Iterator[_Read]:
+        """Yield what is read of each item, in order; some at once, where the driver can."""
+        rest = iter(items)
+        with ThreadPoolExecutor(_AT_ONCE if self._fs.async_impl else 1) as threads:
+            while batch := list(islice(rest, _BATCH)):
+                yield from threads.map(read, batch)
 
     def _path(self, name: str) -> str:
         return name.removeprefix(self._prefix).removeprefix("/")
@@ -360,21 +382,30 @@ class RemoteStore:
                 remedy="publish to s3://, gs:// or a mounted folder",
                 wrong_use=True,
             )
-        sizes = {stored.path: stored.size for stored in self._existing()}
+        held = {stored.path: stored for stored in self._existing()}
         sent = _read_journal(journal)
         due = [
             path
             for path, sha256 in sorted(products.items())
-            if sent.get(path) != sha256 or sizes.get(path) != _size(root / path)
+            if path not in held
+            or held[path].size != _size(root / path)
+            or sent.get(path) not in {sha256, _as_held(sha256, held[path])}
         ]
         for first in range(0, len(due), _BATCH):
             batch = {path: products[path] for path in due[first : first + _BATCH]}
             with self._unavailable("cannot be written"):
                 self._upload(root, batch)
             _append_journal(journal, batch)
+        if due:
+            # As a listing states it: an answer about one object may state its time otherwise.
+            made = {one.path: one for one in self._existing()}
+            _append_journal(
+                journal,
+                {path: _as_held(products[path], made[path]) for path in due if path in made},
+            )
         others = [
             path
-            for path in sizes.keys() - products.keys()
+            for path in held.keys() - products.keys()
             if not (beside and path.startswith(f"{beside}/"))
         ]
         return Published(tuple(due), len(products) - len(due), len(others))
@@ -522,6 +553,11 @@ def _size(product: Path) -> int:
         return product.stat().st_size
 
 
+def _as_held(sha256: str, stored: Stored) -> str:
+    """Return the digest of a product with what changes if its copy in a store does."""
+    return f"{sha256} {stored.mtime_ns}"
+
+
 def _read_journal(journal: Path) -> dict[str, str]:
     """Read lines in the format of sha256sum; the last line of a path counts."""
     try:
@@ -545,6 +581,7 @@ def _failures() -> tuple[type[Exception], ...]:
     return (
         OSError,
         EOFError,
+        NotImplementedError,
         *(getattr(module, name) for module, name in loaded if module is not None),
     )
 

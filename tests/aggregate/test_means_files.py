@@ -13,11 +13,9 @@ from support.archives.aggregate_archive import add_day, facts_of
 from support.products.compliance import findings
 from support.products.made_products import MAKERS
 
-from lidarops.aggregate.facts import Refused, groups, read_product_facts
+from lidarops.aggregate.facts import Period, Refused, Weights, groups, read_product_facts
 from lidarops.aggregate.means import MeansResult, write_means
 from lidarops.aggregate.means_variables import (
-    Period,
-    Weights,
     averaged,
     layout,
     systematic,

@@ -20,7 +20,7 @@ from lidarops.aggregate.index import write_index
 from lidarops.aggregate.open_products import open_products
 from lidarops.errors import ProductError, RetrievalInputError
 from lidarops.kinds import flags_of, kinds
-from lidarops.netcdf.read import opened_stored
+from lidarops.netcdf.stored import opened_stored, stored_product
 from lidarops.netcdf.variables import summarize_flags
 
 
@@ -161,6 +161,7 @@ def test_only_selected_files_are_opened_and_each_once_but_for_the_first(
         patch.setattr(xr, "open_dataset", counting(xr.open_dataset))
         place = "lidarops.aggregate.open_products.opened_stored"
         patch.setattr(place, counting(opened_stored))
+        patch.setattr("lidarops.aggregate.facts.stored_product", counting(stored_product))
         data = open_products(tmp_path, **since)
     selected = [facts.path for facts in facts_of(tmp_path) if facts.kind == "homogeneous"][2:]
     assert new in selected

@@ -149,6 +149,18 @@ def test_damaged_files_are_refused_with_a_reason(campaign: Campaign, store: Stor
     assert len(store.granules(status=Status.GOOD)) == 6
 
 
+def test_files_of_no_known_format_are_opened_once(
+    campaign: Campaign, store: Store, opened: list[str]
+) -> None:
+    root = _fill(campaign)
+    for number in range(5):
+        raw_archives.write(root / "coast" / f"h-log{number}", b"Operator log: clouds\n")
+    assert scan_archive(campaign, store).refused == 5
+    assert len(opened) == 11
+    assert scan_archive(campaign, store).refused == 5
+    assert len(opened) == 11
+
+
 def test_an_unreadable_file_does_not_abort(campaign: Campaign, store: Store) -> None:
     root = _fill(campaign)
     (root / "coast" / "h-link").symlink_to("nowhere")

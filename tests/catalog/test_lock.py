@@ -18,7 +18,7 @@ from lidarops.catalog import lock as lock_module
 from lidarops.catalog.database import LOCK, PRODUCT_INPUT, SCHEMA_VERSION
 from lidarops.catalog.lock import Lock
 from lidarops.catalog.store import Store
-from lidarops.errors import CatalogError
+from lidarops.errors import CatalogError, UnavailableError
 from lidarops.records import Role
 
 
@@ -160,6 +160,35 @@ def test_a_server_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPat
         url = f"postgresql+psycopg://me@127.0.0.1:{silent.getsockname()[1]}/catalog"
         with pytest.raises(CatalogError, match=r"timeout expired.*check that the server runs"):
             Store(url, "test")
+
+
+@pytest.mark.parametrize(
+    ("said", "remedy"),
+    [
+        ('FATAL: password authentication failed for user "me"', "PGPASSWORD"),
+        ("fe_sendauth: no password supplied", "PGPASSWORD"),
+        ('FATAL: no pg_hba.conf entry for host "10.0.0.7"', "ask who runs the server"),
+        ('FATAL: database "catalog" does not exist', "createdb NAME"),
+        ('FATAL: role "me" does not exist', "correct user and name"),
+        ("ERROR: permission denied for schema public", "the right to make and change tables"),
+        ("FATAL: sorry, too many clients already", "when fewer programs use the server"),
+        ("FATAL: terminating connection due to administrator command", "when the server runs"),
+        ("FATAL: the database system is starting up", "when the server runs"),
+        ("could not extend file: No space left on device", "make space on the disk"),
+        ("connection refused", "check that the server runs"),
+    ],
+)
+def test_what_a_server_says_has_its_own_remedy(
+    said: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    psycopg = pytest.importorskip("psycopg")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise psycopg.OperationalError(said)
+
+    monkeypatch.setattr(psycopg, "connect", refuse)
+    with pytest.raises(UnavailableError, match=remedy):
+        Store("postgresql+psycopg://me@127.0.0.1:1/catalog", "test")
 
 
 def test_an_invalid_url_is_refused() -> None:

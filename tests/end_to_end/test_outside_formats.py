@@ -238,6 +238,7 @@ def test_a_file_is_tried_again_when_its_format_is_added(
     known = formats.raw_formats()
     with Store(campaign.catalog_url, campaign.name) as store, monkeypatch.context() as patch:
         patch.setattr(formats, "raw_formats", lambda: {"licel": known["licel"]})
+        patch.setattr("lidarops.catalog.scan.reading_version", lambda: "without the package")
         assert scan_archive(campaign, store).refused == 1
         assert scan_archive(campaign, store).unchanged == 1
         (refused,) = store.refused()

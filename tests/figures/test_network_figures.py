@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
-from support.products.drawn import figures, labelled, views
+from support.products.drawn import assert_same_series, figures, labelled, views
 from support.products.made_network import product
 
 from lidarops.errors import ProductError
@@ -32,12 +31,12 @@ def test_series_hold_values_and_errors(made):
     assert [crossing.label for crossing in series] == ["crossing 0", "crossing 1", "crossing 2"]
     for v, crossing in enumerate(series):
         np.testing.assert_array_equal(
-            crossing.values("total_extinction"), made["total_extinction"].values[:, v]
+            crossing.quantities["total_extinction"], made["total_extinction"].values[:, v]
         )
         whole = np.hypot(
             made["total_extinction_standard_error"], made["total_extinction_systematic_error"]
         ).values[:, v]
-        np.testing.assert_allclose(crossing.values("total_extinction_standard_error"), whole)
+        np.testing.assert_allclose(crossing.quantities["total_extinction_standard_error"], whole)
 
 
 def test_scenes_are_joined_in_time(made):
@@ -46,7 +45,7 @@ def test_scenes_are_joined_in_time(made):
     whole = read_crossings(made)
     assert [crossing.key for crossing in joined] == [(0,), (1,), (2,)]
     for crossing, expected in zip(joined, whole, strict=True):
-        pd.testing.assert_frame_equal(crossing.table, expected.table)
+        assert_same_series(crossing, expected)
 
 
 def test_the_map_shows_each_crossing_to_scale(made):
@@ -105,7 +104,7 @@ def test_series_are_drawn(made):
         figure.panels, ("visibility", "total_extinction"), (1.0, 1e3), strict=True
     ):
         for line, crossing in zip(labelled(panel, "crossing"), series, strict=True):
-            np.testing.assert_allclose(line.y, scale * crossing.values(quantity), rtol=1e-6)
+            np.testing.assert_allclose(line.y, scale * crossing.quantities[quantity], rtol=1e-6)
         assert "km" in panel.y.label
 
 

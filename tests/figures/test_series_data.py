@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import timedelta
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.products.drawn import assert_same_series
 from support.products.fabricated import START, homogeneous, times
 
 from lidarops.errors import ProductError
@@ -24,16 +24,15 @@ def test_values_are_those_of_the_product():
     for k, section in enumerate((near, far)):
         np.testing.assert_array_equal(section.time, product["time"].values)
         np.testing.assert_array_equal(section.flag, product["quality_flag"].values[:, k])
-        for name in section.table:
-            shown = "quality_flag" if name == "flag" else name
-            np.testing.assert_array_equal(section.values(name), product[shown].values[:, k])
+        for name, values in section.quantities.items():
+            np.testing.assert_array_equal(values, product[name].values[:, k])
 
 
 def test_sections_and_times_are_sorted_together():
     product = homogeneous(times(START, 40, 60.0))
     shuffled = product.isel(time=np.random.default_rng(1).permutation(40), section=[1, 0])
     for straight, sorted_ in zip(read_sections(product), read_sections(shuffled), strict=True):
-        pd.testing.assert_frame_equal(straight.table, sorted_.table)
+        assert_same_series(straight, sorted_)
 
 
 @pytest.mark.parametrize("name", ["total_extinction", "background_standard_error", "quality_flag"])
@@ -75,7 +74,7 @@ def test_join_sorts_in_time_and_separates_other_bounds():
     middle = joined[1]
     assert (np.diff(middle.time) > np.timedelta64(0)).all()
     np.testing.assert_array_equal(
-        middle.values("total_extinction"),
+        middle.quantities["total_extinction"],
         np.concatenate(
             [early["total_extinction"].values[:, 0], late["total_extinction"].values[:, 0]]
         ),
@@ -99,10 +98,10 @@ def test_thin_is_the_block_mean_of_unflagged_values(count, points, seed):
     blocks = [block[good[block]] for block in blocks if good[block].any()]
     assert thinned.time.size == len(blocks)
     for name in ("total_extinction", "background"):
-        value, error = (section.values(column) for column in (name, f"{name}_standard_error"))
+        value, error = (section.quantities[column] for column in (name, f"{name}_standard_error"))
         of_mean = [np.sqrt((error[b] ** 2).sum()) / b.size for b in blocks]
-        np.testing.assert_allclose(thinned.values(name), [value[b].mean() for b in blocks])
-        np.testing.assert_allclose(thinned.values(f"{name}_standard_error"), of_mean, rtol=1e-6)
+        np.testing.assert_allclose(thinned.quantities[name], [value[b].mean() for b in blocks])
+        np.testing.assert_allclose(thinned.quantities[f"{name}_standard_error"], of_mean, rtol=1e-6)
 
 
 def test_thin_does_not_average_across_a_gap():

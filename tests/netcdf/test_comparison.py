@@ -23,7 +23,7 @@ from lidarops.cli import app
 from lidarops.errors import ProductError
 from lidarops.figures.wording import change_in_words
 from lidarops.flags import Quality
-from lidarops.netcdf import read
+from lidarops.netcdf import stored
 from lidarops.netcdf.comparison import compare_products, quantity_changes
 from lidarops.netcdf.write import write_product
 from lidarops.records import Change, Grade, InputRecord, Measure, Role, Stamp
@@ -303,7 +303,7 @@ def test_a_damaged_product_is_one_error(name: str, damaged: int, tmp_path: Path)
 
 
 def test_a_product_larger_than_memory_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(read, "_MEMORY_SHARE", 1e-12)
+    monkeypatch.setattr(stored, "_MEMORY_SHARE", 1e-12)
     assert compared(tmp_path).grade is Grade.NONE
 
 

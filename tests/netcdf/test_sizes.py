@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from lidarops.cli import app
 from lidarops.errors import ProductError
-from lidarops.netcdf import read
-from lidarops.netcdf.read import check_sizes
+from lidarops.netcdf import stored
+from lidarops.netcdf.read import opened_product
 
 
 def _unwritten(file: Path) -> None:
@@ -64,6 +64,11 @@ def _virtual(file: Path) -> None:
 def _variable_length(file: Path) -> None:
     with h5py.File(file, "a") as product:
         product.create_dataset("bomb", (2,), dtype=h5py.vlen_dtype("i4"))[0] = np.arange(3)
+
+
+def check_sizes(path: Path) -> None:
+    with opened_product(path):
+        pass
 
 
 CRAFTED: list[Callable[[Path], None]] = [
@@ -137,7 +142,7 @@ def test_honest_files_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     zeros.isel(t=slice(9)).to_netcdf(tmp_path / "old.nc", format="NETCDF3_64BIT")
     check_sizes(tmp_path / "old.nc")
     # On a machine of little memory.
-    monkeypatch.setattr(read, "_MEMORY_SHARE", 1e-6)
+    monkeypatch.setattr(stored, "_MEMORY_SHARE", 1e-6)
     with pytest.raises(ProductError, match=r"x: .*on this machine"):
         check_sizes(tmp_path / "zeros.nc")
 

@@ -12,9 +12,8 @@ import xarray as xr
 from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
-from lidarops.aggregate.facts import Facts, read_product_facts
+from lidarops.aggregate.facts import Facts, Period, read_product_facts
 from lidarops.aggregate.means import write_means
-from lidarops.aggregate.means_variables import Period
 from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Quality, Severity
 from lidarops.kinds import flags_of

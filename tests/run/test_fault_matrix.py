@@ -217,9 +217,7 @@ def _stated(product: Path) -> str:
 
 def _told(matrix: Matrix, result: Result) -> str:
     """Return what a run tells of files that it refused, lost or cannot use."""
-    refused = (
-        f"{granule.path}: {granule.reason}" for granule in refused_files(matrix.campaign, result)
-    )
+    refused = (f"{granule.path}: {granule.reason}" for granule in refused_files(result))
     rows = (f"{row.subject}: {row.problem}" for row in finding_rows(result.findings))
     failures = (f"{scene}: {error}" for scene, error in result.failures.items())
     return "\n".join((*refused, *rows, *failures))

@@ -160,10 +160,25 @@ def test_refused_files_are_counted_by_reason_and_fail(tmp_path: Path) -> None:
     shown = CliRunner().invoke(app, ["plan", str(file)], env=terminal(300))
     text = _STYLE.sub("", shown.output)
     assert shown.exit_code == 1
-    assert "5 files refused (lidarops catalog names them):" in text
+    assert "5 files refused (lidarops catalog --all names them):" in text
     assert len(re.findall(r"^  2 files: .*truncated", text, re.MULTILINE)) == 2
     document = json.loads(CliRunner().invoke(app, ["plan", str(file), "--json"]).output)
     assert len(document["refused_files"]) == 5
+
+
+def test_a_catalog_of_many_refused_files_lists_some_and_how_to_list_all(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    folder = tmp_path / "raw" / "coast"
+    for number in range(30):
+        (folder / f"h{number + 1:02}").write_bytes(b"damaged")
+    shown = {}
+    for options in ((), ("--all",)):
+        command = ["catalog", str(file), *options]
+        shown[options] = CliRunner().invoke(app, command, env=terminal(300)).output
+    named = {options: len(re.findall(r"coast/h\d\d", text)) for options, text in shown.items()}
+    assert named == {(): 20, ("--all",): 30}
+    assert "Refused, the first 20 of 30 (--all)" in _STYLE.sub("", shown[()])
+    assert "31 files: 31 added" in shown[()]
 
 
 def test_a_campaign_whose_only_file_is_refused_says_why_nothing_is_planned(tmp_path: Path) -> None:

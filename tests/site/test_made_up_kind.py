@@ -18,9 +18,8 @@ from support.products.made_products import MAKERS
 
 from lidarops import kinds
 from lidarops.aggregate import means as means_of_products
-from lidarops.aggregate.facts import groups
+from lidarops.aggregate.facts import Period, groups
 from lidarops.aggregate.means import write_means
-from lidarops.aggregate.means_variables import Period
 from lidarops.netcdf.variables import layout_of
 from lidarops.reports import run_page
 from lidarops.reports.gallery import Gallery, fill

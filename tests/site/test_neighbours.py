@@ -9,7 +9,7 @@ import pytest
 from lidarops.site.product_entry import Entry, with_neighbours
 
 ENTRY = Entry(
-    path="", sha256="", size=1, digest="", campaign="c", station="s",
+    path="", sha256="", size=1, campaign="c", station="s",
     place="S", instrument="i", name="I", kind="signal", channel="a", light="", latitude=None,
     longitude=None, altitude=None, license="", start="", stop="", values=0, usable=0,
     unflagged=0, profiles=1, available=1, lacking="", problem="",

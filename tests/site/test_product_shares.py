@@ -16,7 +16,7 @@ from lidarops.site.quality import read_quality
 def entry(available: int, profiles: int = 100, kind: str = "raman", lacking: str = "") -> Entry:
     return Entry(
         path="odesa/lidar/x.nc", sha256="", size=1,
-        digest="", campaign="odesa", station="odesa", place="Odesa", instrument="lidar",
+        campaign="odesa", station="odesa", place="Odesa", instrument="lidar",
         name="Lidar", kind=kind, channel="photon_355o", light="355 nm", latitude=None,
         longitude=None, altitude=None, license="", start="2026-03-01T10:00:00",
         stop="2026-03-01T11:00:00", values=1000, usable=0 if lacking else 864, unflagged=0,

@@ -85,6 +85,20 @@ def left_alive(others: Collection[BaseProcess], seconds: float) -> list[BaseProc
     return alive
 
 
+def wait_until_idle(process: BaseProcess) -> None:
+    """Wait until a process waits for work: it sleeps, and uses no more CPU time."""
+    before, still = "", 0
+    for _ in range(600):
+        # From the state on; the name before it may hold spaces.
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+        now = " ".join((fields[0], *fields[11:13]))
+        still = still + 1 if now == before and fields[0] == "S" else 0
+        if still == 10:
+            return
+        before = now
+        time.sleep(0.1)
+
+
 @pytest.fixture
 def no_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
@@ -168,8 +182,7 @@ class TestEach:
             start(process)
             if next(starts):
                 begun.set()
-                # Until the process waits for work.
-                time.sleep(2.0)
+                wait_until_idle(process)
 
         def waiting(thread: _ExecutorManagerThread, cause: object) -> None:
             begun.wait(60)
@@ -180,7 +193,7 @@ class TestEach:
         with Processes(2, 2) as pool:
             assert len(list(pool.map_items(deadly, range(40), at_a_time=6, lost=lost))) == 40
         assert begun.is_set()
-        assert not left_alive(others, 5.0)
+        assert not left_alive(others, 60.0)
 
     @pytest.mark.parametrize(
         "error", [BlockingIOError("no more processes"), EOFError("unexpected EOF")]

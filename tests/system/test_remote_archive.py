@@ -67,6 +67,26 @@ def test_a_web_server_is_scanned_like_a_folder(campaign: Campaign, tmp_path: Pat
     assert digests[0] == digests[1]
 
 
+def test_files_of_a_web_server_are_asked_for_together(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both, alone = threading.Barrier(2), []
+    send = http.server.SimpleHTTPRequestHandler.send_head
+
+    def waiting(self: http.server.SimpleHTTPRequestHandler) -> Any:
+        if "/h" in self.path:
+            try:
+                both.wait(20)
+            except threading.BrokenBarrierError:
+                alone.append(self.path)
+        return send(self)
+
+    monkeypatch.setattr(_Quiet, "send_head", waiting)
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert scan_archive(campaign, store).added == 2
+    assert not alone
+
+
 def test_a_missing_server_ends_the_scan_and_the_catalog_stays(campaign: Campaign) -> None:
     with Store(campaign.catalog_url, campaign.name) as store:
         scan_archive(campaign, store)

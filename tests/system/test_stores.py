@@ -76,13 +76,34 @@ def test_publish_repairs_a_store_that_lost_or_cut_an_object(tmp_path: Path, url:
     assert store.publish(root, made, journal).uploaded == ("coast/a.nc", "coast/b.nc")
 
 
+def test_publish_repairs_an_object_that_another_of_its_size_replaced(
+    tmp_path: Path, url: str
+) -> None:
+    import fsspec
+
+    root, journal = tmp_path / "products", tmp_path / "journal"
+    made = products(root, a=b"one", b=b"two")
+    store = RemoteStore(url)
+    store.publish(root, made, journal)
+    assert store.publish(root, made, journal).uploaded == ()
+    fs, prefix = fsspec.core.url_to_fs(url)
+    # S3 states times in seconds, so only the tag shows this.
+    fs.pipe_file(f"{prefix}/coast/a.nc", b"ONE")
+    assert store.publish(root, made, journal).uploaded == ("coast/a.nc",)
+    assert store.head("coast/a.nc", 9) == b"one"
+    assert store.publish(root, made, journal).uploaded == ()
+
+
 def test_publish_after_a_crash_in_the_journal(tmp_path: Path, url: str) -> None:
     root, journal = tmp_path / "products", tmp_path / "journal"
     made = products(root, a=b"one", b=b"two")
     store = RemoteStore(url)
     store.publish(root, made, journal)
-    journal.write_text(journal.read_text()[:-4])
+    # The digests come first, then what the store states of its copies.
+    digests = journal.read_text().splitlines()[:3]
+    journal.write_text("\n".join(digests)[:-4])
     assert store.publish(root, made, journal).uploaded == ("coast/b.nc",)
+    journal.write_text(journal.read_text()[:-4])
     assert store.publish(root, made, journal).uploaded == ()
 
 
@@ -165,10 +186,20 @@ class QuietHandler(http.server.SimpleHTTPRequestHandler):
         """Do not log."""
 
 
-@pytest.mark.parametrize("unknown", ["nothing://bucket", "s3x://bucket/a"])
-def test_unknown_url(unknown: str) -> None:
-    with pytest.raises(CatalogError, match="cannot be opened"):
+@pytest.mark.parametrize(
+    "unknown",
+    ["nothing://bucket", "s3x://bucket/a", "http://[::1", "http://host:99999/a", "reference://a",
+     "github://a", "dir://a"],
+)  # fmt: skip
+def test_a_url_that_no_driver_can_open_is_wrong_use(unknown: str) -> None:
+    with pytest.raises(CatalogError, match="cannot be opened") as caught:
         RemoteStore(unknown)
+    assert caught.value.wrong_use
+
+
+def test_a_url_whose_driver_lists_nothing_is_reported() -> None:
+    with pytest.raises(UnavailableError, match="cannot be listed"):
+        list(RemoteStore("data://a").files())
 
 
 def test_a_store_that_does_not_answer_is_reported(

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from lidarops.errors import ProductError
@@ -42,33 +41,35 @@ def read_sections(product: xr.Dataset) -> list[TimeSeries]:
         If a variable is missing or has other dimensions or units.
     """
     _check(product)
-    order = np.argsort(product["time"].values, kind="stable")
-    time = product["time"].values.astype("datetime64[ns]")[order]
-    flags = quality_bits(product["quality_flag"])[order]
+    stored = product.variables
+    order = np.argsort(stored["time"].values, kind="stable")
+    time = stored["time"].values.astype("datetime64[ns]")[order]
+    flags = quality_bits(stored["quality_flag"])[order]
     rejecting = rejecting_mask(bits_of(product))
-    bounds = product["section_bounds"].values.astype(np.float64)
+    bounds = stored["section_bounds"].values.astype(np.float64)
     values = {name: float_values(product, name)[order] for name in _ALONG_BOTH[:-1]}
     sections = []
     for k in np.argsort(bounds[:, 0], kind="stable"):
-        columns = {"flag": flags[:, k]} | {name: both[:, k] for name, both in values.items()}
+        columns = {name: both[:, k] for name, both in values.items()}
         near, far = bounds[k].tolist()
         label = f"{near / 1e3:g}\N{EN DASH}{far / 1e3:g} km"
-        sections.append(TimeSeries(pd.DataFrame(columns, time), rejecting, label, (near, far)))
+        sections.append(TimeSeries(time, columns, flags[:, k], rejecting, label, (near, far)))
     return sections
 
 
 def _check(product: xr.Dataset) -> None:
     require(product, {"time": ("time",)} | dict.fromkeys(_ALONG_BOTH, ("time", "section")))
-    if "section_bounds" not in product or product["section_bounds"].shape[1:] != (2,):
+    bounds = product.variables.get("section_bounds")
+    if bounds is None or bounds.shape[1:] != (2,):
         raise ProductError("has no section bounds", field="section_bounds")
-    units = product["total_extinction"].attrs.get("units")
+    units = product.variables["total_extinction"].attrs.get("units")
     if units != "m-1":
         raise ProductError(f"has the units {units!r}, not 'm-1'", field="total_extinction")
 
 
 def _read(product: xr.Dataset, _: int) -> _Content | None:
     sections = read_sections(product)
-    unit = units(str(product["background"].attrs.get("units", "")))
+    unit = units(str(product.variables["background"].attrs.get("units", "")))
     return (unit, sections) if product.sizes["time"] and sections else None
 
 

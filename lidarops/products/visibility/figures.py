@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -114,17 +113,19 @@ def read_crossings(product: xr.Dataset) -> list[TimeSeries]:
     value, random, systematic = (float_values(product, name) for name in _EXTINCTION)
     visibility, lower, upper = (float_values(product, name) / 1e3 for name in _VISIBILITY)
     values = {
-        "flag": product["quality_flag"].values.astype(np.int64),
         "total_extinction": value,
         "total_extinction_standard_error": np.hypot(random, systematic),
         "visibility": visibility,
         "visibility_standard_error": np.abs(upper - lower) / 2.0,
     }
+    flags = product["quality_flag"].values.astype(np.int64)
     time = product["time"].values.astype("datetime64[ns]")
     rejecting = flags_of("visibility").rejecting
     return [
         TimeSeries(
-            pd.DataFrame({name: both[:, v] for name, both in values.items()}, time),
+            time,
+            {name: both[:, v] for name, both in values.items()},
+            flags[:, v],
             rejecting,
             f"crossing {number}",
             (number,),

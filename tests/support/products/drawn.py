@@ -14,6 +14,7 @@ from lidarops.figures import browser
 from lidarops.figures.kind_figures import figures_of
 from lidarops.figures.panels import BLANK, FIRST, Axis, Band, Curve, Figure, Image, Panel
 from lidarops.figures.raster import COLUMNS
+from lidarops.figures.series_data import TimeSeries
 
 STEPS = 65534
 
@@ -89,3 +90,12 @@ def decoded(codes: Any, bar: Axis) -> Any:
     """Return the values of codes of a logarithmic colour scale; NaN where they hold none."""
     share = np.where(codes >= FIRST, (codes.astype(float) - FIRST) / (255 - FIRST), np.nan)
     return bar.low * (bar.high / bar.low) ** share
+
+
+def assert_same_series(found: TimeSeries, expected: TimeSeries) -> None:
+    """Check that two series have the same times, flags and values."""
+    np.testing.assert_array_equal(found.time, expected.time)
+    np.testing.assert_array_equal(found.flag, expected.flag)
+    assert found.quantities.keys() == expected.quantities.keys()
+    for name, values in expected.quantities.items():
+        np.testing.assert_array_equal(found.quantities[name], values)
