@@ -26,7 +26,6 @@ CLIPPED: Final = 3.0
 """Limit of relative errors: a quotient of noise has no variance."""
 _PEER_PROFILES: Final = 1500
 _QUICK_PEER_PROFILES: Final = 500
-_CHUNK_BLOCKS: Final = 5
 CASES: Final = tuple(enumerate(product(scenes.AIRS, scenes.NOISES)))
 """Air and noise, each with its number, which is part of the seed."""
 
@@ -40,7 +39,7 @@ def measure_network(
     ----------
     effort : Effort
     profiles : int, optional
-        Number of profiles of which the coverage is that, rounded up to whole blocks.
+        Number of profiles of which the coverage is that.
     peer_profiles : int, optional
         Number of profiles of each comparison with the peers.
     """
@@ -66,7 +65,7 @@ def measure_network(
         f"Bins of {scenes.STEP:g} m, relative noise of each bin as given, plus 1 % of the power at "
         f"the first crossing of the beam; blocks of {BLOCK} profiles. Of extinction at the near "
         "crossings that all methods solve; relative, and clipped at 300 %, because a quotient of "
-        f"noise has no variance. Coverage: of {math.prod(_chunks(profiles)):,} other profiles. The "
+        f"noise has no variance. Coverage: of {profiles:,} other profiles. The "
         "peers fit extinctions and beam constants by scipy.optimize.least_squares, weighted as if "
         "point values were independent, without errors or flags, and with all points; lidarops "
         "leaves out those that are too noisy. They fit single profiles, or the mean of a block, "
@@ -77,18 +76,9 @@ def measure_network(
     return comparison("networks of lidars", works, note)
 
 
-def _chunks(profiles: int) -> tuple[int, int]:
-    """Return the number of chunks that are drawn together, and their size, of whole blocks."""
-    blocks = -(-profiles // BLOCK)
-    return -(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * BLOCK
-
-
 def solve_case(clean: Signals, noise: float, profiles: int, seed: int) -> dict[str, NetworkResult]:
     """Return the results of every solver by name."""
-    number, size = _chunks(profiles)
-    beams = len(clean.network.origin)
-    chunks = [clean.draw(noise, size, beams, seed, chunk) for chunk in range(number)]
-    power, variance = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    power, variance = clean.draw(noise, profiles, len(clean.network.origin), seed)
     return {method: solve(power, variance, clean) for method, solve in scenes.SOLVERS.items()}
 
 
