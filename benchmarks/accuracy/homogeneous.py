@@ -10,14 +10,7 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from benchmarks.accuracy.comparison import (
-    BIAS,
-    COVERAGE,
-    RMSE,
-    comparison,
-    score_errors,
-    time_profiles,
-)
+from benchmarks.accuracy import comparison
 from benchmarks.harness.figure import CPU_TIME, Array, Figure, Score, Work, cpu_time, share
 from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes.homogeneous_paths import (
@@ -32,9 +25,6 @@ from benchmarks.scenes.homogeneous_paths import (
 
 PROFILES: Final = 10_000
 QUICK_PROFILES: Final = 4_000
-_WARM: Final = 64
-_ROUNDS: Final = 3
-"""Timed calls, of which the least counts: others share the processor."""
 _INFORMED: Final = frozenset({"linearized", "known_background", "known_extinction"})
 """Methods that are given more than the profile."""
 _NOTE: Final = (
@@ -42,7 +32,7 @@ _NOTE: Final = (
     "to 5 per km, signal 15 to 100 000 times the noise. The bound is the inverse Fisher matrix of "
     "background, amplitude and extinction. Profiles that a method rejects do not count for its "
     "error. The peer starts from the fit of the mean of 64 profiles, and tests no residuals. "
-    "Median over the paths of the RMSE over the bound; its largest value, and the "
+    "Median over the paths of the comparison.RMSE over the bound; its largest value, and the "
     "largest mean error, each over all paths; mean shares of flagged and rejected profiles."
 )
 
@@ -64,7 +54,7 @@ def measure_homogeneous(effort: Effort, *, profiles: int | None = None) -> Study
         for name, solver in solvers.items():
             scores[name].append(score_path(solver, scenario, power))
         effort.progress(1)
-    return comparison("homogeneous path", list(_works(scores)), _NOTE)
+    return comparison.study("homogeneous path", list(_works(scores)), _NOTE)
 
 
 def score_path(solver: PathSolver, scenario: Scenario, power: Any) -> Score:
@@ -76,8 +66,10 @@ def score_path(solver: PathSolver, scenario: Scenario, power: Any) -> Score:
     scenario : Scenario
     power : (profile, bin) float
     """
-    solver(power[:_WARM], scenario)
-    spent, solution = time_profiles(partial(solver, power, scenario), len(power), _ROUNDS)
+    solver(power[:_START_PROFILES], scenario)
+    spent, solution = comparison.time_profiles(
+        partial(solver, power, scenario), len(power), comparison.ROUNDS
+    )
     score: Score = {
         "flagged": share(float(solution.flagged.mean())),
         "rejected": share(float(solution.rejected.mean())),
@@ -90,7 +82,7 @@ def score_path(solver: PathSolver, scenario: Scenario, power: Any) -> Score:
         kept = np.isfinite(error) & ~solution.rejected
         # A value that is given has no score.
         if kept.sum() >= 2 and np.any(stated[kept] > 0):
-            errors = score_errors(error, stated, kept)
+            errors = comparison.score_errors(error, stated, kept)
             score |= {f"{name}: {quantity}": figure for quantity, figure in errors.items()}
     return score
 
@@ -98,29 +90,23 @@ def score_path(solver: PathSolver, scenario: Scenario, power: Any) -> Score:
 def _works(scores: dict[str, list[Score]]) -> Iterator[Work]:
     """Yield the errors of extinction, then of background, on all paths together."""
     for quantity, (method, paths) in product(QUANTITIES, scores.items()):
-        errors = _ranked(paths, f"{quantity}: {RMSE}")
+        errors = _ranked(paths, f"{quantity}: {comparison.RMSE}")
         if errors:
             half = len(errors) // 2
             times = [figure.value for figure in _ranked(paths, CPU_TIME)]
             shares = {name: _ranked(paths, name) for name in ("flagged", "rejected")}
-            yield Work(
-                f"median of {len(paths)} paths",
-                f"{quantity}, RMSE over the Cramér-Rao bound",
-                method,
-                errors[half],
-                _ranked(paths, f"{quantity}: {COVERAGE}")[half],
-                cpu_time(float(np.median(times))),
-                ours=method not in {*PEERS, TAIL_MEAN},
-                informed=method in _INFORMED,
-                more={
-                    "worst": errors[-1],
-                    BIAS: max(_ranked(paths, f"{quantity}: {BIAS}"), key=lambda f: abs(f.value)),
-                    **{
-                        name: share(float(np.mean([figure.value for figure in figures])))
-                        for name, figures in shares.items()
-                    },
-                },
+            worst = max(
+                _ranked(paths, f"{quantity}: {comparison.BIAS}"), key=lambda f: abs(f.value)
             )
+            means = {name: share(float(np.mean([figure.value for figure in figures])))
+                     for name, figures in shares.items()}  # fmt: skip
+            yield Work(
+                f"median of {len(paths)} paths", f"{quantity}, RMSE over the Cramér-Rao bound",
+                method, errors[half], _ranked(paths, f"{quantity}: {comparison.COVERAGE}")[half],
+                cpu_time(float(np.median(times))), ours=method not in {*PEERS, TAIL_MEAN},
+                informed=method in _INFORMED,
+                more={"worst": errors[-1], comparison.BIAS: worst} | means,
+            )  # fmt: skip
 
 
 def _ranked(paths: Sequence[Score], quantity: str) -> list[Figure]:

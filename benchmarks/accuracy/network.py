@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.accuracy.comparison import comparison, time_profiles
+from benchmarks.accuracy import comparison
 from benchmarks.harness.figure import TWO_SIDED, Array, Figure, Work, root_by_block, share_by_block
 from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes import lidar_networks as scenes
@@ -25,7 +25,6 @@ QUICK_PROFILES: Final = 500
 CLIPPED: Final = 3.0
 """Limit of relative errors: a quotient of noise has no variance."""
 _PEER_PROFILES: Final = 1500
-_QUICK_PEER_PROFILES: Final = 500
 CASES: Final = tuple(enumerate(product(scenes.AIRS, scenes.NOISES)))
 """Air and noise, each with its number, which is part of the seed."""
 
@@ -44,7 +43,7 @@ def measure_network(
         Number of profiles of each comparison with the peers.
     """
     profiles = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
-    compared = peer_profiles or (_QUICK_PEER_PROFILES if effort.quick else _PEER_PROFILES)
+    compared = peer_profiles or (QUICK_PROFILES if effort.quick else _PEER_PROFILES)
     cases = [
         (number, air)
         for number, (air, noise) in CASES
@@ -73,7 +72,7 @@ def measure_network(
         "block, too. In air that stays as it is, a mean is hard to surpass; in air that moves, it "
         "is wrong."
     )
-    return comparison("networks of lidars", works, note)
+    return comparison.study("networks of lidars", works, note)
 
 
 def solve_case(clean: Signals, noise: float, profiles: int, seed: int) -> dict[str, NetworkResult]:
@@ -104,7 +103,9 @@ def compare(clean: Signals, profiles: int, seed: int) -> dict[str, tuple[Figure,
     times, errors = {}, {}
     methods: dict[str, Callable[[Array, Array, Signals], Any]] = {**scenes.SOLVERS, **PEERS}
     for name, solve in methods.items():
-        times[name], solved = time_profiles(partial(solve, power, variance, clean), profiles)
+        times[name], solved = comparison.time_profiles(
+            partial(solve, power, variance, clean), profiles
+        )
         errors[name] = getattr(solved, "extinction", solved)[:, near] / truth - 1.0
     common = np.all([np.isfinite(error) for error in errors.values()], axis=0)
     return {

@@ -14,15 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from benchmarks.harness.figure import (
-    Array,
-    Mask,
-    Random,
-    Scores,
-    Target,
-    correlated,
-    log_uniform,
-)
+from benchmarks.harness.figure import Array, Mask, Random, Scores, Target, correlated, log_uniform
 from benchmarks.harness.rates import COVERED, Failure, Part, ScoredValues, shares
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.background import cubic_and_tail

@@ -38,12 +38,7 @@ from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
 from lidarops.retrieve.multiangle import _calibration, _smoothing, optical_depth, smooth_profile
 from lidarops.retrieve.multiangle.flags import MultiAngleQuality
-from lidarops.retrieve.network import (
-    _beam_signals,
-    _block_solution,
-    _changing_field,
-    outlying_bins,
-)
+from lidarops.retrieve.network import _beam_signals, _block_solution, _changing_field, outlying_bins
 
 PAGES: Final = Path(__file__).resolve().parents[2] / "docs/algorithms"
 """Of the tables."""
