@@ -149,6 +149,7 @@ def _hashes(record: RunRecord) -> dict[str, str]:
     return {product.path: product.sha256 for scene in record.scenes for product in scene.products}
 
 
+@pytest.mark.slow
 def test_products_do_not_depend_on_workers_and_chunks(
     demo: tuple[Campaign, RunRecord], repository: Path, demo_archive: Path, tmp_path: Path
 ) -> None:
