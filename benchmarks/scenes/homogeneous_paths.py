@@ -182,7 +182,7 @@ def solve_by(
 
     Known values are exact; the prior of "linearized" is 20 percent low.
     """
-    given = {
+    given: dict[str, Any] = {
         HomogeneousMethod.LINEARIZED: {"extinction": WRONG_PRIOR * scenario.extinction},
         HomogeneousMethod.KNOWN_EXTINCTION: {"extinction": scenario.extinction},
         HomogeneousMethod.KNOWN_BACKGROUND: {"background": scenario.background},

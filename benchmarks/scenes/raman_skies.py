@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -38,7 +38,7 @@ _COUNTS: Final = (30.0, 5000.0)
 """Of a Raman bin at 1 km."""
 _LIDAR_RATIOS: Final = (25.0, 90.0)
 """sr."""
-_EXACT: Final = dict.fromkeys(
+_EXACT: Final[dict[str, Any]] = dict.fromkeys(
     ("angstrom_standard_error", "molecular_relative_error", "overlap_relative_error"), 0.0
 )
 _TOPS: Final = (2000.0, 5000.0)

@@ -39,9 +39,10 @@ _DARK_SHARE: Final = 0.1
 _ANALOG: Final[dict[str, Any]] = {"channels": ["analog_532o"]}
 _PHOTON: Final[dict[str, Any]] = {"channels": ["photon_532o"]}
 _MINUTE: Final[dict[str, Any]] = {"average": "1min"}
-_ALONE: Final = {"here": (("",), 50.0, 10.0, {"full_overlap_range": 300})}
+_Lidars = dict[str, tuple[Sequence[str], float, float, dict[str, float]]]
+_ALONE: Final[_Lidars] = {"here": (("",), 50.0, 10.0, {"full_overlap_range": 300})}
 _LEVEL: Final[dict[str, float]] = {"full_overlap_range": 150, "zenith_angle": 90.0}
-_NETWORK: Final = {
+_NETWORK: Final[_Lidars] = {
     "west": ("012", 47.25, 11.3, _LEVEL | {"azimuth": 70.0}),
     "east": ("345", 47.25, 11.353, _LEVEL | {"azimuth": 310.0}),
     "north": ("6789", 47.2811, 11.3265, _LEVEL | {"azimuth": 190.0}),
