@@ -80,6 +80,8 @@ class Trace:
 
 def main(paths: list[Path]) -> None:
     """Trace a run over each campaign, and print the figures."""
+    if "prefect" in sys.modules:
+        raise ImportError("lidarops.run imports Prefect")
     sys.meta_path.insert(0, Absent())
     # What is imported late would count as called.
     for module in pkgutil.walk_packages(lidarops.__path__, "lidarops."):
