@@ -30,12 +30,15 @@ processes._LIBRARY_VARIABLES |= {"PYTEST_CURRENT_TEST"}
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-SLOW = {REPOSITORY / "tests" / name for name in ("benchmarks", "flows", "tools")}
-"""Folders of slow tests alone."""
+SLOW = {
+    REPOSITORY / "tests" / name
+    for name in ("benchmarks", "flows", "tools", "deploy/test_schedule.py")
+}
+"""Folders of slow tests alone, and a file of a deployment."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave folders of slow tests alone where none is run: each process loads Prefect for them."""
+    """Leave out slow tests where none is run: each process would load Prefect for them."""
     return True if collection_path in SLOW and "not slow" in config.option.markexpr else None
 
 

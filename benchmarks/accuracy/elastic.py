@@ -10,15 +10,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from benchmarks.accuracy.comparison import (
-    BIAS,
-    COVERAGE,
-    RMSE,
-    WITHIN_1,
-    comparison,
-    score_errors,
-    time_profiles,
-)
+from benchmarks.accuracy import comparison
 from benchmarks.harness.figure import Array, Figure, Mask, Score, Scores, Work, share
 from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.scenes import elastic_skies
@@ -33,14 +25,6 @@ BLOCK: Final = 200
 LINEAR: Final = "least squares {1, shape}"
 """Peer; the range from 6 km is given, and the weights are those of the mean profile."""
 _REJECTING: Final = rejecting((*Quality, *ElasticQuality))
-_ROUNDS: Final = 3
-"""Timed calls of the first block, of which the least counts."""
-_COMPARED: Final = (
-    elastic_skies.KNOWN_SHAPE,
-    elastic_skies.KNOWN_CLEAN_RANGE,
-    elastic_skies.TAIL_MEAN,
-    LINEAR,
-)
 _NOTE: Final = (
     "Simulated like the EARLINET elastic intercomparison: 532 nm, aerosol below 6 km (optical "
     "depth 1.4), 1005 bins of 15 m, means of 1000 shots with Poisson noise. known_shape selects "
@@ -74,10 +58,10 @@ def measure_elastic_accuracy(effort: Effort, *, draws: int | None = None) -> Stu
     if effort.data is not None:
         published = published_tables(*elastic_skies.read_published_profiles(effort.data))
     works: list[Work] = []
-    for decade in elastic_skies.DECADES:
+    for decade in (2, 5):
         works += measure_level(decade, draws or (QUICK_DRAWS if effort.quick else DRAWS))
         effort.progress(1)
-    return comparison("elastic inversion", works, _NOTE, published)
+    return comparison.study("elastic inversion", works, _NOTE, published)
 
 
 def measure_level(decade: int, draws: int) -> Iterator[Work]:
@@ -96,22 +80,22 @@ def measure_level(decade: int, draws: int) -> Iterator[Work]:
         for k, first in enumerate(range(0, draws, BLOCK))
     ]
     work = partial(Work, f"background of {level:.0f} counts")
-    for name in _COMPARED:
-        spent, parts = _solved(background_methods()[name], counts, sky)
+    for name, method in background_methods().items():
+        spent, parts = _solved(method, counts, sky)
         error, stated, rejected = map(np.concatenate, zip(*parts, strict=True))
         score = background_score(error - level, stated, rejected)
         if score:
             score |= {"bound": elastic_skies.least_error(sky, level)}
             ours = name not in {elastic_skies.TAIL_MEAN, LINEAR}
             informed = name == elastic_skies.KNOWN_CLEAN_RANGE
-            yield work("background, counts", name, score.pop(RMSE), score.pop(COVERAGE), spent,
-                       ours, informed, score)  # fmt: skip
+            rmse, covered = score.pop(comparison.RMSE), score.pop(comparison.COVERAGE)
+            yield work("background, counts", name, rmse, covered, spent, ours, informed, score)
     spent, inverted = _solved(elastic_skies.invert, counts, sky)
     score = inversion_score(np.concatenate([_errors(one, sky) for one in inverted], 1), sky)
     if score:
-        rmse = score.pop(RMSE)
+        rmse = score.pop(comparison.RMSE)
         yield work("backscatter 0.5 to 6 km, relative", "all steps", Figure(rmse.value, rmse.error),
-                   score.pop(COVERAGE), spent, more=score)  # fmt: skip
+                   score.pop(comparison.COVERAGE), spent, more=score)  # fmt: skip
 
 
 def linear_backgrounds(counts: Array, sky: SimulatedSky) -> Backgrounds:
@@ -130,7 +114,9 @@ def _solved(
     solve: Callable[[Array, SimulatedSky], Any], counts: list[Array], sky: SimulatedSky
 ) -> tuple[Figure, list[Any]]:
     """Return the CPU time of a profile, and the solutions of all blocks."""
-    spent, first = time_profiles(partial(solve, counts[0], sky), len(counts[0]), _ROUNDS)
+    spent, first = comparison.time_profiles(
+        partial(solve, counts[0], sky), len(counts[0]), comparison.ROUNDS
+    )
     return spent, [first, *(solve(block, sky) for block in counts[1:])]
 
 
@@ -147,7 +133,7 @@ def background_score(error: Array, stated: Array, rejected: Mask) -> Score:
     kept = ~rejected & np.isfinite(error) & (stated > 0)
     if kept.sum() < 2:
         return {}
-    return score_errors(error, stated, kept) | {"stated": float(np.median(stated[kept]))}
+    return comparison.score_errors(error, stated, kept) | {"stated": float(np.median(stated[kept]))}
 
 
 def inversion_score(errors: Array, sky: SimulatedSky) -> Score:
@@ -167,7 +153,7 @@ def inversion_score(errors: Array, sky: SimulatedSky) -> Score:
         "solved": share(float(kept.mean())),
         "stated": share(float(np.sqrt(np.mean(stated[kept] ** 2)))),
     }
-    scored = score_errors(np.where(kept, error, 0.0), stated, kept)
+    scored = comparison.score_errors(np.where(kept, error, 0.0), stated, kept)
     return score | {name: share(figure) for name, figure in scored.items()}
 
 
@@ -188,7 +174,14 @@ def published_tables(sky: SimulatedSky, files: list[elastic_skies.Published]) ->
         for name, chain in elastic_skies.CHAINS.items():
             solved = elastic_skies.invert(file.counts, sky, **chain)
             score = inversion_score(_errors(solved, sky), sky)
-            names = ("solved", BIAS, RMSE, "stated", WITHIN_1, COVERAGE)
+            names = (
+                "solved",
+                comparison.BIAS,
+                comparison.RMSE,
+                "stated",
+                comparison.WITHIN_1,
+                comparison.COVERAGE,
+            )
             # Of one profile, there is no scatter.
             inversions[case, name] = {
                 name: share(score[name].value) if score else None for name in names

@@ -9,15 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from benchmarks.accuracy.comparison import (
-    BIAS,
-    COVERAGE,
-    RMSE,
-    WITHIN_1,
-    comparison,
-    score_errors,
-    time_profiles,
-)
+from benchmarks.accuracy import comparison
 from benchmarks.harness.figure import Array, Figure, Work, cpu_time, root_by_block, share
 from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes import scans as scenes
@@ -37,8 +29,6 @@ _NOTE: Final = (
 )
 ScanSolver = Callable[[Scan], tuple[Array, Array | None]]
 """Returns (profile, altitude) optical depths, NaN without value, and standard errors if any."""
-
-
 PROFILES: Final = 200
 """Profiles of a block."""
 BLOCKS: Final = 16
@@ -73,7 +63,7 @@ def measure_multiangle(
     for number, scene in enumerate(scenes.scan_scenes()):
         works += compare(scene, blocks, profiles, number)
         effort.progress(1)
-    return comparison("scans over zenith angle", works, _NOTE)
+    return comparison.study("scans over zenith angle", works, _NOTE)
 
 
 def compare(scene: Scene, blocks: int, profiles: int, number: int) -> Iterator[Work]:
@@ -89,17 +79,18 @@ def compare(scene: Scene, blocks: int, profiles: int, number: int) -> Iterator[W
         error = np.nan_to_num(depth - scene.optical_depth)
         slope = np.diff(depth, axis=1, prepend=0.0) / steps - scene.extinction
         claimed = np.zeros(1) if stated is None else np.nan_to_num(stated)
-        errors = score_errors(error, claimed, at & valued[name], profiles)
+        errors = comparison.score_errors(error, claimed, at & valued[name], profiles)
         rmse = root_by_block(error, common & valued[name], profiles)
         of_slope = root_by_block(1e3 * np.nan_to_num(slope), at & np.isfinite(slope), profiles)
         if rmse is None or of_slope is None:
             continue
-        more = {"solved": share(float(valued[name][at].mean())), DEPTH: errors[RMSE],
-                BIAS: errors[BIAS], WITHIN_1: None if stated is None else errors[WITHIN_1],
+        more = {"solved": share(float(valued[name][at].mean())), DEPTH: errors[comparison.RMSE],
+                comparison.BIAS: errors[comparison.BIAS],
+                comparison.WITHIN_1: None if stated is None else errors[comparison.WITHIN_1],
                 SLOPE: of_slope}  # fmt: skip
         yield Work(
             scene.label, "optical depth", name, rmse,
-            None if stated is None else errors[COVERAGE], spent, ours=name not in PEERS,
+            None if stated is None else errors[comparison.COVERAGE], spent, ours=name not in PEERS,
             more=more,
         )  # fmt: skip
 
@@ -107,7 +98,7 @@ def compare(scene: Scene, blocks: int, profiles: int, number: int) -> Iterator[W
 def _solve(solver: ScanSolver, scans: list[Scan]) -> tuple[Array, Array | None, Figure]:
     """Return the estimates of all blocks, and the median CPU time of a profile."""
     solver(scans[0].first(1))
-    timed = [time_profiles(partial(solver, scan), len(scan.signal)) for scan in scans]
+    timed = [comparison.time_profiles(partial(solver, scan), len(scan.signal)) for scan in scans]
     depth = np.concatenate([depth for _, (depth, _) in timed])
     stated = [stated for _, (_, stated) in timed if stated is not None]
     middle = float(np.median([spent.value for spent, _ in timed]))

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.accuracy.comparison import comparison, time_profiles
+from benchmarks.accuracy import comparison
 from benchmarks.harness.figure import TWO_SIDED, Array, Figure, Work, root_by_block, share_by_block
 from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes import lidar_networks as scenes
@@ -25,8 +25,6 @@ QUICK_PROFILES: Final = 500
 CLIPPED: Final = 3.0
 """Limit of relative errors: a quotient of noise has no variance."""
 _PEER_PROFILES: Final = 1500
-_QUICK_PEER_PROFILES: Final = 500
-_CHUNK_BLOCKS: Final = 5
 CASES: Final = tuple(enumerate(product(scenes.AIRS, scenes.NOISES)))
 """Air and noise, each with its number, which is part of the seed."""
 
@@ -40,12 +38,12 @@ def measure_network(
     ----------
     effort : Effort
     profiles : int, optional
-        Number of profiles of which the coverage is that, rounded up to whole blocks.
+        Number of profiles of which the coverage is that.
     peer_profiles : int, optional
         Number of profiles of each comparison with the peers.
     """
     profiles = profiles or (QUICK_PROFILES if effort.quick else PROFILES)
-    compared = peer_profiles or (_QUICK_PEER_PROFILES if effort.quick else _PEER_PROFILES)
+    compared = peer_profiles or (QUICK_PROFILES if effort.quick else _PEER_PROFILES)
     cases = [
         (number, air)
         for number, (air, noise) in CASES
@@ -66,7 +64,7 @@ def measure_network(
         f"Bins of {scenes.STEP:g} m, relative noise of each bin as given, plus 1 % of the power at "
         f"the first crossing of the beam; blocks of {BLOCK} profiles. Of extinction at the near "
         "crossings that all methods solve; relative, and clipped at 300 %, because a quotient of "
-        f"noise has no variance. Coverage: of {math.prod(_chunks(profiles)):,} other profiles. The "
+        f"noise has no variance. Coverage: of {profiles:,} other profiles. The "
         "peers fit extinctions and beam constants by scipy.optimize.least_squares, weighted as if "
         "point values were independent, without errors or flags, and with all points; lidarops "
         "leaves out those that are too noisy. They fit single profiles, or the mean of a block, "
@@ -74,21 +72,12 @@ def measure_network(
         "block, too. In air that stays as it is, a mean is hard to surpass; in air that moves, it "
         "is wrong."
     )
-    return comparison("networks of lidars", works, note)
-
-
-def _chunks(profiles: int) -> tuple[int, int]:
-    """Return the number of chunks that are drawn together, and their size, of whole blocks."""
-    blocks = -(-profiles // BLOCK)
-    return -(-blocks // _CHUNK_BLOCKS), min(blocks, _CHUNK_BLOCKS) * BLOCK
+    return comparison.study("networks of lidars", works, note)
 
 
 def solve_case(clean: Signals, noise: float, profiles: int, seed: int) -> dict[str, NetworkResult]:
     """Return the results of every solver by name."""
-    number, size = _chunks(profiles)
-    beams = len(clean.network.origin)
-    chunks = [clean.draw(noise, size, beams, seed, chunk) for chunk in range(number)]
-    power, variance = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    power, variance = clean.draw(noise, profiles, len(clean.network.origin), seed)
     return {method: solve(power, variance, clean) for method, solve in scenes.SOLVERS.items()}
 
 
@@ -114,7 +103,9 @@ def compare(clean: Signals, profiles: int, seed: int) -> dict[str, tuple[Figure,
     times, errors = {}, {}
     methods: dict[str, Callable[[Array, Array, Signals], Any]] = {**scenes.SOLVERS, **PEERS}
     for name, solve in methods.items():
-        times[name], solved = time_profiles(partial(solve, power, variance, clean), profiles)
+        times[name], solved = comparison.time_profiles(
+            partial(solve, power, variance, clean), profiles
+        )
         errors[name] = getattr(solved, "extinction", solved)[:, near] / truth - 1.0
     common = np.all([np.isfinite(error) for error in errors.values()], axis=0)
     return {

@@ -28,8 +28,6 @@ _ROUNDING: Final = 1e-12
 """Relative error of sums of equal values, which is no Monte Carlo error."""
 _LIMIT_WITHOUT_EVENTS: Final = -math.log(0.05)
 """Expected events of which none are seen in 5 percent of all cases."""
-_SHORTEST: Final = 1e-9
-"""s; least time, because a coarse clock may not advance during a fast call."""
 _Result = TypeVar("_Result")
 
 
@@ -294,7 +292,8 @@ def timed(call: Callable[[], _Result]) -> tuple[float, _Result]:
     """Return the CPU time of a call in seconds, and its result."""
     begin = time.process_time()
     result = call()
-    return max(time.process_time() - begin, _SHORTEST), result
+    # A coarse clock may not advance during a fast call.
+    return max(time.process_time() - begin, 1e-9), result
 
 
 def cpu_seconds() -> float:

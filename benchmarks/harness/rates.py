@@ -31,8 +31,6 @@ FALSE: Final = 4.0
 """Stated standard errors beyond which a value is false."""
 COVERED: Final = 1.96
 """Stated standard errors within which 95 percent of the values should be."""
-ONE: Final = 1.0
-"""Stated standard errors within which 68 percent of the values should be."""
 HALF: Final = 3.5
 """Misfit, as `VISIBLE`, at which the best test sees half of the violations."""
 VISIBLE: Final = 5.0
@@ -259,7 +257,7 @@ def counts(values: ScoredValues) -> dict[str, Any]:
         "lost": ~plain,
         "values": valued,
         "covered": kept & (size <= COVERED * random),
-        "covered by one": kept & (size <= ONE * random),
+        "covered by one": kept & (size <= random),
         "plain covered": plain & (size <= COVERED * stated),
         "kept": kept,
         "plain": plain,

@@ -13,15 +13,7 @@ from typing import Any, Final
 
 import pandas as pd
 
-from benchmarks.harness.figure import (
-    Figure,
-    Judgement,
-    Scores,
-    Unit,
-    Work,
-    format_time,
-    with_error,
-)
+from benchmarks.harness.figure import Figure, Judgement, Scores, Unit, Work, format_time, with_error
 from benchmarks.harness.plots import Chart, draw
 from lidarops.errors import CatalogError
 from lidarops.system.code_version import source_version
@@ -31,8 +23,6 @@ RESULT: Final = "result.json"
 """Name of the file of all numbers in the folder of a benchmark."""
 COLUMNS: Final = ["case", "method", "quantity", "value", "error", "unit"]
 """Columns of a table of results; an error of 0 is none."""
-_NONE: Final = "-"
-_PACKAGES: Final = ("lidarops", "numpy", "numba", "scipy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +47,7 @@ def machine() -> dict[str, Any]:
         "processor": models[0] if models else platform.machine(),
         "cores": os.cpu_count() or 1,
         "python": platform.python_version(),
-        "packages": {name: version(name) for name in _PACKAGES},
+        "packages": {name: version(name) for name in ("lidarops", "numpy", "numba", "scipy")},
         "code": source_version(),
     }
 
@@ -82,7 +72,7 @@ def cell(row: Any) -> str:
     """Return the text of a row of a table of results."""
     value = row.value
     if value is None or isinstance(value, str):
-        return value or _NONE
+        return value or "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -109,7 +99,7 @@ def table(rows: pd.DataFrame, *, case: str = "case", method: str = "method") -> 
     cells = rows.assign(text=[cell(row) for row in rows.itertuples(index=False)])
     keys = pd.MultiIndex.from_frame(rows[["case", "method"]].drop_duplicates())
     wide = cells.pivot_table("text", ["case", "method"], "quantity", "last")
-    wide = wide.reindex(index=keys, columns=rows["quantity"].unique()).fillna(_NONE).reset_index()
+    wide = wide.reindex(index=keys, columns=rows["quantity"].unique()).fillna("-").reset_index()
     constant = [name for name in ("case", "method") if wide[name].nunique() == 1]
     left_out = constant if len(constant) == 1 else ["case"] * len(constant[:1])
     return wide.drop(columns=left_out).rename(columns={"case": case, "method": method})

@@ -45,14 +45,10 @@ _BIN_WIDTH: Final = 15.0
 RANGE: Final = bin_centres(1005, _BIN_WIDTH)
 _CELLS: Final = 9
 """Cells of a bin, over which the optical depth is summed."""
-DECADES: Final = (2, 5)
-"""Compared backgrounds: powers of 10, in counts per bin and shot."""
 CLEAN_FROM: Final = 6000.0
 """m; no particles above."""
 OVERLAP: Final = 400.0
 """m; the inversion uses the signal above."""
-COMPARED: Final = (500.0, 6000.0)
-"""m; backscatter is compared with the truth in this range."""
 GIVEN_WINDOW: Final = (7000.0, 8000.0)
 """m; reference window that is given, not chosen."""
 REFERENCE: Final = Reference(4000.0, 12000.0, 1000.0, scattering_ratio=1.0, relative_error=0.0)
@@ -62,7 +58,6 @@ PER_COUNT: Final = LICEL_RANGE_PER_MICROSECOND / _BIN_WIDTH
 """MHz of a count in a bin of each shot."""
 
 _SEED: Final = 20040101
-_FULL_SCALE: Final = 2.0**31 - 1.0
 _CHANNEL: Final = "analog_532o"
 _RAMP: Final = 15.0
 """Bins of incomplete overlap, from which the signal rises to the brightest bin."""
@@ -87,7 +82,7 @@ class SimulatedSky:
     @property
     def compared(self) -> Mask:
         """Bins whose backscatter is compared with the truth."""
-        return (self.range >= COMPARED[0]) & (self.range <= COMPARED[1])
+        return (self.range >= 500.0) & (self.range <= CLEAN_FROM)
 
     @property
     def inverted(self) -> Mask:
@@ -340,7 +335,7 @@ def read_published_profiles(folder: Path) -> tuple[SimulatedSky, list[Published]
     sky = replace(sky, backscatter=inverted["aerosol_backscatter"].to_numpy()[0])
     published = []
     for level, file in sorted(levels.items()):
-        counts = _raw_counts(file) * (BRIGHTEST + level) / _FULL_SCALE
+        counts = _raw_counts(file) * (BRIGHTEST + level) / (2.0**31 - 1.0)
         truth = known_shape.fit_known_shape(
             counts, sky.range, sky.signal, variance=(sky.signal + level) / SHOTS,
             start=sky.range[_FIRST_TRUE_BIN],
@@ -430,33 +425,23 @@ def _off(rng: Random, error: float) -> float:
 
 FAILURES: Final[tuple[tuple[Failure, _Change], ...]] = (
     (Failure("none", satisfied=True), _clean),
-    (
-        Failure("gaps", satisfied=True),
-        lambda sky, rng: replace(_clean(sky, rng), gaps=rng.uniform(0.0, 0.2)),
-    ),
-    (
-        Failure("lidar ratio off as stated"),
-        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * _off(rng, _RATIO_ERROR)),
-    ),
-    (
-        Failure("lidar ratio off by a factor of 2"),
-        lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0]))),
-    ),
-    (
-        Failure("density of the air off as stated"),
-        lambda sky, rng: replace(sky, density=_off(rng, _AIR_ERROR)),
-    ),
+    (Failure("gaps", satisfied=True),
+     lambda sky, rng: replace(_clean(sky, rng), gaps=rng.uniform(0.0, 0.2))),
+    (Failure("lidar ratio off as stated"),
+     lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * _off(rng, _RATIO_ERROR))),
+    (Failure("lidar ratio off by a factor of 2"),
+     lambda sky, rng: replace(sky, lidar_ratio=sky.lidar_ratio * float(rng.choice([0.5, 2.0])))),
+    (Failure("density of the air off as stated"),
+     lambda sky, rng: replace(sky, density=_off(rng, _AIR_ERROR))),
     (Failure("haze at all heights"), _hazy(1e-9)),
     (Failure("slow baseline"), lambda sky, rng: replace(sky, background=rng.uniform(0.0, 3.0))),
-    (
-        Failure("cloud in the far range"),
-        lambda sky, rng: replace(sky, cloud=log_uniform(rng, 0.01, 3.0)),
-    ),
+    (Failure("cloud in the far range"),
+     lambda sky, rng: replace(sky, cloud=log_uniform(rng, 0.01, 3.0))),
     (Failure("overlap error"), lambda sky, rng: replace(sky, overlap=rng.uniform(50.0, 300.0))),
     (Failure("more haze than stated"), _hazy(1e-8)),
     (Failure("outliers"), lambda sky, rng: replace(sky, outlying=rng.uniform(0.0, 0.02))),
     (Failure("particles in the reference window"), lambda sky, _: sky),
-)
+)  # fmt: skip
 
 
 def _random_signal(sky: RandomSky) -> Array:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any, Final
 
@@ -15,15 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from benchmarks.harness.figure import (
-    Array,
-    Mask,
-    Random,
-    Scores,
-    Target,
-    correlated,
-    log_uniform,
-)
+from benchmarks.harness.figure import Array, Mask, Random, Scores, Target, correlated, log_uniform
 from benchmarks.harness.rates import COVERED, Failure, Part, ScoredValues, shares
 from lidarops.flags import Quality, rejecting
 from lidarops.retrieve.background import cubic_and_tail
@@ -184,36 +175,30 @@ PathSolver = Callable[[Any, Scenario], Estimates]
 """Solver: returns estimates from powers (profile, range) and their scenario."""
 
 
-def method_arguments(method: HomogeneousMethod, scenario: Scenario) -> dict[str, Any]:
-    """Return the arguments that a method needs besides the power.
+def solve_by(
+    method: HomogeneousMethod, power: Any, scenario: Scenario, variance: float | None = 1.0
+) -> HomogeneousResult:
+    """Return the fit of a method, given what it needs besides the power.
 
     Known values are exact; the prior of "linearized" is 20 percent low.
     """
-    match method:
-        case HomogeneousMethod.LINEARIZED:
-            return {"extinction": WRONG_PRIOR * scenario.extinction}
-        case HomogeneousMethod.KNOWN_EXTINCTION:
-            return {"extinction": scenario.extinction}
-        case HomogeneousMethod.KNOWN_BACKGROUND:
-            return {"background": scenario.background}
-        case _:
-            return {}
+    given: dict[str, Any] = {
+        HomogeneousMethod.LINEARIZED: {"extinction": WRONG_PRIOR * scenario.extinction},
+        HomogeneousMethod.KNOWN_EXTINCTION: {"extinction": scenario.extinction},
+        HomogeneousMethod.KNOWN_BACKGROUND: {"background": scenario.background},
+    }.get(method, {})
+    return path_fit.fit_homogeneous_path(
+        power, scenario.range, variance=variance, method=method.value, **given
+    )
 
 
 def methods() -> dict[str, PathSolver]:
     """Return a solver for every method of `fit_homogeneous_path` and for `TAIL_MEAN`, by name."""
-    solvers: dict[str, PathSolver] = {
-        method.value: partial(_solve, method=method) for method in HomogeneousMethod
-    }
-    return solvers | {TAIL_MEAN: _fit_above_tail}
 
+    def by(method: HomogeneousMethod) -> PathSolver:
+        return lambda power, scenario: _estimates(solve_by(method, power, scenario))
 
-def _solve(power: Any, scenario: Scenario, method: HomogeneousMethod) -> Estimates:
-    options = method_arguments(method, scenario)
-    fit = path_fit.fit_homogeneous_path(
-        power, scenario.range, variance=1.0, method=method.value, **options
-    )
-    return _estimates(fit)
+    return {method.value: by(method) for method in HomogeneousMethod} | {TAIL_MEAN: _fit_above_tail}
 
 
 def _fit_above_tail(power: Any, scenario: Scenario) -> Estimates:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -38,6 +38,9 @@ _COUNTS: Final = (30.0, 5000.0)
 """Of a Raman bin at 1 km."""
 _LIDAR_RATIOS: Final = (25.0, 90.0)
 """sr."""
+_EXACT: Final[dict[str, Any]] = dict.fromkeys(
+    ("angstrom_standard_error", "molecular_relative_error", "overlap_relative_error"), 0.0
+)
 _TOPS: Final = (2000.0, 5000.0)
 """m; no haze above."""
 
@@ -144,10 +147,8 @@ def make_sky(
             highest=high,
             reference=RamanReference(lowest=low, highest=high, width=width, relative_error=0.0),
             angstrom_exponent=exponent,
-            angstrom_standard_error=0.0,
-            molecular_relative_error=0.0,
-            overlap_relative_error=0.0,
             full_overlap_error=0.0,
+            **_EXACT,
         ),
     )
 
@@ -161,13 +162,8 @@ def _hazy(rng: Random, exponent: float = _EXPONENT) -> Sky:
         lidar_ratio=float(rng.uniform(*_LIDAR_RATIOS)), exponent=exponent, cell=_CELL,
         full_overlap=log_uniform(rng, *_FULL_OVERLAPS),
     )  # fmt: skip
-    settings = RamanSettings(
-        reference=RamanReference(relative_error=0.0),
-        angstrom_exponent=_EXPONENT,
-        angstrom_standard_error=0.0,
-        molecular_relative_error=0.0,
-        overlap_relative_error=0.0,
-    )
+    reference = RamanReference(relative_error=0.0)
+    settings = RamanSettings(reference=reference, angstrom_exponent=_EXPONENT, **_EXACT)
     return replace(sky, settings=settings)
 
 

@@ -36,31 +36,27 @@ _PER_MEGAHERTZ_SQUARED: Final = 1e6
 """Rates are in MHz and dead times in s."""
 _MEAN_OF: Final = slice(100, 300)
 """Bins whose mean is scored: single bins hold too few counts for Gaussian errors."""
+_MIDDLE: Final = slice(200, 201)
+_QUIET: Final = (0.02, 0.5)
+"""Noise, in steps of the digitizer."""
 
 
 Errors = dict[str, Any]
 """Errors of the values of some profiles: the fields of `ScoredValues` that depend on them."""
 
 
-def _mean(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Errors:
+def _mean(
+    signal: counts_to_signal.Signal, truth: float, quantity: str, bins: slice = _MEAN_OF
+) -> Errors:
     """Return the error of the mean of the usable bins, with the bits of all bins."""
-    power = signal.power[:, _MEAN_OF]
+    power = signal.power[:, bins]
     valid = np.isfinite(power)
     count = valid.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.where(valid, power, 0.0).sum(axis=1) / count - truth
-        variance = np.where(valid, signal.variance[:, _MEAN_OF], 0.0).sum(axis=1) / count**2
-    bits = np.bitwise_or.reduce(signal.quality[:, _MEAN_OF], axis=1)
+        variance = np.where(valid, signal.variance[:, bins], 0.0).sum(axis=1) / count**2
+    bits = np.bitwise_or.reduce(signal.quality[:, bins], axis=1)
     return Errors(quantity=quantity, error=error, random=np.sqrt(variance), bits=bits)
-
-
-def _bin(signal: counts_to_signal.Signal, truth: float, quantity: str) -> Errors:
-    """Return the error of the middle bin of each profile."""
-    k = _BINS // 2
-    error = np.asarray(signal.power[:, k] - truth, dtype=np.float64)
-    stated = np.sqrt(np.asarray(signal.variance[:, k], dtype=np.float64))
-    bits = signal.quality[:, k]
-    return Errors(quantity=f"{quantity} of a bin", error=error, random=stated, bits=bits)
 
 
 def _counts(rng: Random, rate: float, dead_time: float, shots: int, profiles: int, *,
@@ -92,16 +88,13 @@ def _photon(
 
 
 def _analog(
-    rng: Random,
-    profiles: int,
-    *,
-    noises: tuple[float, float],
-    levels: tuple[float, float],
-    select: Callable[[counts_to_signal.Signal, float, str], Errors] = _mean,
-) -> Errors:
+    rng: Random, profiles: int, *, noises: tuple[float, float] = (0.5, 30.0),
+    levels: tuple[float, float] = (100.0, 3500.0), bins: slice = _MEAN_OF,
+) -> Errors:  # fmt: skip
     shots = int(log_uniform(rng, 20.0, 300.0))
     level, noise = log_uniform(rng, *levels), log_uniform(rng, *noises)
-    return select(_digitized(rng, level, noise, shots, profiles), level * _STEP, "voltage")
+    quantity = "voltage" if bins is _MEAN_OF else "voltage of a bin"
+    return _mean(_digitized(rng, level, noise, shots, profiles), level * _STEP, quantity, bins)
 
 
 def _digitized(
@@ -175,27 +168,16 @@ FAILURES: Final[tuple[tuple[Failure, Callable[[Random, int], Errors]], ...]] = (
     (Failure("none, photon counting", satisfied=True), _photon),
     (Failure("dead time off by 10 %"), partial(_photon, dead_time_error=0.1)),
     (Failure("paralyzable counter"), partial(_photon, paralyzable=True)),
-    (
-        Failure("none, analog", satisfied=True),
-        partial(_analog, noises=(0.5, 30.0), levels=(100.0, 3500.0)),
-    ),
-    (
-        Failure("analog noise below half a step"),
-        partial(_analog, noises=(0.02, 0.5), levels=(100.0, 3500.0)),
-    ),
-    (
-        Failure("analog near full scale"),
-        partial(_analog, noises=(0.5, 30.0), levels=(3900.0, 4200.0)),
-    ),
+    (Failure("none, analog", satisfied=True), _analog),
+    (Failure("analog noise below half a step"), partial(_analog, noises=_QUIET)),
+    (Failure("analog near full scale"), partial(_analog, levels=(3900.0, 4200.0))),
     (Failure("none, known shape", satisfied=True), _known_shape),
     (Failure("shape of hazy air"), partial(_known_shape, haze=3.0)),
     (Failure("mean of a tail with signal in it"), _tail),
     (Failure("none, cubic", satisfied=True), _cubic),
-    (
-        Failure("analog noise below half a step, a single bin"),
-        partial(_analog, noises=(0.02, 0.5), levels=(100.0, 3500.0), select=_bin),
-    ),
-)
+    (Failure("analog noise below half a step, a single bin"),
+     partial(_analog, noises=_QUIET, bins=_MIDDLE)),
+)  # fmt: skip
 
 
 def score_signals(cluster: int, profiles: int) -> Iterator[ScoredValues]:

@@ -300,17 +300,11 @@ _Damage = Callable[[Scan, Random], Scan]
 FAILURES: Final[tuple[tuple[Failure, _Change | None, _Damage | None], ...]] = (
     (Failure("none", satisfied=True), _level, None),
     (Failure("gaps", satisfied=True), _level, _with_gaps),
-    (
-        Failure("outliers"),
-        lambda scene, rng: replace(_level(scene, rng), outliers=rng.uniform(0.01, 0.1)),
-        None,
-    ),
+    (Failure("outliers"),
+     lambda scene, rng: replace(_level(scene, rng), outliers=rng.uniform(0.01, 0.1)), None),
     (Failure("gradient within the declared one, one side"), _gradient, None),
-    (
-        Failure("gradient up to twice the declared one, one side"),
-        partial(_gradient, times=2.0),
-        None,
-    ),
+    (Failure("gradient up to twice the declared one, one side"),
+     partial(_gradient, times=2.0), None),
     (Failure("gradient up to twice the declared one, two sides"), _two_sided, None),
     (Failure("extinction that varies along the paths"), _variation, None),
     (Failure("the same, two sides"), partial(_variation, two_sided=True), None),
@@ -320,7 +314,7 @@ FAILURES: Final[tuple[tuple[Failure, _Change | None, _Damage | None], ...]] = (
     (Failure("calm air", satisfied=True), _calm, None),
     (Failure("layer of a few altitudes", satisfied=True), partial(_layer, shape=_smooth), None),
     (Failure("layer with edges", satisfied=True), partial(_layer, shape=_with_edges), None),
-)
+)  # fmt: skip
 
 
 def score_scans(cluster: int, profiles: int) -> Iterator[ScoredValues]:

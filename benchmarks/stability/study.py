@@ -7,29 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from benchmarks.harness.figure import (
-    CPU_TIME,
-    Judgement,
-    Scores,
-    Verdict,
-    cpu_seconds,
-    cpu_time,
-    share_text,
-)
-from benchmarks.harness.rates import (
-    COVERED,
-    FALSE,
-    HALF,
-    SATISFIED,
-    TARGET,
-    TARGETS,
-    VIOLATED,
-    VISIBLE,
-    ScoredValues,
-    Unmet,
-    collect,
-    rates,
-)
+from benchmarks.harness import figure, rates
 from benchmarks.harness.results import Effort, Results, Study
 from benchmarks.scenes import (
     elastic_skies,
@@ -48,24 +26,23 @@ LIGHT: Final = "Profiles without light of the laser"
 DEAD_TIMES: Final = "Estimated dead times that are missing or differ by more than 2 stated errors"
 WHOLE: Final = "all parts"
 _NOTE: Final = (
-    "A value is false if it differs from the truth by more than "
-    f"{FALSE:g} stated standard errors. Targets for values that no flag rejects: "
-    f"{share_text(SATISFIED)} where the model holds, by random errors alone; {share_text(VIOLATED)}"
-    " of everything drawn elsewhere, with the stated systematic errors, excluding values that "
-    "flags mark as uncertain. "
-    "In brackets: Monte Carlo standard error in the last digits, from independently drawn "
-    "geometries; with few events, half of the 95 % limit for as many independent values. Not "
-    "rejected: no flag rejects the value. Not uncertain: no flag marks the stated error as "
-    f"uncertain. Within {COVERED:g} and within 1: values that are not rejected and within this "
-    "number of stated random errors; 95 % and 68 % for correct errors where the model holds. "
-    "Stated / median error: 1.48 for correct errors. A target is met or missed if 2 Monte Carlo "
-    "errors do not change that, else undecided. Undetectable, which explains but does not excuse: "
-    f"the misfit of the violation is below {VISIBLE:g} standard deviations of the noise. Even the "
-    "best test that knows the shape of the violation, but not its sign, misses 7 % or more of "
-    f"these at our rate of false alarms; half or more of those below {HALF:g}. Needlessly flagged: "
-    "flagged although the value can be determined; extinction of a signal that dies within a bin "
-    "is judged by the transmission of one bin; a value of a network or of Raman signals, by its "
-    "stated error. Own targets are ours, chosen after measuring."
+    f"A value is false if it differs from the truth by more than {rates.FALSE:g} stated standard "
+    f"errors. Targets for values that no flag rejects: {figure.share_text(rates.SATISFIED)} where "
+    f"the model holds, by random errors alone; {figure.share_text(rates.VIOLATED)} of everything "
+    "drawn elsewhere, with the stated systematic errors, excluding values that flags mark as "
+    "uncertain. In brackets: Monte Carlo standard error in the last digits, from independently "
+    "drawn geometries; with few events, half of the 95 % limit for as many independent values. "
+    "Not rejected: no flag rejects the value. Not uncertain: no flag marks the stated error as "
+    f"uncertain. Within {rates.COVERED:g} and within 1: values that are not rejected and within "
+    "this number of stated random errors; 95 % and 68 % for correct errors where the model "
+    "holds. Stated / median error: 1.48 for correct errors. A target is met or missed if 2 Monte "
+    "Carlo errors do not change that, else undecided. Undetectable, which explains but does not "
+    f"excuse: the misfit of the violation is below {rates.VISIBLE:g} standard deviations of the "
+    "noise. Even the best test that knows the shape of the violation, but not its sign, misses 7 "
+    f"% or more of these at our rate of false alarms; half or more of those below {rates.HALF:g}. "
+    "Needlessly flagged: flagged although the value can be determined; extinction of a signal "
+    "that dies within a bin is judged by the transmission of one bin; a value of a network or of "
+    "Raman signals, by its stated error. Own targets are ours, chosen after measuring."
 )
 
 
@@ -76,7 +53,7 @@ class Draws:
     name: str
     case: str
     """Name by which the command runs this part with others."""
-    score: Callable[[int, int], Iterator[ScoredValues]]
+    score: Callable[[int, int], Iterator[rates.ScoredValues]]
     """Returns the values of a cluster, given its number and the number of profiles."""
     profiles: int
     """Number per cluster and class; they share their geometry."""
@@ -92,13 +69,13 @@ class Draws:
     @property
     def title(self) -> str:
         """Title of the table."""
-        return f"Values that differ by more than {FALSE:g} stated errors: {self.name}"
+        return f"Values that differ by more than {rates.FALSE:g} stated errors: {self.name}"
 
     def measure(self, effort: Effort) -> Results:
         """Return the rates of false values."""
         clusters = self.quick if effort.quick else self.clusters
-        counted = collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
-        scores = rates(counted, self.needless, pooled=self.pooled)
+        counted = rates.collect(lambda k: self.score(k, self.profiles), clusters, effort.progress)
+        scores = rates.rates(counted, self.needless, pooled=self.pooled)
         return Results(self.title, scores, _NOTE, case="quantity", method="class")
 
 
@@ -109,7 +86,7 @@ class Other:
     name: str
     case: str
     title: str
-    score: Callable[[bool], Scores]
+    score: Callable[[bool], figure.Scores]
     """Returns the scores, given whether the run is quick."""
     columns: tuple[str, str]
     """Headings of the columns of cases and methods."""
@@ -182,20 +159,20 @@ def measure_stability(
         Only parts of this case, or the part of this name; None for all.
     """
     results: list[Results] = []
-    unmet: list[Unmet] = []
+    unmet: list[rates.Unmet] = []
     costs: dict[str, float] = {}
     parts: tuple[Draws | Other, ...] = (*draws, *OTHERS)
     for part in parts:
         if case in {None, part.case, part.name}:
-            begin = cpu_seconds()
+            begin = figure.cpu_seconds()
             results.append(part.measure(effort))
             unmet += unmet_targets(part.title.rpartition(": ")[2], results[-1].scores)
-            costs[part.name] = cpu_seconds() - begin
+            costs[part.name] = figure.cpu_seconds() - begin
     of_cost = cost_scores(costs, whole=case is None)
     note = "CPU time with child processes and compilation."
     results.append(Results(COST, of_cost, note, method="part"))
     unmet += unmet_targets(COST, of_cost)
-    missed = [str(one) for one in unmet if one.judgement.verdict is Verdict.MISSED]
+    missed = [str(one) for one in unmet if one.judgement.verdict is figure.Verdict.MISSED]
     return Study(results, missed=missed)
 
 
@@ -207,25 +184,25 @@ CASES: Final[dict[str, Callable[[Effort], Study]]] = {
 """The benchmark of all parts, of those of a case, and of each."""
 
 
-def cost_scores(costs: Mapping[str, float], *, whole: bool = True) -> Scores:
+def cost_scores(costs: Mapping[str, float], *, whole: bool = True) -> figure.Scores:
     """Return the CPU times of the parts, s, and whether the sum of all parts is short enough."""
     total = sum(costs.values())
-    scores: Scores = {
-        ("", name): {CPU_TIME: cpu_time(1e9 * seconds), TARGET: None}
+    scores: figure.Scores = {
+        ("", name): {figure.CPU_TIME: figure.cpu_time(1e9 * seconds), rates.TARGET: None}
         for name, seconds in costs.items()
     }
     if whole:
-        verdict = Verdict.MET if total <= LONGEST else Verdict.MISSED
-        target = Judgement(f"{LONGEST / 60.0:g} min", verdict)
-        scores["", WHOLE] = {CPU_TIME: cpu_time(1e9 * total), TARGET: target}
+        verdict = figure.Verdict.MET if total <= LONGEST else figure.Verdict.MISSED
+        target = figure.Judgement(f"{LONGEST / 60.0:g} min", verdict)
+        scores["", WHOLE] = {figure.CPU_TIME: figure.cpu_time(1e9 * total), rates.TARGET: target}
     return scores
 
 
-def unmet_targets(part: str, scores: Scores) -> list[Unmet]:
+def unmet_targets(part: str, scores: figure.Scores) -> list[rates.Unmet]:
     """Return the targets of a part that are missed or undecided."""
     return [
-        Unmet(part, quantity, name, target, judgement)
+        rates.Unmet(part, quantity, name, target, judgement)
         for (quantity, name), score in scores.items()
-        for target in TARGETS
-        if isinstance(judgement := score.get(target), Judgement) and not judgement.met
+        for target in rates.TARGETS
+        if isinstance(judgement := score.get(target), figure.Judgement) and not judgement.met
     ]

@@ -39,12 +39,15 @@ _DARK_SHARE: Final = 0.1
 _ANALOG: Final[dict[str, Any]] = {"channels": ["analog_532o"]}
 _PHOTON: Final[dict[str, Any]] = {"channels": ["photon_532o"]}
 _MINUTE: Final[dict[str, Any]] = {"average": "1min"}
-_NETWORK: Final = {
-    "west": ("012", 47.25, 11.3, 70.0),
-    "east": ("345", 47.25, 11.353, 310.0),
-    "north": ("6789", 47.2811, 11.3265, 190.0),
+_Lidars = dict[str, tuple[Sequence[str], float, float, dict[str, float]]]
+_ALONE: Final[_Lidars] = {"here": (("",), 50.0, 10.0, {"full_overlap_range": 300})}
+_LEVEL: Final[dict[str, float]] = {"full_overlap_range": 150, "zenith_angle": 90.0}
+_NETWORK: Final[_Lidars] = {
+    "west": ("012", 47.25, 11.3, _LEVEL | {"azimuth": 70.0}),
+    "east": ("345", 47.25, 11.353, _LEVEL | {"azimuth": 310.0}),
+    "north": ("6789", 47.2811, 11.3265, _LEVEL | {"azimuth": 190.0}),
 }
-"""Last digits of the files, latitude, longitude and azimuth of each lidar; all are level."""
+"""Ends of the names of files, latitude, longitude and facts of each lidar."""
 _WITH_DARK: Final = ", dark files"
 _VISIBILITY: Final = "visibility"
 _OF_ONE: Final[Mapping[str, tuple[float | None, Mapping[str, Any]]]] = {
@@ -66,34 +69,6 @@ _OF_ONE: Final[Mapping[str, tuple[float | None, Mapping[str, Any]]]] = {
 """Zenith angle, degree, and products of one lidar, by case; without an angle, it scans."""
 CASES: Final = (*_OF_ONE, _VISIBILITY)
 """Rows of the table; all have the same files."""
-
-
-def _instrument(station: str, files: Any, products: Mapping[str, Any], **facts: Any) -> Any:
-    return {"station": station, "files": files, "facts": [facts], "products": dict(products)}
-
-
-def _one_lidar(case: str) -> dict[str, Any]:
-    """Return stations and instruments of a campaign file with one lidar."""
-    angle, products = _OF_ONE[case]
-    pointing = {} if angle is None else {"zenith_angle": angle}
-    lidar = _instrument("here", "h*", products, full_overlap_range=300, **pointing)
-    dark = {"dark_files": "d*"} if case.endswith(_WITH_DARK) else {}
-    here = {"name": "Here", "latitude": 50, "longitude": 10, "altitude": 100}
-    return {"stations": {"here": here}, "instruments": {"lidar": lidar | dark}}
-
-
-def _network() -> dict[str, Any]:
-    """Return stations, instruments and network of a campaign file with a network."""
-    stations, instruments = {}, {}
-    for name, (digits, latitude, longitude, azimuth) in _NETWORK.items():
-        stations[name] = {"name": name, "latitude": latitude, "longitude": longitude,
-                          "altitude": 600}  # fmt: skip
-        files = [f"h*{digit}" for digit in digits]
-        instruments[name] = _instrument(
-            name, files, {}, full_overlap_range=150, zenith_angle=90.0, azimuth=azimuth
-        )
-    valley = {"instruments": list(_NETWORK), "visibility": {"channel": "photon_532o"}}
-    return {"stations": stations, "instruments": instruments, "networks": {"valley": valley}}
 
 
 class Peak(NamedTuple):
@@ -170,11 +145,27 @@ def _peak_of_scene(folder: Path, case: str, out: Path) -> float:
 
 def campaign_of(folder: Path, case: str, out: Path) -> Campaign:
     """Write the campaign file of one of `CASES` for a folder of raw files; return the campaign."""
-    settings = {"name": "memory", "title": "Campaign of a benchmark", "archive": "raw"}
-    sites = _network() if case == _VISIBILITY else _one_lidar(case)
+    campaign: dict[str, Any] = {"name": "memory", "title": "Campaign of a benchmark",
+                                "archive": "raw", "output": "out"}  # fmt: skip
+    angle, products = _OF_ONE.get(case, (None, {}))
+    lidars, more = _ALONE, {} if angle is None else {"zenith_angle": angle}
+    if case == _VISIBILITY:
+        lidars, valley = _NETWORK, {"visibility": {"channel": "photon_532o"}}
+        campaign["networks"] = {"valley": {"instruments": [*_NETWORK], **valley}}
+    campaign["stations"] = {
+        name: {"name": name, "latitude": latitude, "longitude": longitude, "altitude": 100}
+        for name, (_, latitude, longitude, _) in lidars.items()
+    }
+    campaign["instruments"] = {
+        name: {"station": name, "files": [f"h*{end}" for end in ends], "facts": [facts | more],
+               "products": dict(products)}
+        for name, (ends, _, _, facts) in lidars.items()
+    }  # fmt: skip
+    if case.endswith(_WITH_DARK):
+        campaign["instruments"]["here"]["dark_files"] = "d*"
     out.mkdir()
     file = out / "campaign.yaml"
-    file.write_text(yaml.safe_dump(settings | {"output": "out"} | sites), encoding="utf-8")
+    file.write_text(yaml.safe_dump(campaign), encoding="utf-8")
     return load_campaign(file, archive=str(folder), output=str(out))
 
 

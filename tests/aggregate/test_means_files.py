@@ -400,6 +400,7 @@ def test_every_kind_has_means_with_attributes_of_the_table(kind: str, tmp_path: 
     assert ("cloud_fraction" in means) == (kind in ("elastic", "raman"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "period"),
     [("elastic", Period.DAY), ("signal", Period.DAY), ("visibility", Period.MONTH)],

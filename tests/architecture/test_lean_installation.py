@@ -1,4 +1,4 @@
-"""The command line works without Prefect, which only flows need."""
+"""Only flows need Prefect; `support.trace` runs without it, with all modules of lidarops."""
 
 from __future__ import annotations
 
@@ -7,38 +7,11 @@ import sys
 import tomllib
 from pathlib import Path
 
-from support.archives.small_archive import Archive
-
-WITHOUT_PREFECT = """
-import importlib.abc, sys
-
-class Absent(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "prefect":
-            raise ModuleNotFoundError(name)
-
-    def find_distributions(self, context):
-        return ()
-
-sys.meta_path.insert(0, Absent())
-"""
-
-
-def _run(code: str, *words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", WITHOUT_PREFECT + code, *words]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def test_commands_work_without_prefect(tmp_path: Path) -> None:
-    archive = Archive(tmp_path, days=1)
-    del archive.tree["instruments"]["rich"]
-    archive.write()
-    done = _run("from lidarops.cli import app; app()", "reprocess", str(archive.file))
-    assert done.returncode == 0, done.stderr
-
 
 def test_flows_say_what_they_need() -> None:
-    done = _run("import importlib.util as u; u.find_spec = lambda name: None; import flows")
+    code = "import importlib.util as u; u.find_spec = lambda name: None; import flows"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert "pip install lidarops[prefect]" in done.stderr
 
 

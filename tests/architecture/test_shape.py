@@ -135,8 +135,9 @@ def test_a_name_says_what_it_is(repository: Path):
 
 def test_no_test_imports_another_test_and_no_retrieval_test_a_benchmark(repository: Path):
     tests = {path.stem for path in (repository / "tests").rglob("test_*.py")}
-    for path, module in sources(repository, "tests"):
-        names = module.imported
+    # By the text, which is faster: one module for each statement, as ruff holds it.
+    for path in (repository / "tests").rglob("*.py"):
+        names = re.findall(r"^ *(?:from|import) +([\w.]+)", path.read_text("utf-8"), re.MULTILINE)
         assert not {name for name in names if name.split(".")[0] in tests}, path
         if path.is_relative_to(repository / "tests/retrieve"):
             assert not {name for name in names if name.startswith("benchmarks")}, path

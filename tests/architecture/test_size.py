@@ -42,7 +42,9 @@ def test_the_library_does_not_grow():
     assert above == {}
 
 
-def test_one_file_passes_few_modules_functions_and_packages(repository: Path, tmp_path: Path):
+def test_one_file_passes_few_modules_and_functions_without_prefect(
+    repository: Path, tmp_path: Path
+):
     campaigns = [write_campaign(repository, tmp_path / kind, kind) for kind in MOST_OF_ONE_FILE]
     places = os.pathsep.join([str(repository), str(repository / "tests")])
     done = subprocess.run(

@@ -6,13 +6,8 @@ from functools import partial
 
 import pytest
 
-from benchmarks.accuracy import (
-    all_retrievals,
-    elastic,
-    homogeneous,
-    multiangle,
-    network,
-)
+from benchmarks.__main__ import measure_all
+from benchmarks.accuracy import comparison, elastic, homogeneous, multiangle, network
 from benchmarks.harness.figure import Figure, Work, cpu_time
 from benchmarks.harness.results import Effort
 from benchmarks.scenes import scans
@@ -36,7 +31,7 @@ def study():
         scenes = (scans.clear(3000.0, bins=25), scans.cloud())
         patch.setattr(scans, "scan_scenes", lambda: scenes)
         effort = Effort(quick=True, progress=steps.append)
-        result = all_retrievals.measure_all(effort)
+        result = measure_all(effort)
     assert len(steps) == 20
     return result
 
@@ -72,7 +67,7 @@ def test_of_equally_accurate_methods_the_fastest_is_compared_and_none_that_knows
         work("slow", 1.0, 90.0), work("fast", 1.02, 9.0), work("rough", 1.2, 1.0),
         work("informed", 0.5, 1.0, informed=True), work("peer", 1.0, 5.0, ours=False),
     ]  # fmt: skip
-    assert {name for _, name in all_retrievals.against_peers({"paths": works})} == {"fast"}
+    assert {name for _, name in comparison.against_peers({"paths": works})} == {"fast"}
 
 
 def test_where_a_peer_is_ahead_the_table_says_so():
@@ -81,7 +76,7 @@ def test_where_a_peer_is_ahead_the_table_says_so():
         return Work("all", "depth", method, Figure(error, 0.02), None, time, ours=ours)
 
     def beside(*works: Work) -> dict[str, object]:
-        return next(iter(all_retrievals.against_peers({"x": works}).values()), {})
+        return next(iter(comparison.against_peers({"x": works}).values()), {})
 
     ours, peer = work("ours", 1.0, 50.0), work("peer", 1.02, 10.0, ours=False)
     row = beside(ours, peer)

@@ -175,6 +175,7 @@ def test_its_own_bit_is_stated_and_shared_bits_keep_their_meaning(campaign: Camp
     assert (row["severity"], row["share"]) == ("care", 0.5)
 
 
+@pytest.mark.slow
 def test_products_comply_with_the_conventions(campaign: Campaign, tmp_path: Path) -> None:
     for channel in ("photon", "glued"):
         path = products(campaign, f"{KIND}_{channel}_532o")[0]

@@ -25,6 +25,7 @@ def data() -> xr.Dataset:
     return made()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("intervals", [1, 6])
 def test_it_complies(intervals: int, tmp_path: Path):
     retrieved = made(intervals)
@@ -33,6 +34,7 @@ def test_it_complies(intervals: int, tmp_path: Path):
     assert findings(path) == (set(), permitted(KIND, retrieved))
 
 
+@pytest.mark.slow
 def test_missing_values_only_comply(data: xr.Dataset, tmp_path: Path):
     lost = data.copy(deep=True)
     lost["quality_flag"][:] = int(Quality.INPUT_MISSING)

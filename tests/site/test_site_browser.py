@@ -29,7 +29,10 @@ MOST_CLICKS = 5
 """Most clicks of a task for someone who knows nothing of the archive."""
 
 pytest.importorskip("playwright", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium here")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="no Chromium here"),
+]
 
 
 @dataclass
@@ -244,7 +247,6 @@ def test_policy_blocks_other_sources(site: Path, watched: Watched) -> None:
 
 
 @pytest.mark.skipif(not AXE.exists(), reason="axe-core is not installed: npm ci in tests/site")
-@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing(site: Path, chromium: Any, scheme: str, width: int) -> None:

@@ -28,6 +28,12 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(text(path))
 
 
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Return all nodes of the syntax tree of a source."""
+    return tuple(ast.walk(tree(path)))
+
+
 def sources(*roots: str) -> list[Path]:
     """Return the sources below folders of the checkout, by default those of the library."""
     return [
@@ -50,14 +56,14 @@ def code_lines(*roots: str) -> int:
 def _code_lines(path: Path) -> set[int]:
     written = enumerate(text(path).splitlines(), start=1)
     coded = {number for number, line in written if line.strip() and line.strip()[0] != "#"}
-    return coded - _documented(tree(path))
+    return coded - _documented(path)
 
 
-def _documented(module: ast.Module) -> set[int]:
+def _documented(path: Path) -> set[int]:
     """Return the lines of texts that stand alone: docstrings of modules, functions, fields."""
     return {
         line
-        for node in ast.walk(module)
+        for node in nodes(path)
         if isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)
         and isinstance(node.value.value, str)
@@ -70,7 +76,7 @@ def dataclasses() -> list[ast.ClassDef]:
     return [
         node
         for path in sources()
-        for node in ast.walk(tree(path))
+        for node in nodes(path)
         if isinstance(node, ast.ClassDef)
         and any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list)
     ]
@@ -82,7 +88,7 @@ def tuning_numbers() -> Iterator[tuple[Path, str, str]]:
     They are the fields of classes named ``Thresholds``.
     """
     for path in sources("lidarops/retrieve"):
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef) and node.name == "Thresholds":
                 for entry, following in zip(node.body, [*node.body[1:], ast.Pass()], strict=True):
                     if isinstance(entry, ast.AnnAssign):
@@ -114,7 +120,7 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
     The parameters of commands, of typer and of Prefect, are the options of the user.
     """
     for path in sources():
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if isinstance(node, ast.FunctionDef) and not _is_command(node, path):
                 yield f"{path.relative_to(ROOT)}:{node.lineno} {node.name}", node
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import shutil
+from functools import cache
 from pathlib import Path
 
 from lidarops.kinds import kinds
+from lidarops.system import code_version
 from lidarops.system.code_version import Sources, source_roots, version_of
+
+# By their text, of which a test changes that of few modules.
+code_version.imported_modules = cache(code_version.imported_modules)
 
 
 class Copy:

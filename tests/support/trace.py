@@ -3,24 +3,39 @@
 Makes the stale products of each campaign, and prints as a line of JSON how many modules of lidarops
 were entered, how many functions called, and how often a function called one of another package.
 Code that numba has compiled is not seen. Each run is a process of its own: what an earlier one
-cached is not called again.
+cached is not called again. Prefect is absent, as where only the command line is installed.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.abc
 import json
 import os
 import pkgutil
 import sys
 from pathlib import Path
 from types import CodeType, FrameType
+from typing import Any
 
 import lidarops
 from lidarops.campaign.model import load_campaign
 from lidarops.run.archive import reprocess
 
 ROOT = Path(lidarops.__file__).parent
+
+
+class Absent(importlib.abc.MetaPathFinder):
+    """Finder of modules by which Prefect is not installed."""
+
+    def find_spec(self, name: str, *_: Any) -> None:
+        """Refuse Prefect."""
+        if name.partition(".")[0] == "prefect":
+            raise ModuleNotFoundError(name)
+
+    def find_distributions(self, _: object) -> tuple[()]:
+        """Name no package."""
+        return ()
 
 
 class Trace:
@@ -65,6 +80,9 @@ class Trace:
 
 def main(paths: list[Path]) -> None:
     """Trace a run over each campaign, and print the figures."""
+    if "prefect" in sys.modules:
+        raise ImportError("lidarops.run imports Prefect")
+    sys.meta_path.insert(0, Absent())
     # What is imported late would count as called.
     for module in pkgutil.walk_packages(lidarops.__path__, "lidarops."):
         if not module.name.endswith("__main__"):

@@ -255,7 +255,11 @@ def test_an_index_that_lists_its_own_folder_costs_no_file(
     assert granules == {"coast/h0": Status.GOOD, "./": Status.REFUSED}
 
 
-@pytest.fixture(params=["http", "s3", "memory", "file"])
+S3 = pytest.param("s3", marks=pytest.mark.slow)
+"""By a server of another package; the stand-in of `support.servers` answers as one by default."""
+
+
+@pytest.fixture(params=["http", S3, "memory", "file"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> RemoteStore:
     """A store of each kind with the raw file ``coast/h0``."""
     if request.param == "http":
@@ -273,7 +277,7 @@ NAMES = ["h6.0", "h7.0", "h8.0", "h6/h6.0", "+4 5/h6.0", "[a]/h6.0", "{a,b}/h6.0
 """Files whose folders and names hold characters that patterns and URLs use."""
 
 
-@pytest.fixture(params=["folder", "http", "s3", "memory", "file"])
+@pytest.fixture(params=["folder", "http", S3, "memory", "file"])
 def archive(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     """Folder or URL of each kind that holds one raw file under each of `NAMES`."""
     files = {f"n/{name}": raw_archives.content(0) for name in NAMES}

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from benchmarks.__main__ import BENCHMARKS, app, measure
 from benchmarks.accuracy import homogeneous
-from benchmarks.accuracy.homogeneous_peers import PEERS
+from benchmarks.accuracy.homogeneous import PEERS
 from benchmarks.harness.figure import CPU_TIME
 from benchmarks.harness.results import Effort, Study
 from benchmarks.scenes.homogeneous_paths import (
@@ -235,7 +235,8 @@ def test_speeds_are_multiples_of_the_read_of_their_setting(timed):
 
 
 def test_calls_alternate_and_the_least_time_counts(monkeypatch):
-    clock = iter([0.0, 5.0, 0.0, 7.0, 0.0, 4.0, 0.0, 9.0])
+    # The first round, which compiles, does not count.
+    clock = iter([0.0, 1.0, 0.0, 1.0, 0.0, 5.0, 0.0, 7.0, 0.0, 4.0, 0.0, 9.0])
     calls: list[str] = []
     monkeypatch.setattr("time.process_time", lambda: next(clock))
     functions = {name: (lambda name=name: calls.append(name)) for name in "ab"}
@@ -271,7 +272,5 @@ def test_the_command_prints_writes_and_dates(monkeypatch, accuracy, tmp_path):
     assert passed[0].quick
     assert "direct" in result.stdout
     assert "result.json" in result.stdout.replace("\n", "")
-    printed = CliRunner().invoke(app, [*words, "--json"])
     content = json.loads((tmp_path / "result.json").read_text())
-    assert json.loads(printed.stdout) == content
     assert len(content["date"]) == len("2024-01-01")

@@ -392,7 +392,7 @@ def test_the_background_of_few_photons_is_within_its_error():
     signal, shots = light(r), np.full(100, 18_000)
     expected = np.where(r < 250.0, 0.0, 1000.0 * signal / signal[133] + 0.01)
     scores = []
-    for _ in range(10):
+    for _ in range(4):
         counts = rng.poisson(expected, (100, r.size)).astype(np.int32)
         found = photon_signal(counts, shots, r, bin_width=7.5, dead_time=0.0)
         data = averages(found.power, found.variance, r)
@@ -401,7 +401,8 @@ def test_the_background_of_few_photons_is_within_its_error():
         deviation = retrieved["background"] - 0.01 / (18_000 * 0.05)
         scores.append(deviation / retrieved["background_standard_error"])
     score = np.concatenate(scores)
-    assert np.mean(np.abs(score) > 4.0) <= 1e-3
+    # None of 400: 95 of 100 times, a rate of 0.75 % would show. The mean has an error of 0.05.
+    assert not np.any(np.abs(score) > 4.0)
     assert abs(score.mean()) < 0.2
 
 

@@ -21,7 +21,7 @@ import pytest
 from support.servers.ports import KEYS
 
 BUCKET = "archive"
-SCHEMES = ("http", "s3")
+SCHEMES = ("http", pytest.param("s3", marks=pytest.mark.slow))
 
 
 @dataclass
