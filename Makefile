@@ -5,7 +5,9 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-
 # Processes that tests start load compiled sources: 0.1 s less for each of them.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-deployment lint bench docs golden lock clean
+.PHONY: install demo test test-deployment lint bench docs golden lock clean
+
+install: .venv/.runtime
 
 demo: .venv/.runtime
 	rm -rf demo

@@ -39,7 +39,7 @@ def _section(name: str, command: Any) -> Iterator[str]:
         yield "```"
     rows = [_row(item) for item in command.params if item.help]
     if rows:
-        yield from table(("", "default", "meaning"), rows)
+        yield from table(("name", "default", "meaning"), rows)
     yield ""
 
 

@@ -21,7 +21,7 @@ def _kinds() -> Iterator[str]:
         layout = layout_of(kind)
         yield f"\n## Variables of `{kind}`\n\n{layout.title}. {layout.comment}"
         rows = map(_cells, (*layout.coordinates, *layout.variables))
-        yield from table(("variable", "dimensions", "unit", "standard name", "what it is"), rows)
+        yield from table(("variable", "what it is"), rows)
 
 
 def own_kinds() -> list[str]:
@@ -31,13 +31,16 @@ def own_kinds() -> list[str]:
 
 def _cells(row: Row) -> tuple[str, ...]:
     units = (row.units or "").replace("{signal}", "mV or MHz")
-    name = (row.standard_name or "none").replace(" standard_error", " + standard_error")
     text = row.long_name + (" (not in every product)" if row.optional else "")
     if row.error_kind is not None and not row.uncertain:
         text += f"; {row.error_kind}"
     remark = (row.comment or "").replace(NO_STANDARD_NAME, "").strip()
-    about = f"{text}. {remark}".strip() if remark else text
-    return f"`{row.name}`", ", ".join(row.dims) or "none", units or "none", name, about
+    dims = ", ".join(row.dims) or "none"
+    sentences = [f"{text}.", remark, f"*Unit:* {units or 'none'}. *Dimensions:* {dims}."]
+    if row.standard_name:
+        name, *modifier = row.standard_name.split(" ")
+        sentences.append(f"*Standard name:* {' + '.join([f'`{name}`', *modifier])}.")
+    return f"`{row.name}`", " ".join(filter(None, sentences))
 
 
 def _bits() -> Iterator[str]:

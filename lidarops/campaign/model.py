@@ -358,8 +358,8 @@ class Instrument(SettingsModel):
     facts: list[InstrumentFacts] = Field(
         default=[InstrumentFacts()],
         min_length=1,
-        description="about the instrument, one entry for each period; files of no period are"
-        " refused",
+        description="about the instrument, one entry for each period; files outside all of them"
+        " are refused",
     )
     products: Products = Products()
 

@@ -411,7 +411,7 @@ def _left_out(contents: FolderContents, archive: str) -> Iterator[str]:
         # As seen from the campaign file.
         (named, [f"{archive}/{path}" for path in tables]),
         ("? packed and not read: unpack them, and run init again", packed),
-        (f"of no raw format and not read ({formats})", rest),
+        (f"not read, unknown format ({formats})", rest),
         ("damaged", [f"{path}: {reason}" for path, reason in contents.refused]),
     ):
         if paths:

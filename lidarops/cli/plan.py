@@ -197,7 +197,7 @@ def _show_judged(judged: Judgement, *, stale: bool) -> None:
     """Print all of a scene."""
     memory = _memory(judged)["to_be_made" if stale else "everything"]
     scene = judged.scene
-    title = f"{scene.id}: {len(scene.granules)} granules, {len(scene.dark)} dark"
+    title = f"{scene.id}: {len(scene.granules)} files, {len(scene.dark)} dark"
     title += f", about {memory / 1e6:.0f} MB of memory"
     if not stale:
         _show_plan(title, judged.requested)
@@ -320,7 +320,7 @@ def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: 
         title = several if len(group) > 1 else f"{first.id}: "
         files = zip(*((j.scene.granules, j.scene.dark) for j in group), strict=True)
         granules, dark = (sum(map(len, part)) for part in files)
-        title += f"{granules} granules, {dark} dark"
+        title += f"{granules} files, {dark} dark"
         if len(group) == 1:
             title += f", plan {group[0].requested.hash[:12]}"
         say_wrapped(title, "")

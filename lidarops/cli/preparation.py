@@ -92,7 +92,7 @@ def init(
     (base / _SCHEMA).write_text(json.dumps(editor_schema(), indent=2) + "\n", encoding="utf-8")
     campaign.write_text(text, encoding="utf-8")
     questions = sum("# ?" in line or "; ?" in line for line in text.splitlines())
-    say(f"{campaign}: {questions} lines have a question; next: lidarops plan {campaign}")
+    say(f"{campaign}: {questions} values to check, marked ?; next: lidarops plan {campaign}")
 
 
 def _free_output(campaign: Path) -> str:

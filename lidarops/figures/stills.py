@@ -10,6 +10,7 @@ from matplotlib import colormaps, dates, rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure as Canvas
+from matplotlib.ticker import LogFormatter
 
 from lidarops.figures.panels import (
     BLANK,
@@ -23,6 +24,7 @@ from lidarops.figures.panels import (
     Image,
     Layer,
     Panel,
+    number,
 )
 from lidarops.figures.wording import visible
 
@@ -89,6 +91,8 @@ def _draw(canvas: Canvas, axes: Axes, panel: Panel, seen: set[str], *, labelled:
         axes.xaxis.set_major_locator(locator)
         words = dates.ConciseDateFormatter(locator)  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_formatter(words)
+    _name_ticks(axes.xaxis, panel.x)
+    _name_ticks(axes.yaxis, panel.y)
     axes.tick_params(labelbottom=labelled)
     axes.set_ylabel(visible(panel.y.label))
     axes.set_xlabel(visible(panel.x.label) if labelled else "")
@@ -97,6 +101,19 @@ def _draw(canvas: Canvas, axes: Axes, panel: Panel, seen: set[str], *, labelled:
     if panel.bar is not None:
         _bar(canvas, axes, panel.bar)
     _legend(axes, seen)
+
+
+class _Numbers(LogFormatter):
+    """Labels of logarithmic axes, as texts write numbers: those of matplotlib are formulas."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return number(x) if super().__call__(x, pos) else ""
+
+
+def _name_ticks(drawn: Any, axis: Axis) -> None:
+    if axis.log:
+        drawn.set_major_formatter(_Numbers())
+        drawn.set_minor_formatter(_Numbers())
 
 
 def _legend(axes: Axes, seen: set[str]) -> None:
@@ -113,7 +130,8 @@ def _legend(axes: Axes, seen: set[str]) -> None:
 def _bar(canvas: Canvas, axes: Axes, bar: Axis) -> None:
     norm = LogNorm(bar.low, bar.high) if bar.log else Normalize(bar.low, bar.high)
     shown = ScalarMappable(norm, _COLOURS)
-    canvas.colorbar(shown, ax=axes, label=visible(bar.label), pad=0.02, aspect=25)
+    drawn = canvas.colorbar(shown, ax=axes, label=visible(bar.label), pad=0.02, aspect=25)
+    _name_ticks(drawn.ax.yaxis, bar)
 
 
 def _layer(axes: Axes, layer: Layer) -> None:

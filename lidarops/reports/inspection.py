@@ -99,7 +99,7 @@ def tables(file: Path) -> Iterator[Table]:
         others = [{"file": path} for path in description["other"][:_OTHERS]]
         yield _table("Groups of like files", description["groups"], _GROUP)
         yield _table("Damaged files", description["refused"], ("file", "reason"))
-        yield _table("Files of no raw format", others, ("file",))
+        yield _table("Files of unknown format", others, ("file",))
     elif description["type"] == "raw":
         yield _table("Channels", description["channels"], _CHANNEL)
         lines = description.get(_HEADER, "").splitlines()

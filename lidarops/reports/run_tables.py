@@ -91,7 +91,7 @@ def summary(record: RunRecord) -> list[tuple[str, str]]:
             counted(len(record.scenes), "scene") + f", {failed:,} failed{ended_internally}",
         ),
         ("Products", f"{products.total():,}" + (f": {kinds}" if kinds else "")),
-        ("Granules", f"{processed:,} processed, {_number_refused(record):,} refused"),
+        ("Files", f"{processed:,} processed, {_number_refused(record):,} refused"),
         *(
             (
                 f"Quality, {kind}",
@@ -170,7 +170,7 @@ def _problems(record: RunRecord) -> Iterator[str]:
         yield f"{counted(failed, 'scene')} failed"
     refused = _number_refused(record)
     if refused:
-        yield f"{counted(refused, 'granule')} refused"
+        yield f"{counted(refused, 'file')} refused"
     unusable = [scene.scene for scene in record.scenes if scene.unusable]
     if unusable:
         yield f"{counted(len(unusable), 'scene')} without a usable value: {listed(unusable)}"

@@ -147,10 +147,10 @@ def test_variables_and_flags_of_the_golden_products_are_listed(repository) -> No
                 assert f"| `{word}` | {mask} |" in bits, path.name
 
 
-def test_every_flag_that_rejects_values_points_to_facts_or_is_named_as_of_none(repository) -> None:
+def test_every_flag_that_rejects_values_points_to_facts_or_to_nothing_to_set(repository) -> None:
     page = (repository / "docs/howto/campaign.md").read_text(encoding="utf-8")
     section = page.partition("## Most values are rejected")[2]
-    (of_none,) = re.findall(r"^Of no fact: (.*)$", section, re.MULTILINE)
+    (of_none,) = re.findall(r"^Nothing to set: (.*)$", section, re.MULTILINE)
     cells = [*re.findall(r"^\| (`.*?) \|", section, re.MULTILINE), of_none]
     named = [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
     bits = [bit for kind in OWN_KINDS for bit in flags_of(kind)]

@@ -44,7 +44,7 @@ def test_the_example_follows_from_the_formulas(stated: dict[str, tuple[float, fl
         "ledger": ledger,
         "`W_max`": scene / (PRODUCTS * t_ledger),
         "everything, `T_full`": first + all_scenes / WORKERS + ledger,
-        "a night of n = 1e5 granules in s = 70 scenes, one worker": night,
+        "a night of n = 1e5 files in s = 70 scenes, one worker": night,
     }
     for name, value in expected.items():
         number, digit = stated[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -62,6 +63,16 @@ def test_a_still_is_a_reproducible_file_of_its_type(suffix: str, begin: bytes):
     assert first.startswith(begin)
     assert len(first) > 5_000
     assert still(every_layer(), suffix) == first
+
+
+def test_logarithmic_axes_and_bars_are_labelled_with_numbers():
+    # Texts are drawn as shapes, with the text in a comment before.
+    text = still(every_layer(), ".svg").decode()
+    assert "mathdefault" not in text
+    labels = re.findall(r"<!-- (\S+) -->", text)
+    # The axis from 0.1 to 100, and the bar from 0.01 to 10.
+    assert labels.count("0.1") >= 2
+    assert {"0.01", "10", "100"} <= set(labels)
 
 
 def test_a_page_holds_positions_to_16_bits_and_codes():

@@ -223,7 +223,7 @@ class TestDegenerateRuns:
         refused[0] = replace(refused[0], start=datetime(2026, 3, 1, tzinfo=UTC))
         run = run_record(tmp_path, scenes, refused=tuple(refused))
         page = built(run, tmp_path / "report")
-        assert "3 scenes failed and 9 granules refused." in page.text
+        assert "3 scenes failed and 9 files refused." in page.text
         assert "while cataloguing 2026-03-01 raw/0" in page.text
         assert "while cataloguing not known raw/1" in page.text
         for i in range(3):
@@ -284,7 +284,7 @@ class TestDegenerateRuns:
         assert run_tables.outcome_word(scenes[0]) == "no usable value"
         assert run_tables.outcome_word(scenes[1]) == "done"
         refused = replace(run, refused=(fab.granule("raw/0", "cause"),))
-        assert run_tables.verdict(refused).startswith("1 granule refused and 1 scene without a")
+        assert run_tables.verdict(refused).startswith("1 file refused and 1 scene without a")
         only_idle = replace(run, scenes=scenes[1:])
         verdict = "1 of 2 products has no usable value. All files were read."
         assert run_tables.verdict(only_idle) == verdict

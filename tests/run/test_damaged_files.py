@@ -121,7 +121,7 @@ def test_a_damaged_line_end_between_datasets_costs_its_file_only(
     assert result.record is not None
     [row] = run_tables.refused(result.record)
     assert row["files"] == [f"rich/{name}"]
-    assert "1 granule refused" in run_tables.verdict(result.record)
+    assert "1 file refused" in run_tables.verdict(result.record)
     assert "no CRLF follows the counts" in row["reason"]
     assert len(made(result.record)) == 4
     stated = _stated(campaign)

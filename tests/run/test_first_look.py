@@ -247,7 +247,7 @@ def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_
     some = '# ? 10 of 30 files show no light of the laser, such as "h2141610.200000": dark files?'
     assert some in text
     assert "# 1 file, ? packed and not read: unpack them, and run init again:" in text
-    assert "# 2 files, of no raw format and not read (.txt 2):" in text
+    assert "# 2 files, not read, unknown format (.txt 2):" in text
     (tmp_path / "raw/alone").mkdir()
     (tmp_path / "raw/alone/session.zip").touch()
     shown = CliRunner().invoke(app, ["init", str(tmp_path / "raw/alone"), str(tmp_path / "b.yaml")])

@@ -85,7 +85,7 @@ def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
     archive.write()
     first = planned(archive.file)
     assert len(first) <= MOST_LINES
-    assert "poor_20260301T000000 to poor_20260325T000000: 25 scenes, 65 granules, 0 dark" in first
+    assert "poor_20260301T000000 to poor_20260325T000000: 25 scenes, 65 files, 0 dark" in first
     assert len(planned(archive.file, "--all")) > MOST_LINES
     for options in ([], ["--force"]):
         run = CliRunner().invoke(app, ["reprocess", str(archive.file), *options], env=terminal(80))

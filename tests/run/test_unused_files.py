@@ -282,7 +282,7 @@ def test_the_report_names_the_day_of_which_no_file_can_be_read(archive: Archive)
     assert record is not None
     [row] = run_tables.refused(record)
     assert (len(row["files"]), row["days"]) == (3, "2026-03-02")
-    assert "3 granules refused" in run_tables.verdict(record)
+    assert "3 files refused" in run_tables.verdict(record)
     assert bring_up_to_date(campaign).has_failures
 
 
