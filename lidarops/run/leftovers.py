@@ -38,7 +38,7 @@ from lidarops.scene.job import nothing_to_do
 
 _NAMES_SHOWN: Final = 3
 _IDLE: Final = (
-    "matches no file that is lost, refused or in no scene: take the entry out, or correct it"
+    "matches no raw file that is lost, refused or unused: take the entry out, or correct it"
 )
 _OVER: Final = "has expired: its files count again; take the entry out, or set until later"
 
