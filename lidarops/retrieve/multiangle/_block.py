@@ -122,7 +122,7 @@ def typical_profiles(noise: Array) -> Indices:
 
     Of all where there are few, or none of these. `noise` is that of `BeamBlock`.
     """
-    shown = np.count_nonzero(noise < np.inf, axis=1).max(axis=1) > 2
+    shown = (noise < np.inf).sum(axis=1, dtype=np.int32).max(axis=1) > 2
     every = np.flatnonzero(shown | ~shown.any() | (len(noise) <= _TYPICAL))
     return every[every_nth(every.size)]
 
@@ -134,7 +134,7 @@ def make_beam_block(
 
     Parameters
     ----------
-    signal, variance : (profile, angle, altitude) float
+    signal, variance : (profile, angle, altitude) float; one variance may be that of all profiles
     scan : Scan
     dead_time_change : (profile, angle, altitude) float, optional
     """
@@ -286,12 +286,12 @@ def _fill_sums(row: Array, sums: Array) -> None:
 def _end(sums: Array) -> int:
     """Return the first altitude of a beam from which the signal is lost in noise."""
     altitudes = sums.shape[1]
-    for k in range(altitudes):
-        # The window begins at the altitude, and is moved inside the grid.
-        j = min(k + _PAD, max(altitudes - 1 - _PAD, (altitudes - 1) // 2))
+    # The window begins at the altitude, and is moved inside the grid.
+    last = max(altitudes - 1 - _PAD, (altitudes - 1) // 2)
+    for j in range(min(_PAD, last), last + 1):
         least = THRESHOLDS.lowest_snr**2 * sums[1, j] * sums[2, j]
         if sums[2, j] > 0.0 and not (sums[0, j] > 0.0 and sums[0, j] * sums[0, j] > least):
-            return k
+            return max(j - _PAD, 0)
     return int(altitudes)
 
 
@@ -306,7 +306,7 @@ def take_logarithms(
 
     Parameters
     ----------
-    signal, variance : (profile, angle, altitude) float
+    signal, variance : (profile, angle, altitude) float; one variance may be that of all profiles
     usable : (angle,) bool
     logarithm : (profile, angle, altitude) float64
         Corrected; 0 where there is no sample.
@@ -319,7 +319,7 @@ def take_logarithms(
     row, sums = np.zeros((3, altitudes + 2 * _PAD)), np.empty((3, altitudes))
     for t in range(count):
         for a in range(angles):
-            _clean(signal[t, a], variance[t, a], row)
+            _clean(signal[t, a], variance[min(t, len(variance) - 1), a], row)
             _fill_sums(row, sums)
             end = _end(sums) if usable[a] else 0
             alive[t, :end] += 1

@@ -10,21 +10,22 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _smoothing
-from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise, decayed_sums
+from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 
 class Sandwich(NamedTuple):
     """A profile that represents all of a block in quantities that depend on weights only.
 
-    Matrices over altitudes, of which a column is that of one optical depth.
+    Matrices over altitudes, of which a row is that of one optical depth.
     """
 
     inverse: Array
     """Posterior covariance."""
     data: Array
-    """Response of the optical depths to the estimates, transposed."""
+    """Response of the optical depths to the estimates."""
     pilot: Array
     """The same of the change of the pilot solution by smoothing."""
     noise: Array
@@ -40,40 +41,30 @@ class Sandwich(NamedTuple):
         stiffness: Array,
         weight: float,
     ) -> Self:
-        """Return the matrices.
+        """Return the matrices of the results of `typical_profile` and of their precision.
 
-        Parameters
-        ----------
-        typical : (altitude, 1) float, (altitude - 1, 1) float
-            Information, and correlation of errors at neighbouring altitudes in equal air.
-        bands : (2, altitude, 1) float
-            Precision of the same.
-        correlation : float
-            Of the air at neighbouring altitudes.
-        stiffness : (3, altitude) float
-        weight : float
-            Of the penalty.
+        `correlation` is that of the air at neighbouring altitudes, `weight` that of the penalty.
         """
         information, shared = typical
         every = np.eye(len(information))
-        repeated = np.repeat(bands, len(every), axis=2)
         factors, rough = (
-            _smoothing.factor_bands(repeated, stiffness, np.full(len(every), times * weight))
-            for times in (1.0, THRESHOLDS.pilot)
+            np.repeat(_smoothing.factor_bands(bands, stiffness, own), len(every), axis=2)
+            for own in np.array([[weight], [THRESHOLDS.pilot * weight]])
         )
         inverse = _smoothing.solve_bands(factors, every)
-        data = _smoothing.multiply(bands, inverse)
-        pilot = _smoothing.multiply(bands, _smoothing.solve_bands(rough, every - data))
+        repeated = np.repeat(bands, len(every), axis=2)
+        data = _smoothing.multiply(repeated, inverse)
+        pilot = _smoothing.multiply(repeated, _smoothing.solve_bands(rough, every - data))
         known = information[:, 0] > 0.0
         variance = np.where(known, 1.0 / np.where(known, information[:, 0], 1.0), 0.0)
         # Neighbours of the ends are as those of the altitudes beside them.
         beside = shared[:, 0] if len(shared) else np.zeros(1)
-        share = np.convolve(np.pad(beside, 1, mode="edge"), [0.5, 0.5], mode="valid")
+        share = 0.5 * (np.append(beside, beside[-1]) + np.append(beside[0], beside))
         share = share[: variance.size]
         noise = np.stack(
             [variance * (1.0 - share), np.sqrt(variance * share), np.full(share.size, correlation)]
         )
-        return cls(inverse, data, pilot, noise)
+        return cls(inverse, data.T.copy(), pilot.T.copy(), noise)
 
     def parts(self, upper: Integers, lower: Integers) -> Array:
         """Return posterior variances of differences of optical depths, and their components.
@@ -91,24 +82,38 @@ class Sandwich(NamedTuple):
             Posterior variance, variance from noise and air, expected square of the smoothing error,
             variance of the smoothing error estimated from the pilot, and variance from air alone.
         """
-        each = np.arange(upper.size)
+        return np.asarray(_parts(*self, upper, lower))
 
-        def between(matrix: Array) -> Array:
-            return matrix[:, upper] - np.where(lower >= 0, matrix[:, np.maximum(lower, 0)], 0.0)
 
-        solved, x, y = (between(matrix) for matrix in (self.inverse, self.data, self.pilot))
-        posterior = solved[upper, each] - np.where(lower >= 0, solved[lower, each], 0.0)
-        model = np.maximum(posterior - (solved * x).sum(axis=0), 0.0)
-        (noise, air), of_pilot = self._noise_and_air(x), self._noise_and_air(y)
-        return np.stack([posterior, noise + air, model, sum(of_pilot), air])
-
-    def _noise_and_air(self, y: Array) -> tuple[Array, Array]:
-        """Return the parts of y'Vy of each column: the share of the air decays with distance."""
-        own, root, decay = self.noise[:, :, np.newaxis]
-        common = root * y
-        linked = np.ones((len(y) - 1, y.shape[1]), dtype=np.bool_)
-        tail = decayed_sums(common, linked, float(decay[0, 0]))
-        return (own * y**2).sum(axis=0), (common * (common + 2.0 * tail)).sum(axis=0)
+@compiled
+def _parts(
+    inverse: Array, data: Array, pilot: Array, noise: Array, upper: Integers, lower: Integers
+) -> Array:
+    """Return what `Sandwich.parts` returns."""
+    out = np.empty((5, upper.size))
+    for d in range(upper.size):
+        u, below = upper[d], lower[d]
+        posterior, explained = inverse[u, u], 0.0
+        if below >= 0:
+            posterior += inverse[below, below] - inverse[u, below] - inverse[below, u]
+        # The share of the air decays with distance.
+        own, decayed, of_own, of_air = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
+        for k in range(len(inverse)):
+            solved, x, y = inverse[u, k], data[u, k], pilot[u, k]
+            if below >= 0:
+                solved -= inverse[below, k]
+                x -= data[below, k]
+                y -= pilot[below, k]
+            explained += solved * x
+            for i, value in enumerate((x, y)):
+                decayed[i] = noise[2, k] * (decayed[i] + own[i])
+                own[i] = noise[1, k] * value
+                of_own[i] += noise[0, k] * value * value
+                of_air[i] += own[i] * (own[i] + 2.0 * decayed[i])
+        out[0, d], out[2, d] = posterior, max(posterior - explained, 0.0)
+        out[1, d], out[4, d] = of_own[0] + of_air[0], of_air[0]
+        out[3, d] = of_own[1] + of_air[1]
+    return out
 
 
 def typical_profile(information: Array, shared: Array) -> tuple[Array, Array]:
@@ -128,18 +133,8 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     """Return the squared optical depth of each profile over the usual one, formula 5 of the page.
 
     The smoothing error of a profile is proportional to its extinction. Profiles are compared at
-    the highest altitude within the reach of each.
-
-    Parameters
-    ----------
-    depth, variance : (profile, altitude) float64
-    within : (profile, altitude) bool
-        Altitudes within the reach, at least one of every profile.
-
-    Returns
-    -------
-    (profile,) float64
-        1 where noise exceeds the optical depth by far.
+    the highest altitude within the reach of each, one at least. Arguments are (profile, altitude);
+    results (profile,), 1 where noise exceeds the optical depth by far.
     """
     tops, own = np.unique(within.sum(axis=1) - 1, return_inverse=True)
     reached = within[:, tops]
@@ -168,12 +163,7 @@ def _median(values: Array, count: Integers) -> Array:
 def _smoothing_square(bias: Array, known: Array) -> Array:
     """Return the square of the smoothing error, formula 4 of the page, (difference,).
 
-    Parameters
-    ----------
-    bias : (profile, difference) float64
-        NaN beyond the reach.
-    known : (5, difference) float64
-        From `sandwich`.
+    `bias` is (profile, difference), NaN beyond the reach; `known` is from `Sandwich.parts`.
     """
     _, _, model, noise, _ = known
     present = np.isfinite(bias)
@@ -210,10 +200,7 @@ class Calibration(NamedTuple):
     def factors(self, upper: Integers, lower: Integers) -> tuple[Array, Array]:
         """Return the factors on variances, (profile or 1, difference), and those of the air alone.
 
-        Parameters
-        ----------
-        upper, lower : (difference,) int64
-            Altitudes in ascending order; -1 for the lidar.
+        Of differences between altitudes as in `Sandwich.parts`.
         """
         known = self.sandwich.parts(upper, lower)
         below = lower >= 0
@@ -222,10 +209,11 @@ class Calibration(NamedTuple):
         )
         square = known[2]
         if self.change is not None:
-            beside = np.where(below, self.change[:, np.maximum(lower, 0)], 0.0)
-            bias = self.change[:, upper] - beside
+            beside = self.change[:, np.maximum(lower, 0)] if below.any() else 0.0
+            bias = self.change[:, upper] - np.where(below, beside, 0.0)
             square = self.scale[:, np.newaxis] * _smoothing_square(bias, known)
-        return few * (known[1] + np.atleast_2d(square)) / known[0], few * known[4] / known[0]
+        few = few / known[0]
+        return few * (known[1] + np.atleast_2d(square)), few * known[4]
 
 
 def inflation(noise: AltitudeNoise) -> Array:

@@ -83,8 +83,6 @@ def _beam_means(beams: BeamBlock, inhomogeneity: Array, *thirds: Indices) -> tup
     some = beams.typical()
     clear = replace(some, noise=np.where(some.noise < scatter, some.noise, np.inf), sides=True)
     fit = refit(clear, scatter, np.zeros_like(scatter), np.inf)
-    size = np.nan_to_num(fit.residual) / np.sqrt(clear.noise + scatter)
-    size = np.clip(size, -_CLIPPED, _CLIPPED)
     value, freedom = [], []
     for third in thirds:
         used = fit.column(kh.FREEDOM)[:, third]
@@ -93,7 +91,8 @@ def _beam_means(beams: BeamBlock, inhomogeneity: Array, *thirds: Indices) -> tup
         on = 2 * filled >= third.size
         # The root gives white noise variance 1, however many altitudes are missing.
         root = np.sqrt(np.maximum(filled, 1))
-        mean = size[..., third].sum(axis=2) / root[:, np.newaxis]
+        size = fit.residual[..., third] / np.sqrt(clear.noise[..., third] + scatter[third])
+        mean = np.nansum(np.clip(size, -_CLIPPED, _CLIPPED), axis=2) / root[:, np.newaxis]
         value.append(np.where(on[:, np.newaxis], mean, 0.0))
         freedom.append(np.where(on, used.sum(axis=1) / np.maximum(filled, 1), 0.0))
     return np.stack(value), np.stack(freedom)
@@ -146,17 +145,8 @@ def _levers(
 ) -> None:  # fmt: skip
     """Fill what a residual adds to a gradient, and what a gradient adds to a residual.
 
-    Parameters
-    ----------
-    noise : (angle, altitude) float
-    tested : (altitude,) bool
-    inhomogeneity, altitude : (altitude,) float
-    limit : float
-        Noise from which a sample is left out.
-    design : (2, angle, altitude) float
-        Distance and path.
-    lever, arm : (angle, altitude) float
-        Outputs; 0 where the sample is too noisy, or constant and path explain the distance.
+    Both are (angle, altitude); 0 where the noise exceeds the limit, or constant and path explain
+    the distance. `design`, (2, angle, altitude), are distance and path.
     """
     angles, altitudes = noise.shape
     sums, least = np.zeros((6, altitudes)), np.zeros(altitudes)
@@ -209,7 +199,8 @@ def visible_gradient(beams: BeamBlock, fit: Regression, altitude: Array) -> floa
     # Empty blocks at both ends make windows of half the length there: near ranges are distorted.
     block = 1 + (2.0 * (altitude - altitude[0]) / THRESHOLDS.gradient_window).astype(np.int64)
     # Where none is fitted.
-    tested = (fit.table[:, kh.SLOPES :] != 0.0).any(axis=1) & (fit.column(kh.FREEDOM) > 0.0)
+    sloped = (fit.column(kh.SLOPES) != 0.0) | (fit.column(kh.SLOPES + 1) != 0.0)
+    tested = sloped & (fit.column(kh.FREEDOM) > 0.0)
     change = np.empty((0, *beams.noise.shape[1:]))
     if beams.dead_time_change is not None:
         expected = np.exp(beams.logarithm - np.nan_to_num(fit.residual))
@@ -235,19 +226,11 @@ def _gradient_sums(
 ) -> None:  # fmt: skip
     """Add what the beams of each profile show of a gradient along an axis, in blocks of altitudes.
 
-    Parameters
-    ----------
-    residual, leverage, noise : (profile, angle, altitude) float
-    tested : (profile, altitude) bool
-    inhomogeneity, altitude : (altitude,) float
-    design : (2, angle, altitude) float
-        Horizontal distance along the axis over altitude, and slant path.
-    block : (altitude,) int
-    change : (profile or 0, angle, altitude) float
-        Of the logarithm, with one standard error of the dead time.
-    sums : (5, profile, angle, block) float
-        Output: of lever times residual and arm; of both with the lever over what a fit leaves of an
-        error, because beams of large leverage keep less; and of lever times change.
+    `design`, (2, angle, altitude), are the distances along the axis over altitude, and the path;
+    `change`, (profile or 0, angle, altitude), that of the logarithm with one standard error of the
+    dead time. `sums`, (5, profile, angle, block), are those of lever times residual and arm; of
+    both with the lever over what a fit leaves of an error, because beams of large leverage keep
+    less; and of lever times change.
     """
     lever, arm = np.empty(noise.shape[1:]), np.empty(noise.shape[1:])
     for t in range(noise.shape[0]):
@@ -272,12 +255,8 @@ def _gradient_beyond_chance(sums: Array) -> float:
     """Return the largest gradient along an axis that is beyond chance and the dead time, m-1.
 
     The error by chance follows from the scatter of the beams of all profiles about the gradient,
-    whose altitudes may be correlated. An error of the dead time is common to all beams.
-
-    Parameters
-    ----------
-    sums : (5, window, profile times angle) float
-        From `_gradient_sums`.
+    whose altitudes may be correlated. An error of the dead time is common to all beams. `sums`,
+    (5, window, profile times angle), are those of `_gradient_sums`.
     """
     total, weight, product, part, shift = sums
     information = weight.sum(axis=1)

@@ -82,16 +82,9 @@ def _add_sums(
 def _factor(a: Array, f: Array, spare: Array, most_added: float) -> None:
     """Factor the normal equations as L D L', leaving out what depends on others, and fill `_SHARE`.
 
-    Parameters
-    ----------
-    a : (column, column, altitude) float
-        Lower triangle of the sums; becomes L, with D on the diagonal.
-    f : (3, column, altitude) float
-        Right sides; becomes their solution.
-    spare : (altitude,) float
-        Number of beams; becomes the residual degrees of freedom.
-    most_added : float
-        See `fit_levels`.
+    `a`, (column, column, altitude), the lower triangle of the sums, becomes L with D on the
+    diagonal; `f`, (3, column, altitude), the right sides, their solution; `spare` the residual
+    degrees of freedom.
     """
     for c in range(a.shape[0]):
         for k in range(a.shape[2]):
@@ -147,16 +140,17 @@ def _solve(a: Array, f: Array, centre: Array, out: Array) -> None:
 
 @compiled
 def _fill_residuals(
-    y: Array, weights: Array, design: Array, a: Array, f: Array,
+    y: Array, weights: Array, design: Array, used: int, a: Array, f: Array,
     residual: Array, hat: Array, lever: Array,
 ) -> None:  # fmt: skip
     """Fill residuals, leverages, and the parts of beams in an optical depth of unit variance."""
-    q = np.empty(f.shape[1:])
+    q = np.empty((used, y.shape[1]))
+    lever[:] = 0.0
     for beam in range(y.shape[0]):
         for k in range(y.shape[1]):
             residual[beam, k] = y[beam, k] - f[_RIGHT, 0, k]
-        hat[beam], lever[beam] = f[_INVERSE, 0], 0.0
-        for c in range(1, len(q)):
+            hat[beam, k] = weights[beam, k] * f[_INVERSE, 0, k]
+        for c in range(1, used):
             for k in range(y.shape[1]):
                 q[c, k] = design[beam, c, k] - a[c, 0, k]
             for e in range(1, c):
@@ -165,11 +159,9 @@ def _fill_residuals(
             for k in range(y.shape[1]):
                 residual[beam, k] -= f[_RIGHT, c, k] * q[c, k]
             for k in range(y.shape[1]):
-                hat[beam, k] += f[_INVERSE, c, k] * q[c, k] * q[c, k]
+                hat[beam, k] += weights[beam, k] * f[_INVERSE, c, k] * q[c, k] * q[c, k]
             for k in range(y.shape[1]):
-                lever[beam, k] += f[_SHARE, c, k] * q[c, k]
-        hat[beam] *= weights[beam]
-        lever[beam] *= weights[beam]
+                lever[beam, k] += weights[beam, k] * f[_SHARE, c, k] * q[c, k]
 
 
 @compiled
@@ -225,7 +217,7 @@ def fit_levels(
         _factor(a, f, spare, most_added)
         _solve(a, f, centre, out[t])
         own, hat = residuals[t], leverages[t]
-        _fill_residuals(y[t], weights, design, a, f[:, :used], own, hat, lever)
+        _fill_residuals(y[t], weights, design, used, a, f, own, hat, lever)
         _add_squares(weights, own, hat, lever, out[t])
         _clear(weights, f[_INVERSE, _PATH], spare, own, hat, out[t])
 

@@ -58,15 +58,19 @@ def penalty(altitude: Array) -> Array:
     return bands
 
 
+@compiled
 def multiply(bands: Array, columns: Array) -> Array:
-    """Multiply columns, (altitude, system), each by its own tridiagonal matrix (2, altitude, ...).
+    """Multiply columns, (altitude, system), each by its own tridiagonal matrix.
 
-    The second band links an altitude with the one above it.
+    The second of the bands, (2, altitude, system), links an altitude with the one above it.
     """
-    out: Array = bands[0] * columns
-    beside = bands[1][:-1]
-    out[1:] += beside * columns[:-1]
-    out[:-1] += beside * columns[1:]
+    out = np.empty(columns.shape)
+    last = len(columns) - 1
+    for i in range(last + 1):
+        for j in range(columns.shape[1]):
+            value = bands[0, i, j] * columns[i, j]
+            value += bands[1, i - 1, j] * columns[i - 1, j] if i > 0 else 0.0
+            out[i, j] = value + (bands[1, i, j] * columns[i + 1, j] if i < last else 0.0)
     return out
 
 
@@ -89,21 +93,20 @@ def factor_bands(bands: Array, stiffness: Array, weight: Array) -> Array:
     """
     altitudes, systems = bands.shape[1:]
     f = np.zeros((3, altitudes + _PAD, systems))
-    # Those of the last altitudes times their pivots.
-    edge, far, farther = np.zeros(systems), np.zeros(systems), np.zeros(systems)
+    # Loops that write one array are vectorised.
+    across = np.zeros(systems)
     for i in range(altitudes):
-        near_l, far_l = f[1, i - 1], f[2, i - 2]
+        # The last ones of the penalty are zero.
+        far, farther = stiffness[2, i - 1], stiffness[2, i - 2]
         for j in range(systems):
-            pivot = bands[0, i, j] + weight[j] * stiffness[0, i]
-            pivot -= near_l[j] * edge[j] + far_l[j] * farther[j]
-            across = bands[1, i, j] + weight[j] * stiffness[1, i] - near_l[j] * far[j]
-            beyond = weight[j] * stiffness[2, i]
-            f[0, i, j] = 1.0 / pivot
-            f[1, i, j] = across / pivot
-            f[2, i, j] = beyond / pivot
-            edge[j] = across
-            farther[j] = far[j]
-            far[j] = beyond
+            pivot = bands[0, i, j] + weight[j] * stiffness[0, i] - f[1, i - 1, j] * across[j]
+            f[0, i, j] = 1.0 / (pivot - f[2, i - 2, j] * (weight[j] * farther))
+        for j in range(systems):
+            across[j] = bands[1, i, j] + weight[j] * (stiffness[1, i] - f[1, i - 1, j] * far)
+        for j in range(systems):
+            f[1, i, j] = across[j] * f[0, i, j]
+        for j in range(systems):
+            f[2, i, j] = weight[j] * stiffness[2, i] * f[0, i, j]
     return f
 
 
@@ -154,12 +157,12 @@ class Smoother(NamedTuple):
     @classmethod
     def of(cls, bands: Array, stiffness: Array, weight: Array, share: Array) -> Self:
         """Return the systems with weights (candidate,) of their shares."""
-        repeated = np.repeat(bands, share.size, axis=2)
-        return cls(bands, share, factor_bands(repeated, stiffness, np.tile(weight, bands.shape[2])))
+        weights = np.tile(weight, bands.shape[2])
+        return cls(bands, share, factor_bands(_apart(bands, share), stiffness, weights))
 
     def solve(self, right: Array) -> Array:
         """Return the solutions of all systems for (altitude, profile) right-hand sides."""
-        return np.asarray(solve_bands(self.factors, np.repeat(right, self.share.size, axis=1)))
+        return np.asarray(solve_bands(self.factors, _apart(right, self.share)))
 
     def respond(self, columns: Array) -> Array:
         """Return the smoothed form of (altitude, profile) estimates."""
@@ -174,9 +177,15 @@ class Smoother(NamedTuple):
 
     def mixed(self, value: Array, variance: Array) -> tuple[Array, Array]:
         """Return mean and variance of the mixture of the solutions of each profile."""
+        if self.share.size == 1:
+            return value, variance
         mean = self.mean(value)
-        away = value - np.repeat(mean, self.share.size, axis=1)
-        return mean, self.mean(variance + away**2)
+        return mean, self.mean(variance + (value - _apart(mean, self.share)) ** 2)
+
+
+def _apart(values: Array, share: Array) -> Array:
+    """Return values of profiles, the last axis, for the systems of each."""
+    return values if share.size == 1 else np.repeat(values, share.size, axis=-1)
 
 
 # Choice of the weight by restricted likelihood and Cp ---------------------------------------------
@@ -192,15 +201,19 @@ def _misfits(
     for i in range(weight.size):
         f = factor_bands(bands, stiffness, np.full(profiles, weight[i]))
         away = estimates - solve_bands(f, right)
-        product = np.ones(profiles)
+        both = multiply(bands, away)
+        product, squares, risks = np.ones(profiles), np.zeros(profiles), np.zeros(profiles)
         for k in range(altitudes):
-            product *= f[0, k]
+            for t in range(profiles):
+                product[t] *= f[0, k, t]
+            for t in range(profiles):
+                squares[t] += right[k, t] * away[k, t]
+            for t in range(profiles):
+                risks[t] += both[k, t] * away[k, t]
             if k % _LOGARITHM_EVERY == 0 or k == altitudes - 1:
-                out[0, i] -= np.log(product).sum()
+                squares -= np.log(product)
                 product[:] = 1.0
-        out[0, i] += (right * away).sum()
-        out[1, i] = (away * away * bands[0]).sum()
-        out[1, i] += 2.0 * (away[1:] * away[:-1] * bands[1, :-1]).sum()
+        out[0, i], out[1, i] = squares.sum(), risks.sum()
     return out
 
 
@@ -243,14 +256,7 @@ def score_smoothing(
 
 
 def freedom(bands: Array, stiffness: Array, weight: Array) -> Array:
-    """Return the effective degrees of freedom of one profile with each weight.
-
-    Parameters
-    ----------
-    bands : (2, altitude, 1) float64
-    stiffness : (3, altitude) float64
-    weight : (smoothing,) float64
-    """
+    """Return the effective degrees of freedom of one profile, (2, altitude, 1), by weight."""
     repeated = np.repeat(bands, weight.size, axis=2)
     diagonal, beside = invert_bands(factor_bands(repeated, stiffness, weight))
     return np.asarray((bands[0] * diagonal + 2.0 * bands[1] * beside).sum(axis=0))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
+
+_HALF: Final = THRESHOLDS.pooled // 2
+"""Altitudes on either side over which is pooled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +55,39 @@ def correlation_of_air(
     columns : (column, beam, altitude) float64
         Of the fit: ones, slant path, and horizontal distances.
     """
-    scatter, free = np.sqrt(variance), np.sqrt(np.maximum(1.0 - leverage, 0.0))
-    weight = scatter * free / (noise + variance)
-    value, expected = np.nan_to_num(residual) * weight, scatter * free * weight
-    products = (value[..., 1:] * value[..., :-1]).sum(axis=1)
-    norms = (expected[..., 1:] * expected[..., :-1]).sum(axis=1)
-    on = noise < np.inf
-    pairs = (on[..., 1:] != on[..., :-1]).any(axis=1) & (norms > 0.0)
-    spare = on.sum(axis=1) - np.where(on, leverage, 0.0).sum(axis=1)
-    pairs &= np.minimum(spare[:, 1:], spare[:, :-1]) > 0.5
+    sums = np.zeros((4, noise.shape[0], noise.shape[2]))
+    _add_neighbours(residual, noise, leverage, variance, sums)
+    products, norms, changed, spare = sums
+    pairs = (changed > 0.0) & (norms > 0.0)
+    pairs[:, :-1] &= np.minimum(spare[:, 1:], spare[:, :-1]) > 0.5
     if pairs.any():
-        norms[pairs] *= _common_share(on, leverage, columns, *np.nonzero(pairs))
+        norms[pairs] *= _common_share(noise < np.inf, leverage, columns, *np.nonzero(pairs))
     norm = float(norms.sum())
     return min(max(float(products.sum()) / norm, 0.0), THRESHOLDS.most_correlated) if norm else 0.0
+
+
+@compiled
+def _add_neighbours(
+    residual: Array, noise: Array, leverage: Array, variance: Array, sums: Array
+) -> None:
+    """Add over beams products at an altitude and the next, with their expectation in equal air.
+
+    And the numbers of beams that begin or end, and of degrees of freedom: (4, profile, altitude).
+    """
+    altitudes = noise.shape[2]
+    value, expected = np.empty(altitudes), np.empty(altitudes)
+    for t in range(noise.shape[0]):
+        for a in range(noise.shape[1]):
+            for k in range(altitudes):
+                free = variance[k] * max(1.0 - leverage[t, a, k], 0.0)
+                expected[k] = free / (noise[t, a, k] + variance[k])
+                weight = math.sqrt(free) / (noise[t, a, k] + variance[k])
+                value[k] = residual[t, a, k] * weight if weight > 0.0 else 0.0
+                sums[3, t, k] += 1.0 - leverage[t, a, k] if noise[t, a, k] < np.inf else 0.0
+            for k in range(altitudes - 1):
+                sums[0, t, k] += value[k] * value[k + 1]
+                sums[1, t, k] += expected[k] * expected[k + 1]
+                sums[2, t, k] += (noise[t, a, k] < np.inf) != (noise[t, a, k + 1] < np.inf)
 
 
 def _common_share(on: Booleans, leverage: Array, columns: Array, t: Indices, k: Indices) -> Array:
@@ -91,44 +116,16 @@ def _common_share(on: Booleans, leverage: Array, columns: Array, t: Indices, k: 
 
 
 @compiled
-def decayed_sums(values: Array, linked: Booleans, decay: float) -> Array:
-    """Return the sums of the values before, less by a factor for each step; 0 across a gap.
-
-    Parameters
-    ----------
-    values : (altitude, profile) float
-    linked : (altitude - 1, profile) bool
-        Whether an altitude is linked with the next.
-    decay : float
-    """
-    out = np.zeros_like(values)
-    for k in range(1, len(values)):
-        for t in range(values.shape[1]):
-            along = decay * (out[k - 1, t] + values[k - 1, t])
-            out[k, t] = along if linked[k - 1, t] else 0.0
-    return out
-
-
-def _mean_covariances(information: Array, shared: Array) -> Array:
-    """Return the covariances of neighbours in equal air, means over 15 altitudes.
-
-    Weighted by information: where samples are missing, neighbours see the air along different
-    beams, but altitudes a few steps apart do not see less of it in common.
-    """
-    both = information[1:] * information[:-1]
-    total, weight = (windowed(values) for values in (np.maximum(shared, 0.0) * np.sqrt(both), both))
-    return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.0))
-
-
 def windowed(values: Array) -> Array:
-    """Return sums over the window around each altitude, the first axis, cut at the ends."""
-    half, out = THRESHOLDS.pooled // 2, values.copy()
-    for step in range(1, half + 1):
-        out[step:] += values[:-step]
-        out[:-step] += values[step:]
+    """Return sums over the window around each altitude, (altitude,), cut at the ends."""
+    out = np.zeros(values.size)
+    for k in range(values.size):
+        for j in range(max(k - _HALF, 0), min(k + _HALF + 1, values.size)):
+            out[k] += values[j]
     return out
 
 
+@compiled
 def correlated_precision(information: Array, shared: Array, correlation: float) -> Array:
     """Return the precision of the estimates as a chain along altitude.
 
@@ -148,26 +145,59 @@ def correlated_precision(information: Array, shared: Array, correlation: float) 
     (2, altitude, profile) float64
         Diagonal, and the off-diagonal (of an altitude with the one above it).
     """
-    known = information > 0.0
-    own = np.where(known, 1.0 / np.where(known, information, 1.0), 0.0)
-    links = known[1:] & known[:-1]
-    joint = np.where(links, _mean_covariances(information, shared), 0.0)
-    around = np.pad(np.stack([links, joint]), ((0, 0), (1, 1), (0, 0)))
-    count, both = around[:, 1:] + around[:, :-1]
-    air = np.sqrt(np.minimum(both / np.maximum(count, 1.0), own))
-    along = decayed_sums(air, links, correlation)
-    along += decayed_sums(air[::-1].copy(), links[::-1].copy(), correlation)[::-1]
-    sums = own + air * along
-    variance = np.where(links, 0.5 * (own[1:] + own[:-1]), 1.0)
-    both = np.minimum(joint, variance)
-    slow = 1.0 / (variance + both * 2.0 * correlation / (1.0 - correlation))
-    product = 2.0 * (variance - both * correlation) * slow
-    u = 0.125 * (product + np.sqrt(product * (product + 16.0)))
-    link = np.where(links, 0.25 * slow * (1.0 / (u * u) - 1.0), 0.0)
-    bands = np.zeros((2, *own.shape))
-    bands[0] = known
-    bands[0, :-1] += link * sums[1:]
-    bands[0, 1:] += link * sums[:-1]
-    bands[0] /= np.where(known, sums, 1.0)
-    bands[1, :-1] = -link
+    altitudes, profiles = information.shape
+    joint, bands = _mean_covariances(information, shared), np.zeros((2, altitudes, profiles))
+    own, air, along = np.zeros(altitudes + 1), np.zeros(altitudes + 1), np.zeros(altitudes + 1)
+    odds = 2.0 * correlation / (1.0 - correlation)
+    for t in range(profiles):
+        sums = 0.0
+        for k in range(altitudes):
+            down, up = joint[k, t], joint[k + 1, t]
+            own[k] = 1.0 / information[k, t] if information[k, t] > 0.0 else 0.0
+            pairs = max((1.0 if down >= 0.0 else 0.0) + (1.0 if up >= 0.0 else 0.0), 1.0)
+            air[k] = math.sqrt(min((max(down, 0.0) + max(up, 0.0)) / pairs, own[k]))
+            sums = correlation * (sums + air[k - 1]) if down >= 0.0 else 0.0
+            along[k] = own[k] + air[k] * sums
+        for k in range(altitudes - 1, -1, -1):
+            sums = correlation * (sums + air[k + 1]) if joint[k + 1, t] >= 0.0 else 0.0
+            along[k] += air[k] * sums
+            bands[0, k, t] = 1.0 if own[k] > 0.0 else 0.0
+        for k in range(altitudes - 1):
+            if joint[k + 1, t] >= 0.0:
+                variance = 0.5 * (own[k + 1] + own[k])
+                both = min(joint[k + 1, t], variance)
+                slow = 1.0 / (variance + both * odds)
+                product = 2.0 * (variance - both * correlation) * slow
+                u = 0.125 * (product + math.sqrt(product * (product + 16.0)))
+                link = 0.25 * slow * (1.0 / (u * u) - 1.0)
+                bands[0, k, t] += link * along[k + 1]
+                bands[0, k + 1, t] += link * along[k]
+                bands[1, k, t] = -link
+        for k in range(altitudes):
+            bands[0, k, t] /= along[k] if own[k] > 0.0 else 1.0
     return bands
+
+
+@compiled
+def _mean_covariances(information: Array, shared: Array) -> Array:
+    """Return the covariances of neighbours in equal air, means over 15 altitudes.
+
+    (altitude + 1, profile): of an altitude with the one below, -1 where either has no estimate.
+    Weighted by information: where samples are missing, neighbours see the air along different
+    beams, but altitudes a few steps apart do not see less of it in common.
+    """
+    pairs, profiles = shared.shape
+    both, joint = information[1:] * information[:-1], np.zeros(shared.shape)
+    for k in range(pairs):
+        for t in range(profiles):
+            joint[k, t] = max(shared[k, t], 0.0) * math.sqrt(both[k, t])
+    out, weight = np.full((pairs + 2, profiles), -1.0), np.empty(profiles)
+    for k in range(pairs):
+        out[k + 1], weight[:] = 0.0, 0.0
+        for j in range(max(k - _HALF, 0), min(k + _HALF + 1, pairs)):
+            for t in range(profiles):
+                out[k + 1, t] += joint[j, t]
+                weight[t] += both[j, t]
+        for t in range(profiles):
+            out[k + 1, t] = out[k + 1, t] / weight[t] if both[k, t] > 0.0 else -1.0
+    return out

@@ -199,12 +199,13 @@ def retrieve_optical_depth(
     height = slant_paths.altitude_grid(altitude, station)
     scan = slant_paths.make_scan(zenith_angle, height, azimuth)
     rows = _cube(signal, "signal", scan.path.shape)
-    noise = inputs.real_array(variance, "variance")
+    noise = inputs.broadcast(inputs.real_array(variance, "variance"), rows.shape, "variance")
+    noise = noise[:1] if noise.strides[0] == 0 else noise
     if np.any(noise < 0):
         raise RetrievalInputError(
             "is negative", field="variance", remedy="give squares of the signal's unit"
         )
-    noise = _cube(inputs.broadcast(noise, rows.shape, "variance"), "variance", rows.shape)
+    noise = _cube(noise, "variance", scan.path.shape)
     _check(settings, method)
     block = BlockSettings(
         **{item.name: getattr(settings, item.name) for item in fields(settings)},
@@ -318,7 +319,7 @@ def _mark_variation(values: Values, beams: BeamBlock, fit: Regression) -> None:
 
 def _mark_missing(values: Values, signal: Array, variance: Array, carried: Flags | None) -> None:
     """Raise the bits of the signals and the reasons for missing values, in place."""
-    samples = np.count_nonzero(np.isfinite(signal + variance), axis=1)
+    samples = np.isfinite(signal + variance).sum(axis=1, dtype=np.int32)
     if carried is None:
         carried = np.where(samples > 0, np.int32(0), np.int32(Quality.INPUT_MISSING))
     quality = values["quality"]
@@ -487,8 +488,10 @@ def _joint(beams: BeamBlock, fit: Regression, settings: BlockSettings) -> Values
     own = {name: getattr(smooth, name) for name in _OF_SMOOTH}
     own |= _gradient_errors(np.stack(of_smooth), settings) | _layers(smooth, settings)
     for name, part in own.items():
-        values[name] = np.full((len(within), *part.shape[1:]), np.nan)
-        values[name][rows] = part
+        values[name] = part
+        if rows.size < len(within):
+            values[name] = np.full((len(within), *part.shape[1:]), np.nan)
+            values[name][rows] = part
     values["quality"][rows] |= np.where(
         smooth.interpolated, np.int32(MultiAngleQuality.INTERPOLATED), np.int32(0)
     )

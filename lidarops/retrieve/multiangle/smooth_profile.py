@@ -131,16 +131,18 @@ def smooth_optical_depth(
     patterson1971 (likelihood), mallows1973 (Cp), wahba1983 (intervals), takahashi1973 (variances).
     """
     _require_uniform(altitude)
-    used = (np.isfinite(optical_depth) & (information > 0.0)).T
-    estimates, precise = (np.where(used, values.T, 0.0) for values in (optical_depth, information))
+    used = (np.isfinite(optical_depth) & (information > 0.0)).T.copy()
+    estimates, precise = (
+        np.where(used, values.T, 0.0).copy() for values in (optical_depth, information)
+    )
     widened = np.ones(altitude.size) if noise is None else inflation(noise)
     if noise is None:
         noise = AltitudeNoise(0.0, np.zeros((used.shape[1], altitude.size - 1)), np.zeros(0))
-    shared, stiffness = noise.shared.T, _smoothing.penalty(altitude)
+    shared, stiffness = noise.shared.T.copy(), _smoothing.penalty(altitude)
     bands = correlated_precision(precise, shared, noise.correlation)
     typical = typical_profile(precise, shared)
     of_typical = correlated_precision(*typical, noise.correlation)
-    weight, share = _choose(bands, estimates, precise, altitude, of_typical)
+    weight, share = _choose(bands, estimates, precise, altitude, stiffness, of_typical)
     smoother = Smoother.of(bands, stiffness, weight, share)
     middle = float(np.exp(share @ np.log(weight)))
     sandwich = Sandwich.of(typical, of_typical, noise.correlation, stiffness, middle)
@@ -166,10 +168,10 @@ def _choose(
     estimates: Array,
     information: Array,
     altitude: Array,
+    stiffness: Array,
     of_typical: Array,
 ) -> tuple[Array, Array]:
     """Return the weights of smoothness of a block, and their shares."""
-    stiffness = _smoothing.penalty(altitude)
     highest = int(np.flatnonzero((information > 0.0).any(axis=1))[-1])
     unit = float(information[information > 0.0].mean()) * altitude[highest] ** 3
     profiles = estimates.shape[1]
