@@ -198,6 +198,18 @@ def test_refused_files_are_counted_by_reason_and_fail(tmp_path: Path) -> None:
     assert len(document["refused_files"]) == 5
 
 
+def test_a_plan_names_the_second_of_two_copies_of_a_profile(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    folder = tmp_path / "raw" / "coast"
+    (folder / "h01").write_bytes((folder / "h00").read_bytes())
+    document = json.loads(CliRunner().invoke(app, ["plan", str(file), "--json"]).output)
+    reason = "starts at the same time as coast/h00, which is used"
+    assert document["files_set_aside"] == {"coast/h01": reason}
+    shown = CliRunner().invoke(app, ["plan", str(file)], env=terminal(300))
+    assert shown.exit_code == 1
+    assert f"coast/h01 │ {reason}" in _STYLE.sub("", shown.output)
+
+
 def test_a_campaign_whose_only_file_is_refused_says_why_nothing_is_planned(tmp_path: Path) -> None:
     file = written(tmp_path)
     raw = tmp_path / "raw" / "coast" / "h00"
