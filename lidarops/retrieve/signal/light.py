@@ -6,7 +6,6 @@ cannot decide this by itself: its noise would reject single profiles.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
@@ -147,8 +146,7 @@ def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str
     A channel that tells is judged by its own counts, but for faint pick-up where two others of its
     laser show no light; another one, or where it has none, by those of
     the same laser that tell, where all agree and one has counts. Where no channel of any laser
-    shows light in the sum of all profiles, none has any, and where none of several of a laser does,
-    none of this one.
+    shows light in the sum of all profiles, none has any.
 
     Parameters
     ----------
@@ -157,17 +155,13 @@ def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str
     lasers : mapping
         Channel -> its laser, as headers number it.
     """
-    seen = {
-        lasers[name]
-        for name, one in found.items()
-        if not (len(one.excess) >= FEWEST and one.of_sum < THRESHOLDS.shows_light)
-    }
-    several = {laser for laser, channels in Counter(lasers.values()).items() if channels > 1}
+    nothing = all(
+        len(one.excess) >= FEWEST and one.of_sum < THRESHOLDS.shows_light for one in found.values()
+    )
     dark: dict[str, Booleans] = {}
     own = _dark_of_their_own(found, lasers)
     for name, one in found.items():
         same = [other for other in own if lasers[other] == lasers[name]]
-        nothing = not seen or lasers[name] in several - seen
         unlit = [own[other] for other in same] or [np.full_like(one.measured, nothing)]
         agreed: Booleans = np.logical_and.reduce(unlit)
         agreed = agreed & ~np.logical_and.reduce([found[other].blank for other in same or found])

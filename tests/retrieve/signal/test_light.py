@@ -176,19 +176,6 @@ def test_nothing_holds_light_where_no_channel_of_a_laser_shows_any():
     assert not dark_of({"photon": photons(rng, 0.0, number=4)})["photon"].any()
 
 
-@pytest.mark.parametrize("channels", [1, 2])
-def test_one_of_two_lasers_that_is_off_all_the_time_is_told_by_several_channels(channels):
-    """Of a single channel, a weak one holds light that it does not show."""
-    rng = np.random.default_rng(14)
-    off = {f"green {number}": photons(rng, 0.0) for number in range(channels)}
-    dark = dark_of({"ultraviolet": photons(rng, 5000.0), **off}, dict.fromkeys(off, "2"))
-    assert not dark["ultraviolet"].any()
-    assert [dark[name].all() for name in off] == [channels > 1] * channels
-    # Weak light of one of both that the sum of all profiles shows.
-    seen = {"ultraviolet": photons(rng, 5000.0), **off, "green 0": photons(rng, 30.0)}
-    assert not any(rows.any() for rows in dark_of(seen, dict.fromkeys(off, "2")).values())
-
-
 def test_a_gap_is_no_profile_without_light():
     rng = np.random.default_rng(9)
     counts, shots = with_dark(rng, photons, 5), np.full(45, 600)
