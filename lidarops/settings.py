@@ -122,8 +122,10 @@ def as_interval(value: Any) -> Any:
     """Return an interval for a text such as 6h or 30min; leave other values as they are."""
     if isinstance(value, str) and value != "day":
         units = {"s": 1, "min": 60, "h": 3600, "d": 86400}
+        units |= {"second": 1, "minute": 60, "hour": 3600, "day": 86400}
         number = value.rstrip("abcdefghijklmnopqrstuvwxyz ")
         unit = value[len(number) :].strip()
+        unit = unit if unit in units else unit.removesuffix("s")
         if unit in units:
             try:
                 return timedelta(seconds=float(number) * units[unit])

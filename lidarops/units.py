@@ -11,10 +11,15 @@ PATTERN: Final = r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)\s*"
 """Regular expression of a number and what is behind it."""
 _QUANTITY: Final = re.compile(PATTERN, re.ASCII)
 _FACTORS: Final = {
-    "m": {"nm": "1e-9", "um": "1e-6", "mm": "1e-3", "cm": "1e-2", "m": "1", "km": "1e3"},
+    "m": {
+        "nm": "1e-9", "um": "1e-6", "mm": "1e-3", "cm": "1e-2", "m": "1", "km": "1e3",
+        "meters": "1", "metres": "1",
+    },
     "nm": {"nm": "1", "um": "1e3", "m": "1e9"},
     "s": {
         "ns": "1e-9", "us": "1e-6", "ms": "1e-3", "s": "1", "min": "60", "h": "3600", "d": "86400",
+        "seconds": "1", "minute": "60", "minutes": "60", "hour": "3600", "hours": "3600",
+        "day": "86400", "days": "86400",
     },
     "h": {"min": "0.016666666666666666", "h": "1", "d": "24"},
     "m-1": {"m-1": "1", "km-1": "1e-3", "Mm-1": "1e-6"},
@@ -40,7 +45,11 @@ _SMALL: Final = {"s": (1e-6, "ns"), "m": (1e-4, "nm")}
 
 def is_quantity(text: str) -> bool:
     """Return whether a text is a number with something behind it, which may be a unit."""
-    return _QUANTITY.fullmatch(text) is not None
+    return _found(text) is not None
+
+
+def _found(text: str) -> re.Match[str] | None:
+    return _QUANTITY.fullmatch(text.replace("\N{MINUS SIGN}", "-"))
 
 
 def parse_quantity(text: str, unit: str) -> float | None:
@@ -49,7 +58,7 @@ def parse_quantity(text: str, unit: str) -> float | None:
     None where the text is no finite number with a unit of that dimension. ``km^-1`` and ``/km`` are
     ``km-1``.
     """
-    found = _QUANTITY.fullmatch(text)
+    found = _found(text)
     if found is None:
         return None
     name = " ".join(found[2].replace("µ", "u").replace("μ", "u").replace("^", "").split())

@@ -5,6 +5,7 @@ Messages state the line, the key, the value, and what is expected there.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Self
@@ -16,6 +17,8 @@ from pydantic_core import ErrorDetails
 from lidarops.settings import NO_UNIT, nearest
 from lidarops.units import PATTERN, is_quantity, is_small, parse_quantity, written
 
+_DECIMAL: Final = re.compile(r"[+-]?(?:0|[1-9][0-9_]*)", re.ASCII)
+"""Whole number that is the same in any version of YAML."""
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
 """Appended by pydantic to the location of an invalid key."""
@@ -36,8 +39,23 @@ class Loader(yaml.SafeLoader):
     """Reads a YAML file as `yaml.SafeLoader`, but yes, no, on and off as texts.
 
     A key or a name may be ``no``. Where a model has a boolean, pydantic takes these texts for one,
-    as it does 1, 0, ``'true'`` and ``'false'``.
+    as it does 1, 0, ``'true'`` and ``'false'``. Texts are also what YAML 1.1 reads in another base:
+    ``-5:00``, which is 5 h and not 300 s, and ``060``, which is 60 and not 48.
     """
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> Any:
+        """Return a decimal number, or the text of what is none."""
+        text = str(node.value)
+        return super().construct_yaml_int(node) if _DECIMAL.fullmatch(text) else text
+
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> Any:
+        """Return a number, or the text of one with colons."""
+        text = str(node.value)
+        return text if ":" in text else super().construct_yaml_float(node)
+
+
+for _name in ("int", "float"):
+    Loader.add_constructor(f"tag:yaml.org,2002:{_name}", getattr(Loader, f"construct_yaml_{_name}"))
 
 
 Loader.yaml_implicit_resolvers = {

@@ -25,6 +25,7 @@ from lidarops.catalog.folder import (
     Purpose,
     instruments_of,
 )
+from lidarops.catalog.granules import out_of_order
 from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
@@ -295,11 +296,9 @@ def _clock(group: FileGroup, look: FirstLook | None) -> Iterator[str]:
     twice = sum(start < stop - _SECOND for (_, stop), (start, _) in pairwise(spans))
     if twice:
         yield f"files that start before another one stops: {twice}; is a clock hour there twice?"
-    starts = sorted((path, header.start) for path, header in members)
-    for (_, before), (path, start), (_, after) in zip(starts, starts[1:], starts[2:], strict=False):
-        if before <= after and not before - _DAY <= start <= after + _DAY:
-            yield f"{path} starts more than a day away from those beside it by name"
-            return
+    paths, starts = zip(*sorted((path, header.start) for path, header in members), strict=True)
+    for place in out_of_order(starts, room=_DAY)[:1]:
+        yield f"{paths[place]} starts more than a day away from those beside it by name"
 
 
 def _shift(channel: ChannelLayout, lag: float | None, stated: float | None) -> str:

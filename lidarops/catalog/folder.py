@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from operator import itemgetter
+from statistics import median
 from typing import Final
 
 from lidarops.catalog.raw_files import (
@@ -34,8 +35,10 @@ from lidarops.records import FEWEST_ALIKE, UNKNOWN_FORMAT, ChannelLayout, Detect
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 from lidarops.system.stores import Stored
 
-_LASERS: Final = (355e-9, 532e-9, 1064e-9)
-"""m; lines of Nd:YAG lasers."""
+_LASERS: Final = (
+    355e-9, 532e-9, 1064e-9, 266e-9, 308e-9, 511e-9, 527e-9, 694e-9, 1047e-9, 1053e-9
+)  # fmt: skip
+"""m; lines of Nd:YAG lasers, of xenon chloride, copper vapour, Nd:YLF and ruby."""
 _SAME_LINE: Final = 0.6e-9
 """m; rounding of headers."""
 _ROTATIONAL: Final = 3.6e-9
@@ -179,15 +182,18 @@ class InstrumentHeaders:
 
     @property
     def zenith_angle(self) -> float:
-        """Mean of its zenith angles in degree; 0 where none is known."""
-        angles = self._zenith_angles
-        return sum(angles) / len(angles) if angles else 0.0
+        """Median zenith angle of its files in degree; 0 where none is known."""
+        return median(self._zenith_angles or [0.0])
 
     @property
     def zenith_span(self) -> float:
-        """Largest minus smallest zenith angle, degree."""
+        """Largest minus smallest zenith angle of all files but a tenth at either end, degree.
+
+        A fixed lidar may have been slanted for some files.
+        """
         angles = self._zenith_angles
-        return max(angles) - min(angles) if angles else 0.0
+        few = len(angles) // 10
+        return angles[-1 - few] - angles[few] if angles else 0.0
 
     @property
     def reaches_clean_air(self) -> bool:
@@ -273,8 +279,9 @@ class InstrumentHeaders:
         return pairs
 
     @property
-    def _zenith_angles(self) -> tuple[float, ...]:
-        return tuple(angle for group in self.signal for angle in group.zenith_angles)
+    def _zenith_angles(self) -> list[float]:
+        stated = (header for group in self.signal for header in group.headers if not header.doubt)
+        return sorted(h.zenith_angle for h in stated if h.zenith_angle is not None)
 
     @property
     def _by_mode(self) -> tuple[ChannelLayout, ...]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
@@ -31,6 +32,8 @@ Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?(e[-+]?\d+)?")
+_FEWEST_IN_ORDER: Final = 5
+"""Files whose starts follow the order of names not by chance."""
 _MOST_VALUES: Final = 3
 """Notes that differ by a number only, as of the angles of a scan, of which each is reported."""
 
@@ -364,3 +367,27 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
     stored["contradictions"] = _sentences(stored["contradictions"])
     stored["layout"] = layouts[stored["layout"]]
     return Granule(**stored)
+
+
+def out_of_order(starts: Sequence[datetime], room: timedelta = timedelta()) -> list[int]:
+    """Return which files, in order of names, start before or after both files beside them.
+
+    None where the others do not follow the order of names, or are too few to tell: six files do so
+    but for one in less than 4 % of all orders.
+
+    Parameters
+    ----------
+    starts : sequence of datetime
+    room : timedelta
+        By how much more than that.
+    """
+    times = [-math.inf, *(start.timestamp() for start in starts), math.inf]
+    beside = enumerate(zip(times, times[1:], times[2:], strict=False))
+    away = room.total_seconds()
+    places = [
+        place
+        for place, (before, time, after) in beside
+        if before <= after and not before - away <= time <= after + away
+    ]
+    rest = [start for place, start in enumerate(starts) if place not in places]
+    return places if len(rest) >= _FEWEST_IN_ORDER and rest == sorted(rest) else []

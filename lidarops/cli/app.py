@@ -13,13 +13,14 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import wraps
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, ParamSpec
 
 import typer
 
 from lidarops.errors import REFUSED, UNAVAILABLE, LidarOpsError, UnavailableError
-from lidarops.figures.wording import visible
+from lidarops.figures.wording import listed, visible
 from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
@@ -185,18 +186,28 @@ def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]])
 def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0) -> int:
     """Print tables of plain text, but those without rows, and return the number of lines.
 
-    With `most`, so many rows of each, or fewer where they would fill more than so many lines. On a
-    terminal, cells fold between words only, so that names can be read and copied. Where the words
-    are too long for columns, each row is a paragraph.
+    With `most`, so many rows of each, or fewer where all tables together would fill more than so
+    many lines: each has its next row in turn, while there is room. On a terminal, cells fold
+    between words only, so that names can be read and copied. Where the words are too long for
+    columns, each row is a paragraph, as are those of one column.
     """
     whole = [(title, list(columns), list(rows)) for title, columns, rows in tables]
-    shown = [line for table in whole for line in _table(*table, most)]
-    while most and len(shown) > lines:
-        most -= 1
-        shown = [line for table in whole for line in _table(*table, most)]
-    for line in shown:
+    shown = [_table(*table, most) for table in whole]
+    if most is not None and sum(map(len, shown)) > lines:
+        shown = [_table(*table, 0) for table in whole]
+        left = lines - sum(map(len, shown))
+        growing = list(range(len(whole)))
+        for rows, place in product(range(1, most + 1), range(len(whole))):
+            if place in growing:
+                higher = _table(*whole[place], rows)
+                more = len(higher) - len(shown[place])
+                if more > left:
+                    growing.remove(place)
+                else:
+                    left, shown[place] = left - more, higher
+    for line in chain.from_iterable(shown):
         typer.echo(line)
-    return len(shown)
+    return sum(map(len, shown))
 
 
 def _table(title: str, names: list[str], rows: list[Iterable[Any]], most: int | None) -> list[str]:
@@ -209,12 +220,13 @@ def _table(title: str, names: list[str], rows: list[Iterable[Any]], most: int | 
     head = wrapped(title, "") if rows else []
     if not kept:
         return head
-    widths = _column_widths(names, kept, terminal_width())
+    widths = _column_widths(names, kept, terminal_width()) if len(names) > 1 else None
     if widths is None:
+        end = [""] if len(names) > 1 else []
         paragraphs = [
             wrapped(f"{name}: {cell}" if name else cell, "  ") or [""]
             for row in kept
-            for name, cell in zip((*names, ""), (*row, ""), strict=True)
+            for name, cell in zip((*names, *end), (*row, *end), strict=True)
         ]
         return [*head, *(line for paragraph in paragraphs for line in paragraph)]
     from rich.console import Console
@@ -403,5 +415,5 @@ def never_made(findings: Findings) -> str:
     """Return the requested products that no scene gives, for the end of a line."""
     from lidarops.reports.findings import unmade_words
 
-    names = ", ".join(unmade_words(findings))
+    names = listed(unmade_words(findings))
     return f"; requested, but made in no scene: {names}" if names else ""

@@ -30,6 +30,7 @@ from lidarops.cli.app import (
     show_error,
     show_rows,
     show_tables,
+    terminal_width,
 )
 from lidarops.errors import UNAVAILABLE, LidarOpsError
 
@@ -52,10 +53,13 @@ _MANY_PRODUCTS = 12
 """More products are summed by kind and channel, unless --all is given."""
 _MANY_FILES = 20
 """Most rows of each table of a catalog, without --all."""
-_FEW_ROWS = 3
-"""Most rows of other tables, without --all."""
+_WIDE = 120
+"""Characters of a line; in shorter ones, the columns about a product do not fit, and all are
+summed."""
 _LINES = 45
-"""Lines about products and in tables, without --all."""
+"""Lines in the tables of a run, without --all."""
+_FEW = 8
+"""Lines about removed products, without --all."""
 _FEW_FLAGS = 4
 """Flags that a sum of products names."""
 _LEAST_MEMORY = 2**20
@@ -276,8 +280,8 @@ def reprocess(
             for made in earlier:
                 say(f"report of an earlier run: {made}")
     if removed is not None and not as_json:
-        most = None if everything else _FEW_ROWS
-        show_tables([_orphan_table(result, f"{removed} removed")], most, _LINES)
+        most = None if everything else _FEW
+        show_tables([_orphan_table(result, f"{removed} removed")], most, _FEW)
     if result.signal:
         raise typer.Exit(128 + result.signal)
     if result.status is RunStatus.STOPPED:
@@ -386,24 +390,28 @@ def _print_places(result: Result, page: Path | None) -> None:
 def _print_result(
     campaign: Campaign, result: Result, *, no_scene: bool, removing: bool, everything: bool
 ) -> None:
-    scenes, most = result.scenes, None if everything else _FEW_ROWS
-    left = _LINES - _show_products(scenes, everything=everything)
-    show_tables(_tables(result, removing=removing), most, left)
+    from lidarops.figures.wording import listed
+
+    scenes = result.scenes
+    tables = _product_tables(scenes, everything=everything)
+    found = _tables(result, removing=removing)
+    show_tables((*tables, *found), None if everything else _LINES, _LINES)
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
-        names = ", ".join(sorted({f"{product.kind} {product.channel}" for product in empty}))
-        say(f"products without a usable value, flags say why: {len(empty)} ({names})")
+        names = listed({f"{product.kind} {product.channel}" for product in empty})
+        words = f"products without a usable value, flags say why: {len(empty)} ({names})"
+        say_wrapped(words, "")
     if no_scene:
         typer.echo(NO_SCENE)
     elif result.record is not None:
         ended = f" ({result.status.value})" if result.status != "finished" else ""
         place = from_here(campaign.products_root)
-        say(f"products: {place}{ended}{never_made(result.findings)}")
+        say_wrapped(f"products: {place}{ended}{never_made(result.findings)}", "")
     else:
         state = "the archive is not what the campaign states, see above"
         if not result.findings.failed:
             state = "every requested product is fresh or cannot be made"
-        say(f"nothing to do: {state}{never_made(result.findings)}")
+        say_wrapped(f"nothing to do: {state}{never_made(result.findings)}", "")
 
 
 def _tables(result: Result, *, removing: bool) -> Iterator[Table]:
@@ -464,29 +472,30 @@ def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str
     return list(rejection_rows(scenes))
 
 
-def _show_products(scenes: Sequence[SceneOutcome], *, everything: bool) -> int:
-    """Print what was made; of many products, the sums of each kind and channel: so many lines."""
+def _product_tables(scenes: Sequence[SceneOutcome], *, everything: bool) -> Iterator[Table]:
+    """Yield what was made; of many products, the sums of each kind and channel."""
     from lidarops.figures.wording import counted
 
-    numbers = "values", "good", "care", "reject"
     made = [product for scene in scenes for product in scene.products]
-    if everything or len(made) <= _MANY_PRODUCTS:
-        single = "scene", "kind", "channel", *numbers, "flags"
-        rows = (row for scene in scenes for row in _product_rows(scene))
-        most = None if everything else _MANY_PRODUCTS
-        return show_tables([("Products", single, rows)], most, _LINES)
-    alike: dict[tuple[str, str, str], list[ProductRecord]] = defaultdict(list)
+    if everything or (len(made) <= _MANY_PRODUCTS and terminal_width() >= _WIDE):
+        names = "scene", "kind", "channel", "values", "good", "care", "reject", "flags"
+        yield "Products", names, (row for scene in scenes for row in _product_rows(scene))
+        return
+    alike: dict[str, list[ProductRecord]] = defaultdict(list)
     for scene in scenes:
         for product in scene.products:
-            alike[scene.instrument, product.kind, product.channel].append(product)
-    said = say_wrapped(f"{len(made)} products, summed (--all lists them)", "")
-    for (instrument, kind, channel), products in sorted(alike.items())[:_MANY_PRODUCTS]:
-        words = f"{instrument} {kind} {channel}: {counted(len(products), 'product')}"
-        said += say_wrapped(f"{words}, {_summed(products)}", "  ")
-    if len(alike) > _MANY_PRODUCTS:
-        said += say_wrapped(f"and {len(alike) - _MANY_PRODUCTS} further sums (--all)", "  ")
-    errors = [(scene.scene, scene.error) for scene in scenes if scene.error]
-    return said + show_tables([("Failed", ("scene", "error"), errors)], _FEW_ROWS, _LINES)
+            alike[f"{scene.instrument} {product.kind} {product.channel}"].append(product)
+    title = f"{counted(len(made), 'product')}, summed (--all lists them)"
+    yield (
+        title,
+        ("",),
+        (
+            (f"{name}: {counted(len(products), 'product')}, {_summed(products)}",)
+            for name, products in sorted(alike.items())
+        ),
+    )
+    errors = ((scene.scene, scene.error) for scene in scenes if scene.error)
+    yield "Failed", ("scene", "error"), errors
 
 
 def _summed(products: Sequence[ProductRecord]) -> str:

@@ -111,7 +111,10 @@ def _plan(
     with Store(settings.catalog_url, settings.name) as store:
         refused = acknowledged(settings, store.refused())
     unexpected = not all(granule.is_expected for granule in refused)
-    judgements = assess(settings, selection=selection, everything=not stale, update=False)
+    set_aside: dict[str, str] = {}
+    judgements = assess(
+        settings, selection=selection, everything=not stale, update=False, set_aside=set_aside
+    )
     earlier = earlier_problems(settings, selection)
     scenes = []
     first: dict[str, Scene] = {}
@@ -136,7 +139,6 @@ def _plan(
             alike.setdefault((judged.scene.instrument, *lines), []).append(judged)
     empty = _empty(settings, first.values())
     no_scene = not count and selects_no_scene(settings, selection)
-    lacking = settings.metadata.lacking
     if as_json:
         document = {
             "scenes": scenes,
@@ -144,8 +146,9 @@ def _plan(
             "failed_before": earlier[0],
             "without_a_usable_value": list(earlier[1]),
             "refused_files": {granule.path: granule.reason for granule in refused},
+            "files_set_aside": set_aside,
             **findings_document(findings),
-            "lacking_metadata": list(lacking),
+            "lacking_metadata": list(settings.metadata.lacking),
             "empty_in_first_file": empty,
         }
         typer.echo(json.dumps(document, indent=2))
@@ -155,16 +158,20 @@ def _plan(
             say(NO_SCENE)
         printed += _show_refused([granule.reason for granule in refused])
         columns = "product", "flag", "values", "settings"
-        first_files = "Without a usable value in the first files", columns, empty
-        tables = first_files, *finding_tables(findings), *_earlier(*earlier)
+        tables: list[Table] = [
+            ("Without a usable value in the first files", columns, empty),
+            ("Not used", ("file", "reason"), set_aside.items()),
+        ]
+        tables += [*finding_tables(findings), *_earlier(*earlier)]
         show_tables(tables, None if everything else _FEW, _LINES - printed)
-        words = f"metadata of the campaign: products will lack {', '.join(lacking)}"
+        lacking = ", ".join(settings.metadata.lacking)
+        words = f"metadata of the campaign: products will lack {lacking}"
         say_wrapped(words if lacking else "", "")
         # With --stale, fresh scenes are not judged.
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
-    exit_with_status(failed=failed or unexpected or any(earlier) or findings.failed)
+    exit_with_status(failed=any((failed, unexpected, set_aside, *earlier, findings.failed)))
 
 
 def _empty(campaign: Campaign, scenes: Collection[Scene]) -> list[tuple[str, str, str, str]]:

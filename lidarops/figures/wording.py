@@ -23,6 +23,8 @@ SEVERITIES: Final[Mapping[Severity | None, str]] = {
 """What the severity of a quality bit means; None where it is not known."""
 _NAMED: Final = 2
 """Most descriptions that `named_shares` names."""
+_MOST_NAMES: Final = 8
+"""Most names that `listed` lists."""
 _HIDDEN: Final = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff"
     "\N{LEFT-TO-RIGHT EMBEDDING}-\N{RIGHT-TO-LEFT OVERRIDE}"
@@ -125,6 +127,13 @@ def utc(time: np.datetime64) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun, in the plural with an s."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return sorted names on one line, cut after the first few."""
+    ordered = sorted(names)
+    more = f" and {len(ordered) - _MOST_NAMES} more" if len(ordered) > _MOST_NAMES else ""
+    return ", ".join(ordered[:_MOST_NAMES]) + more
 
 
 def visible(text: str) -> str:

@@ -641,7 +641,7 @@ def _parse_datasets(
         if d.active and d.kind is DatasetKind.OTHER
     ]
     notes += [
-        f"polarisation l of {d.name} is taken as parallel, as older files have it"
+        f"polarisation l of {d.name} means parallel, as in older files"
         for d in datasets
         if d.active and d.polarisation == "p" and d.wavelength_label.endswith("l")
     ]

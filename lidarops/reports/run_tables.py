@@ -15,6 +15,7 @@ from lidarops.figures.wording import (
     counted,
     decided_on,
     duration,
+    listed,
     percent,
     size,
     verdicts_in_words,
@@ -36,8 +37,6 @@ from lidarops.reports.findings import disagreement_rows, finding_rows, scene_not
 from lidarops.scene.retrieval import idle_window
 
 _T = TypeVar("_T")
-_MOST_NAMES: Final = 8
-"""Most names listed in one cell."""
 _UNKNOWN: Final = "bit unknown to this version of lidarops"
 _LAST: Final = 1 << PLACES
 """Place of unknown bits in a table."""
@@ -329,13 +328,6 @@ def scenes_without_product(record: RunRecord) -> list[tuple[str, list[str]]]:
 
 def _most_frequent_first(groups: Mapping[Any, list[_T]]) -> list[tuple[Any, list[_T]]]:
     return sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
-
-
-def listed(names: Iterable[str]) -> str:
-    """Return sorted names on one line, cut after the first few."""
-    ordered = sorted(names)
-    more = f" and {len(ordered) - _MOST_NAMES} more" if len(ordered) > _MOST_NAMES else ""
-    return ", ".join(ordered[:_MOST_NAMES]) + more
 
 
 def moment(time: datetime) -> str:

@@ -125,6 +125,7 @@ def assess(
     selection: Selection | None = None,
     everything: bool = False,
     update: bool = True,
+    set_aside: dict[str, str] | None = None,
 ) -> Iterator[Judgement]:
     """Judge what every scene needs, and why. Processes nothing.
 
@@ -137,6 +138,8 @@ def assess(
         Whether to yield also scenes that need nothing.
     update : bool
         Whether to update the catalog first.
+    set_aside : dict, optional
+        Takes the good files that belong to no scene, and why, by path.
 
     Yields
     ------
@@ -154,13 +157,13 @@ def assess(
         months = set(judge.months(days)).intersection(days)
         # Months last: by then it is known which of their products are to be made.
         for part in (days, sorted(months)):
-            scenes = (
-                judged for batch in judge.batches(part) for judged in judge.days(batch).judgements
-            )
-            for judged in scenes:
-                asked = everything or judged.due or judged.held or judged.frozen or judged.kept
-                if asked and bool(judged.scene.granules) == (part is days):
-                    yield judge.explained(judged)
+            for told in map(judge.days, judge.batches(part)):
+                if set_aside is not None:
+                    set_aside |= {granule.path: granule.reason for granule in told.set_aside}
+                for judged in told.judgements:
+                    asked = everything or judged.due or judged.held or judged.frozen or judged.kept
+                    if asked and bool(judged.scene.granules) == (part is days):
+                        yield judge.explained(judged)
 
 
 def survey(

@@ -38,6 +38,7 @@ from lidarops.records import Scene, SceneOutcome, file_channels, is_glued
 from lidarops.reports.rejections import rejection_rows
 from lidarops.retrieve.signal.light import FEWEST, light_begins, rise_ends
 from lidarops.run.archive import bring_up_to_date
+from lidarops.run.scenes import scan_cycles_of
 from lidarops.scene.dependence import scene_facts
 from lidarops.scene.job import Job
 from lidarops.scene.plan import plan_scene
@@ -233,19 +234,22 @@ def empty_in_first_files(
 ) -> Iterator[tuple[str, str, str, str]]:
     """Yield what the first files of scenes leave without a usable value, and why.
 
-    Product, flag, share of the values and settings, but not what a longer average may change. With
-    that, ranges without light.
+    Product, flag, share of the values and settings, but not what a longer average may change. Of a
+    scan the files are those of its first cycle of most beams. With that, ranges without light.
     """
     for scene in scenes:
-        first = replace(scene, granules=scene.granules[:FEWEST])
+        cycles = scan_cycles_of(scene.granules)
+        ((whole, beams),) = Counter(cycles).most_common(1)
+        own = (g for g, cycle in zip(scene.granules, cycles, strict=True) if cycle == whole)
+        first = replace(scene, granules=tuple(own) if beams > 1 else scene.granules[:FEWEST])
         if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
             yield from _without_near_light(campaign, first)
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
-            own = campaign.model_copy(update={"output": folder})
-            outcome = process_scene(Job(own, first, plan_scene(first, own)))
+            here = campaign.model_copy(update={"output": folder})
+            outcome = process_scene(Job(here, first, plan_scene(first, here)))
         empty = tuple(product for product in outcome.products if product.usable == 0)
         for row in rejection_rows([replace(outcome, products=empty)]):
-            if row[-1].startswith(_OF_ONE_PROFILE):
+            if beams > 1 or row[-1].startswith(_OF_ONE_PROFILE):
                 yield row
 
 

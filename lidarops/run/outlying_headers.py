@@ -13,6 +13,7 @@ from dataclasses import fields, replace
 from statistics import median
 from typing import Any, Final, NamedTuple
 
+from lidarops.catalog.granules import out_of_order
 from lidarops.raw.formats import time_in_path
 from lidarops.raw.header import RawChannel, RawHeader
 from lidarops.records import FEWEST_ALIKE, Granule, Role, Status, day_of
@@ -111,7 +112,7 @@ def outlying_headers(
         if len(around) <= FEWEST_ALIKE:
             continue
         statements = [*_setups(around, day, read), *_intervals(around, day, read)]
-        statements += _times(around, day, ahead)
+        statements += [*_times(around, day, ahead), *_out_of_order(around, day)]
         if role is Role.SIGNAL:
             statements += _pointings(around, day)
         for place, text, refused in statements:
@@ -217,6 +218,21 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Statements:
             # Such a file may be the only one of its day before or after a change of time.
             summer = abs(abs(own - usual) - _SUMMER_TIME) <= room
             yield place, text, not summer
+
+
+def _out_of_order(around: Sequence[Granule], day: int) -> Statements:
+    """Yield which files start out of the order of names, where names tell no time."""
+    folders: dict[str, list[tuple[str, int]]] = defaultdict(list)
+    for place, granule in enumerate(around):
+        if time_in_path(granule.path, granule.format) is None:
+            folders[granule.path.rpartition("/")[0]].append((granule.path, place))
+    for members in folders.values():
+        files = [around[place] for _, place in sorted(members)]
+        for index in out_of_order([granule.start for granule in files if granule.start]):
+            start = files[index].start
+            if start and day_of(start) == day:
+                text = f"the start {start:%Y-%m-%d %H:%M:%S} UTC, out of the order of names"
+                yield sorted(members)[index][1], text, False
 
 
 def _shots(header: RawHeader | None) -> int:

@@ -262,14 +262,14 @@ def _keep_cycles_whole(
         earlier, later = windows[before], windows[after]
         if before[1] != after[0] or after[0] in edges or not earlier:
             continue
-        numbers = _cycles([*earlier, *later])
+        numbers = scan_cycles_of([*earlier, *later])
         last = numbers[len(earlier) - 1]
         crossing = sum(1 for number in numbers[len(earlier) :] if number == last)
         earlier += later[:crossing]
         del later[:crossing]
 
 
-def _cycles(granules: Sequence[Granule]) -> list[int]:
+def scan_cycles_of(granules: Sequence[Granule]) -> list[int]:
     """Return the scan cycle of each granule; all differ where the beam does not scan."""
     angles = [granule.zenith_angle for granule in granules]
     known = [angle for angle in angles if angle is not None]

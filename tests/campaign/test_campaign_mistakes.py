@@ -87,6 +87,9 @@ def _message(folder: Path, text: str) -> str:
             "line 6: stations.coast.latitude: must be a number from -90 to 90 degree, not 'north'",
         ),
         ("latitude: 46.4", "latitude: yes", "from -90 to 90 degree, not 'yes'"),
+        # YAML 1.1 reads 46 min 24 s as 2784, or 46.4 h as a number of minutes.
+        ("latitude: 46.4", "latitude: 0:24", "from -90 to 90 degree, not '0:24'"),
+        ("latitude: 46.4", "latitude: -1:00.5", "from -90 to 90 degree, not '-1:00.5'"),
         ("latitude: 46.4", "lattitude: 46.4", "unknown key; did you mean 'latitude'? keys here"),
         ("latitude: 46.4, ", "", "line 6: stations.coast.latitude: is required: a number from -90"),
         (
@@ -208,6 +211,14 @@ def test_a_number_without_a_point_is_read(tmp_path: Path) -> None:
     path.write_text(CAMPAIGN.replace("4.0e-9", "4e-9"))
     facts = load_campaign(path).instruments["lidar"].facts[0]
     assert facts.channels["photon_532o"].dead_time == 4e-9
+
+
+@pytest.mark.parametrize("text", ["044", "+44", "44"])
+def test_a_number_with_a_zero_before_it_is_decimal(tmp_path: Path, text: str) -> None:
+    """YAML 1.1 reads 044 as 36."""
+    path = tmp_path / "campaign.yaml"
+    path.write_text(CAMPAIGN.replace("latitude: 46.4", f"latitude: {text}"))
+    assert load_campaign(path).stations["coast"].latitude == 44.0
 
 
 @pytest.mark.parametrize("word", ["yes", "no", "on", "off"])

@@ -505,17 +505,33 @@ def test_the_letters_of_a_station_are_no_words(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "elastic"), [(529, False), (530, False), (535, False), (540, True)]
+    ("laser", "line", "elastic"),
+    [(532, 529, False), (532, 530, False), (532, 535, False), (532, 540, True), (694, 692, False)],
 )
 def test_rotational_raman_lines_are_not_proposed_as_elastic(
-    tmp_path: Path, line: int, elastic: bool
+    tmp_path: Path, laser: int, line: int, elastic: bool
 ) -> None:
     for number in range(2):
         data = content(number, seed=number, zenith_angle=0.0)
         # The analog record becomes that of the other line.
         data = data.replace(b"00532.o 0 0 00 000 12", f"00{line}.o 0 0 00 000 12".encode())
+        data = data.replace(b"00532.o", f"00{laser}.o".encode())
         write(tmp_path / f"raw/h{number}", data)
     campaign, _ = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     (lidar,) = campaign.instruments.values()
     proposed = lidar.products.requested["elastic"].channels
-    assert ("photon_532o" in proposed, f"analog_{line}o" in proposed) == (True, elastic)
+    assert (f"photon_{laser}o" in proposed, f"analog_{line}o" in proposed) == (True, elastic)
+
+
+@pytest.mark.parametrize(("slanted", "kind"), [(2, "elastic"), (6, "multiangle")])
+def test_a_fixed_lidar_with_some_slanted_files_is_no_scan(
+    tmp_path: Path, slanted: int, kind: str
+) -> None:
+    """Two of twenty, as for a test; six are a part of what it does."""
+    for number in range(20):
+        angle = 40.0 if number >= 20 - slanted else 5.0
+        write(tmp_path / f"raw/h26{number:02}", content(number, seed=number, zenith_angle=angle))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (lidar,) = campaign.instruments.values()
+    assert set(lidar.products.requested) == {"signal", kind}
+    assert "# zenith_angle: the beam moves from 5 to 40 degree by the headers" in text

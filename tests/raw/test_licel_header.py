@@ -354,7 +354,7 @@ def test_the_letter_of_older_files_is_parallel_but_beside_letters_of_newer_ones(
     header = parse(datasets=tuple(lines))
     names = ["analog_532p", "photon_532p", "analog_532s", "photon_532s"]
     assert [channel.name for channel in header.channels] == names
-    assert "polarisation l of analog_532p is taken as parallel" in " ".join(header.notes)
+    assert "polarisation l of analog_532p means parallel" in " ".join(header.notes)
     circular = parse(datasets=tuple(line.replace("532.s", "532.r") for line in lines))
     assert circular.channels[0].name == "analog_532l"
     # Letters of another wavelength tell nothing.

@@ -254,6 +254,19 @@ def test_files_without_light_and_packed_ones_are_questions(data_root: Path, tmp_
     assert "unpack session.zip" in shown.output
 
 
+@pytest.mark.slow
+def test_a_plan_looks_at_a_whole_cycle_of_a_scan(data_root: Path, tmp_path: Path) -> None:
+    """The first files are beams of their own, by which no scan can be judged."""
+    if not (data_root / "savant").is_dir():
+        pytest.skip("no real scan")
+    path = tmp_path / "campaign.yaml"
+    CliRunner().invoke(app, ["init", "--headers-only", str(data_root / "savant"), str(path)])
+    rows = [row for row in told("plan", path)["empty_in_first_file"] if "multiangle" in row[0]]
+    words = "dark: no dark files within 24 h of the scene"
+    product = "multiangle analog_355p of u-c-vol-lidar"
+    assert rows == [[product, "poor_stratification", "100 %", words]]
+
+
 def test_a_plan_tells_that_a_laser_was_off(data_root: Path, tmp_path: Path) -> None:
     case = data_root / "cases/laser_off/rawoff"
     if not case.is_dir():

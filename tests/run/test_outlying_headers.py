@@ -296,6 +296,37 @@ def test_a_clock_that_the_facts_state_contradicts_no_name(tmp_path: Path) -> Non
     assert not result.set_aside
 
 
+@pytest.mark.parametrize(
+    ("minutes", "noted"),
+    [
+        ([0, 1, 182, 3, 4, 5], "13:02"),
+        ([0, 1, 2, -177, 4, 5], "07:03"),
+        # Another sort of names, and too few files.
+        ([3, 4, 5, 0, 1, 2], ""),
+        ([0, 1, 182, 3, 4], ""),
+    ],
+)
+def test_a_start_out_of_the_order_of_names_is_noted_where_these_tell_no_time(
+    tmp_path: Path, minutes: list[float], noted: str
+) -> None:
+    archive = _archive(tmp_path, [600.0 + minute for minute in minutes])
+    result, products = _run(archive)
+    assert not result.has_failures
+    with xr.open_dataset(archive.folder / "out/products" / min(products)) as opened:
+        notes = opened.attrs.get("lidarops_input_notes", "")
+    words = f"states the start 2026-03-01 {noted}:00 UTC, out of the order of names: 1 of 6 files"
+    assert (words in notes) == bool(noted)
+    assert ("out of the order" in notes) == bool(noted)
+
+
+def test_a_file_of_another_day_than_those_beside_it_by_name_contradicts(tmp_path: Path) -> None:
+    """Names tell no time; a later session is none."""
+    minutes = [600.0, 601.0, 602.0, 60_000.0, 604.0, 605.0, 90_000.0, 90_001.0]
+    result, _ = _run(_archive(tmp_path, minutes))
+    text = "poor/h3 starts at 2026-04-11 16:00, more than a day away from those beside it by name"
+    assert [row.problem for row in finding_rows(result.findings) if row.fails] == [text]
+
+
 @pytest.mark.parametrize("name", ["pilar", "saopaulo", "manaus", "savant"])
 def test_no_measured_file_lies_off_those_around_it(
     name: str, data_root: Path, tmp_path: Path
