@@ -137,9 +137,7 @@ class Granules(Database):
     ) -> list[Granule]:
         """Return the granules of the campaign, ordered by instrument, start time and path."""
         conditions += () if status is None else (_C.status == status.value,)
-        query = sa.select(*(_C[name] for name in _GRANULE_NAMES)).where(
-            _C.campaign == self.campaign, *conditions
-        )
+        query = sa.select(*_GRANULE_COLUMNS).where(_C.campaign == self.campaign, *conditions)
         query = query.order_by(_C.instrument, _C.start, _C.path)
         layouts = dict(self.read(sa.select(LAYOUT), lambda row: (row.hash, _layout_from(row[1]))))
         with self.stream(query) as rows:
@@ -322,6 +320,7 @@ class Granules(Database):
 
 
 _GRANULE_NAMES: Final = tuple(field.name for field in fields(Granule))
+_GRANULE_COLUMNS: Final = tuple(_C[name] for name in _GRANULE_NAMES)
 _ROLES: Final = {role.value: role for role in Role}
 _STATUSES: Final = {status.value: status for status in Status}
 

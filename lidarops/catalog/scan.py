@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from itertools import chain
+from operator import itemgetter
 from typing import Final, NamedTuple
 from urllib.parse import unquote
 
@@ -131,7 +132,7 @@ def scan_archive(
             pairs = readers.map_items(
                 read_row, due, at_a_time=_TOGETHER, fewest=_WORTH_PROCESSES, lost=crashed
             )
-            rows = (row for _, row in pairs)
+            rows = map(itemgetter(1), pairs)
         for row in rows:
             work.enter(row)
     return work.finish()

@@ -264,7 +264,7 @@ def _pass(states: DayStates, lock: Lock, options: Options) -> Result:
         empty_scenes=empty_scenes,
         set_aside=set_aside,
         findings=find(states, summary.idle_patterns, settled=verdicts),
-        refused=acknowledged(campaign, states.refused_files),
+        refused=acknowledged(campaign, store.refused()),
     )
 
 

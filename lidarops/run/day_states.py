@@ -168,12 +168,7 @@ class DayStates:
     @cached_property
     def refused(self) -> tuple[RefusedFile, ...]:
         """Files that the catalog refuses, with times to which they belong."""
-        return tuple(dated(self.campaign, self.store, self.refused_files))
-
-    @cached_property
-    def refused_files(self) -> list[Granule]:
-        """Files that the catalog refuses."""
-        return self.store.refused()
+        return tuple(dated(self.campaign, self.store))
 
     def ancillary(self, name: str) -> str:
         """Return the SHA-256 of an ancillary file when it was first needed."""

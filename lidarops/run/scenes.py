@@ -393,9 +393,7 @@ class RefusedFile(NamedTuple):
     """Whether it belongs only to scenes without dark files, of which it may be the one."""
 
 
-def dated(
-    campaign: Campaign, catalog: Granules, refused: Iterable[Granule]
-) -> Iterator[RefusedFile]:
+def dated(campaign: Campaign, catalog: Granules) -> Iterator[RefusedFile]:
     """Yield refused files with the times of the good files beside which they belong.
 
     These are the ones before and after in the order of names, of the same folder, instrument and
@@ -406,7 +404,7 @@ def dated(
     the dark file before to the one after.
     """
     folders: dict[str, list[Granule]] = defaultdict(list)
-    for granule in refused:
+    for granule in catalog.refused():
         folders[granule.path.rpartition("/")[0]].append(granule)
     for folder, granules in sorted(folders.items()):
         rows: dict[tuple[str, Role], list[DatedFile]] = defaultdict(list)

@@ -293,9 +293,9 @@ def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
     start = datetime(2026, 3, 1, tzinfo=UTC)
     days = [start + timedelta(days=day) for day in range(3650)]
     catalog = create_autospec(Granules, instance=True)
-    catalog.files_in.return_value = []
+    catalog.refused.return_value, catalog.files_in.return_value = refused, []
     catalog.nearest_days.return_value = days
-    assert sum(1 for _ in dated(archive.write(), catalog, refused)) == MOST_IN_DOUBT * len(days)
+    assert sum(1 for _ in dated(archive.write(), catalog)) == MOST_IN_DOUBT * len(days)
 
 
 @pytest.mark.parametrize(
@@ -385,5 +385,6 @@ def test_a_refused_file_belongs_beside_the_files_of_like_names(
     }
     refused = Granule(path, 0, 0, "poor", Role.SIGNAL, Status.REFUSED, "cannot be read: Stale")
     catalog = create_autospec(Granules, instance=True)
+    catalog.refused.return_value = [refused]
     catalog.files_in.side_effect = lambda folder: files.get(folder, [])
-    assert [file.time.day for file in dated(archive.write(), catalog, [refused])] == days
+    assert [file.time.day for file in dated(archive.write(), catalog)] == days
