@@ -406,7 +406,7 @@ def main(
     else:
         made = counted(sum(len(scene.products) for scene in result.scenes), "product")
         typer.echo(f"made:     {made} of {counted(len(result.scenes), 'scene')}")
-        known = [file.reason for file in refused_files(settings, result) if file.is_expected]
+        known = [file.reason for file in refused_files(result) if file.is_expected]
         for why, files in Counter(reason.partition(":")[0] for reason in known).items():
             typer.echo(f"not used: {counted(files, 'file')}, {why}")
         typer.echo(f"products: {result.record.products}\nreport:   {built}")

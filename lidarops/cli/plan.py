@@ -32,10 +32,11 @@ from lidarops.cli.app import (
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
+from lidarops.records import ACKNOWLEDGED
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
-    from lidarops.records import LeftOut, Plan, PlannedStep, Scene
+    from lidarops.records import Granule, LeftOut, Plan, PlannedStep, Scene
     from lidarops.run.options import Selection
     from lidarops.run.staleness import Judgement, Stale
 
@@ -110,7 +111,6 @@ def _plan(
     findings = survey(settings, selection=selection, wait=wait)
     with Store(settings.catalog_url, settings.name) as store:
         refused = acknowledged(settings, store.refused())
-    unexpected = not all(granule.is_expected for granule in refused)
     set_aside: dict[str, str] = {}
     judgements = assess(
         settings, selection=selection, everything=not stale, update=False, set_aside=set_aside
@@ -171,7 +171,15 @@ def _plan(
         whole = "" if stale else f" of {count}"
         say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
-    exit_with_status(failed=any((failed, unexpected, set_aside, *earlier, findings.failed)))
+    exit_with_status(
+        failed=any((failed, _unexpected(refused, set_aside), *earlier, findings.failed))
+    )
+
+
+def _unexpected(refused: list[Granule], set_aside: dict[str, str]) -> bool:
+    """Return whether a file is not used, and the campaign does not say so."""
+    known = all(granule.is_expected for granule in refused)
+    return not (known and all(why.startswith(ACKNOWLEDGED) for why in set_aside.values()))
 
 
 def _empty(campaign: Campaign, scenes: Collection[Scene]) -> list[tuple[str, str, str, str]]:

@@ -159,7 +159,8 @@ def assess(
         for part in (days, sorted(months)):
             for told in map(judge.days, judge.batches(part)):
                 if set_aside is not None:
-                    set_aside |= {granule.path: granule.reason for granule in told.set_aside}
+                    aside = acknowledged(campaign, told.set_aside)
+                    set_aside |= {granule.path: granule.reason for granule in aside}
                 for judged in told.judgements:
                     asked = everything or judged.due or judged.held or judged.frozen or judged.kept
                     if asked and bool(judged.scene.granules) == (part is days):
