@@ -255,6 +255,8 @@ def terminal_width() -> int:
 
 def wrapped(text: str, indent: str) -> list[str]:
     """Return lines of a text that fold between words only, the later ones indented further."""
+    if text.isprintable() and 0 < len(text) <= terminal_width() - len(indent):
+        return [indent + text]
     later = f"{indent}  "
     return textwrap.wrap(
         " ".join(text.split()),

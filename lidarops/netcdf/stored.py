@@ -213,6 +213,9 @@ class StoredVariable:
             If they cannot be read.
         """
         with reading(self._path):
+            if self._type.get_class() == h5t.STRING and self._type.is_variable_str():
+                text = h5py.Dataset(self._stored).asstr(errors="replace")
+                return np.asarray(text[() if key is ... else key], object)
             if key is not ...:
                 return np.asarray(h5py.Dataset(self._stored)[key], self.dtype)
             values = np.empty(self.shape, self.dtype)

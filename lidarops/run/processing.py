@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from lidarops.catalog.granules import joined_notes
 from lidarops.catalog.lock import Lock
-from lidarops.catalog.raw_files import acknowledged_reasons
+from lidarops.catalog.raw_files import acknowledged, acknowledged_reasons
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import RunStatus, Verdict
 from lidarops.records import FileNote
@@ -141,6 +141,7 @@ class Pass:
             set_aside=acknowledged_reasons(self.campaign, set_aside),
             frozen=told.frozen,
             findings=findings,
+            refused=() if record else acknowledged(self.campaign, self.store.refused()),
             signal=self.stop.signal,
         )
 

@@ -18,7 +18,7 @@ from lidarops.campaign.model import Campaign
 from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
-from lidarops.netcdf import read
+from lidarops.netcdf import stored
 from lidarops.netcdf.comparison import compare_products
 from lidarops.records import Grade
 from lidarops.run.archive import reprocess
@@ -131,8 +131,7 @@ def test_whatever_the_library_raises_is_stated(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     product = _products(finished)[0]
-    monkeypatch.setattr(read.xr, "open_dataset", _foreign(error))
-    monkeypatch.setattr(read.xr.backends.NetCDF4DataStore, "open", _foreign(error))
+    monkeypatch.setattr(stored, "StoredProduct", _foreign(error))
     for command in (
         ("inspect", product),
         ("plot", product, "--out", tmp_path / "figure.png"),

@@ -153,15 +153,15 @@ def test_missing_variable_is_named(name):
         read(signal(times(START, 3, 60.0)).drop_vars(name))
 
 
-def test_of_an_unknown_kind_usable_tells_what_bits_mean():
+def test_of_an_unknown_kind_the_file_tells_which_bits_reject():
     product = signal(times(START, 4, 60.0), bins=10).assign_attrs(lidarops_kind="wind")
-    product["quality_flag"].values[:] = 0
-    product["quality_flag"].attrs |= {"flag_masks": [1, 2], "flag_meanings": "calm stormy"}
-    product["quality_flag"].values[0], product["quality_flag"].values[1] = 1, 3
+    flags = product["quality_flag"]
+    flags.values[:] = 0
+    flags.attrs |= {"flag_masks": [1, 2], "flag_meanings": "calm stormy"}
+    flags.attrs.pop("flag_assessments", None)
+    flags.values[0], flags.values[1] = 1, 3
     assert read(product).flagged.any(axis=1).tolist() == [True, True, False, False]
-    verdict = np.zeros((4, 10), np.int8)
-    verdict[0], verdict[1] = 1, 2
-    product["usable"] = ("time", "range"), verdict
+    flags.attrs["flag_assessments"] = "Indeterminate Bad"
     assert read(product).flagged.any(axis=1).tolist() == [False, True, False, False]
 
 

@@ -81,8 +81,9 @@ class _Scratch(NamedTuple):
 @summing
 def _weigh(variance: Array, shape: Array, weights: Array) -> None:
     for i in range(weights.size):
-        good = (variance[i] > 1.0 / HUGE) & (variance[i] < math.inf) & (shape[i] > 0.0)
-        weights[i] = 1.0 / variance[i] if good & (shape[i] < HUGE) else 0.0
+        weight = 1.0 / variance[i]
+        good = (weight > 0.0) & (weight < math.inf) & (shape[i] > 0.0) & (shape[i] < HUGE)
+        weights[i] = weight if good else 0.0
 
 
 @summing
