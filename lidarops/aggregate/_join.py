@@ -34,8 +34,13 @@ def shared_attributes(attributes: Sequence[Mapping[str, Any]]) -> dict[str, Any]
         key: value
         for key, value in first.items()
         if not key.startswith(_PER_PRODUCT)
-        and all(key in other and np.array_equal(other[key], value) for other in attributes[1:])
+        and all(_is_same(value, other.get(key)) for other in attributes[1:])
     }
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    # Most are texts, which need no arrays.
+    return one == other if isinstance(one, str) else np.array_equal(one, other)
 
 
 class Part(NamedTuple):

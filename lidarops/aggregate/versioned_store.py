@@ -245,16 +245,16 @@ def _write_group(
         facts = products[at]
         with _unreadable(facts), facts.opened(root) as product:
             with reading(facts.path):
-                stated = product.attrs.whole()
+                shared = [shared_attributes([*shared, product.attrs])]
+                version = product.attrs["product_version"]
                 pattern = None if at or 0 not in lacking else pattern_of(product, facts)
             if pattern is not None:
                 _create(store, name, pattern)
                 rows = _resized(_root(store)[name], starts[-1], len(products))
             if at in lacking:
                 _add(rows, product, facts, at, starts[at])
-        shared = [shared_attributes([*shared, stated])]
         if at in lacking and facts.id not in held.places:
-            changes.added.append((facts.path, stated["product_version"]))
+            changes.added.append((facts.path, version))
     for parts in rows.values():
         parts.write()
     attributes = {key: plain(value) for key, value in shared[0].items()}

@@ -8,9 +8,10 @@ from __future__ import annotations
 import json
 import logging
 import math
+import sys
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from datetime import UTC, datetime
@@ -61,9 +62,9 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
         If the folder cannot be written, or a setting is not a plain JSON type.
     """
     target = Path(folder) / FILE_NAME
-    document = {"format": _FORMAT, "version": _VERSION, "record": plain(record)}
     try:
-        text = json.dumps(document, indent=1, allow_nan=False)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(target, _document(record))
     except (TypeError, ValueError) as error:
         raise CatalogError(
             f"the run record holds a value that JSON cannot hold: {error}",
@@ -71,9 +72,6 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
             field="settings",
             remedy="use only text, finite numbers, booleans, lists and mappings in settings",
         ) from error
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, text.encode("ascii"))
     except OSError as error:
         raise UnavailableError(
             f"cannot be written: {error}",
@@ -83,6 +81,23 @@ def save_run_record(record: RunRecord, folder: Path) -> Path:
         ) from error
     (target.parent / JOURNAL).unlink(missing_ok=True)
     return target
+
+
+def _document(record: RunRecord) -> Iterator[bytes]:
+    """Yield the record as JSON, one scene at a time, because all of them would fill memory."""
+    stated = plain(replace(record, scenes=()))
+    document = {"format": _FORMAT, "version": _VERSION, "record": stated}
+    before, opened, after = _text(document).partition('"scenes": [')
+    yield f"{before}{opened}".encode("ascii")
+    # As deep as they lie in the document.
+    for number, scene in enumerate(record.scenes):
+        text = f"\n{_text(plain(scene))}".replace("\n", "\n   ")
+        yield f"{',' if number else ''}{text}".encode("ascii")
+    yield ("\n  " if record.scenes else "").encode("ascii") + after.encode("ascii")
+
+
+def _text(document: object) -> str:
+    return json.dumps(document, indent=1, allow_nan=False)
 
 
 def exists(folder: Path) -> bool:
@@ -271,7 +286,8 @@ def _checked(value: object, kind: type[_T], words: str, place: str) -> _T:
 
 
 _SCALARS: Final[Mapping[object, tuple[Any, Callable[[Any], object], str]]] = {
-    str: (str, str, "text"),
+    # Scenes of an instrument have most of their words in common.
+    str: (str, sys.intern, "text"),
     bool: (bool, bool, "true or false"),
     int: (int, int, "a whole number"),
     float: ((int, float), float, "a number below 1e308"),

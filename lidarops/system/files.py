@@ -9,7 +9,7 @@ import os
 import stat
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
@@ -133,7 +133,7 @@ def last_change(file: Path) -> float:
 
 
 def write_atomically(
-    target: Path, content: bytes, as_of: float | None = None, *, sync: bool = True
+    target: Path, content: bytes | Iterable[bytes], as_of: float | None = None, *, sync: bool = True
 ) -> None:
     """Write `content` to a temporary file beside `target`, sync it and rename it.
 
@@ -141,8 +141,8 @@ def write_atomically(
     ----------
     target : Path
         File to create or replace; its folder must exist.
-    content : bytes
-        Whole content.
+    content : bytes, or iterable of bytes
+        Whole content, or its parts.
     as_of : float, optional
         Time that the file states as that of its change, s since 1970; default now.
     sync : bool, optional
@@ -157,7 +157,7 @@ def write_atomically(
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+            stream.writelines([content] if isinstance(content, bytes) else content)
             if sync:
                 stream.flush()
                 os.fsync(stream.fileno())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -200,7 +201,19 @@ def test_settings_outside_json_are_refused(tmp_path, value):
     record = fab.run_record(tmp_path, [fab.outcome("s", plan=plan)])
     with pytest.raises(CatalogError, match="settings"):
         save_run_record(record, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_saving_takes_little_memory_whatever_the_scenes(tmp_path):
+    record = fab.run_record(tmp_path, [fab.outcome(f"s{number}") for number in range(1000)])
+    tracemalloc.start()
+    try:
+        size = save_run_record(record, tmp_path).stat().st_size
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    # All of it as one text would take more than the file.
+    assert peak < 0.5 * size
 
 
 def test_saving_replaces_the_file_and_leaves_no_other(tmp_path):
