@@ -11,14 +11,19 @@ likelihood. What a profile knows is its normal matrix N_t and right side h_t.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.network._beam_fit import invert
 from lidarops.retrieve.network.thresholds import THRESHOLDS
+
+_LARGE: Final = 1e100
+"""Size of a product, at which its logarithm is taken."""
 
 # Prior -------------------------------------------------------------------------------------------
 
@@ -91,9 +96,8 @@ def likeliest_change(
     along = side @ roots @ vectors
     square = (modes @ along[:, np.newaxis]) ** 2
     amplitude = np.array(THRESHOLDS.changes)
-    each = amplitude[:, np.newaxis, np.newaxis, np.newaxis, np.newaxis] ** 2 * variance[..., None]
-    scaled = each * np.maximum(size, 0.0)[:, np.newaxis, np.newaxis]
-    costs = (np.log1p(scaled) - each * square / (1.0 + scaled)).sum(axis=(-2, -1))
+    costs = np.zeros((len(amplitude), len(roots), len(variance)))
+    _fill_costs(amplitude**2, variance, np.maximum(size, 0.0), square, costs)
     if not costs.min() < -THRESHOLDS.least_change:
         return None
     # The likelihood is that of small changes: of those about as likely, the largest is safe.
@@ -101,6 +105,22 @@ def likeliest_change(
     largest = likely[likely[:, 0] == likely[-1, 0]]
     k, length, rho = largest[np.argmin(costs[tuple(largest.T)])]
     return Change(amplitude[k] * roots[length], THRESHOLDS.correlations[rho])
+
+
+@compiled
+def _fill_costs(power: Array, variance: Array, size: Array, square: Array, costs: Array) -> None:
+    """Fill (amplitude, length, correlation) -2 ln likelihoods relative to no change."""
+    for k, length, rho in np.ndindex(costs.shape):
+        cost, product = 0.0, 1.0
+        for mode in range(variance.shape[1]):
+            each = power[k] * variance[rho, mode]
+            for c in range(size.shape[1]):
+                scaled = 1.0 + each * size[length, c]
+                cost -= each * square[length, rho, mode, c] / scaled
+                product *= scaled
+                if product > _LARGE:
+                    cost, product = cost + math.log(product), 1.0
+        costs[k, length, rho] = cost + math.log(product)
 
 
 def solve_changing(
@@ -143,7 +163,8 @@ def _solve_chain(normal: Array, side: Array, rho: float, covariance: Array) -> N
         if t > 0:
             normal[t] -= link * link * covariance[t - 1]
             side[t] += link * (covariance[t - 1] @ side[t - 1])
-        covariance[t] = np.linalg.inv(normal[t])
+        covariance[t] = normal[t]
+        invert(covariance[t])
     for t in range(profiles - 1, -1, -1):
         normal[t] = covariance[t]
         if t < profiles - 1:
