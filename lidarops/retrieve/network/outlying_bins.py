@@ -250,8 +250,8 @@ def _all_fit(
             spread += before * before * noise[g - 1 - i] + after * after * noise[g + 1 + i]
         ratio = math.exp(min(gap / exponent, _LARGEST_LOGARITHM))
         size = exponent * (ratio - 1.0)
-        # Half of what is outlying: rounding does not count.
-        limit = 0.25 * THRESHOLDS.outlier**2 * (spread + noise[g] * ratio * ratio)
+        # A little less than what is outlying: rounding does not count.
+        limit = 0.99 * THRESHOLDS.outlier**2 * (spread + noise[g] * ratio * ratio)
         if not size * size < limit:
             return False
     return True
