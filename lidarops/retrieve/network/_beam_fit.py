@@ -66,11 +66,11 @@ def linearise(beams: Beams, constants: Array, reach: Indices) -> Linear:
     """
     shape = max(len(beams.value), len(constants), len(reach)), *beams.value.shape[1:]
     most = shape[2]
-    out = Linear(
+    out = (
         np.zeros(shape), np.zeros((*shape, 2 * most)), np.zeros((*shape, most)), np.zeros(shape)
-    )
-    _linearise(beams[:3], constants, reach, tuple(out))
-    return out
+    )  # fmt: skip
+    _linearise(beams[:3], constants, reach, out)
+    return Linear(*out)
 
 
 @compiled

@@ -20,7 +20,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import special
-from scipy.ndimage import convolve1d
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
 from lidarops.retrieve.common.compiled_code import compiled
@@ -102,7 +101,11 @@ def running_sums(values: Array, half: int | None) -> Array:
     """Return (1, item) sums of all profiles, or (profile, item) ones of those up to `half` away."""
     if half is None:
         return np.asarray(values.sum(axis=0, keepdims=True))
-    return np.asarray(convolve1d(values, np.ones(2 * half + 1), axis=0, mode="constant"))
+    total = values.copy()
+    for k in range(1, half + 1):
+        total[k:] += values[:-k]
+        total[:-k] += values[k:]
+    return total
 
 
 def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:

@@ -360,7 +360,7 @@ def _take_logarithms(
     logs = np.where(known, exponent * (np.log(safe) + layout.log_factor[beam, start:end]), 0.0)
     used = slice(low - start, high - start)
     lost = ~known
-    rows = np.flatnonzero(lost[:, used].any(axis=1)) if together else []
+    rows = np.flatnonzero(together & lost[:, used].any(axis=1))
     lost[rows] &= ~_negative_by_noise(power[rows], variance[rows])
     lost = lost[:, used]
     stops = np.where(lost.any(axis=1), np.argmax(lost, axis=1) + low, high)
