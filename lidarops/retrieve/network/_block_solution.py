@@ -111,7 +111,7 @@ def running_sums(values: Array, half: int | None) -> Array:
 def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:
     """Return the powers of a beam over their energies, for (profile,) numbers of passages."""
     depth = mean_depth(reach)
-    complete = ((reach >= depth) & (depth > 0)).astype(np.float64)
+    complete = (reach >= depth) & (depth > 0)
     last = layout.first_passage[beam.number] + depth - 1
     stop = int(layout.window[last]) + layout.weights.shape[1] if depth else beam.low
     place = beam.start + np.arange(beam.power.shape[1])
@@ -119,16 +119,16 @@ def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:
     known = (beam.codes != LOST) | (before & (beam.power <= 0.0))
     kept = known & (beam.codes != KEPT)
     # What deviates in most profiles is air.
-    kept |= known & (2.0 * (complete @ kept) < complete.sum())
+    kept |= known & (2 * kept[complete].sum(axis=0) < complete.sum())
     power, variance = np.where(kept, beam.power, 0.0), np.where(kept, beam.variance, 0.0)
-    inside = (before & kept & (place >= beam.low) & (place < stop)).astype(np.float64)
+    inside = before & kept & (place >= beam.low) & (place < stop)
     part = inside * power
-    typical = complete @ part / np.maximum(complete @ inside, 1.0)
-    energy = part.sum(axis=1) / (inside @ typical) * typical.sum()
+    typical = part[complete].sum(axis=0) / np.maximum(inside[complete].sum(axis=0), 1)
+    energy = part.sum(axis=1) / (inside * typical).sum(axis=1) * typical.sum()
     energy = np.where(energy > 0.0, energy, np.inf)[:, np.newaxis]
     power, variance = power / energy, variance / energy**2
     noise = (variance * inside).sum(axis=1)
-    weight = np.where(np.isfinite(noise) & (noise > 0.0), complete / noise, 0.0)
+    weight = np.where(complete & np.isfinite(noise) & (noise > 0.0), 1.0 / noise, 0.0)
     factor = layout.log_factor[beam.number, place]
     return ScaledBeam(
         beam, factor, place, stop, energy, power, variance, kept & np.isfinite(energy),
