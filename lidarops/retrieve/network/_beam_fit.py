@@ -13,16 +13,19 @@ and P is the precision of the prior; then k changes by g' W (y - A x) / (g' W g)
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.network._condensed_signals import Beams
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _PASSES: Final = 24
 _ROUNDING: Final = 1e-9
+_TINY: Final = float(np.finfo(float).tiny)
 
 
 class Linear(NamedTuple):
@@ -39,9 +42,7 @@ class Linear(NamedTuple):
 
     def normal(self, beams: Beams) -> tuple[Array, Array]:
         """Return normal matrices sum A' M A, and right sides sum A' M y."""
-        normal = gathered(self.information @ beams.select, beams)
-        side = self.information @ self.value[..., np.newaxis]
-        return normal, gathered(side, beams)[..., 0]
+        return _normal_equations(self.information, self.value, beams)[:2]
 
     def sides(self, beams: Beams, change: Array) -> Array:
         """Return (profile, crossing, case) changes of right sides.
@@ -53,7 +54,8 @@ class Linear(NamedTuple):
 
 def gathered(values: Array, beams: Beams) -> Array:
     """Return (profile, crossing, case) sums of (profile, beam, passage, case) values."""
-    return np.tensordot(values, beams.select, ((1, 2), (0, 1))).swapaxes(1, 2)
+    select = beams.select.reshape(-1, beams.select.shape[2])
+    return np.asarray(select.T @ values.reshape(len(values), len(select), -1))
 
 
 def linearise(beams: Beams, constants: Array, reach: Indices) -> Linear:
@@ -62,26 +64,115 @@ def linearise(beams: Beams, constants: Array, reach: Indices) -> Linear:
     The (profile or 1, beam) constants are ln w at the last passages of the beams, and `reach` the
     (profile or 1, beam) numbers of passages in use, at most those of the beams.
     """
-    place = np.arange(beams.value.shape[2])
-    inside, before = (place < reach[..., np.newaxis] - k for k in (0, 1))
-    end = np.exp(constants)[..., np.newaxis]
-    weight = end + beams.integral[..., ::-1].cumsum(axis=-1)[..., ::-1]
-    value = np.where(inside, beams.value - np.log(weight), 0.0)
-    by_integral = -np.triu(np.ones(2 * place.shape)) / weight[..., np.newaxis]
-    # The integral behind the last passage in use is part of the constant.
-    by_integral = by_integral * before[..., np.newaxis, :]
-    unit = np.broadcast_to(np.eye(place.size), by_integral.shape)
-    turn = np.concatenate([unit, by_integral], axis=-1) * inside[..., np.newaxis]
-    covariance = turn @ beams.covariance @ turn.swapaxes(-1, -2)
-    # Without a passage there is no equation; a little more keeps the others regular.
-    extra = np.diagonal(covariance, axis1=-2, axis2=-1) * THRESHOLDS.smallest_pivot + ~inside
-    inverse = np.linalg.inv(covariance + extra[..., np.newaxis] * np.eye(place.size))
-    lever = np.where(inside, end / weight, 0.0)
-    gain = (inverse @ lever[..., np.newaxis])[..., 0]
-    known = np.maximum((lever * gain).sum(axis=-1, keepdims=True), np.finfo(float).tiny)
-    both = inside[..., np.newaxis] & inside[..., np.newaxis, :]
-    taken = gain[..., np.newaxis] * gain[..., np.newaxis, :] / known[..., np.newaxis]
-    return Linear(value, turn, np.where(both, inverse - taken, 0.0), gain / known)
+    shape = max(len(beams.value), len(constants), len(reach)), *beams.value.shape[1:]
+    most = shape[2]
+    out = (
+        np.zeros(shape), np.zeros((*shape, 2 * most)), np.zeros((*shape, most)), np.zeros(shape)
+    )  # fmt: skip
+    _linearise(beams[:3], constants, reach, out)
+    return Linear(*out)
+
+
+@compiled
+def _linearise(
+    signals: tuple[Array, Array, Array],
+    constants: Array,
+    reach: Indices,
+    out: tuple[Array, Array, Array, Array],
+) -> None:
+    """Fill `Linear`, 0 where a passage is not in use."""
+    (values, integrals, covariances), (value, turn, information, gain) = signals, out
+    most = values.shape[2]
+    weight, lever, half = np.empty(most), np.empty(most), np.empty((most, 2 * most))
+    for t in range(len(value)):
+        of_beam, of_constant, of_reach = (
+            min(t, len(values) - 1), min(t, len(constants) - 1), min(t, len(reach) - 1)
+        )  # fmt: skip
+        for b in range(value.shape[1]):
+            size, covariance = reach[of_reach, b], covariances[of_beam, b]
+            matrix, levered = information[t, b, :size, :size], gain[t, b]
+            total = end = math.exp(constants[of_constant, b])
+            for p in range(most - 1, -1, -1):
+                total += integrals[of_beam, b, p]
+                weight[p], lever[p] = total, end / total
+            for p in range(size):
+                value[t, b, p] = values[of_beam, b, p] - math.log(weight[p])
+                turn[t, b, p, p] = 1.0
+                # The integral behind the last passage in use is part of the constant.
+                turn[t, b, p, most + p : most + size - 1] = -1.0 / weight[p]
+            _carry(covariance, weight, size, half)
+            _carry(half.T, weight, size, matrix)
+            for p in range(size):
+                # A little more keeps it regular.
+                matrix[p, p] *= 1.0 + THRESHOLDS.smallest_pivot
+            invert(matrix)
+            known = 0.0
+            for p in range(size):
+                for q in range(size):
+                    levered[p] += matrix[p, q] * lever[q]
+                known += lever[p] * levered[p]
+            known = max(known, _TINY)
+            for p in range(size):
+                for q in range(size):
+                    matrix[p, q] -= levered[p] * levered[q] / known
+            levered /= known
+
+
+@compiled
+def _carry(covariance: Array, weight: Array, size: int, out: Array) -> None:
+    """Fill rows of y from the rows of u and I."""
+    most = len(weight)
+    for k in range(out.shape[1]):
+        behind = 0.0
+        for p in range(size - 1, -1, -1):
+            if p < size - 1:
+                behind += covariance[most + p, k]
+            out[p, k] = covariance[p, k] - behind / weight[p]
+
+
+@compiled
+def invert(matrix: Array) -> None:
+    """Invert a positive definite matrix in place."""
+    size = len(matrix)
+    for k in range(size):
+        pivot, matrix[k, k] = 1.0 / matrix[k, k], 1.0
+        for j in range(size):
+            matrix[k, j] *= pivot
+        for i in range(size):
+            if i != k:
+                factor, matrix[i, k] = matrix[i, k], 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[k, j]
+
+
+def _normal_equations(information: Array, value: Array, beams: Beams) -> tuple[Array, Array, Array]:
+    """Return sum A' M A, sum A' M y and y' M y of each profile."""
+    crossings = beams.select.shape[2]
+    profiles = len(value)
+    out = (
+        np.zeros((profiles, crossings, crossings)),
+        np.zeros((profiles, crossings)),
+        np.zeros(profiles),
+    )
+    _add_beams(information, value, beams.crossing, out)
+    return out
+
+
+@compiled
+def _add_beams(
+    information: Array, value: Array, crossing: Indices, out: tuple[Array, Array, Array]
+) -> None:
+    """Add normal matrices, right sides and squares of all beams."""
+    normal, side, square = out
+    for t in range(len(value)):
+        for b in range(value.shape[1]):
+            for p in range(value.shape[2]):
+                along, row = 0.0, crossing[b, p]
+                for q in range(value.shape[2]):
+                    normal[t, row, crossing[b, q]] += information[t, b, p, q]
+                    along += information[t, b, p, q] * value[t, b, q]
+                side[t, row] += along
+                square[t] += along * value[t, b, p]
 
 
 def start_constants(beams: Beams) -> Array:
@@ -148,14 +239,13 @@ def compare(beams: Beams, linear: Linear, x: Array, reach: Indices) -> tuple[Arr
     They are those of the beams alone, at their own best field, and about a field.
     """
     inside = np.arange(beams.value.shape[2]) < reach[..., np.newaxis]
-    residual = np.where(inside, linear.value - x[:, beams.crossing], 0.0)[..., np.newaxis]
-    weighted = linear.information @ residual
-    about = (weighted * residual).sum(axis=(1, 2, 3))
-    normal, side = gathered(linear.information @ beams.select, beams), gathered(weighted, beams)
+    residual = np.where(inside, linear.value - x[:, beams.crossing], 0.0)
+    normal, side, about = _normal_equations(linear.information, residual, beams)
     # Directions that no beam determines have no side: a little information there does not count.
     size = np.diagonal(normal, axis1=1, axis2=2).max(axis=1)[:, np.newaxis, np.newaxis]
     little = np.where(size > 0.0, _ROUNDING * size, 1.0) * np.eye(normal.shape[1])
-    taken = (side * np.linalg.solve(normal + little, side)).sum(axis=(1, 2))
+    solved = np.linalg.solve(normal + little, side[..., np.newaxis])[..., 0]
+    taken = (side * solved).sum(axis=1)
     spare = reach.sum(axis=1) - (reach > 0).sum(axis=1)
     freedom = np.stack([spare - seen(beams, reach).sum(axis=1), spare], axis=1)
     return np.stack([about - taken, about], axis=1), freedom.astype(np.float64)

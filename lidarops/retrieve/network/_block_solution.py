@@ -13,15 +13,16 @@ linear in small changes of the signals, and states how it follows them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import special
-from scipy.ndimage import convolve1d
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.network import _beam_fit, _changing_field
 from lidarops.retrieve.network._beam_fit import Linear, Solution
 from lidarops.retrieve.network._beam_signals import Block, Causes, Estimates, Response
@@ -100,7 +101,11 @@ def running_sums(values: Array, half: int | None) -> Array:
     """Return (1, item) sums of all profiles, or (profile, item) ones of those up to `half` away."""
     if half is None:
         return np.asarray(values.sum(axis=0, keepdims=True))
-    return np.asarray(convolve1d(values, np.ones(2 * half + 1), axis=0, mode="constant"))
+    total = values.copy()
+    for k in range(1, half + 1):
+        total[k:] += values[:-k]
+        total[:-k] += values[k:]
+    return total
 
 
 def _scale(beam: CleanBeam, layout: FitLayout, reach: Indices) -> ScaledBeam:
@@ -340,16 +345,15 @@ def _disagreeing(signals: _Signals) -> Booleans:
     inside = np.arange(signals.linear.value.shape[2]) < signals.reach[..., np.newaxis]
     every = np.where(inside, signals.linear.value, np.nan)
     freedom = np.maximum(signals.reach - 1, 1)
-    limit = special.chdtri(freedom, THRESHOLDS.least_neighbourly)
+    each = np.arange(1, every.shape[2] + 1)
+    limit = special.chdtri(each, THRESHOLDS.least_neighbourly)[freedom - 1]
     while np.sum(~odd) > 1:
-        value, information = every[~odd], signals.linear.information[~odd]
-        (before, onward), (after, back) = _neighbours(value), _neighbours(value[::-1])
-        segments = (before, after[::-1]), (before, onward), (after[::-1], back[::-1])
-        squares = [_apart(information, value, *ends) for ends in segments]
-        above = np.nan_to_num(np.fmin.reduce(squares) / limit[~odd])
-        last = np.concatenate([value[:1], value[:-1]])
+        value = every[~odd]
+        square, step = np.empty((2, *value.shape[:2]))
+        _compare_neighbours(signals.linear.information[~odd], value, square, step)
+        above = square / limit[~odd]
         # Of noise alone it is 1.
-        step = _apart(information, value, last, last) / freedom[~odd] - 1.0
+        step = step / freedom[~odd] - 1.0
         worst = int(np.argmax(above.max(axis=1)))
         others = np.isfinite(step)
         # The steps to and from it are not typical.
@@ -361,26 +365,71 @@ def _disagreeing(signals: _Signals) -> Booleans:
     return odd & lit
 
 
-def _neighbours(value: Array) -> tuple[Array, Array]:
-    """Return medians of the profiles before each one, and these continued; NaN without any."""
-    number, profiles = THRESHOLDS.neighbours, len(value)
-    padded = np.concatenate([np.full((2 * number, *value.shape[1:]), np.nan), value])
-    earlier = np.stack([padded[k : k + number + profiles] for k in range(number)])
-    flat = earlier.reshape(number, -1)
-    medians = median(flat, np.isfinite(flat)).reshape(-1, *value.shape[1:])
-    far, near = medians[:profiles], medians[number:]
-    return near, np.where(np.isfinite(far), 2.0 * near - far, near)
+@compiled
+def _compare_neighbours(information: Array, value: Array, square: Array, step: Array) -> None:
+    """Fill (profile, beam) chi-squares about neighbours, 0 without any, and about the last profile.
+
+    The former are those of the nearest point between two fields: the medians before and after, or
+    either of these and where it leads.
+    """
+    profiles, beams, most = value.shape
+    number = THRESHOLDS.neighbours
+    ends, work, known = np.empty((4, most)), np.empty((2, most)), np.empty(number)
+    for t in range(profiles):
+        for b in range(beams):
+            own, matrix = value[t, b], information[t, b]
+            for p in range(most):
+                for side in range(2):
+                    way = 2 * side - 1
+                    near = _median_beside(value[:, b, p], t + way, way, known)
+                    far = _median_beside(value[:, b, p], t + way * (1 + number), way, known)
+                    ends[side, p] = near
+                    ends[2 + side, p] = 2.0 * near - far if math.isfinite(far) else near
+            least = np.inf
+            for start, stop in ((0, 1), (0, 2), (1, 3)):
+                apart = _apart(matrix, own, ends[start], ends[stop], work)
+                least = apart if apart < least else least
+            square[t, b] = least if least < np.inf else 0.0
+            last = value[max(t - 1, 0), b]
+            step[t, b] = _apart(matrix, own, last, last, work)
 
 
-def _apart(information: Array, value: Array, start: Array, stop: Array) -> Array:
-    """Return (profile, beam) chi-squares about the nearest point between two fields."""
-    rest, step = np.nan_to_num(value - start), np.nan_to_num(stop - start)
-    weighted = (information @ step[..., np.newaxis])[..., 0]
-    length, along = ((each * weighted).sum(axis=2) for each in (step, rest))
-    share = np.clip(along / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
-    rest = (rest - share[..., np.newaxis] * step)[..., np.newaxis]
-    known = np.isfinite(start[..., 0]) & np.isfinite(stop[..., 0])
-    return np.where(known, (rest * (information @ rest)).sum(axis=(2, 3)), np.nan)
+@compiled
+def _median_beside(value: Array, first: int, way: int, known: Array) -> float:
+    """Return the median of the known values of some profiles; NaN without any."""
+    count = 0
+    for t in range(first, first + way * len(known), way):
+        if 0 <= t < len(value) and math.isfinite(value[t]):
+            place = count
+            while place > 0 and known[place - 1] > value[t]:
+                known[place] = known[place - 1]
+                place -= 1
+            known[place] = value[t]
+            count += 1
+    return 0.5 * (known[(count - 1) // 2] + known[count // 2]) if count > 0 else np.nan
+
+
+@compiled
+def _apart(information: Array, value: Array, start: Array, stop: Array, work: Array) -> float:
+    """Return the chi-square about the nearest point between two fields; NaN without them."""
+    if not (math.isfinite(start[0]) and math.isfinite(stop[0])):
+        return np.nan
+    for p in range(len(value)):
+        for k, change in enumerate((value[p] - start[p], stop[p] - start[p])):
+            work[k, p] = change if math.isfinite(change) else 0.0
+    rest, step = work
+    length = along = 0.0
+    for p in range(len(value)):
+        for q in range(len(value)):
+            length += step[p] * information[p, q] * step[q]
+            along += rest[p] * information[p, q] * step[q]
+    if length > 0.0:
+        rest -= min(max(along / length, 0.0), 1.0) * step
+    square = 0.0
+    for p in range(len(value)):
+        for q in range(len(value)):
+            square += rest[p] * information[p, q] * rest[q]
+    return square
 
 
 class _Field(NamedTuple):

@@ -11,14 +11,19 @@ likelihood. What a profile knows is its normal matrix N_t and right side h_t.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.network._beam_fit import invert
 from lidarops.retrieve.network.thresholds import THRESHOLDS
+
+_LARGE: Final = 1e100
+"""Size of a product, at which its logarithm is taken."""
 
 # Prior -------------------------------------------------------------------------------------------
 
@@ -91,9 +96,8 @@ def likeliest_change(
     along = side @ roots @ vectors
     square = (modes @ along[:, np.newaxis]) ** 2
     amplitude = np.array(THRESHOLDS.changes)
-    each = amplitude[:, np.newaxis, np.newaxis, np.newaxis, np.newaxis] ** 2 * variance[..., None]
-    scaled = each * np.maximum(size, 0.0)[:, np.newaxis, np.newaxis]
-    costs = (np.log1p(scaled) - each * square / (1.0 + scaled)).sum(axis=(-2, -1))
+    costs = np.zeros((len(amplitude), len(roots), len(variance)))
+    _fill_costs(amplitude**2, variance, np.maximum(size, 0.0), square, costs)
     if not costs.min() < -THRESHOLDS.least_change:
         return None
     # The likelihood is that of small changes: of those about as likely, the largest is safe.
@@ -101,6 +105,22 @@ def likeliest_change(
     largest = likely[likely[:, 0] == likely[-1, 0]]
     k, length, rho = largest[np.argmin(costs[tuple(largest.T)])]
     return Change(amplitude[k] * roots[length], THRESHOLDS.correlations[rho])
+
+
+@compiled
+def _fill_costs(power: Array, variance: Array, size: Array, square: Array, costs: Array) -> None:
+    """Fill (amplitude, length, correlation) -2 ln likelihoods relative to no change."""
+    for k, length, rho in np.ndindex(costs.shape):
+        cost, product = 0.0, 1.0
+        for mode in range(variance.shape[1]):
+            each = power[k] * variance[rho, mode]
+            for c in range(size.shape[1]):
+                scaled = 1.0 + each * size[length, c]
+                cost -= each * square[length, rho, mode, c] / scaled
+                product *= scaled
+                if product > _LARGE:
+                    cost, product = cost + math.log(product), 1.0
+        costs[k, length, rho] = cost + math.log(product)
 
 
 def solve_changing(
@@ -115,10 +135,8 @@ def solve_changing(
     unit, spread = np.eye(len(prior)), np.zeros(normal.shape)
     solved = np.zeros((*side.shape[:2], side.shape[2] + len(prior)))
     if change is not None:
-        root = change.root
-        solved = root.T @ np.concatenate([side, normal], axis=2)
-        _solve_chain(root.T @ normal @ root, solved, change.correlation, spread)
-        solved, spread = root @ solved, root @ spread @ root.T
+        solved = np.concatenate([side, normal], axis=2)
+        _solve_chain(normal, solved, change.root, change.correlation, spread)
     by_side, left = solved[..., : side.shape[2]], unit - solved[..., side.shape[2] :]
     known = (normal @ left).sum(axis=0)
     known = (known + known.T) / 2.0 + prior + THRESHOLDS.weak_precision * unit
@@ -128,25 +146,49 @@ def solve_changing(
 
 
 @compiled
-def _solve_chain(normal: Array, side: Array, rho: float, covariance: Array) -> None:
-    """Overwrite right sides by deviations of unit variance in a chain of profiles.
+def _solve_chain(normal: Array, side: Array, root: Array, rho: float, covariance: Array) -> None:
+    """Overwrite right sides by deviations in a chain of profiles, and fill their covariances.
 
-    The precision of the chain is tridiagonal in time: it is eliminated forwards, and solved
-    backwards. `normal` is overwritten; `covariance` is filled.
+    Those of unit variance have a precision that is tridiagonal in time: it is eliminated forwards,
+    and solved backwards.
     """
     profiles, size = normal.shape[:2]
-    link = rho / (1.0 - rho * rho)
+    link, down = rho / (1.0 - rho * rho), np.ascontiguousarray(root.T)
+    work, wide = np.empty((2, size, size)), np.empty(side.shape[1:])
     for t in range(profiles):
+        _multiply(down, normal[t], work[0])
+        _multiply(work[0], root, covariance[t])
+        _multiply(down, side[t], wide)
+        side[t] = wide
         ends = (t == 0) + (t == profiles - 1)
         for c in range(size):
-            normal[t, c, c] += (1.0 + (1 - ends) * rho * rho) / (1.0 - rho * rho)
+            covariance[t, c, c] += (1.0 + (1 - ends) * rho * rho) / (1.0 - rho * rho)
         if t > 0:
-            normal[t] -= link * link * covariance[t - 1]
-            side[t] += link * (covariance[t - 1] @ side[t - 1])
-        covariance[t] = np.linalg.inv(normal[t])
+            covariance[t] -= link * link * covariance[t - 1]
+            _multiply(covariance[t - 1], side[t - 1], wide)
+            side[t] += link * wide
+        invert(covariance[t])
     for t in range(profiles - 1, -1, -1):
-        normal[t] = covariance[t]
         if t < profiles - 1:
             side[t] += link * side[t + 1]
-            covariance[t] += link * link * (normal[t] @ covariance[t + 1] @ normal[t])
-        side[t] = normal[t] @ side[t]
+        _multiply(covariance[t], side[t], wide)
+        side[t] = wide
+        if t < profiles - 1:
+            _multiply(covariance[t], covariance[t + 1], work[0])
+            _multiply(work[0], covariance[t], work[1])
+            covariance[t] += link * link * work[1]
+    for t in range(profiles):
+        _multiply(root, side[t], wide)
+        side[t] = wide
+        _multiply(root, covariance[t], work[0])
+        _multiply(work[0], down, covariance[t])
+
+
+@compiled
+def _multiply(first: Array, second: Array, out: Array) -> None:
+    """Fill a product of small matrices, for which a call of BLAS takes longer."""
+    for i in range(out.shape[0]):
+        out[i] = 0.0
+        for k in range(first.shape[1]):
+            for j in range(out.shape[1]):
+                out[i, j] += first[i, k] * second[k, j]

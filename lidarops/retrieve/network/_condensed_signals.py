@@ -359,7 +359,10 @@ def _take_logarithms(
     known = positive & (noise < np.inf)
     logs = np.where(known, exponent * (np.log(safe) + layout.log_factor[beam, start:end]), 0.0)
     used = slice(low - start, high - start)
-    lost = ~(known | _negative_by_noise(power, variance) if together else known)[:, used]
+    lost = ~known
+    rows = np.flatnonzero(together & lost[:, used].any(axis=1))
+    lost[rows] &= ~_negative_by_noise(power[rows], variance[rows])
+    lost = lost[:, used]
     stops = np.where(lost.any(axis=1), np.argmax(lost, axis=1) + low, high)
     at_stop = power[np.arange(len(power)), np.minimum(stops, end - 1) - start]
     reason = np.where((at_stop <= 0.0) & (at_stop > -HUGE), NOT_POSITIVE, MISSING)

@@ -232,6 +232,32 @@ def _keep_in_place(logs: Array, codes: Codes, doubt: Array) -> None:
 
 
 @compiled
+def _all_fit(
+    row: tuple[Array, Array, float, Array, Array], used: tuple[int, int], codes: Codes
+) -> bool:
+    """Return whether all bins are good, and the used ones fit their neighbours without doubt."""
+    logs, noise, exponent, _, plan = row
+    if used[0] < _SIDE or used[1] + _SIDE > codes.size:
+        return False
+    for g in range(used[0] - _SIDE, used[1] + _SIDE):
+        if codes[g] != GOOD:
+            return False
+    for g in range(used[0], used[1]):
+        gap, spread = logs[g], 0.0
+        for i in range(_SIDE):
+            before, after = plan[g, i], plan[g, _SIDE + i]
+            gap -= before * logs[g - 1 - i] + after * logs[g + 1 + i]
+            spread += before * before * noise[g - 1 - i] + after * after * noise[g + 1 + i]
+        ratio = math.exp(min(gap / exponent, _LARGEST_LOGARITHM))
+        size = exponent * (ratio - 1.0)
+        # A little less than what is outlying: rounding does not count.
+        limit = 0.99 * THRESHOLDS.outlier**2 * (spread + noise[g] * ratio * ratio)
+        if not size * size < limit:
+            return False
+    return True
+
+
+@compiled
 def _search_row(
     row: tuple[Array, Array, float, Array, Array],
     used: tuple[int, int],
@@ -252,7 +278,6 @@ def _search_row(
             deviations[g] = 0.0
             if codes[g] == GOOD:
                 deviations[g] = _deviation(row, codes, g, _SIDE, work)
-        # On most beams, no used bin is outlying.
         if number == 0 and not np.any(deviations[used[0] : used[1]] > THRESHOLDS.outlier):
             return True
         if number == 0 and np.sum(deviations > THRESHOLDS.outlier) > most:
@@ -305,7 +330,11 @@ def search(
         if stops[n] > low:
             codes[n, stops[n] + THRESHOLDS.margin :] = LOST
             row = logs[n], noise[n], exponent, grid, plan
-            if not _search_row(row, (low, stops[n]), codes[n], doubt[n], work):
+            used = low, stops[n]
+            # On most beams, no used bin is outlying.
+            if not (
+                _all_fit(row, used, codes[n]) or _search_row(row, used, codes[n], doubt[n], work)
+            ):
                 stops[n] = low
 
 
