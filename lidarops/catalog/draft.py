@@ -30,7 +30,7 @@ from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.raw.formats import time_in_path
-from lidarops.raw.header import POINTING_NOTE, HeaderOrder, label_of
+from lidarops.raw.header import LEFT_OUT, POINTING_NOTE, HeaderOrder, label_of
 from lidarops.records import ChannelLayout, DetectionMode, file_channels, is_glued
 
 _NEAR: Final = 0.2
@@ -228,6 +228,8 @@ def _instrument(
     doubtful = [header for header in headers.main.headers if header.time_doubt]
     if doubtful:
         yield f"    name_times: ignored  # ? {doubtful[0].time_doubt}"
+    notes = {note for header in headers.main.headers for note in header.notes}
+    yield from (f"    # {note}" for note in sorted(notes) if note.endswith(LEFT_OUT))
     yield from _facts(headers, estimates=estimates)
     yield "    products:"
     for kind in kinds_of(Scope.CHANNEL):

@@ -31,7 +31,14 @@ from lidarops.raw.header import (
     named_layout,
     recorder_names,
 )
-from lidarops.records import FEWEST_ALIKE, UNKNOWN_FORMAT, ChannelLayout, DetectionMode
+from lidarops.records import (
+    FEWEST_ALIKE,
+    UNKNOWN_FORMAT,
+    ChannelLayout,
+    DetectionMode,
+    file_channels,
+    is_glued,
+)
 from lidarops.retrieve.raman.scattering import NITROGEN_SHIFT, WATER_SHIFT, is_raman_line
 from lidarops.system.stores import Stored
 
@@ -242,6 +249,11 @@ class InstrumentHeaders:
         if self.look is None:
             return first
         share = self.look.shares.get
+        if is_glued(first):
+            analog, photon = file_channels(first)
+            # Glued with a counter that gives nothing, it is the analog record alone.
+            if photon in self.look.reasons and share(analog, 0.0) >= share(first, 0.0):
+                first = analog
         best = max((first, *others), key=lambda name: share(name, 0.0))
         if share(best, 0.0) <= _CLEARLY * share(first, 0.0):
             best = first

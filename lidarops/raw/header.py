@@ -38,6 +38,8 @@ Names = Mapping[Recorder, str]
 _Channel = TypeVar("_Channel")
 HeaderOrder = Literal["longitude_first", "latitude_first"]
 HeaderPointing = Literal["stated", "elevation", "zenith_angle"]
+LEFT_OUT: Final = "is left out"
+"""Words at the end of notes on datasets that give no channel."""
 POINTING_NOTE: Final = "taken as"
 """Words of the notes on headers that tell how their pointing is read."""
 

@@ -28,6 +28,7 @@ from typing import Any, Final, NamedTuple
 from lidarops.constants import LICEL_RANGE_PER_MICROSECOND
 from lidarops.errors import RawFormatError
 from lidarops.raw.header import (
+    LEFT_OUT,
     TIME_REMEDY,
     IncompleteHeaderError,
     RawChannel,
@@ -634,9 +635,15 @@ def _parse_datasets(
         f"{d.name} is no signal by its type, and one by its device {d.device}"
         for d in datasets
         if d.active and d.mode is None and d.device.startswith(_SIGNAL_DEVICES)
+        if not _lacks_bits(d)
     ]
     notes += [
-        f"dataset {d.device} cannot be a signal and is left out"
+        f"{d.name} ({d.device}) states 0 bits and {LEFT_OUT}"
+        for d in datasets
+        if d.active and _lacks_bits(d)
+    ]
+    notes += [
+        f"dataset {d.device} cannot be a signal and {LEFT_OUT}"
         for d in datasets
         if d.active and d.kind is DatasetKind.OTHER
     ]
@@ -667,6 +674,10 @@ def _parse_datasets(
         field="size",
         remedy="copy the file again from the instrument, or leave it out",
     )
+
+
+def _lacks_bits(dataset: Dataset) -> bool:
+    return dataset.kind in _ANALOG and dataset.adc_bits == 0
 
 
 def _parse_lines(block: bytes) -> list[Dataset]:

@@ -356,8 +356,8 @@ def _estimate_dead_time(signal: ChannelSignal, analog: ChannelSignal, lag: str |
         signal.notes.append(
             f"dead_time: estimate of {signal.channel}: the data give none against"
             f" {analog.channel}, so that pile-up is not corrected, and flagged for an"
-            f" assumed {_ASSUMED_DEAD_TIME}; give dead_time in s, as the data sheet of the counter"
-            " states it"
+            f" assumed {_ASSUMED_DEAD_TIME}; give dead_time, such as 4 ns, as the data sheet of"
+            " the counter states it"
         )
     else:
         signal.dead_time = estimate.dead_time

@@ -436,6 +436,17 @@ def test_files_in_an_archive_without_compression_are_packed_ones(tmp_path: Path)
     assert "# 1 file, ? packed and not read: unpack them, and run init again:" in text
 
 
+def test_a_dataset_without_bits_is_named_in_draft_and_catalog(tmp_path: Path) -> None:
+    whole = content()
+    assert whole.count(b" 12 000600 ") == 1
+    write(tmp_path / "raw/h00", whole.replace(b" 12 000600 ", b" 00 000600 "))
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    words = "analog_532o (BT0) states 0 bits and is left out"
+    assert text.count(f"    # {words}\n") == 1
+    (granule,) = granules(campaign)
+    assert words in granule.notes
+
+
 def test_the_session_folders_of_a_night_are_told_apart(data_root: Path, tmp_path: Path) -> None:
     case = data_root / "cases/session_folders"
     campaign, text = drafted(case, tmp_path / "campaign.yaml")

@@ -173,7 +173,7 @@ def test_a_product_states_the_estimated_dead_time_of_its_nitrogen_channel(reposi
     assert "no estimate" in stated["raman"]
     (note,) = record.scenes[0].notes
     assert "dead_time: estimate of photon_387o" in note
-    assert "give dead_time in s" in note
+    assert "give dead_time, such as 4 ns" in note
 
 
 def test_each_value_below_its_error_has_a_bit(night):

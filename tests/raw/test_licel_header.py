@@ -331,6 +331,7 @@ INACTIVE = ANALOG.replace(" 1 0", " 0 0", 1)
     [
         ANALOG.replace(" 12 0", " 00 0"),
         ANALOG.replace(" 12 0", " 00 0").replace("0.500", "0.000"),
+        ANALOG.replace(" 1 0", " 1 2", 1).replace(" 12 0", " 00 0"),
         ANALOG.replace(" 1 0", " 1 6", 1).replace("BT0", "PD0"),
         ANALOG.replace("00532.p", "green").replace("BT0", "PD1"),
         ANALOG.replace("7.50", "none").replace("BT0", "PM0"),
@@ -345,7 +346,10 @@ def test_a_dataset_that_cannot_be_a_signal_costs_itself_alone(tmp_path, line):
     with open_archive(path) as archive:
         np.testing.assert_array_equal(archive["photon_532p"].values[0] > 0, [True] * 4)
     device = line.split()[-1]
-    assert any("no signal by its type" in note for note in header.notes) == (device == "BT0")
+    (note,) = header.notes
+    assert device in note
+    assert ("states 0 bits" in note) == (device == "BT0")
+    assert note.endswith(" is left out")
 
 
 def test_the_letter_of_older_files_is_parallel_but_beside_letters_of_newer_ones():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -39,6 +39,7 @@ _LINE: Final = {"glue_slope": "MHz mV-1", "glue_slope_standard_error": "MHz mV-1
 _LAG: Final = {"glue_lag": "1", "glue_lag_standard_error": "1"}
 _WINDOW: Final = {"glue_bottom": "m", "glue_top": "m"}
 _MISSING: Final = np.int32(Quality.INPUT_MISSING)
+_NEAR: Final = np.int32(Quality.INCOMPLETE_OVERLAP)
 _WITHHELD: Final = Quality.INPUT_MISSING | Quality.NO_SIGNAL | Quality.NO_GLUING
 
 
@@ -126,7 +127,7 @@ def glue(
         records[1],
         analog[CORRELATION_LENGTH].to_numpy(),
         lag=lag.bins,
-        distance=photon["range"].to_numpy().astype(np.float64),
+        distances=[c["range"].to_numpy().astype(np.float64) for c in (analog, photon)],
         dead_time_error=(dead_time_error or 0.0) * 1e6,
         slope=slope,
     )
@@ -200,12 +201,16 @@ def _glue(
     correlation_length: Block,
     *,
     lag: float,
-    distance: Array,
+    distances: Sequence[Array],
     dead_time_error: float,
     slope: Slope | None,
 ) -> tuple[Block, ...]:
     analog, analog_variance, analog_quality = of_analog
     photon, photon_variance, photon_quality = of_photon
+    qualities, distance = (analog_quality, photon_quality), distances[-1]
+    # Full overlap is a matter of range, which a lag that the ranges do not state changes.
+    full = np.maximum(*map(_last_near, qualities, distances))[..., np.newaxis]
+    analog_quality, photon_quality = (quality & ~_NEAR for quality in qualities)
     # Bins at negative ranges hold no light and are not glued.
     ahead = slice(int(np.searchsorted(distance, 0.0, side="right")), None)
     r = distance[ahead]
@@ -258,7 +263,7 @@ def _glue(
     quality |= np.where(distance >= bottom, photon_quality, 0)
     quality |= np.where(alone, int(Quality.SINGLE_RECORD), 0)[..., np.newaxis]
     quality |= np.where(alone | line, 0, int(Quality.NO_GLUING))[..., np.newaxis]
-    quality |= np.where(distance <= 0.0, _MISSING, 0)
+    quality |= np.where(distance <= 0.0, _MISSING, 0) | np.where(distance <= full, _NEAR, 0)
     # One record alone may be off, or weaker than its noise.
     unlit = analog_quality & photon_quality & np.int32(Quality.NO_SIGNAL)
     quality[unlit.any(axis=-1)] = np.int32(Quality.NO_SIGNAL)
@@ -267,6 +272,12 @@ def _glue(
     own = zip((glued.slope, glued.slope_standard_error), slope or UNKNOWN_SLOPE, strict=True)
     slopes = (np.select(records[:2], values, np.nan) for values in own)
     return power, variance, quality.astype(np.int32), change, *slopes, *window
+
+
+def _last_near(quality: Block, distance: Array) -> Block:
+    """Return the range of the last bin before full overlap, m, (...); minus infinity for none."""
+    farthest: Block = np.where((quality & _NEAR) != 0, distance, -np.inf).max(axis=-1)
+    return farthest
 
 
 def _unsaturated(power: Block, quality: Block) -> Block:

@@ -25,6 +25,7 @@ SHOTS = 600
 DEAD_TIME = 4e-3
 """Microseconds."""
 FULL_SCALE = 100.0
+INCOMPLETE = np.int32(Quality.INCOMPLETE_OVERLAP)
 
 
 def truth(constant=4e8, sky=0.2):
@@ -355,7 +356,7 @@ def test_every_missing_value_has_a_bit_of_its_source_channel():
     photon["power"][1] = np.nan
     photon["quality"][1] = int(Quality.INPUT_MISSING)
     photon["quality"][2, -30:] |= int(Quality.PILE_UP)
-    analog["quality"][2, -30:] |= int(Quality.INCOMPLETE_OVERLAP)
+    analog["quality"][2, -30:] |= int(Quality.OUTLIER)
     analog["quality"][2, :30] |= int(Quality.INCOMPLETE_OVERLAP)
     analog["power"][3, 40] = np.nan
     analog["quality"][3, 40] = int(Quality.INPUT_MISSING)
@@ -393,6 +394,28 @@ def test_bits_move_with_the_lag_and_ends_without_source_are_missing():
     ahead = labeled_gluing.glue(analog, photon, ChannelLag(-3.0))
     hit = (ahead["quality"].to_numpy()[0] & int(Quality.INPUT_MISSING)) != 0
     assert np.flatnonzero(hit).tolist() == [0, 1, 2, 108]
+
+
+@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("lag", [-3.0, 0.0, 4.5, 8.0])
+@pytest.mark.parametrize("unlit", [None, "analog", "photon"])
+def test_incomplete_overlap_ends_at_its_range_whatever_the_lag(lag, stated, unlit):
+    """The ranges of the analog bins may state the lag, or not."""
+    full = distance[110]
+    records = dict(zip(("analog", "photon"), recorded(truth(), lag=lag), strict=True))
+    if stated:
+        records["analog"] = records["analog"].assign_coords(range=distance - lag * BIN)
+    for name, record in records.items():
+        near = record["range"].to_numpy() < full
+        record["quality"][:] = record["quality"] | np.where(near, INCOMPLETE, 0)
+        if name == unlit:
+            record["quality"][:] = int(Quality.NO_SIGNAL)
+    result = labeled_gluing.glue(*records.values(), ChannelLag(lag), slope=(RATIO, 0.1))
+    near = (result["quality"].to_numpy() & INCOMPLETE) != 0
+    # Half a bin is known of the counter alone.
+    assert near[:, :109].all()
+    assert near[:, 109].all() or (lag, stated, unlit) == (4.5, True, "photon")
+    assert not near[:, 110:].any()
 
 
 def test_bins_at_negative_ranges_are_missing():
