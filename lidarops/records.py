@@ -453,7 +453,7 @@ class Change:
     """Inputs, settings, steps and software that differ."""
     measure: Measure = Measure.ERROR
     lost: int = 0
-    """Number of values that are missing or rejected in only one of both."""
+    """Number of values that are missing or rejected in only one of the two."""
     flags: int = 0
     """Number of flags and states that differ."""
     moved: str = ""
