@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, date, datetime
@@ -384,6 +385,11 @@ class Plan:
 def canonical(value: Any) -> str:
     """Return JSON with sorted keys, without spaces."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def without_numbers(text: str) -> str:
+    """Return a text with a sign for each number: those that differ by values only are equal."""
+    return re.sub(r"-?\d+(\.\d+)?(e[-+]?\d+)?", "#", text)
 
 
 def digest(value: Any) -> str:

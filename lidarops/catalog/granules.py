@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,13 +24,12 @@ from lidarops.records import (
     Holding,
     Role,
     Status,
+    without_numbers,
 )
 
 _C = GRANULE.c
 Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
-
-_NUMBER: Final = re.compile(r"-?\d+(\.\d+)?(e[-+]?\d+)?")
 _FEWEST_IN_ORDER: Final = 5
 """Files whose starts follow the order of names not by chance."""
 _MOST_VALUES: Final = 3
@@ -340,7 +338,7 @@ def joined_notes(notes: Iterable[FileNote]) -> tuple[FileNote, ...]:
     """
     wordings: dict[tuple[str, bool, str], Counter[str]] = defaultdict(Counter)
     for note in notes:
-        wording = note.instrument, note.contradicts, _NUMBER.sub("#", note.text)
+        wording = note.instrument, note.contradicts, without_numbers(note.text)
         wordings[wording][note.text] += note.files
     joined = []
     for (instrument, contradicts, _), texts in wordings.items():
