@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, date, datetime
@@ -386,6 +387,11 @@ def canonical(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
+def without_numbers(text: str) -> str:
+    """Return a text with a sign for each number: those that differ by values only are equal."""
+    return re.sub(r"-?\d+(\.\d+)?(e[-+]?\d+)?", "#", text)
+
+
 def digest(value: Any) -> str:
     """Return the sha256 of plain JSON types."""
     return hashlib.sha256(canonical(value).encode()).hexdigest()
@@ -453,7 +459,7 @@ class Change:
     """Inputs, settings, steps and software that differ."""
     measure: Measure = Measure.ERROR
     lost: int = 0
-    """Number of values that are missing or rejected in only one of both."""
+    """Number of values that are missing or rejected in only one of the two."""
     flags: int = 0
     """Number of flags and states that differ."""
     moved: str = ""

@@ -291,9 +291,10 @@ def _clock(group: FileGroup, look: FirstLook | None) -> Iterator[str]:
         if (named := time_in_path(path, header.format))
     ]
     if hours := round(median(away) / 1800.0) / 2.0 if away else 0.0:
-        yield f"headers are {hours:+g} h from names: one of both is local time"
+        yield f"headers are {hours:+g} h from names: one of the two is local time"
     if look is not None and look.clock is not None:
-        yield "the light of the sky fits {:+g} to {:+g} h".format(*look.clock)
+        clocks = " to ".join(dict.fromkeys(f"{end:+g}" for end in look.clock))
+        yield f"the light of the sky fits {clocks} h"
     spans = sorted((header.start, header.stop) for _, header in members)
     twice = sum(start < stop - _SECOND for (_, stop), (start, _) in pairwise(spans))
     if twice:

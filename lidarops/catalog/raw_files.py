@@ -327,7 +327,15 @@ def _left_out(header: RawHeader, facts: InstrumentFacts, instrument: Instrument,
     if role is Role.SIGNAL and facts.invalid:
         return f"{INVALID}: {facts.invalid}"
     if role is Role.SIGNAL and not any(facts is stated for stated in instrument.facts):
-        return "is of a time that no period of the facts holds (give one, or one that is `invalid`)"
+        utc = header.start - timedelta(seconds=facts.clock_offset)
+        ends = [fact.valid_to for fact in instrument.facts if fact.valid_to <= utc]
+        begins = [fact.valid_from for fact in instrument.facts if fact.valid_from > utc]
+        beside = [f"one ends {max(ends):%Y-%m-%d %H:%M}"] if ends else []
+        beside += [f"one begins {min(begins):%Y-%m-%d %H:%M}"] if begins else []
+        return (
+            f"starts {utc:%Y-%m-%d %H:%M}, a time that no period of the facts holds:"
+            f" {', '.join(beside)} (give one, or one that is `invalid`)"
+        )
     return ""
 
 

@@ -6,6 +6,7 @@ import json
 from collections import Counter, defaultdict
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,6 +34,7 @@ from lidarops.cli.app import (
     terminal_width,
 )
 from lidarops.errors import UNAVAILABLE, LidarOpsError
+from lidarops.records import without_numbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -327,7 +329,13 @@ def _cluster(
 
 def _refused_table(refused: Iterable[Granule]) -> Table:
     rows = ((granule.path, granule.instrument, granule.reason) for granule in refused)
-    return "Refused", ("file", "instrument", "reason"), rows
+    return "Refused", ("file", "instrument", "reason"), _varied(rows)
+
+
+def _varied(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return rows that end with a reason, one of each kind first: tables may show few."""
+    of_kind: dict[str, Iterator[int]] = defaultdict(count)
+    return sorted(rows, key=lambda row: next(of_kind[without_numbers(row[-1])]))
 
 
 def _run_summary(result: Result, page: Path | None) -> dict[str, Any]:
@@ -437,7 +445,8 @@ def _tables(result: Result, *, removing: bool) -> Iterator[Table]:
     yield _refused_table(refused)
     listed = {granule.path for granule in refused}
     set_aside = ((path, why) for path, why in result.set_aside.items() if path not in listed)
-    yield "Not used", ("file or scene", "reason"), (*set_aside, *result.empty_scenes.items())
+    unused = (*set_aside, *result.empty_scenes.items())
+    yield "Not used", ("file or scene", "reason"), _varied(unused)
     yield from finding_tables(result.findings)
     for title, where, found in (
         ("Channels that disagree", "channels", disagreement_rows(scenes)),

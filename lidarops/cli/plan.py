@@ -32,7 +32,7 @@ from lidarops.cli.app import (
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
-from lidarops.records import ACKNOWLEDGED
+from lidarops.records import ACKNOWLEDGED, without_numbers
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
@@ -400,9 +400,12 @@ def _show_refused(reasons: Sequence[str]) -> int:
     said = say_wrapped(
         f"{counted(len(reasons), 'file')} refused (lidarops catalog --all names them):", ""
     )
-    frequent = Counter(reasons).most_common(_REASONS)
-    for reason, count in frequent:
-        said += say_wrapped(f"{counted(count, 'file')}: {reason}", "  ")
+    kinds_of_reason = Counter(map(without_numbers, reasons))
+    examples = {without_numbers(reason): reason for reason in reversed(reasons)}
+    frequent = kinds_of_reason.most_common(_REASONS)
+    for kind, count in frequent:
+        others = ", and the like" if reasons.count(examples[kind]) < count else ""
+        said += say_wrapped(f"{counted(count, 'file')}: {examples[kind]}{others}", "  ")
     rest = len(reasons) - sum(count for _, count in frequent)
     return said + (say_wrapped(f"{counted(rest, 'file')}: other reasons", "  ") if rest else 0)
 

@@ -62,7 +62,7 @@ class _Difference:
     count: int
     """Number of values that differ."""
     lost: int = 0
-    """Number of those that are missing or rejected in only one of both."""
+    """Number of those that are missing or rejected in only one of the two."""
     flags: int = 0
     moved: str = ""
     """How its values are of another place, time, wavelength, unit or state."""

@@ -191,7 +191,7 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Statements:
     """Yield which files start away from the time in their name as no other file does.
 
     Names tell start or stop, in any time zone: the other files show how far they are from it. A
-    clock that is set moves both, and summer time may move one of both by an hour.
+    clock that is set moves both, and summer time may move one of the two by an hour.
     """
     away: dict[int, float] = {}
     longest = 0.0

@@ -389,6 +389,5 @@ def clock_of_sky(
         back = timedelta(hours=half / 2.0)
         day = [solar_elevation(moment - back, latitude, longitude) > _DUSK for moment in utc]
         wrong[half / 2.0] = int(np.sum(bright != np.array(day)))
-    fewest = min(wrong.values())
-    fit = [hours for hours, files in wrong.items() if files == fewest]
-    return (min(fit), max(fit)) if wrong[0.0] > fewest + 1 else None
+    fit = [hours for hours, files in wrong.items() if files <= min(wrong.values()) + 1]
+    return None if 0.0 in fit else (min(fit), max(fit))

@@ -103,8 +103,20 @@ def test_the_clock_that_the_light_of_the_sky_fits_is_the_true_one(
         assert found is None or found[0] <= clock / 2.0 <= found[1]
     else:
         assert found is not None
-        # Of the day before, too.
-        assert min(abs(hours - clock / 2.0) % 24.0 for hours in found) <= 0.5
+        assert found[0] <= clock / 2.0 <= found[1]
+        # Or of the day before, too.
+        assert not 2.0 < found[1] - found[0] < 22.0
+
+
+def test_a_lamp_before_dawn_does_not_exclude_the_true_clock() -> None:
+    """A file an hour by a clock 4 h late; the last of the night is lit."""
+    utc = [datetime(2024, 3, 1, hour, 30, tzinfo=UTC) for hour in range(8, 18)]
+    sun = [solar_elevation(moment, *MANAUS) for moment in utc]
+    sky = np.array([1e-3 + sky_brightness(elevation) for elevation in sun])
+    sky[1] = 1.0
+    found = clock_of_sky(sky, [moment - timedelta(hours=4) for moment in utc], *MANAUS)
+    assert found is not None
+    assert found[0] <= -4.0 <= found[1]
 
 
 @pytest.mark.parametrize("hours", [range(12, 16), range(1, 5)])
@@ -169,7 +181,7 @@ def test_channels_without_light_are_not_proposed_and_named(tmp_path: Path) -> No
 
 QUESTIONS = {
     "saopaulo": ["BT1; ? range_offset: -64 m, it lags photon counting by 8.5 bins"],
-    "public/manaus_20111017_day": ["; the light of the sky fits -4.5 to -4 h"],
+    "public/manaus_20111017_day": ["; the light of the sky fits -5 to -3.5 h"],
 }
 """Manaus has the time of UTC-4, by which this day was recorded."""
 

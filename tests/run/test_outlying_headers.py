@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 from support.archives.small_archive import DAY, Archive
 
 from lidarops.campaign.model import load_campaign
+from lidarops.catalog.granules import out_of_order
 from lidarops.catalog.scan import scan_archive
 from lidarops.catalog.store import Store
 from lidarops.raw.formats import RawFile, read_raw_header
@@ -325,6 +329,38 @@ def test_a_file_of_another_day_than_those_beside_it_by_name_contradicts(tmp_path
     result, _ = _run(_archive(tmp_path, minutes))
     text = "poor/h3 starts at 2026-04-11 16:00, more than a day away from those beside it by name"
     assert [row.problem for row in finding_rows(result.findings) if row.fails] == [text]
+
+
+@given(data=st.data(), count=st.integers(10, 60), sessions=st.integers(1, 4))
+def test_wrong_dates_are_found_among_names_in_order(
+    data: st.DataObject, count: int, sessions: int
+) -> None:
+    """Up to an eighth of the files, also neighbours, while another file is hours out of order."""
+    first = datetime(2024, 1, 1, 23, tzinfo=UTC)
+    starts = [
+        first + timedelta(days=20 * (k * sessions // count), minutes=5 * (k // 2))
+        for k in range(count)
+    ]
+    assert out_of_order(starts, timedelta(days=1)) == []
+    swapped = data.draw(st.integers(1, count - 1))
+    starts[swapped] -= timedelta(hours=6)
+    assert out_of_order(starts, timedelta(days=1)) == []
+    # As many files in order come first, or nothing tells which of both are wrong.
+    inner = st.integers(count // 8 + 2, count - 1)
+    wrong = data.draw(st.sets(inner, min_size=1, max_size=count // 8))
+    for place in wrong:
+        starts[place] -= timedelta(days=365)
+    assert set(out_of_order(starts, timedelta(days=1))) == wrong
+
+
+@pytest.mark.parametrize("days", [2, 3, 7])
+def test_names_that_count_anew_each_day_tell_no_order(days: int) -> None:
+    first = datetime(2024, 1, 1, tzinfo=UTC)
+    starts = [
+        first + timedelta(days=day, minutes=number) for number in range(20) for day in range(days)
+    ]
+    assert out_of_order(starts) == []
+    assert out_of_order(starts, timedelta(days=1)) == []
 
 
 @pytest.mark.parametrize("name", ["pilar", "saopaulo", "manaus", "savant"])

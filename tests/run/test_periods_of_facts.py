@@ -53,7 +53,8 @@ def test_files_of_no_period_of_facts_are_refused(archive: Archive) -> None:
     assert result.exit_code == 1
     assert sorted(json.loads(result.stdout)["refused_files"]) == OF_SECOND
     reasons = refused(archive)
-    assert "is of a time that no period of the facts holds" in reasons["rich/h10"]
+    words = "starts 2026-03-02 10:00, a time that no period of the facts holds: one ends"
+    assert f"{words} 2026-03-02 00:00, one begins 2026-03-03 00:00 (" in reasons["rich/h10"]
     # The facts may be mistaken.
     assert products_of_second(archive) == before
 

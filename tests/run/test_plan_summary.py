@@ -193,7 +193,7 @@ def test_refused_files_are_counted_by_reason_and_fail(tmp_path: Path) -> None:
     text = _STYLE.sub("", shown.output)
     assert shown.exit_code == 1
     assert "5 files refused (lidarops catalog --all names them):" in text
-    assert len(re.findall(r"^  2 files: .*truncated", text, re.MULTILINE)) == 2
+    assert len(re.findall(r"^  5 files: .*truncated.*, and the like", text, re.MULTILINE)) == 1
     document = json.loads(CliRunner().invoke(app, ["plan", str(file), "--json"]).output)
     assert len(document["refused_files"]) == 5
 
@@ -211,6 +211,17 @@ def test_a_catalog_of_many_refused_files_lists_some_and_how_to_list_all(tmp_path
     assert named == {(): 20, ("--all",): 30}
     assert "Refused, the first 20 of 30 (--all)" in _STYLE.sub("", shown[()])
     assert "31 files: 31 added" in shown[()]
+
+
+def test_a_catalog_lists_each_kind_of_reason_first(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    folder = tmp_path / "raw" / "coast"
+    whole = (folder / "h00").read_bytes()
+    for number in range(30):
+        (folder / f"h{number + 1:02}").write_bytes(whole[: -100 - number])
+    (folder / "h99").write_bytes(b"damaged")
+    shown = CliRunner().invoke(app, ["catalog", str(file)], env=terminal(300)).output
+    assert set(re.findall(r"coast/h\d\d", shown)[:2]) == {"coast/h01", "coast/h99"}
 
 
 def test_a_plan_names_the_second_of_two_copies_of_a_profile(tmp_path: Path) -> None:
