@@ -18,19 +18,19 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 67_797,
-    "lines of code alone": 44_073,
-    "modules": 265,
+    "lines": 69_138,
+    "lines of code alone": 45_085,
+    "modules": 266,
     "dataclasses": 219,
-    "lines of dataclasses": 6_098,
+    "lines of dataclasses": 6_088,
     "tuning numbers": 214,
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_819,
+    "lines of the largest package": 5_901,
 }
 MOST_OF_ONE_FILE = {
-    "homogeneous": {"modules": 59, "functions": 567, "changes": 215},
+    "homogeneous": {"modules": 60, "functions": 582, "changes": 243},
     "elastic": {"modules": 69, "functions": 705, "changes": 226},
 }
 
