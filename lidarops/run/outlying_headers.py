@@ -221,12 +221,16 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Statements:
 
 
 def _out_of_order(around: Sequence[Granule], day: int) -> Statements:
-    """Yield which files start out of the order of names, where names tell no time."""
-    folders: dict[str, list[tuple[str, int]]] = defaultdict(list)
+    """Yield which files start out of the order of names, where names tell no time.
+
+    Only names that agree but for numbers have an order: a file may be renamed.
+    """
+    alike: dict[tuple[str, str], list[tuple[str, int]]] = defaultdict(list)
     for place, granule in enumerate(around):
         if time_in_path(granule.path, granule.format) is None:
-            folders[granule.path.rpartition("/")[0]].append((granule.path, place))
-    for members in folders.values():
+            folder, _, name = granule.path.rpartition("/")
+            alike[folder, "".join(c for c in name if not c.isdigit())].append((granule.path, place))
+    for members in alike.values():
         files = [around[place] for _, place in sorted(members)]
         for index in out_of_order([granule.start for granule in files if granule.start]):
             start = files[index].start

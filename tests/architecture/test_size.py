@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from lidarops.cli import app
 
 MOST = {
-    "lines": 69_138,
-    "lines of code alone": 45_085,
+    "lines": 69_142,
+    "lines of code alone": 45_086,
     "modules": 266,
     "dataclasses": 219,
     "lines of dataclasses": 6_088,
@@ -31,7 +31,7 @@ MOST = {
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 60, "functions": 582, "changes": 243},
-    "elastic": {"modules": 69, "functions": 705, "changes": 226},
+    "elastic": {"modules": 70, "functions": 714, "changes": 253},
 }
 
 
