@@ -27,7 +27,7 @@ MOST = {
     "tuning numbers that are assumed": 55,
     "copied thresholds": 0,
     "most parameters": 10,
-    "lines of the largest package": 5_901,
+    "lines of the largest package": 5_905,
 }
 MOST_OF_ONE_FILE = {
     "homogeneous": {"modules": 60, "functions": 582, "changes": 243},
