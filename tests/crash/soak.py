@@ -481,7 +481,10 @@ def _digests(root: Path, skipped: Callable[[Path], bool] = lambda _: False) -> d
 
 
 def _views(place: Path) -> dict[str, str]:
-    """Return the digests of site, aggregates and published files."""
+    """Return the digests of site, aggregates and published files.
+
+    Without the manifest of the site, which states what the build found and not what a reader sees.
+    """
     return {
         f"{name}/{path}": digest
         for name, root in (
@@ -490,6 +493,7 @@ def _views(place: Path) -> dict[str, str]:
             ("published", place / "published"),
         )
         for path, digest in _digests(root).items()
+        if (name, path) != ("site", "manifest.json")
     }
 
 
