@@ -57,6 +57,7 @@ from support.faults import sitecustomize as faults  # noqa: E402
 from lidarops.cli import app  # noqa: E402
 from lidarops.netcdf.comparison import compare_products  # noqa: E402
 from lidarops.records import Grade  # noqa: E402
+from lidarops.system.files import MANIFEST  # noqa: E402
 
 RUN_ID = re.compile(rb"\d{8}T\d{6}-[0-9a-f]{6}")
 SCENES = 2
@@ -471,9 +472,11 @@ def _processes(place: Path) -> list[int]:
 
 def _digests(root: Path, skipped: Callable[[Path], bool] = lambda _: False) -> dict[str, str]:
     return {
-        # The site links the report of the last run, by the id of the run.
+        # The site links the report of the last run, by the id of the run; its manifest states it.
         path.relative_to(root).as_posix(): hashlib.sha256(
-            RUN_ID.sub(b"RUN", path.read_bytes()) if path.suffix == ".html" else path.read_bytes()
+            RUN_ID.sub(b"RUN", path.read_bytes())
+            if path.suffix == ".html" or path.name == MANIFEST
+            else path.read_bytes()
         ).hexdigest()
         for path in sorted(root.rglob("*"))
         if path.is_file() and not path.name.startswith(".") and not skipped(path)
@@ -481,10 +484,7 @@ def _digests(root: Path, skipped: Callable[[Path], bool] = lambda _: False) -> d
 
 
 def _views(place: Path) -> dict[str, str]:
-    """Return the digests of site, aggregates and published files.
-
-    Without the manifest of the site, which states what the build found and not what a reader sees.
-    """
+    """Return the digests of site, aggregates and published files."""
     return {
         f"{name}/{path}": digest
         for name, root in (
@@ -493,7 +493,6 @@ def _views(place: Path) -> dict[str, str]:
             ("published", place / "published"),
         )
         for path, digest in _digests(root).items()
-        if (name, path) != ("site", "manifest.json")
     }
 
 
