@@ -32,7 +32,7 @@ LAZY_BYTES: Final = 1 << 14
 
 
 class _Lazy(BackendArray):
-    """Values of a variable that are read when they are asked for."""
+    """Values of a variable, read on access."""
 
     def __init__(self, stored: StoredVariable) -> None:
         self._stored = stored

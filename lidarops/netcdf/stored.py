@@ -1,4 +1,4 @@
-"""Products as HDF5 stores them, without xarray and netCDF4: only what is asked for is read.
+"""Read variables and attributes of products by HDF5 alone, without xarray and netCDF4.
 
 Whatever a library raises for a damaged file is raised as `ProductError`, which names the file. What
 a file states is checked against its size before anything of it is read: a crafted file of some kB
@@ -80,7 +80,9 @@ def reading(
 
 
 class Attributes(Mapping[str, Any]):
-    """Attributes as netCDF4 gives them, in the order of the file; read when they are asked for.
+    """Attributes of a file or variable in the order of the file, with the values of netCDF4.
+
+    Each is read on first access.
 
     Parameters
     ----------

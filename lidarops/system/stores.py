@@ -58,7 +58,7 @@ _LONGEST_SILENCE: Final = 30.0
 _BATCH: Final = 100
 """Files that are transferred at the same time."""
 _AT_ONCE: Final = 16
-"""Files whose begin or size a store is asked for at the same time."""
+"""Concurrent requests for headers or sizes of files in a store."""
 _NAMES_SHOWN: Final = 3
 
 _LOG = logging.getLogger(__name__)
@@ -581,7 +581,7 @@ def _failures() -> tuple[type[Exception], ...]:
     return (
         OSError,
         EOFError,
-        NotImplementedError,
+        NotImplementedError,  # raised by fsspec of drivers that cannot list files
         *(getattr(module, name) for module, name in loaded if module is not None),
     )
 
