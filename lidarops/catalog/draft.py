@@ -299,9 +299,9 @@ def _clock(group: FileGroup, look: FirstLook | None) -> Iterator[str]:
     twice = sum(start < stop - _SECOND for (_, stop), (start, _) in pairwise(spans))
     if twice:
         yield f"files that start before another one stops: {twice}; is a clock hour there twice?"
-    paths, starts = zip(*sorted((path, header.start) for path, header in members), strict=True)
-    for place in out_of_order(starts, room=_DAY)[:1]:
-        yield f"{paths[place]} starts more than a day away from those beside it by name"
+    starts = {path: header.start for path, header in members}
+    for path in out_of_order(starts, room=_DAY)[:1]:
+        yield f"{path} starts more than a day away from those beside it by name"
 
 
 def _shift(channel: ChannelLayout, lag: float | None, stated: float | None) -> str:

@@ -367,20 +367,34 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
     return Granule(**stored)
 
 
-def out_of_order(starts: Sequence[datetime], room: timedelta = timedelta()) -> list[int]:
-    """Return which files, in order of names, start before or after both files beside them.
+def out_of_order(starts: Mapping[str, datetime], room: timedelta = timedelta()) -> list[str]:
+    """Return the files that start before or after both files beside them by name.
 
-    These are the nearest of the longest run of files whose starts follow the order of names. None
-    where over one and an eighth of the files are away, or too few are not: names that count anew
-    each day tell no order. Six files follow it but for one in less than 4 % of all orders.
+    These are the nearest of the longest run of files whose starts follow the order of names. Names
+    have an order in one folder, where they agree but for numbers: a file may be renamed. None where
+    over one and an eighth of the files are away, or too few are not: names that count anew each day
+    tell no order. Six files follow it but for one in less than 4 % of all orders.
 
     Parameters
     ----------
-    starts : sequence of datetime
+    starts : mapping of str to datetime
+        By path.
     room : timedelta
         By how much more than that. Files that are less away do not count against the order.
     """
-    times = [start.timestamp() for start in starts]
+    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for path in sorted(starts):
+        folder, _, name = path.rpartition("/")
+        alike[folder, without_numbers(name)].append(path)
+    return [
+        paths[place]
+        for paths in alike.values()
+        for place in _away([starts[path].timestamp() for path in paths], room.total_seconds())
+    ]
+
+
+def _away(times: Sequence[float], room: float) -> list[int]:
+    """Return the places of the times that are away from the longest run that does not fall."""
     # Last file of the best run of each length, and the file before each (patience sorting).
     ends: list[int] = []
     previous: list[int] = []
@@ -392,12 +406,12 @@ def out_of_order(starts: Sequence[datetime], room: timedelta = timedelta()) -> l
     while run and previous[run[-1]] >= 0:
         run.append(previous[run[-1]])
     run.reverse()
-    away, places, within = room.total_seconds(), [], set(run)
+    places, within = [], set(run)
     for place in (place for place in range(len(times)) if place not in within):
         after = bisect_right(run, place)
         before = times[run[after - 1]] if after else -math.inf
         later = times[run[after]] if after < len(run) else math.inf
-        if not before - away <= times[place] <= later + away:
+        if not before - room <= times[place] <= later + room:
             places.append(place)
     enough = len(times) - len(places) >= _FEWEST_IN_ORDER
     return places if enough and len(places) <= max(1, len(times) // 8) else []

@@ -9,12 +9,12 @@ from __future__ import annotations
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from datetime import timedelta
+from datetime import datetime, timedelta
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.catalog.granules import DatedFile, out_of_order
+from lidarops.catalog.granules import out_of_order
 from lidarops.catalog.store import Store, Verdict
 from lidarops.kinds import Scope, kinds
 from lidarops.raw.formats import time_in_path
@@ -120,22 +120,22 @@ def _lone_files(store: Store, instruments: Collection[str]) -> Iterator[FileNote
     """
     sums = store.day_sums()
     days = [one.day for one in sums if one.role is Role.SIGNAL and one.good <= FEWEST_ALIKE]
-    folders: dict[tuple[str, str], list[DatedFile]] = {}
+    folders: dict[tuple[str, str], dict[str, datetime]] = {}
     few = days if len(days) <= _MOST_LONE_DAYS else []
     for granule in (one for day in few for one in store.granules_of(day, day, dark_days=0)):
         folder = granule.path.rpartition("/")[0]
         if granule.role is not Role.SIGNAL or granule.instrument not in instruments:
             continue
         if (folder, granule.instrument) not in folders:
-            folders[folder, granule.instrument] = sorted(
-                file
+            folders[folder, granule.instrument] = {
+                file.path: file.start
                 for file in store.files_in(folder)
                 if (file.instrument, file.role) == (granule.instrument, granule.role)
                 and time_in_path(file.path, granule.format) is None
-            )
-    for (_, instrument), files in folders.items():
-        for place in out_of_order([file.start for file in files], timedelta(days=1)):
-            text = f"{files[place].path} starts at {files[place].start:%Y-%m-%d %H:%M},"
+            }
+    for (_, instrument), starts in folders.items():
+        for path in out_of_order(starts, timedelta(days=1)):
+            text = f"{path} starts at {starts[path]:%Y-%m-%d %H:%M},"
             text += " more than a day away from those beside it by name"
             yield FileNote(instrument, text, contradicts=True, files=1)
 

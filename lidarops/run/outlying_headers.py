@@ -221,22 +221,17 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Statements:
 
 
 def _out_of_order(around: Sequence[Granule], day: int) -> Statements:
-    """Yield which files start out of the order of names, where names tell no time.
-
-    Only names that agree but for numbers have an order: a file may be renamed.
-    """
-    alike: dict[tuple[str, str], list[tuple[str, int]]] = defaultdict(list)
-    for place, granule in enumerate(around):
-        if time_in_path(granule.path, granule.format) is None:
-            folder, _, name = granule.path.rpartition("/")
-            alike[folder, "".join(c for c in name if not c.isdigit())].append((granule.path, place))
-    for members in alike.values():
-        files = [around[place] for _, place in sorted(members)]
-        for index in out_of_order([granule.start for granule in files if granule.start]):
-            start = files[index].start
-            if start and day_of(start) == day:
-                text = f"the start {start:%Y-%m-%d %H:%M:%S} UTC, out of the order of names"
-                yield sorted(members)[index][1], text, False
+    """Yield which files start out of the order of names, where names tell no time."""
+    places = {
+        granule.path: place
+        for place, granule in enumerate(around)
+        if granule.start and time_in_path(granule.path, granule.format) is None
+    }
+    starts = {path: start for path in places if (start := around[places[path]].start)}
+    for path in out_of_order(starts):
+        if day_of(starts[path]) == day:
+            text = f"the start {starts[path]:%Y-%m-%d %H:%M:%S} UTC, out of the order of names"
+            yield places[path], text, False
 
 
 def _shots(header: RawHeader | None) -> int:

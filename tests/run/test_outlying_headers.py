@@ -341,16 +341,17 @@ def test_wrong_dates_are_found_among_names_in_order(
         first + timedelta(days=20 * (k * sessions // count), minutes=5 * (k // 2))
         for k in range(count)
     ]
-    assert out_of_order(starts, timedelta(days=1)) == []
+    assert out_of_order(_counted(starts), timedelta(days=1)) == []
     swapped = data.draw(st.integers(1, count - 1))
     starts[swapped] -= timedelta(hours=6)
-    assert out_of_order(starts, timedelta(days=1)) == []
+    assert out_of_order(_counted(starts), timedelta(days=1)) == []
     # As many files in order come first, or nothing tells which of both are wrong.
     inner = st.integers(count // 8 + 2, count - 1)
     wrong = data.draw(st.sets(inner, min_size=1, max_size=count // 8))
     for place in wrong:
         starts[place] -= timedelta(days=365)
-    assert set(out_of_order(starts, timedelta(days=1))) == wrong
+    found = out_of_order(_counted(starts), timedelta(days=1))
+    assert found == [f"raw/f{place:03}" for place in sorted(wrong)]
 
 
 @pytest.mark.parametrize("days", [2, 3, 7])
@@ -359,8 +360,22 @@ def test_names_that_count_anew_each_day_tell_no_order(days: int) -> None:
     starts = [
         first + timedelta(days=day, minutes=number) for number in range(20) for day in range(days)
     ]
+    assert out_of_order(_counted(starts)) == []
+    assert out_of_order(_counted(starts), timedelta(days=1)) == []
+
+
+def test_only_names_that_agree_but_for_numbers_have_an_order():
+    first = datetime(2024, 1, 1, tzinfo=UTC)
+    starts = _counted([first + timedelta(minutes=k) for k in range(12)])
+    starts["raw/f003"] = first + timedelta(days=30)
+    assert out_of_order(starts) == ["raw/f003"]
+    starts["raw/f-renamed"] = starts.pop("raw/f003")
     assert out_of_order(starts) == []
-    assert out_of_order(starts, timedelta(days=1)) == []
+
+
+def _counted(starts: list[datetime]) -> dict[str, datetime]:
+    """Return the starts of files whose names only count."""
+    return {f"raw/f{place:03}": start for place, start in enumerate(starts)}
 
 
 @pytest.mark.parametrize("name", ["pilar", "saopaulo", "manaus", "savant"])
