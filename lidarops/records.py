@@ -177,11 +177,6 @@ class Granule(Header):
     """Digest of the file; None until the whole file has been read."""
 
     @property
-    def is_declared_invalid(self) -> bool:
-        """Whether the campaign refuses the file, not its content."""
-        return self.reason.startswith(INVALID)
-
-    @property
     def is_expected(self) -> bool:
         """Whether the campaign says that the file is not used."""
         return self.reason.startswith((INVALID, ACKNOWLEDGED))

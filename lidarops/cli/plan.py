@@ -32,7 +32,7 @@ from lidarops.cli.app import (
 )
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
-from lidarops.records import ACKNOWLEDGED, without_numbers
+from lidarops.records import without_numbers
 
 if TYPE_CHECKING:
     from lidarops.campaign.model import Campaign
@@ -111,7 +111,7 @@ def _plan(
     findings = survey(settings, selection=selection, wait=wait)
     with Store(settings.catalog_url, settings.name) as store:
         refused = acknowledged(settings, store.refused())
-    set_aside: dict[str, str] = {}
+    set_aside: list[Granule] = []
     judgements = assess(
         settings, selection=selection, everything=not stale, update=False, set_aside=set_aside
     )
@@ -146,7 +146,7 @@ def _plan(
             "failed_before": earlier[0],
             "without_a_usable_value": list(earlier[1]),
             "refused_files": {granule.path: granule.reason for granule in refused},
-            "files_set_aside": set_aside,
+            "files_set_aside": {granule.path: granule.reason for granule in set_aside},
             **findings_document(findings),
             "lacking_metadata": list(settings.metadata.lacking),
             "empty_in_first_file": empty,
@@ -160,7 +160,7 @@ def _plan(
         columns = "product", "flag", "values", "settings"
         tables: list[Table] = [
             ("Without a usable value in the first files", columns, empty),
-            ("Not used", ("file", "reason"), set_aside.items()),
+            ("Not used", ("file", "reason"), ((one.path, one.reason) for one in set_aside)),
         ]
         tables += [*finding_tables(findings), *_earlier(*earlier)]
         show_tables(tables, None if everything else _FEW, _LINES - printed)
@@ -168,18 +168,10 @@ def _plan(
         words = f"metadata of the campaign: products will lack {lacking}"
         say_wrapped(words if lacking else "", "")
         # With --stale, fresh scenes are not judged.
-        whole = "" if stale else f" of {count}"
-        say_wrapped(f"{counted(to_be_made, 'stale scene')}{whole}", "")
+        say_wrapped(counted(to_be_made, "stale scene") + ("" if stale else f" of {count}"), "")
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
-    exit_with_status(
-        failed=any((failed, _unexpected(refused, set_aside), *earlier, findings.failed))
-    )
-
-
-def _unexpected(refused: list[Granule], set_aside: dict[str, str]) -> bool:
-    """Return whether a file is not used, and the campaign does not say so."""
-    known = all(granule.is_expected for granule in refused)
-    return not (known and all(why.startswith(ACKNOWLEDGED) for why in set_aside.values()))
+    unexpected = (not granule.is_expected for granule in (*refused, *set_aside))
+    exit_with_status(failed=any((failed, *unexpected, *earlier, findings.failed)))
 
 
 def _empty(campaign: Campaign, scenes: Collection[Scene]) -> list[tuple[str, str, str, str]]:

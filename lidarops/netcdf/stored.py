@@ -80,9 +80,7 @@ def reading(
 
 
 class Attributes(Mapping[str, Any]):
-    """Attributes of a file or variable in the order of the file, with the values of netCDF4.
-
-    Each is read on first access.
+    """Attributes in the order of the file, with the values of netCDF4; each read on access.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ def assess(
     selection: Selection | None = None,
     everything: bool = False,
     update: bool = True,
-    set_aside: dict[str, str] | None = None,
+    set_aside: list[Granule] | None = None,
 ) -> Iterator[Judgement]:
     """Judge what every scene needs, and why. Processes nothing.
 
@@ -138,8 +138,8 @@ def assess(
         Whether to yield also scenes that need nothing.
     update : bool
         Whether to update the catalog first.
-    set_aside : dict, optional
-        Takes the good files that belong to no scene, and why, by path.
+    set_aside : list of Granule, optional
+        Takes the good files that belong to no scene, with the reason.
 
     Yields
     ------
@@ -159,8 +159,7 @@ def assess(
         for part in (days, sorted(months)):
             for told in map(judge.days, judge.batches(part)):
                 if set_aside is not None:
-                    aside = acknowledged(campaign, told.set_aside)
-                    set_aside |= {granule.path: granule.reason for granule in aside}
+                    set_aside += acknowledged(campaign, told.set_aside)
                 for judged in told.judgements:
                     asked = everything or judged.due or judged.held or judged.frozen or judged.kept
                     if asked and bool(judged.scene.granules) == (part is days):

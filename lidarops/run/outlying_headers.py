@@ -222,12 +222,12 @@ def _times(around: Sequence[Granule], day: int, ahead: Ahead) -> Statements:
 
 def _out_of_order(around: Sequence[Granule], day: int) -> Statements:
     """Yield which files start out of the order of names, where names tell no time."""
-    places = {
-        granule.path: place
-        for place, granule in enumerate(around)
+    starts = {
+        granule.path: granule.start
+        for granule in around
         if granule.start and time_in_path(granule.path, granule.format) is None
     }
-    starts = {path: start for path in places if (start := around[places[path]].start)}
+    places = {granule.path: place for place, granule in enumerate(around)}
     for path in out_of_order(starts):
         if day_of(starts[path]) == day:
             text = f"the start {starts[path]:%Y-%m-%d %H:%M:%S} UTC, out of the order of names"
