@@ -312,14 +312,17 @@ def _shift(channel: ChannelLayout, lag: float | None, stated: float | None) -> s
 
 
 def _full_overlap(look: FirstLook | None) -> Iterator[str]:
-    found = None if look is None else look.full_overlap
+    look = look or FirstLook(files=0)
+    found = look.full_overlap
     if found is not None and found >= _ASSUMED_OVERLAP:
         yield (
             f"full_overlap_range: {found:g}  # ? m, nearer bins are not used; at least:"
-            " signals rise up to there"
+            f" signals rise up to there, by their parts within {look.within:g} m"
         )
         return
-    seen = "" if found is None else f", signals stop rising at {found:g} m"
+    seen = (
+        "" if found is None else f", signals stop rising at {found:g} m, within {look.within:g} m"
+    )
     yield f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used{seen}"
     yield "full_overlap_assumed: true  # until full_overlap_range is checked"
 
