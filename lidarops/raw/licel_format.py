@@ -109,8 +109,10 @@ def read_dataset(file: RawFile, place: int, stretches: Stretches | None, row: Co
         lead, end = (2, b"\r\n"[: max(left, 0)]) if stretches is None else (0, b"")
         content = file.read(offset - lead, lead + length + len(end))
         before, behind = content[:lead], content[lead + length :]
-        # LF alone ends a dataset, but not the only one where the header has CRLF.
-        alone = behind[:1] == b"\n" and (left > 2 or (left == 1 and before != b"\r\n"))
+        # LF alone ends a dataset, but not the only one behind a header in CRLF. No count is so
+        # large that its last byte is CR or LF: that is of a line end, and a byte before is lost.
+        alone = behind[:1] == b"\n" and content[lead + length - 1] not in b"\r\n"
+        alone = alone and (left > 2 or (left == 1 and before != b"\r\n"))
         ended = (behind == end or alone) and before[1:] in (b"", b"\n")
         if len(content) < lead + length or not ended:
             raise RawFormatError(

@@ -397,7 +397,7 @@ def test_lines_that_end_with_lf_are_read_where_the_size_proves_the_header(tmp_pa
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_datasets_that_end_with_lf_are_read_where_the_size_proves_it(tmp_path, number, of_header):
     """Of one and two, lines of the header tell it from a missing last CRLF."""
-    data = [struct.pack("<4i", k, 0x0D0A, 0x0A0D0A, 0x0A0A0A0D) for k in range(number)]
+    data = [struct.pack("<4i", k, 0x0D0A, 0x0A0D0A, 0x0D) for k in range(number)]
     datasets = tuple(ANALOG.replace("532", str(532 + k)) for k in range(number))
     head = raw_file(datasets=datasets, data=[], last=b"").replace(b"\r\n", of_header)
     path = tmp_path / "x"
@@ -420,6 +420,16 @@ def test_datasets_that_end_with_lf_are_read_where_the_size_proves_it(tmp_path, n
 def test_a_file_that_lacks_a_byte_for_each_dataset_does_not_end_with_lf(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(raw_file((ANALOG, PHOTON, ANALOG.replace("532", "355")))[:-3])
+    with pytest.raises(RawFormatError, match="no CRLF follows the counts"):
+        licel.read_counts(path)
+
+
+def test_a_lost_byte_of_counts_is_no_line_end_in_lf(tmp_path):
+    """The CR behind them is then their last byte; the first count of the next dataset is 10."""
+    content = bytearray(raw_file())
+    del content[licel.parse_header(bytes(content)).datasets[0].offset]
+    path = tmp_path / "x"
+    path.write_bytes(content)
     with pytest.raises(RawFormatError, match="no CRLF follows the counts"):
         licel.read_counts(path)
 
