@@ -51,8 +51,10 @@ _MOST_FILES: Final = 96
 _MOST_DARK: Final = 20
 _HIGHEST: Final = 8000.0
 """m; usable values count below."""
-_SCATTER: Final = 100.0
-"""m; of a full overlap that one profile shows."""
+_STEP: Final = 10.0
+"""m; a full overlap is not known better."""
+_OF_ONE: Final = 100.0
+"""m; to which one profile shows it."""
 _LATEST: Final = 1000.0
 """m; light of the nearest telescope begins before, unless a record begins before the pulse. Of one
 that sees only far air it begins at 750 m."""
@@ -241,9 +243,11 @@ def empty_in_first_files(
         cycles = scan_cycles_of(scene.granules)
         ((whole, beams),) = Counter(cycles).most_common(1)
         own = (g for g, cycle in zip(scene.granules, cycles, strict=True) if cycle == whole)
-        lit = scene.granules if beams > 1 else _lit(campaign, scene)
-        if len(lit) < min(len(scene.granules), _MOST_DARK + FEWEST):
-            yield f"all of {scene.instrument}", "no light", "some of the first files", UNLIT
+        begin = scene.granules[: _MOST_DARK + FEWEST]
+        lit = begin if beams > 1 else _lit(campaign, scene, begin)
+        if dark := len(begin) - len(lit):
+            share = f"{dark} of the first {len(begin)} files"
+            yield f"all of {scene.instrument}", "no light", share, UNLIT
         first = replace(scene, granules=tuple(own) if beams > 1 else lit[:FEWEST])
         if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
             yield from _without_near_light(campaign, first)
@@ -256,14 +260,13 @@ def empty_in_first_files(
                 yield row
 
 
-def _lit(campaign: Campaign, scene: Scene) -> tuple[Granule, ...]:
-    """Return the first files of a scene; where some show light of the laser, without the others."""
-    first = scene.granules[: _MOST_DARK + FEWEST]
-    unlit = np.ones(len(first), bool)
+def _lit(campaign: Campaign, scene: Scene, some: tuple[Granule, ...]) -> tuple[Granule, ...]:
+    """Return those of some files of a scene that show light of the laser; all if none does."""
+    unlit = np.ones(len(some), bool)
     with suppress(LidarOpsError):
         names = [channel.name for channel in scene.layout]
-        unlit = _unlit(open_counts(first, root=Path(campaign.archive), channels=names))
-    return tuple(g for g, dark in zip(first, unlit, strict=True) if not dark) or first
+        unlit = _unlit(open_counts(some, root=Path(campaign.archive), channels=names))
+    return tuple(file for file, dark in zip(some, unlit, strict=True) if not dark) or some
 
 
 def _without_near_light(campaign: Campaign, scene: Scene) -> Iterator[tuple[str, str, str, str]]:
@@ -293,12 +296,12 @@ def _full_overlap(lit: xr.Dataset, channels: Iterable[str]) -> tuple[float | Non
     """
     ends = {name: end for name in channels if (end := rise_ends(*_mean(lit, name))) is not None}
     if not ends:
-        return None, _SCATTER
+        return None, _OF_ONE
     last = max(ends, key=ends.__getitem__)
     parts = np.array_split(np.arange(lit.sizes["time"]), min(FEWEST, lit.sizes["time"]))
     known = [rise_ends(*_mean(lit.isel(time=part), last)) for part in parts]
     apart = [end for end in known if end is not None]
-    scatter = max(float(np.std(apart, ddof=1)), 1.0) if len(apart) > 1 else _SCATTER
+    scatter = max(float(np.std(apart, ddof=1)), _STEP) if len(apart) > 1 else _OF_ONE
     digit = 10.0 ** np.floor(np.log10(scatter))
     within = float(np.ceil(scatter / digit) * digit)
     return float(np.ceil(ends[last] / within) * within), within
