@@ -388,10 +388,7 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
 def misdated(starts: Mapping[str, datetime]) -> dict[str, str]:
     """Return path -> why a file is refused, of those of another date than their neighbours by name.
 
-    Parameters
-    ----------
-    starts : mapping of str to datetime
-        By path; of files whose names tell no time.
+    Given are the starts, by path, of files whose names tell no time.
     """
     return {
         path: f"{MISDATED}, {' and '.join(f'{one} ({starts[one]:{_MINUTE}})' for one in beside)}:"

@@ -316,10 +316,9 @@ def _late_light(archive: xr.Dataset) -> float | None:
 
 def without_light(contents: FolderContents, root: Path) -> FolderContents:
     """Return what a folder holds, with groups told apart whose files show no light of a laser."""
-    measured = [group for group in contents.groups if group.purpose is Purpose.MEASUREMENT]
     groups = (
         replace(group, purpose=Purpose.UNLIT)
-        if group in measured and _is_unlit(group, measured, root)
+        if group.purpose is Purpose.MEASUREMENT and _is_unlit(group, contents.groups, root)
         else group
         for group in contents.groups
     )
@@ -331,21 +330,22 @@ def _is_unlit(group: FileGroup, groups: Iterable[FileGroup], root: Path) -> bool
 
     A few files tell that beside those of the largest group with the same channels alone.
     """
-    beside = max((g for g in groups if g.layout == group.layout), key=lambda g: len(g.files))
-    files: list[tuple[datetime, str]] = []
-    for one in (group,) if len(group.files) >= FEWEST else {group, beside}:
-        starts = [(h.start, path) for h, path in zip(one.headers, one.files, strict=True)]
-        files += starts[:: max(len(starts) // (2 * FEWEST), 1)]
+    members = list(zip(group.files, group.headers, strict=True))
+    if len(members) < FEWEST:
+        alike = (g for g in groups if (g.purpose, g.layout) == (group.purpose, group.layout))
+        largest = max(alike, key=lambda one: len(one.files))
+        members += zip(largest.files, largest.headers, strict=True)
+    step = len(members) // (2 * FEWEST) or 1
+    starts = {path: header.start for path, header in (*members[:FEWEST], *members[::step])}
     try:
-        paths = [root / path for _, path in files]
+        paths = [root / path for path in starts]
         unlit = _unlit(open_archive(paths, mask_and_scale=False, header_position="ignore"))
     except LidarOpsError:
         # What cannot be read is refused with its reason when it is processed.
         return False
     # The archive sorts by start, then path.
-    return all(
-        dark for (_, path), dark in zip(sorted(files), unlit, strict=True) if path in group.files
-    )
+    ordered = sorted(starts, key=lambda path: (starts[path], path))
+    return all(dark for path, dark in zip(ordered, unlit, strict=True) if path in group.files)
 
 
 def _unlit(archive: xr.Dataset) -> NDArray[np.bool_]:
