@@ -102,6 +102,24 @@ def test_its_former_product_is_left_over_and_its_repair_is_made(tmp_path: Path) 
             assert opened.sizes["time"] == 6
 
 
+@pytest.mark.parametrize("folder", ["", "poor/", "poor/night/"])
+def test_folders_are_judged_as_wholes_however_few_rows_are_written_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    """Of files before and after those of the folders in it; a scan may be killed between writes."""
+    monkeypatch.setattr(scan, "_BATCH", 1)
+    archive = _archive(tmp_path)
+    archive.tree["instruments"]["poor"]["files"] = "**"
+    for number, minutes in enumerate(MINUTES):
+        archive.raw(f"{folder}h{number}", minutes, seed=number)
+        archive.raw(f"{folder}h{number}.d/n1", minutes + 0.1, seed=number)
+    campaign = archive.write()
+    writes = iter([True] * 3)
+    with Store(campaign.catalog_url, campaign.name) as store, pytest.raises(StopIteration):
+        scan_archive(campaign, store, before_write=lambda: next(writes))
+    assert _refused(campaign) == {f"{folder}h3": REASON.replace("poor/", folder)}
+
+
 def test_unchanged_files_are_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
