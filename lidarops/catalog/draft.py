@@ -317,14 +317,10 @@ def _full_overlap(look: FirstLook | None) -> Iterator[str]:
     if found is not None and found >= _ASSUMED_OVERLAP:
         yield (
             f"full_overlap_range: {found:g}  # ? m, nearer bins are not used; at least:"
-            f" signals rise up to there, scattering by {look.within:g} m"
+            f" signals rise up to there, ± {look.within:g} m"
         )
         return
-    seen = (
-        ""
-        if found is None
-        else f", signals stop rising at {found:g} m, scattering by {look.within:g} m"
-    )
+    seen = "" if found is None else f", signals stop rising at {found:g} ± {look.within:g} m"
     yield f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used{seen}"
     yield "full_overlap_assumed: true  # until full_overlap_range is checked"
 
