@@ -47,6 +47,7 @@ CONVENTION: Final = (
 """Conversion of counts to physical values. Later Licel readers divide by 2^adc_bits - 1."""
 
 LF_ENDS: Final = "datasets end with LF instead of CRLF"
+"""Note on a file."""
 _LINE_LIMIT = 1024
 _CACHED_BLOCK = 4 * 1024
 _WITNESSES: Final = 2
