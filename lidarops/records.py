@@ -120,6 +120,8 @@ UNKNOWN_FORMAT: Final = "is of no known raw format"
 """Start of the reason if no installed format recognises a file."""
 INVALID: Final = "is of a period that the facts declare invalid"
 """Start of the reason if a campaign wants no product of a file."""
+MISDATED: Final = "more than a day away from the files beside it by name"
+"""Start of the reason if names only count, and the date in a header cannot be right."""
 ACKNOWLEDGED: Final = "acknowledged"
 """Start of the reason if a campaign knows that a file is refused, or belongs to no scene."""
 FEWEST_ALIKE: Final = 3

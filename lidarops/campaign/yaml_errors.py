@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final, Self
 
 import yaml
@@ -19,6 +20,7 @@ from lidarops.units import PATTERN, is_quantity, is_small, parse_quantity, writt
 
 _DECIMAL: Final = re.compile(r"[+-]?(?:0|[1-9][0-9_]*)", re.ASCII)
 """Whole number that is the same in any version of YAML."""
+_COMMA: Final = re.compile(r"\s*[+-]?\d+,(?!\d{3}\b)\d+\D*$", re.ASCII)
 _MERGE = "tag:yaml.org,2002:merge"
 _KEY = "[key]"
 """Appended by pydantic to the location of an invalid key."""
@@ -189,7 +191,7 @@ class _Problem:
     """One error of pydantic, its place in the file, and what the schema expects there."""
 
     def __init__(self, details: ErrorDetails, tree: yaml.Node | None, root: Expected) -> None:
-        self.details = details
+        self.details, self.tree = details, tree
         self.of_key = details["loc"][-1:] == (_KEY,)
         location = [str(key) for key in details["loc"] if key != _KEY]
         location += [str(key) for key in details.get("ctx", {}).get("keys", ())]
@@ -230,6 +232,11 @@ class _Problem:
 
     def _on_unknown_key(self, key: str) -> str:
         known = self.expected.keys()
+        # In braces, 7,5 m is the value 7 and the key 5 m.
+        entries = list(_children(_find(self.tree, self.keys[:-1])[1]))
+        for (_, _, before), (name, _, _) in pairwise(entries):
+            if name == key and key[:1].isdecimal() and isinstance(before, yaml.ScalarNode):
+                return f"is no key; decimals stand behind a point: {before.value}.{key}"
         question = nearest(key, known)
         near = [name for name in known if repr(name) in question]
         others = [name for name in known if name not in near]
@@ -250,6 +257,8 @@ class _Problem:
         """Return the nearest valid choice, or why YAML reads another type than was meant."""
         value = self.details["input"]
         question = nearest(str(value), self.expected.choices()) if isinstance(value, str) else ""
+        if self.expected.unit and isinstance(value, str) and _COMMA.match(value):
+            question = f"decimals stand behind a point: {value.replace(',', '.').strip()}"
         return f"; {question.strip()}" if question else ""
 
 

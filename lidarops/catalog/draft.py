@@ -25,7 +25,7 @@ from lidarops.catalog.folder import (
     Purpose,
     instruments_of,
 )
-from lidarops.catalog.granules import out_of_order
+from lidarops.catalog.granules import misdated
 from lidarops.constants import LEAST_SPREAD
 from lidarops.errors import CatalogError
 from lidarops.kinds import Scope, kinds_of
@@ -43,7 +43,6 @@ _ASSUMED_OVERLAP: Final = 500.0
 """m; of most telescopes. A signal may stop rising earlier, by haze at the ground."""
 _USED: Final = frozenset({Purpose.MEASUREMENT, Purpose.DARK})
 """Purposes of files that a campaign names; others are a question."""
-_DAY: Final = timedelta(days=1)
 _SECOND: Final = timedelta(seconds=1)
 """Resolution of start and stop."""
 _PROFILES: Final = (".csv", ".nc")
@@ -300,8 +299,7 @@ def _clock(group: FileGroup, look: FirstLook | None) -> Iterator[str]:
     if twice:
         yield f"files that start before another one stops: {twice}; is a clock hour there twice?"
     starts = {path: header.start for path, header in members}
-    for path in out_of_order(starts, room=_DAY)[:1]:
-        yield f"{path} starts more than a day away from those beside it by name"
+    yield from (f"{path} is {reason}" for path, reason in list(misdated(starts).items())[:1])
 
 
 def _shift(channel: ChannelLayout, lag: float | None, stated: float | None) -> str:
@@ -314,14 +312,15 @@ def _shift(channel: ChannelLayout, lag: float | None, stated: float | None) -> s
 
 
 def _full_overlap(look: FirstLook | None) -> Iterator[str]:
-    found = None if look is None else look.full_overlap
+    look = look or FirstLook(files=0)
+    found = look.full_overlap
     if found is not None and found >= _ASSUMED_OVERLAP:
         yield (
             f"full_overlap_range: {found:g}  # ? m, nearer bins are not used; at least:"
-            " signals rise up to there"
+            f" signals rise up to there, ± {look.within:g} m"
         )
         return
-    seen = "" if found is None else f", signals stop rising at {found:g} m"
+    seen = "" if found is None else f", signals stop rising at {found:g} ± {look.within:g} m"
     yield f"full_overlap_range: {_ASSUMED_OVERLAP:g}  # ? m, nearer bins are not used{seen}"
     yield "full_overlap_assumed: true  # until full_overlap_range is checked"
 

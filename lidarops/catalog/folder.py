@@ -149,6 +149,8 @@ class FirstLook:
     """Elastic channels of which a Raman product has usable values."""
     full_overlap: float | None = None
     """m; None where signals do not show it."""
+    within: float = math.nan
+    """m; to what it is known."""
     begins: float | None = None
     """m, where the light of all channels begins if that is not at once."""
     lags: Mapping[str, float] = field(default_factory=dict)

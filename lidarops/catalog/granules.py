@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
+import re
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from datetime import UTC, datetime, timedelta
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import sqlalchemy as sa
@@ -18,6 +19,7 @@ from lidarops.catalog.database import CHANNEL_NAME, GRANULE, LAYOUT, Database
 from lidarops.catalog.raw_files import NO_NOTES, GranuleRow
 from lidarops.raw.header import Names, recorder_names
 from lidarops.records import (
+    MISDATED,
     ChannelLayout,
     DetectionMode,
     FileNote,
@@ -33,6 +35,7 @@ Layouts = Mapping[str, tuple[ChannelLayout, ...]]
 
 _FEWEST_IN_ORDER: Final = 5
 """Files whose starts follow the order of names not by chance."""
+_MINUTE: Final = "%Y-%m-%d %H:%M"
 _MOST_VALUES: Final = 3
 """Notes that differ by a number only, as of the angles of a scan, of which each is reported."""
 
@@ -49,6 +52,7 @@ class Fingerprint(NamedTuple):
     sha256: str | None
     start: datetime | None
     status: str
+    format: str
 
     @property
     def is_damaged(self) -> bool:
@@ -57,12 +61,15 @@ class Fingerprint(NamedTuple):
 
 
 class DatedFile(NamedTuple):
-    """A good file, and when it starts."""
+    """A file whose header could be read, and when it starts."""
 
     path: str
     instrument: str
     role: Role
     start: datetime
+    format: str = ""
+    reason: str = ""
+    """Why it is refused for all that; empty where it is good."""
 
 
 class DaySum(NamedTuple):
@@ -81,12 +88,8 @@ class Granules(Database):
     @contextmanager
     def fingerprints(self) -> Iterator[Iterator[Fingerprint]]:
         """Yield a fingerprint of every granule, ordered by path, without holding them all."""
-        columns = (_C.path, _C.size, _C.mtime_ns, _C.scan_key, _C.stamp_low, _C.stamp_high)
-        query = (
-            sa.select(*columns, _C.sha256, _C.start, _C.status)
-            .where(_C.campaign == self.campaign)
-            .order_by(_C.path)
-        )
+        columns = (_C[name] for name in Fingerprint._fields)
+        query = sa.select(*columns).where(_C.campaign == self.campaign).order_by(_C.path)
         with self.stream(query) as rows:
             yield map(Fingerprint._make, rows)
 
@@ -101,15 +104,29 @@ class Granules(Database):
         with self.stream(query) as rows:
             yield ((path, size, start) for path, size, start in rows)
 
-    def replace(self, rows: Sequence[GranuleRow]) -> None:
-        """Insert granules, replacing rows of the same path."""
+    def replace(
+        self, rows: Sequence[GranuleRow], reasons: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
+        """Insert granules, replacing rows of the same path, and enter reasons of others by path.
+
+        A reason refuses a granule, an empty one makes it good again.
+        """
         layouts = {row.values["layout"]: row.layout for row in rows}
+        judged = sa.update(GRANULE).where(
+            _C.campaign == self.campaign, _C.path == sa.bindparam("file")
+        )
+        # By a digest a scan would know a damaged file.
+        judged = judged.values(status=sa.bindparam("now"), reason=sa.bindparam("why"), sha256=None)
         with self.transaction() as connection:
-            connection.execute(
-                self.upsert(LAYOUT, replacing=False),
-                [{"hash": key, "channels": text} for key, text in layouts.items()],
-            )
-            connection.execute(self.upsert(GRANULE), [row.values for row in rows])
+            if rows:
+                connection.execute(
+                    self.upsert(LAYOUT, replacing=False),
+                    [{"hash": key, "channels": text} for key, text in layouts.items()],
+                )
+                connection.execute(self.upsert(GRANULE), [row.values for row in rows])
+            for path, why in reasons.items():
+                now = Status.REFUSED if why else Status.GOOD
+                connection.execute(judged, {"file": path, "now": now.value, "why": why})
 
     def forget(self, paths: Collection[str]) -> None:
         """Remove the rows of files that are no longer in the archive."""
@@ -162,14 +179,15 @@ class Granules(Database):
         return self.granules(status=Status.REFUSED)
 
     def files_in(self, folder: str) -> list[DatedFile]:
-        """Return the good files that lie in a folder itself; of the archive where it is empty."""
-        columns = (_C.path, _C.instrument, _C.role, _C.start)
-        query = sa.select(*columns).where(*self._good_below(folder))
+        """Return the files with headers in a folder itself; of the archive where it is empty."""
+        columns = (_C.path, _C.instrument, _C.role, _C.start, _C.format, _C.reason)
+        # Of no other file a scan knows the stop.
+        known = _C.campaign == self.campaign, _C.stop.is_not(None)
         begin = f"{folder}/" if folder else ""
-        with self.stream(query) as rows:
+        with self.stream(sa.select(*columns).where(*known, *_below(folder))) as rows:
             return [
-                DatedFile(path, instrument, _ROLES[role], start)
-                for path, instrument, role, start in self.decoded(rows)
+                DatedFile(path, instrument, _ROLES[role], *others)
+                for path, instrument, role, *others in self.decoded(rows)
                 if "/" not in path[len(begin) :]
             ]
 
@@ -180,7 +198,7 @@ class Granules(Database):
         """
         query = (
             sa.select(sa.func.min(_C.start))
-            .where(*self._good_below(folder, Role.SIGNAL), _C.instrument == instrument)
+            .where(*self._good(Role.SIGNAL), *_below(folder), _C.instrument == instrument)
             .group_by(_C.day)
         )
         days = sorted(start for (start,) in self.read(query, tuple))
@@ -191,11 +209,6 @@ class Granules(Database):
     def _good(self, role: Role | None = None) -> list[sa.ColumnElement[bool]]:
         conditions = [_C.campaign == self.campaign, _C.status == Status.GOOD.value]
         return conditions if role is None else [*conditions, _C.role == role.value]
-
-    def _good_below(self, folder: str, role: Role | None = None) -> list[sa.ColumnElement[bool]]:
-        # All paths that begin so: "0" follows "/".
-        below = [_C.path > f"{folder}/", _C.path < f"{folder}0"] if folder else []
-        return [*self._good(role), *below]
 
     def count(self, *conditions: sa.ColumnElement[bool]) -> int:
         """Return the number of granules."""
@@ -324,6 +337,11 @@ _ROLES: Final = {role.value: role for role in Role}
 _STATUSES: Final = {status.value: status for status in Status}
 
 
+def _below(folder: str) -> list[sa.ColumnElement[bool]]:
+    # All paths that begin so: "0" follows "/".
+    return [_C.path > f"{folder}/", _C.path < f"{folder}0"] if folder else []
+
+
 def _layout_from(text: str) -> tuple[ChannelLayout, ...]:
     return tuple(
         ChannelLayout(**{**channel, "mode": DetectionMode(channel["mode"])})
@@ -367,8 +385,23 @@ def _granule_from(row: Any, layouts: Layouts) -> Granule:
     return Granule(**stored)
 
 
-def out_of_order(starts: Mapping[str, datetime], room: timedelta = timedelta()) -> list[str]:
-    """Return the files that start before or after both files beside them by name.
+def misdated(starts: Mapping[str, datetime]) -> dict[str, str]:
+    """Return path -> why a file is refused, of those of another date than their neighbours by name.
+
+    Given are the starts, by path, of files whose names tell no time.
+    """
+    return {
+        path: f"{MISDATED}, {' and '.join(f'{one} ({starts[one]:{_MINUTE}})' for one in beside)}:"
+        f" it starts {starts[path]:{_MINUTE}} (correct the date in its header; if it is right,"
+        " rename the file or move it to another folder)"
+        for path, beside in out_of_order(starts, timedelta(days=1)).items()
+    }
+
+
+def out_of_order(
+    starts: Mapping[str, datetime], room: timedelta = timedelta()
+) -> dict[str, list[str]]:
+    """Return the files that start before or after both files beside them by name, and these.
 
     These are the nearest of the longest run of files whose starts follow the order of names. Names
     have an order in one folder, where they agree but for numbers: a file may be renamed. None where
@@ -383,18 +416,26 @@ def out_of_order(starts: Mapping[str, datetime], room: timedelta = timedelta()) 
         By how much more than that. Files that are less away do not count against the order.
     """
     alike: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for path in sorted(starts):
+    for path in sorted(starts, key=_by_number):
         folder, _, name = path.rpartition("/")
         alike[folder, without_numbers(name)].append(path)
-    return [
-        paths[place]
+    return {
+        paths[place]: [paths[other] for other in beside]
         for paths in alike.values()
-        for place in _away([starts[path].timestamp() for path in paths], room.total_seconds())
-    ]
+        for place, beside in _away(
+            [starts[path].timestamp() for path in paths], room.total_seconds()
+        ).items()
+    }
 
 
-def _away(times: Sequence[float], room: float) -> list[int]:
-    """Return the places of the times that are away from the longest run that does not fall."""
+def _by_number(path: str) -> list[str | int]:
+    """Return a key that orders f9 before f10."""
+    parts = re.split(r"(\d+)", path)
+    return [int(part) if number % 2 else part for number, part in enumerate(parts)]
+
+
+def _away(times: Sequence[float], room: float) -> dict[int, list[int]]:
+    """Return the places away from the longest run of times that does not fall, with the nearest."""
     # Last file of the best run of each length, and the file before each (patience sorting).
     ends: list[int] = []
     previous: list[int] = []
@@ -406,12 +447,13 @@ def _away(times: Sequence[float], room: float) -> list[int]:
     while run and previous[run[-1]] >= 0:
         run.append(previous[run[-1]])
     run.reverse()
-    places, within = [], set(run)
+    places, within = {}, set(run)
     for place in (place for place in range(len(times)) if place not in within):
         after = bisect_right(run, place)
-        before = times[run[after - 1]] if after else -math.inf
-        later = times[run[after]] if after < len(run) else math.inf
-        if not before - room <= times[place] <= later + room:
-            places.append(place)
+        before, later = run[max(after - 1, 0) : after], run[after : after + 1]
+        if any(times[place] < times[one] - room for one in before) or any(
+            times[place] > times[one] + room for one in later
+        ):
+            places[place] = before + later
     enough = len(times) - len(places) >= _FEWEST_IN_ORDER
-    return places if enough and len(places) <= max(1, len(times) // 8) else []
+    return places if enough and len(places) <= max(1, len(times) // 8) else {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from urllib.parse import unquote
 
 from lidarops.campaign.model import Campaign
-from lidarops.catalog.granules import Fingerprint
+from lidarops.catalog.granules import DatedFile, Fingerprint, misdated
 from lidarops.catalog.raw_files import (
     GranuleRow,
     Headers,
@@ -29,7 +29,8 @@ from lidarops.catalog.raw_files import (
 )
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, UnavailableError
-from lidarops.records import UNREADABLE, IdlePattern, Role, Status, digest
+from lidarops.raw.formats import raw_formats, time_in_path
+from lidarops.records import MISDATED, UNREADABLE, IdlePattern, Role, Status, digest
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import CRASHED, Processes
 from lidarops.system.stores import Stored, without_keys
@@ -93,8 +94,9 @@ def scan_archive(
     Only files whose size, modification time or campaign settings changed are opened, or all if the
     code that reads them changed. Of these, only the header is read; the whole file is read only if
     a product was made from it or it may have moved, to compare the content. An unusable file
-    becomes a refused granule with a reason. If nothing changed, nothing is written. Memory grows
-    with the number of changed files, not with the archive.
+    becomes a refused granule with a reason; so does one whose date contradicts those of its folder,
+    as long as they do. If nothing changed, nothing is written. Memory grows with the number of
+    changed files, not with the archive.
 
     Parameters
     ----------
@@ -179,11 +181,13 @@ class _Scan:
         self._idle = set(self._claims)
         self._files = self._changed = 0
         self._judged: deque[Fingerprint | None] = deque()
-        self._pending: list[GranuleRow] = []
+        self._pending: dict[str, list[GranuleRow]] = defaultdict(list)
+        """Rows to write, by the folder that must be listed before because names in it count."""
+        self._held = 0
         # With an empty catalog, no new file can be a moved one.
         self._new: set[str] | None = set() if store.count() else None
         self._added = 0
-        self._gone: list[Fingerprint] = []
+        self._gone: dict[str, Fingerprint] = {}
         self._readable = False
         """Whether a file could be read, now or when the catalog got to know it."""
 
@@ -197,7 +201,7 @@ class _Scan:
                 self._idle.difference_update(owners)
             if file is None or not owners:
                 if before is not None:
-                    self._gone.append(before)
+                    self._gone[before.path] = before
                 continue
             self._files += 1
             if self._files % _BATCH == 0:
@@ -262,9 +266,11 @@ class _Scan:
             # The time of a file that was good is known, also if its name tells none. The stamps
             # leave it out, so that a scan that knows no more writes nothing.
             values["start"] = values["start"] or before.start
-        self._pending.append(row)
-        if len(self._pending) >= _BATCH and self._readable:
-            self._flush()
+        known = values["format"] or (before.format if before else "")
+        self._pending[_counted_in(values["path"], known)].append(row)
+        self._held += 1
+        if self._held >= _BATCH and self._readable:
+            self._flush(f"/{values['path']}")
 
     def _digest(self, path: str) -> str | None:
         try:
@@ -272,12 +278,46 @@ class _Scan:
         except OSError:
             return None
 
-    def _flush(self) -> None:
-        if not self._pending:
-            return
-        self._write()
-        self._store.replace(self._pending)
-        self._pending.clear()
+    def _flush(self, path: str = "") -> None:
+        """Write rows; before the end of the scan not those of folders that hold a path."""
+        self._held = 0
+        done = [folder for folder in self._pending if not (folder and path.startswith(folder))]
+        rows: list[GranuleRow] = []
+        reasons: dict[str, str] = {}
+        for folder in done:
+            own = self._pending.pop(folder)
+            rows += own
+            reasons |= self._misdated(folder, own) if folder else {}
+        if rows or reasons:
+            self._write()
+            self._store.replace(rows, reasons)
+
+    def _misdated(self, folder: str, rows: Sequence[GranuleRow]) -> dict[str, str]:
+        """Refuse misdated rows of a folder; return path -> new reason of known files."""
+        new = {row.values["path"]: row.values for row in rows}
+        known = [
+            file
+            for file in self._store.files_in(folder.strip("/"))
+            if file.path not in new and file.path not in self._gone
+        ]
+        read = (
+            DatedFile(*(values[name] for name in DatedFile._fields))
+            for values in new.values()
+            if values["stop"]
+        )
+        starts: dict[tuple[str, str], dict[str, datetime]] = defaultdict(dict)
+        for file in (*known, *read):
+            if _counted_in(file.path, file.format):
+                starts[file.instrument, file.role][file.path] = file.start
+        reasons = {path: why for own in starts.values() for path, why in misdated(own).items()}
+        for path in new.keys() & reasons.keys():
+            new[path].update(status=Status.REFUSED.value, reason=reasons[path], sha256=None)
+        return {
+            file.path: reasons.get(file.path, "")
+            for file in known
+            if file.reason.startswith(MISDATED if file.reason else "")
+            and file.reason != reasons.get(file.path, "")
+        }
 
     def finish(self) -> ScanSummary:
         """Write the remaining rows, and return the numbers."""
@@ -290,16 +330,19 @@ class _Scan:
                 field="archive",
                 remedy="check the keys and permissions with which lidarops reads it",
             )
+        for path, before in self._gone.items():
+            # What a file is compared with may be gone.
+            self._pending[_counted_in(path, before.format)] += []
         self._flush()
-        if self._added or self._changed:
-            self._store.bind_channel_names()
         moved = self._moved()
         if moved:
             self._write()
             self._store.store_digests(moved)
         if self._gone:
             self._write()
-            self._store.forget([before.path for before in self._gone])
+            self._store.forget(self._gone)
+        if self._added or self._changed or self._gone:
+            self._store.bind_channel_names()
         self._progress(self._files % _BATCH)
         added = self._added - len(moved)
         return ScanSummary(
@@ -339,7 +382,7 @@ class _Scan:
     def _moved(self) -> dict[str, str]:
         """Return path -> SHA-256 of new files with the content of a vanished one."""
         lost: dict[tuple[int, datetime | None], Counter[str]] = defaultdict(Counter)
-        for before in self._gone:
+        for before in self._gone.values():
             if before.sha256:
                 lost[before.size, before.start][before.sha256] += 1
         moved: dict[str, str] = {}
@@ -353,6 +396,13 @@ class _Scan:
                     candidates[digest] -= 1
                     moved[path] = digest
         return moved
+
+
+def _counted_in(path: str, known: str) -> str:
+    """Return the folder, between slashes, of a file whose name only counts; else nothing."""
+    if known not in raw_formats() or time_in_path(path, known) is not None:
+        return ""
+    return f"/{path}".rpartition("/")[0] + "/"
 
 
 def _claims(campaign: Campaign) -> list[_Claim]:

@@ -91,8 +91,8 @@ def init(
     base.mkdir(parents=True, exist_ok=True)
     (base / _SCHEMA).write_text(json.dumps(editor_schema(), indent=2) + "\n", encoding="utf-8")
     campaign.write_text(text, encoding="utf-8")
-    questions = sum("# ?" in line or "; ?" in line for line in text.splitlines())
-    say(f"{campaign}: {questions} values to check, marked ?; next: lidarops plan {campaign}")
+    questions = sum(bool(re.search(r"#(.* )?\?( |$)", line)) for line in text.splitlines())
+    say(f"{campaign}: {questions} questions to check, marked ?; next: lidarops plan {campaign}")
 
 
 def _free_output(campaign: Path) -> str:

@@ -27,6 +27,7 @@ from lidarops.raw.header import HeaderOrder, chosen
 from lidarops.raw.licel_format import COUNTS, Counts, read_dataset
 from lidarops.raw.licel_header import (
     CONVENTION,
+    LF_ENDS,
     Dataset,
     DatasetKind,
     Header,
@@ -336,7 +337,8 @@ def encode(header: Header, counts: Mapping[str, NDArray[Any]]) -> bytes:
         raise RawFormatError(f"not stored by the header: {', '.join(sorted(surplus))}")
     parts = [header.source]
     for dataset in stored:
-        parts += [_counts(dataset, counts).tobytes(), b"\r\n"]
+        end = b"\n" if LF_ENDS in header.notes else b"\r\n"
+        parts += [_counts(dataset, counts).tobytes(), end]
     # The size of a header read from a file without its last CRLF excludes the CRLF.
     return b"".join(parts)[: header.size]
 

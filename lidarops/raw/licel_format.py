@@ -2,7 +2,7 @@
 
 After the header a file holds, for each stored dataset, its bins as little-endian 32-bit counts
 followed by CRLF (`licel2023`). CRLF also occurs inside the data, so datasets are located by offset.
-The CRLF after a dataset is checked when the dataset is read.
+The CRLF, or LF, around a dataset is checked when the dataset is read.
 """
 
 from __future__ import annotations
@@ -99,25 +99,32 @@ def read_dataset(file: RawFile, place: int, stretches: Stretches | None, row: Co
     Raises
     ------
     RawFormatError
-        If counts are missing, or a dataset that is read as a whole is not followed by CRLF.
+        If counts are missing, or a dataset that is read as a whole is not between line ends.
     """
     start, size = 0, row.itemsize
     for first, past in ((0, row.size),) if stretches is None else stretches:
         offset, length = place + size * first, size * (past - first)
         # Only the last CRLF of a file may be missing.
-        end = b"\r\n"[: max(file.size - offset - length, 0)] if stretches is None else b""
-        content = file.read(offset, length + len(end))
-        if len(content) < length or content[length:] != end:
+        left = file.size - offset - length
+        lead, end = (2, b"\r\n"[: max(left, 0)]) if stretches is None else (0, b"")
+        content = file.read(offset - lead, lead + length + len(end))
+        before, behind = content[:lead], content[lead + length :]
+        # LF alone ends a dataset, but not the only one behind a header in CRLF. No count is so
+        # large that its last byte is CR or LF: that is of a line end, and a byte before is lost.
+        alone = behind[:1] == b"\n" and content[lead + length - 1] not in b"\r\n"
+        alone = alone and (left > 2 or (left == 1 and before != b"\r\n"))
+        ended = (behind == end or alone) and before[1:] in (b"", b"\n")
+        if len(content) < lead + length or not ended:
             raise RawFormatError(
-                f"no CRLF follows the counts from byte {place}: the data are not where the"
-                " header says"
+                f"no CRLF follows the counts from byte {place}, or those before: the data are not"
+                " where the header says"
                 if stretches is None
                 else f"ends within the {past - first} counts at byte {offset}",
                 file=file.path,
                 field="data",
                 remedy="copy the file again from the instrument, or leave it out",
             )
-        row[start : start + past - first] = np.frombuffer(content, COUNTS, past - first)
+        row[start : start + past - first] = np.frombuffer(content, COUNTS, past - first, lead)
         start += past - first
 
 

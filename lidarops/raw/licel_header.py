@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import IntEnum
 from functools import lru_cache
+from itertools import product
 from sys import intern
 from typing import Any, Final, NamedTuple
 
@@ -45,6 +46,8 @@ CONVENTION: Final = (
 )
 """Conversion of counts to physical values. Later Licel readers divide by 2^adc_bits - 1."""
 
+LF_ENDS: Final = "datasets end with LF instead of CRLF"
+"""Note on a file."""
 _LINE_LIMIT = 1024
 _CACHED_BLOCK = 4 * 1024
 _WITNESSES: Final = 2
@@ -105,6 +108,7 @@ _NEW_LETTERS: Final = frozenset("pr")
 r."""
 _ANALOG = frozenset({DatasetKind.ANALOG, DatasetKind.ANALOG_SQUARED})
 _PHOTON = frozenset({DatasetKind.PHOTON, DatasetKind.PHOTON_SQUARED})
+_NO_SIGNAL = frozenset({DatasetKind.POWER_METER, DatasetKind.OTHER})
 
 
 class ScanGrid(NamedTuple):
@@ -210,8 +214,8 @@ def parse_header(buffer: bytes, *, file: str = "", size: int | None = None) -> H
     ------
     RawFormatError
         If the bytes are not a header, a value is impossible, or the header promises another
-        size than the file has; the error names file, field and bytes. Only a missing last CRLF
-        is accepted, with a note.
+        size than the file has; the error names file, field and bytes. Only a missing last CRLF,
+        or LF in place of each, is accepted, with a note.
     """
     try:
         return _parse(buffer, file, len(buffer) if size is None else size)
@@ -240,7 +244,8 @@ def _parse(buffer: bytes, file: str, size: int) -> Header:
     block = buffer[block_start:block_end]
     parse = _parse_datasets if len(block) <= _CACHED_BLOCK else _parse_datasets.__wrapped__
     try:
-        datasets, dataset_notes = parse(block, data_start, size)
+        ends = (2, 1) if buffer[:data_start].endswith(b"\r\n") else (1, 2)
+        datasets, dataset_notes = parse(block, data_start, size, ends)
     except RawFormatError:
         _refuse_export(buffer[data_start:])
         raise
@@ -622,14 +627,17 @@ def _parse_lasers(text: str) -> tuple[tuple[Laser, ...], int, str | None, tuple[
 # Dataset lines repeat from file to file: parsing them once makes a header scan fast.
 @lru_cache(maxsize=128)
 def _parse_datasets(
-    block: bytes, data_start: int, size: int
+    block: bytes, data_start: int, size: int, ends: tuple[int, int]
 ) -> tuple[tuple[Dataset, ...], tuple[str, ...]]:
-    """Return the datasets that fit the size of the file, and notes on them."""
+    """Return the datasets that fit the size of the file, and notes on them.
+
+    The lengths of line ends are tried in turn, first that of the line before the counts.
+    """
     datasets = _parse_lines(block)
     notes = [
         f"{d.name} has no shots: its values are undefined"
         for d in datasets
-        if d.active and d.shots == 0 and d.kind is not DatasetKind.OTHER
+        if d.active and d.shots == 0 and d.kind not in _NO_SIGNAL
     ]
     notes += [
         f"{d.name} is no signal by its type, and one by its device {d.device}"
@@ -645,28 +653,31 @@ def _parse_datasets(
     notes += [
         f"dataset {d.device} cannot be a signal and {LEFT_OUT}"
         for d in datasets
-        if d.active and d.kind is DatasetKind.OTHER
+        if d.active and d.kind in _NO_SIGNAL and not d.device.startswith(_SIGNAL_DEVICES)
     ]
     notes += [
         f"polarisation l of {d.name} means parallel, as in older files"
         for d in datasets
         if d.active and d.polarisation == "p" and d.wavelength_label.endswith("l")
     ]
-    # By the specification, inactive datasets are not stored; some software stores them.
+    # By the specification, inactive datasets are not stored; some software stores them. Some ends
+    # datasets with LF: one or two are then as long as with CRLF of which the last is missing, so
+    # the last line of the header decides; bytes around datasets are checked when they are read.
     expected: list[int] = []
-    for all_stored in (False, True):
-        lengths = (4 * d.bins + 2 for d in datasets if d.active or all_stored)
+    for all_stored, end in product((False, True), ends):
+        lengths = [4 * d.bins + end for d in datasets if d.active or all_stored]
         expected.append(data_start + sum(lengths))
         promised = expected[-1]
-        if not (size == promised or (promised - 2 <= size and data_start < promised > size)):
+        if size != promised and not (lengths and end == 2 and promised - 2 <= size < promised):
             continue
-        notes += ["inactive datasets are stored"] * (promised > expected[0])
+        notes += ["inactive datasets are stored"] * all_stored
         notes += ["the last CRLF is missing"] * (size < promised)
+        notes += [LF_ENDS] * (end == 1 and bool(lengths))
         place = data_start
         for index, dataset in enumerate(datasets):
             if dataset.active or all_stored:
                 datasets[index] = replace(dataset, places=(place,))
-                place += 4 * dataset.bins + 2
+                place += 4 * dataset.bins + end
         return tuple(datasets), tuple(notes)
     raise RawFormatError(
         f"the header promises {expected[0]} bytes, the file has {size}:"

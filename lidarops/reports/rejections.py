@@ -24,7 +24,7 @@ _STAGES: Final = {
 }  # fmt: skip
 """Rejecting flags, and the entry of a plan whose settings they follow from."""
 _OF_ANALOG: Final = _STAGES | {"poor_stratification": "dark", "saturated": ""}
-_UNLIT: Final = "none: the laser was off; leave these files out, or name them as dark_files"
+UNLIT: Final = "none: the laser was off; leave these files out, or name them as dark_files"
 
 
 def settings_in_words(step: PlannedStep) -> Iterator[str]:
@@ -39,7 +39,7 @@ def settings_in_words(step: PlannedStep) -> Iterator[str]:
 def decided_by(plan: Plan, product: ProductRecord, flag: str) -> str:
     """Return which settings of a plan a flag of a product follows from; empty if from none."""
     if flag == "no_signal":
-        return _UNLIT
+        return UNLIT
     analog = file_channels(product.channel)[-1].startswith("analog_")
     stage = (_OF_ANALOG if analog else _STAGES).get(flag)
     channels = (product.channel, *file_channels(product.channel))

@@ -9,24 +9,18 @@ from __future__ import annotations
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from datetime import datetime, timedelta
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from lidarops.campaign.model import Campaign, Instrument, InstrumentFacts
-from lidarops.catalog.granules import out_of_order
-from lidarops.catalog.store import Store, Verdict
+from lidarops.catalog.store import Verdict
 from lidarops.kinds import Scope, kinds
-from lidarops.raw.formats import time_in_path
 from lidarops.raw.header import label_of
 from lidarops.records import (
-    FEWEST_ALIKE,
     FactsNote,
-    FileNote,
     Findings,
     Holding,
     IdlePattern,
-    Role,
     Unmade,
     Unmet,
     UnusableFile,
@@ -53,7 +47,6 @@ _NO_OVERLAP: Final = (
     "give neither full_overlap_range nor overlap_profile: bins near the lidar are used as they are,"
     " and a rise of the signal there is no cloud unless clean air beyond shows that"
 )
-_MOST_LONE_DAYS: Final = 50
 _NEVER_TOGETHER: Final = (
     "its instruments have no files at the same time, on the first and the last day"
 )
@@ -94,11 +87,7 @@ def find(
     incomplete, idle = _facts_notes(states, sorted(instruments))
     return Findings(
         unmet=unavailable_channels(campaign, states.names.holdings, instruments, selection),
-        file_notes=(
-            *store.file_notes(instruments),
-            *states.names.notes(instruments),
-            *_lone_files(store, instruments),
-        ),
+        file_notes=(*store.file_notes(instruments), *states.names.notes(instruments)),
         idle_patterns=tuple(one for one in idle_patterns if one.instrument in instruments),
         unusable_files=tuple(_unusable_files(states, sorted(instruments), usable)),
         unmade=tuple(_unmade(states, owners, orphans, settled)),
@@ -111,33 +100,6 @@ def find(
             found for found in (lost.findings if lost else ()) if found.instrument in instruments
         ),
     )
-
-
-def _lone_files(store: Store, instruments: Collection[str]) -> Iterator[FileNote]:
-    """Yield the files of days with few that start far from those beside them by name.
-
-    Where many days have few files, that is usual.
-    """
-    sums = store.day_sums()
-    days = [one.day for one in sums if one.role is Role.SIGNAL and one.good <= FEWEST_ALIKE]
-    folders: dict[tuple[str, str], dict[str, datetime]] = {}
-    few = days if len(days) <= _MOST_LONE_DAYS else []
-    for granule in (one for day in few for one in store.granules_of(day, day, dark_days=0)):
-        folder = granule.path.rpartition("/")[0]
-        if granule.role is not Role.SIGNAL or granule.instrument not in instruments:
-            continue
-        if (folder, granule.instrument) not in folders:
-            folders[folder, granule.instrument] = {
-                file.path: file.start
-                for file in store.files_in(folder)
-                if (file.instrument, file.role) == (granule.instrument, granule.role)
-                and time_in_path(file.path, granule.format) is None
-            }
-    for (_, instrument), starts in folders.items():
-        for path in out_of_order(starts, timedelta(days=1)):
-            text = f"{path} starts at {starts[path]:%Y-%m-%d %H:%M},"
-            text += " more than a day away from those beside it by name"
-            yield FileNote(instrument, text, contradicts=True, files=1)
 
 
 def _members(campaign: Campaign, owner: str) -> Collection[str]:

@@ -34,8 +34,8 @@ from lidarops.netcdf.read import open_product
 from lidarops.raw.archive import open_archive, open_counts
 from lidarops.raw.formats import RawFile, read_all_counts
 from lidarops.raw.header import RawHeader
-from lidarops.records import Scene, SceneOutcome, file_channels, is_glued
-from lidarops.reports.rejections import rejection_rows
+from lidarops.records import Granule, Scene, SceneOutcome, file_channels, is_glued
+from lidarops.reports.rejections import UNLIT, rejection_rows
 from lidarops.retrieve.signal.light import FEWEST, light_begins, rise_ends
 from lidarops.run.archive import bring_up_to_date
 from lidarops.run.scenes import scan_cycles_of
@@ -52,7 +52,9 @@ _MOST_DARK: Final = 20
 _HIGHEST: Final = 8000.0
 """m; usable values count below."""
 _STEP: Final = 10.0
-"""m; multiples of which a full overlap is given as."""
+"""m; a full overlap is not known better."""
+_OF_ONE: Final = 100.0
+"""m; to which one profile shows it."""
 _LATEST: Final = 1000.0
 """m; light of the nearest telescope begins before, unless a record begins before the pulse. Of one
 that sees only far air it begins at 750 m."""
@@ -158,11 +160,11 @@ class _Look:
         lit = archive.isel(time=~unlit if not unlit.all() else unlit)
         names = dict(zip((c.name for c in self.headers.layout), _channels(archive), strict=True))
         # The last one is analog where there is such a record, which counts no pile-up.
-        ends = (rise_ends(*_mean(lit, names[own[-1]])) for own in self.headers.candidates)
-        farthest = max(filter(None, ends), default=None)
+        full_overlap, within = _full_overlap(lit, [names[c[-1]] for c in self.headers.candidates])
         return FirstLook(
             files=len(files),
-            full_overlap=farthest and float(np.ceil(farthest / _STEP) * _STEP),
+            full_overlap=full_overlap,
+            within=within,
             begins=_late_light(lit),
             unlit=tuple(path for path, dark in zip(self.files, unlit, strict=True) if dark),
             clock=self._clock(archive),
@@ -241,7 +243,12 @@ def empty_in_first_files(
         cycles = scan_cycles_of(scene.granules)
         ((whole, beams),) = Counter(cycles).most_common(1)
         own = (g for g, cycle in zip(scene.granules, cycles, strict=True) if cycle == whole)
-        first = replace(scene, granules=tuple(own) if beams > 1 else scene.granules[:FEWEST])
+        begin = scene.granules[: _MOST_DARK + FEWEST]
+        lit = begin if beams > 1 else _lit(campaign, scene, begin)
+        if dark := len(begin) - len(lit):
+            share = f"{dark} of the first {len(begin)} files"
+            yield f"all of {scene.instrument}", "no light", share, UNLIT
+        first = replace(scene, granules=tuple(own) if beams > 1 else lit[:FEWEST])
         if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
             yield from _without_near_light(campaign, first)
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
@@ -251,6 +258,15 @@ def empty_in_first_files(
         for row in rejection_rows([replace(outcome, products=empty)]):
             if beams > 1 or row[-1].startswith(_OF_ONE_PROFILE):
                 yield row
+
+
+def _lit(campaign: Campaign, scene: Scene, some: tuple[Granule, ...]) -> tuple[Granule, ...]:
+    """Return those of some files of a scene that show light of the laser; all if none does."""
+    unlit = np.ones(len(some), bool)
+    with suppress(LidarOpsError):
+        names = [channel.name for channel in scene.layout]
+        unlit = _unlit(open_counts(some, root=Path(campaign.archive), channels=names))
+    return tuple(file for file, dark in zip(some, unlit, strict=True) if not dark) or some
 
 
 def _without_near_light(campaign: Campaign, scene: Scene) -> Iterator[tuple[str, str, str, str]]:
@@ -273,6 +289,24 @@ def _mean(archive: xr.Dataset, channel: str) -> tuple[Floats, Floats]:
     return ranges, np.square(ranges) * (counts - np.median(counts[-counts.size // 4 :]))
 
 
+def _full_overlap(lit: xr.Dataset, channels: Iterable[str]) -> tuple[float | None, float]:
+    """Return where the last of some channels stops rising, m, or None, and how parts scatter, m.
+
+    Both are rounded up: the scatter of parts of the time to a digit, the range to multiples of it.
+    """
+    ends = {name: end for name in channels if (end := rise_ends(*_mean(lit, name))) is not None}
+    if not ends:
+        return None, _OF_ONE
+    last = max(ends, key=ends.__getitem__)
+    parts = np.array_split(np.arange(lit.sizes["time"]), min(FEWEST, lit.sizes["time"]))
+    known = [rise_ends(*_mean(lit.isel(time=part), last)) for part in parts]
+    apart = [end for end in known if end is not None]
+    scatter = max(float(np.std(apart, ddof=1)), _STEP) if len(apart) > 1 else _OF_ONE
+    digit = 10.0 ** np.floor(np.log10(scatter))
+    within = float(np.ceil(scatter / digit) * digit)
+    return float(np.ceil(ends[last] / within) * within), within
+
+
 def _late_light(archive: xr.Dataset) -> float | None:
     """Return where light begins, m; None where it begins at once or is not seen."""
     begins = (light_begins(*_mean(archive, name)) for name in _channels(archive))
@@ -284,24 +318,34 @@ def without_light(contents: FolderContents, root: Path) -> FolderContents:
     """Return what a folder holds, with groups told apart whose files show no light of a laser."""
     groups = (
         replace(group, purpose=Purpose.UNLIT)
-        if group.purpose is Purpose.MEASUREMENT and _is_unlit(group, root)
+        if group.purpose is Purpose.MEASUREMENT and _is_unlit(group, contents.groups, root)
         else group
         for group in contents.groups
     )
     return replace(contents, groups=tuple(groups))
 
 
-def _is_unlit(group: FileGroup, root: Path) -> bool:
-    """Return whether some files of a group show no light, in no channel."""
-    if len(group.files) < FEWEST:
-        return False
-    paths = [root / path for path in group.files[:: len(group.files) // FEWEST]]
+def _is_unlit(group: FileGroup, groups: Iterable[FileGroup], root: Path) -> bool:
+    """Return whether some files of a group show no light, in no channel.
+
+    A few files tell that beside those of the largest group with the same channels alone.
+    """
+    members = list(zip(group.files, group.headers, strict=True))
+    if len(members) < FEWEST:
+        alike = (g for g in groups if (g.purpose, g.layout) == (group.purpose, group.layout))
+        largest = max(alike, key=lambda one: len(one.files))
+        members += zip(largest.files, largest.headers, strict=True)
+    step = len(members) // (2 * FEWEST) or 1
+    starts = {path: header.start for path, header in (*members[:FEWEST], *members[::step])}
     try:
-        archive = open_archive(paths, mask_and_scale=False, header_position="ignore")
-        return bool(_unlit(archive).all())
+        paths = [root / path for path in starts]
+        unlit = _unlit(open_archive(paths, mask_and_scale=False, header_position="ignore"))
     except LidarOpsError:
         # What cannot be read is refused with its reason when it is processed.
         return False
+    # The archive sorts by start, then path.
+    ordered = sorted(starts, key=lambda path: (starts[path], path))
+    return all(dark for path, dark in zip(ordered, unlit, strict=True) if path in group.files)
 
 
 def _unlit(archive: xr.Dataset) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ from lidarops.catalog.store import RecordedProduct, Store
 from lidarops.netcdf.context import product_path
 from lidarops.records import (
     INVALID,
+    MISDATED,
     FactsNote,
     Granule,
     LostFiles,
@@ -186,8 +187,8 @@ class Leftovers:
         idle = [self._idle[path] for path in signals if path in self._idle]
         if idle:
             # Unreadable files may be the only copies.
-            kept = not all(reason.startswith(INVALID) for reason in idle)
-            why = "are refused, or belong to no scene" if kept else "are declared invalid"
+            kept = not all(reason.startswith((INVALID, MISDATED)) for reason in idle)
+            why = "are refused, or belong to no scene" if kept else "are invalid or of another date"
             return f"its raw files {why}", kept, False
         return "no raw file of its scene is left", False, True
 

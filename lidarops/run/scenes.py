@@ -37,6 +37,7 @@ from lidarops.constants import DARK_REACH, LEAST_SPREAD
 from lidarops.errors import RetrievalInputError, SceneError
 from lidarops.kinds import Scope, kinds_of
 from lidarops.records import (
+    MISDATED,
     ChannelLayout,
     FileNote,
     Granule,
@@ -409,12 +410,12 @@ def dated(campaign: Campaign, catalog: Granules) -> Iterator[RefusedFile]:
     for folder, granules in sorted(folders.items()):
         rows: dict[tuple[str, Role], list[DatedFile]] = defaultdict(list)
         for file in sorted(catalog.files_in(folder)):
-            if file.instrument in campaign.instruments:
+            if file.instrument in campaign.instruments and not file.reason:
                 rows[file.instrument, file.role].append(file)
         series = {key: _Series.of(campaign, files) for key, files in rows.items()}
         undated: dict[tuple[str, datetime, datetime], list[Granule]] = defaultdict(list)
         for granule in granules:
-            if granule.start:
+            if granule.start and not granule.reason.startswith(MISDATED):
                 yield RefusedFile(granule, granule.start)
                 continue
             beside = series.get((granule.instrument, granule.role))

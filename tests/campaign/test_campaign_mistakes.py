@@ -86,6 +86,11 @@ def _message(folder: Path, text: str) -> str:
             "latitude: north",
             "line 6: stations.coast.latitude: must be a number from -90 to 90 degree, not 'north'",
         ),
+        # Between braces, a comma ends the value.
+        ("latitude: 46.4", "latitude: '46,4'", "not '46,4'; decimals stand behind a point: 46.4"),
+        ("dead_time: 4.0e-9", "dead_time: '4,5 ns'", "decimals stand behind a point: 4.5 ns"),
+        ("dead_time: 4.0e-9", "dead_time: 4,5 ns", "decimals stand behind a point: 4.5 ns"),
+        ("latitude: 46.4", "latitude: '46,400'", "to 90 degree, not '46,400'"),
         ("latitude: 46.4", "latitude: yes", "from -90 to 90 degree, not 'yes'"),
         # YAML 1.1 reads 46 min 24 s as 2784, or 46.4 h as a number of minutes.
         ("latitude: 46.4", "latitude: 0:24", "from -90 to 90 degree, not '0:24'"),

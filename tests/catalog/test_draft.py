@@ -476,7 +476,7 @@ def test_a_start_far_from_those_beside_it_by_name_is_a_question(tmp_path: Path) 
         write(tmp_path / f"raw/night{number}", content(minutes))
     _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
     question = next(line for line in text.splitlines() if "clock_offset" in line)
-    assert question.endswith("; night2 starts more than a day away from those beside it by name")
+    assert "; night2 is more than a day away from the files beside it by name, night1 (" in question
 
 
 @pytest.mark.parametrize("free", [True, False])

@@ -113,7 +113,7 @@ def test_a_task_reads_only_its_channel_and_files(pilar, monkeypatch):
     read, pread = [], os.pread
     monkeypatch.setattr(os, "pread", lambda d, n, at: read.append(n) or pread(d, n, at))
     archive.analog_532p[4:8].compute(**SYNCHRONOUS)
-    assert read == [4 * 4096 + 2] * 4
+    assert read == [2 + 4 * 4096 + 2] * 4
 
 
 def test_threads_and_pickled_graphs_agree(pilar, stacked):

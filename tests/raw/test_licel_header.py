@@ -315,6 +315,7 @@ def test_datasets_that_are_no_signal_do_not_move_the_others(tmp_path):
     assert [d.name for d in header.channels] == ["analog_532p", "photon_532p"]
     assert counts["photon_532p"].tolist() == [500, 501, 502, 503]
     assert [d.mode for d in header.datasets[1:5]] == [None] * 4
+    assert header.notes == ("dataset PD0 cannot be a signal and is left out",)
     assert all(math.isnan(d.scale) for d in header.datasets[1:5])
     assert len(header.layout) == 2
     every = [dataset.name for dataset in header.datasets]
@@ -390,10 +391,47 @@ def test_lines_that_end_with_lf_are_read_where_the_size_proves_the_header(tmp_pa
     assert values.keys() == expected.keys()
     for name, row in expected.items():
         np.testing.assert_array_equal(values[name], row)
-    # As by a transfer as text, which changes counts too.
-    path.write_bytes(whole.replace(b"\r\n", b"\n"))
+
+
+@pytest.mark.parametrize("of_header", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_datasets_that_end_with_lf_are_read_where_the_size_proves_it(tmp_path, number, of_header):
+    """Of one and two, lines of the header tell it from a missing last CRLF."""
+    data = [struct.pack("<4i", k, 0x0D0A, 0x0A0D0A, 0x0D) for k in range(number)]
+    datasets = tuple(ANALOG.replace("532", str(532 + k)) for k in range(number))
+    head = raw_file(datasets=datasets, data=[], last=b"").replace(b"\r\n", of_header)
+    path = tmp_path / "x"
+    path.write_bytes(head + b"\n".join(data) + b"\n")
+    if number < 3 and of_header == b"\r\n":
+        with pytest.raises(RawFormatError, match="no CRLF follows the counts"):
+            licel.read_counts(path)
+        return
+    header, counts = licel.read_counts(path)
+    assert [row.tobytes() for row in counts.values()] == data
+    assert "datasets end with LF instead of CRLF" in header.notes
+    assert licel.encode(header, counts) == path.read_bytes()
+    if number > 1:
+        # As by a transfer as text, which changes counts too.
+        path.write_bytes(path.read_bytes().replace(b"\r\n", b"\n"))
+        with pytest.raises(RawFormatError, match="truncated"):
+            licel.read_counts(path)
+
+
+def test_a_file_that_lacks_a_byte_for_each_dataset_does_not_end_with_lf(tmp_path):
+    path = tmp_path / "x"
+    path.write_bytes(raw_file((ANALOG, PHOTON, ANALOG.replace("532", "355")))[:-3])
     with pytest.raises(RawFormatError, match="no CRLF follows the counts"):
-        read_physical([path])
+        licel.read_counts(path)
+
+
+def test_a_lost_byte_of_counts_is_no_line_end_in_lf(tmp_path):
+    """The CR behind them is then their last byte; the first count of the next dataset is 10."""
+    content = bytearray(raw_file())
+    del content[licel.parse_header(bytes(content)).datasets[0].offset]
+    path = tmp_path / "x"
+    path.write_bytes(content)
+    with pytest.raises(RawFormatError, match="no CRLF follows the counts"):
+        licel.read_counts(path)
 
 
 def test_inactive_datasets_are_not_stored(tmp_path):
@@ -625,4 +663,5 @@ def test_a_signal_that_is_none_by_its_type_is_noted():
         "power_meter_532p is no signal by its type, and one by its device BC0",
     )
     meter = damaged.replace("BC0", "PD0")
-    assert parse(datasets=(ANALOG, meter)).notes == ()
+    (note,) = parse(datasets=(ANALOG, meter)).notes
+    assert note == "dataset PD0 cannot be a signal and is left out"

@@ -190,9 +190,9 @@ QUESTIONS = {
     ("name", "elastic", "least", "raman"),
     [
         ("pilar", {"analog_532p": 510, "analog_53200o": 510, "analog_355p": 510}, 0.6, set()),
-        ("saopaulo", {"glued_532o": 975, "analog_355o": 975}, 0.6, set()),
-        ("manaus_raman", {"glued_355o": 1600}, 0.6, {"photon_355o"}),
-        ("public/manaus_20111017_day", {"analog_355o": 1400}, 0.05, {"photon_355o"}),
+        ("saopaulo", {"glued_532o": 1010, "analog_355o": 1010}, 0.6, set()),
+        ("manaus_raman", {"glued_355o": 1610}, 0.6, {"photon_355o"}),
+        ("public/manaus_20111017_day", {"analog_355o": 1610}, 0.05, {"photon_355o"}),
     ],
 )
 def test_what_is_proposed_of_real_archives_is_usable(
@@ -293,3 +293,73 @@ def test_a_plan_tells_that_a_laser_was_off(data_root: Path, tmp_path: Path) -> N
     words = "none: the laser was off; leave these files out, or name them as dark_files"
     rows = told("plan", path)["empty_in_first_file"]
     assert ["signal analog_532o of harbour-lidar", "no_signal", "100 %", words] in rows
+
+
+AIR = 7.5 * (np.arange(2000) + 0.5)
+"""m."""
+
+
+def write_light(path: Path, minute: float, light: float, overlap: float = 300.0) -> None:
+    """Write a raw file with so much light, of which nearer than an overlap (m) some is missing."""
+    seen = (
+        light * np.exp(-AIR / 4000.0) * np.square(500.0 / AIR) * np.minimum(AIR / overlap, 1) ** 2
+    )
+    data = raw_archives.content(minute, bins=AIR.size, zenith_angle=0.0)
+    header, rng = licel.parse_header(data), np.random.default_rng(100 + round(minute))
+    counts = {name: rng.poisson(1000.0 + seen).astype(np.int32)
+              for name in ("analog_532o", "photon_532o")}  # fmt: skip
+    raw_archives.write(path, licel.encode(header, counts))
+
+
+def test_few_files_without_light_beside_others_are_a_question(tmp_path: Path) -> None:
+    """Their folder tells nothing, and four are too few to tell by themselves."""
+    for minute in range(12):
+        write_light(tmp_path / f"raw/h26{minute:02d}", minute, 3e4)
+    for minute in range(4):
+        write_light(tmp_path / f"raw/cover/h27{minute}", minute - 10, 0.0)
+        write_light(tmp_path / f"raw/other/h28{minute}", minute + 20, 3e4)
+    campaign, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    assert "# 4 files, ? without light of the laser by path or counts, left out of `files`:" in text
+    assert '#   "cover/h270"' in text
+    (lidar,) = campaign.instruments.values()
+    assert set(lidar.files) == {"h*", "other/h*"}
+
+
+def test_a_plan_looks_at_the_first_files_with_light(tmp_path: Path) -> None:
+    for minute in range(16):
+        write_light(tmp_path / f"raw/h26{minute:02d}", minute, 3e4 * (minute > 3))
+    path = tmp_path / "campaign.yaml"
+    CliRunner().invoke(app, ["init", "--headers-only", str(tmp_path / "raw"), str(path)])
+    rows = told("plan", path)["empty_in_first_file"]
+    words = "none: the laser was off; leave these files out, or name them as dark_files"
+    assert ["all of coast-lidar", "no light", "4 of the first 16 files", words] in rows
+    assert not [row for row in rows if row[1] == "no_signal"]
+
+
+@pytest.mark.parametrize(
+    ("overlaps", "stated"),
+    [((990, 990, 990, 990, 990), "1020  "), ((800, 900, 1000, 1100, 1200), "1200  ")],
+)
+def test_full_overlap_is_rounded_up_to_what_it_is_known_to(
+    tmp_path: Path, overlaps: tuple[float, ...], stated: str
+) -> None:
+    for minute, overlap in enumerate(overlaps):
+        write_light(tmp_path / f"raw/h26{minute}", minute, 1e6, overlap)
+    _, text = drafted(tmp_path / "raw", tmp_path / "campaign.yaml")
+    (line,) = (one for one in text.splitlines() if " full_overlap_range: " in one)
+    assert f"full_overlap_range: {stated}# ? m" in line
+
+
+def test_all_questions_of_a_draft_are_counted(tmp_path: Path) -> None:
+    for minute in range(5):
+        write_light(tmp_path / f"raw/h26{minute}", minute, 1e6)
+        write_light(tmp_path / f"raw/tc/h27{minute}", minute + 10, 1e6)
+    (tmp_path / "raw/sonde.csv").touch()
+    path = tmp_path / "campaign.yaml"
+    shown = CliRunner().invoke(app, ["init", "--headers-only", str(tmp_path / "raw"), str(path)])
+    lines = [line for line in path.read_text().splitlines() if " ? " in line or line.endswith(" ?")]
+    assert (
+        sum(line.startswith(("# 5 files, ? test of", "# 1 file, ? soundings")) for line in lines)
+        == 2
+    )
+    assert f"{len(lines)} questions to check, marked ?" in shown.output

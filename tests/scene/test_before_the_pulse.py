@@ -11,10 +11,12 @@ import xarray as xr
 import yaml
 from support.archives.scene_jobs import scene_jobs
 
-from lidarops.campaign.model import Campaign, load_campaign
+from lidarops.campaign.model import Campaign, ChannelFacts, load_campaign
 from lidarops.raw import licel
+from lidarops.records import ChannelLayout, DetectionMode, after_pulse
 from lidarops.run.archive import Options, reprocess
 from lidarops.run.reproduction import explain_difference, reproduce_product
+from lidarops.scene.case import channel_ranges
 from lidarops.simulate.campaign import simulate_campaign
 
 WIDTH, BINS, BEFORE = 7.5, 2000, 267
@@ -192,3 +194,13 @@ def test_bins_in_which_a_channel_sees_the_pulse_give_no_background(tmp_path: Pat
         _, product = products["signal", channel]
         score = (product.background - sky) / product.background_standard_error
         assert bool((np.abs(score) < 4.0).all())
+
+
+@pytest.mark.parametrize(("stated", "first"), [(900.0, 3.75), (904.0, 7.25), (907.5, 3.75)])
+def test_no_bin_that_begins_before_the_stated_pulse_is_kept(stated: float, first: float) -> None:
+    """A pulse at 904 m leaves within the bin from 900 m on: stated as 0.9 km, that is the first."""
+    record = ChannelLayout("photon_532o", DetectionMode.PHOTON, 532e-9, BINS, WIDTH, 0)
+    (kept,) = after_pulse((record,), stated)
+    assert channel_ranges(kept, ChannelFacts())[0] == pytest.approx(first)
+    assert (BINS - kept.bins) * WIDTH == pytest.approx(stated + first - WIDTH / 2.0)
+    assert 0.0 <= (BINS - kept.bins) * WIDTH - stated < WIDTH
