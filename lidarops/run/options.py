@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from lidarops.run.leftovers import Orphan
 
 Progress = Callable[[SceneOutcome], None]
+Batch = Callable[[], Sequence[SceneOutcome]]
+"""Carries out the next scenes, and returns how they ended."""
+MOST_OF_A_BATCH: Final = 50
 NO_USABLE_VALUE: Final = "no retrieval gave a usable value"
 
 
@@ -112,6 +115,8 @@ class Options:
     """Called with the outcome of each scene as it ends."""
     expect: Callable[[int], None] | None = None
     """Called with the number of granules of each group of stale scenes before processing."""
+    batch: Callable[[Batch], int] = lambda carry_out: len(carry_out())
+    """Called with each batch, which it carries out; returns the number of its scenes."""
 
 
 @dataclass(frozen=True, slots=True)
