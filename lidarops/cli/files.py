@@ -190,7 +190,7 @@ def compare(
 
 @command()
 def runs(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     out: options.Out = None,
     catalog: options.Catalog = None,
     limit: Annotated[
@@ -231,7 +231,7 @@ def _row(run: Run) -> tuple[object, ...]:
 
 @command()
 def verify(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     archive: options.Archive = None,
     out: options.Out = None,
     catalog: options.Catalog = None,

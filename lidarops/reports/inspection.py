@@ -83,7 +83,10 @@ def describe(file: Path) -> dict[str, Any]:
 
 
 def tables(file: Path) -> Iterator[Table]:
-    """Yield the description of a file as tables: title, names of columns, rows; see `describe`."""
+    """Yield the description of a file as tables: title, names of columns, rows; see `describe`.
+
+    Of a product, quality and values come first.
+    """
     description = describe(file)
     about = [
         (key.replace("_", " "), _with_unit(key, value))
@@ -94,6 +97,8 @@ def tables(file: Path) -> Iterator[Table]:
         about += [("notes", note) for note in description["notes"] or ["none"]]
     elif description["type"] == "netcdf":
         about += [item for item in description["attributes"].items() if item[0] not in _LONG]
+        yield _table("Quality", description["quality"], _FLAG)
+        yield _table("Variables", description["variables"], _VARIABLE)
     yield file.name, ("field", "value"), about
     if description["type"] == "folder":
         others = [{"file": path} for path in description["other"][:_OTHERS]]
@@ -104,9 +109,6 @@ def tables(file: Path) -> Iterator[Table]:
         yield _table("Channels", description["channels"], _CHANNEL)
         lines = description.get(_HEADER, "").splitlines()
         yield "Header as written", ("line",), [(line,) for line in lines]
-    else:
-        yield _table("Variables", description["variables"], _VARIABLE)
-        yield _table("Quality", description["quality"], _FLAG)
 
 
 def _with_unit(key: str, value: object) -> str:

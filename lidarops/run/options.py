@@ -106,6 +106,8 @@ class Options:
     """Memory limit of this process, or of a local worker, such as ``2GiB``."""
     cluster: Callable[[], AbstractContextManager[Client]] | None = None
     """Starts or reaches a cluster to run on instead; called only if something is stale."""
+    dashboard: Callable[[str], None] | None = None
+    """Called with the address of the pages of dask, which then are served to this machine."""
     wait: float = 0.0
     """s to wait for another run on the same catalog."""
     profiles_per_chunk: int | None = None

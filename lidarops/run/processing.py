@@ -215,12 +215,17 @@ class Pass:
     def _cluster(self, stack: ExitStack, workers: int) -> Client | None:
         """Start or reach a cluster; None if a signal came first, which then ends the run."""
         options = self.options
-        start = options.cluster or partial(local_client, workers, memory=options.memory)
+        served = options.dashboard is not None
+        start = options.cluster or partial(
+            local_client, workers, memory=options.memory, dashboard=served
+        )
         client = None
         # A queue may take an hour; a signal must not wait for it.
         if not self.stop:
             with self.stop.idle():
                 client = stack.enter_context(start())
+            if options.dashboard and client is not None:
+                options.dashboard(f"dashboard: {client.dashboard_link}")
         if self.stop:
             self.run.begin()
             return None

@@ -44,6 +44,8 @@ def test_products_show_verdicts_bits_and_extremes(kind: str, tmp_path: Path):
     assert counts["good"]["values"] == good
     table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})
     assert all(word in table.output for word in ("Variables", "Quality", "do_not_use", "units"))
+    first = [table.output.index(word) for word in ("do_not_use", "Variables", "Conventions")]
+    assert first == sorted(first)
 
 
 def test_a_folder_shows_a_line_for_each_group_of_like_files(tmp_path: Path):
