@@ -425,7 +425,7 @@ def local_client(
         If the pages need a package that is not installed.
     """
     if dashboard and importlib.util.find_spec("bokeh") is None:
-        raise ClusterError("the pages of dask need bokeh", remedy="pip install bokeh")
+        raise ClusterError("the pages of dask need bokeh", remedy="pip install lidarops[dashboard]")
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
     started = {"distributed.worker.multiprocessing-method": start_method()}
