@@ -22,7 +22,7 @@ from lidarops.figures import image_panels
 from lidarops.figures.panels import Axis
 from lidarops.site import build
 from lidarops.site.build import build_site
-from lidarops.site.product_contents import campaign, citation
+from lidarops.reports.product_contents import campaign, citation
 
 
 class _Links(HTMLParser):
