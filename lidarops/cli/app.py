@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import wraps
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec
@@ -235,24 +235,14 @@ def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0
     """Print tables of plain text, but those without rows, and return the number of lines.
 
     With `most`, so many rows of each, or fewer where all tables together would fill more than so
-    many lines: each has its next row in turn, while there is room. On a terminal, cells fold
-    between words only, so that names can be read and copied. Where the words are too long for
-    columns, each row is a paragraph, as are those of one column.
+    many lines. On a terminal, cells fold between words only, so that names can be read and copied.
+    Where the words are too long for columns, each row is a paragraph, as are those of one column.
     """
     whole = [(title, list(columns), list(rows)) for title, columns, rows in tables]
     shown = [_table(*table, most) for table in whole]
-    if most is not None and sum(map(len, shown)) > lines:
-        shown = [_table(*table, 0) for table in whole]
-        left = lines - sum(map(len, shown))
-        growing = list(range(len(whole)))
-        for rows, place in product(range(1, most + 1), range(len(whole))):
-            if place in growing:
-                higher = _table(*whole[place], rows)
-                more = len(higher) - len(shown[place])
-                if more > left:
-                    growing.remove(place)
-                else:
-                    left, shown[place] = left - more, higher
+    while most and sum(map(len, shown)) > lines:
+        most -= 1
+        shown = [_table(*table, most) for table in whole]
     for line in chain.from_iterable(shown):
         typer.echo(line)
     return sum(map(len, shown))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,12 +32,8 @@ def aggregate(
     channel: Annotated[str | None, typer.Option(help="Only this channel.")] = None,
     station: Annotated[str | None, typer.Option(help="Only this station.")] = None,
     instrument: Annotated[str | None, typer.Option(help="Only this instrument.")] = None,
-    since: Annotated[
-        datetime | None, typer.Option(help="Only products that end after this UTC time.")
-    ] = None,
-    until: Annotated[
-        datetime | None, typer.Option(help="Only products that start before this UTC time.")
-    ] = None,
+    since: options.Since = None,
+    until: options.Until = None,
     means: Annotated[
         str | None, typer.Option(help="Also write means over each day or month.", metavar="PERIOD")
     ] = None,
