@@ -424,7 +424,8 @@ def _print_result(
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = listed({f"{product.kind} {product.channel}" for product in empty})
-        words = f"products without a usable value, flags say why: {len(empty)} ({names})"
+        which = "none of the products has" if result.all_empty else "products without"
+        words = f"{which} a usable value, flags say why: {len(empty)} ({names})"
         say_wrapped(words, "")
     if no_scene:
         typer.echo(NO_SCENE)
