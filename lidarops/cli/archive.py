@@ -247,7 +247,6 @@ def reprocess(
         stated = Shown(stale=True, everything=everything, as_json=as_json, force=force, thaw=thaw)
         show_scenes(settings, selection, stated, wait=wait)
         return
-    served = _dashboard(workers, scheduler or cluster, requested=dashboard)
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with progress_bar("reprocess") as bar:
         chosen = pipeline.Options(
@@ -259,7 +258,7 @@ def reprocess(
             wait=wait,
             profiles_per_chunk=profiles_per_chunk,
             journal=True,
-            dashboard=served,
+            dashboard=partial(typer.echo, err=True) if dashboard else None,
             progress=lambda outcome: bar.advance(outcome.granules),
             expect=bar.grow,
         )
@@ -298,15 +297,6 @@ def reprocess(
         raise typer.Exit(UNAVAILABLE)
     left = result if removed is None else replace(result, orphans=())
     exit_with_status(failed=left.has_failures or (result.record is not None and page is None))
-
-
-def _dashboard(
-    workers: int | None, cluster: str | None, *, requested: bool
-) -> Callable[[str], None] | None:
-    """Return what tells the address of the pages of dask; None where they are not requested."""
-    if requested and cluster is None and (workers or 1) == 1:
-        raise typer.BadParameter("--dashboard is of a dask cluster: give --workers 2, too")
-    return partial(typer.echo, err=True) if requested else None
 
 
 def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:

@@ -107,7 +107,7 @@ class Options:
     cluster: Callable[[], AbstractContextManager[Client]] | None = None
     """Starts or reaches a cluster to run on instead; called only if something is stale."""
     dashboard: Callable[[str], None] | None = None
-    """Called with the address of the pages of dask, which then are served to this machine."""
+    """Called with the address of the pages of dask, which are then served to this machine."""
     wait: float = 0.0
     """s to wait for another run on the same catalog."""
     profiles_per_chunk: int | None = None
@@ -118,7 +118,7 @@ class Options:
     expect: Callable[[int], None] | None = None
     """Called with the number of granules of each group of stale scenes before processing."""
     batch: Callable[[Batch], int] = lambda carry_out: len(carry_out())
-    """Called with each batch, which it carries out; returns the number of its scenes."""
+    """Carries out a batch, and returns the number of its scenes."""
 
 
 @dataclass(frozen=True, slots=True)

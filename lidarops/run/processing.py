@@ -89,7 +89,7 @@ class Pass:
         """Whether days are judged again, and whether for their months."""
         self.failing = 0
         """Number of scenes in a row that failed for a cause that may pass."""
-        self.on_workers = bool(options.cluster) or options.workers > 1
+        self.on_workers = bool(options.cluster or options.dashboard) or options.workers > 1
 
     def carry_out(self) -> Result:
         """Return what was done, and the state of the archive after it.
@@ -205,12 +205,9 @@ class Pass:
             alone=alone,
         )
         # Between batches, a cluster is as busy as within one.
-        carry_out = partial(self._enter_batch, ended)
+        carry_out = partial(self._enter, ended, MOST_OF_A_BATCH)
         while self.options.batch(carry_out) == MOST_OF_A_BATCH:
             pass
-
-    def _enter_batch(self, ended: Iterator[EndedScene]) -> list[SceneOutcome]:
-        return self._enter(islice(ended, MOST_OF_A_BATCH))
 
     def _cluster(self, stack: ExitStack, workers: int) -> Client | None:
         """Start or reach a cluster; None if a signal came first, which then ends the run."""
@@ -231,10 +228,10 @@ class Pass:
             return None
         return client
 
-    def _enter(self, ended: Iterable[EndedScene]) -> list[SceneOutcome]:
+    def _enter(self, ended: Iterable[EndedScene], most: int | None = None) -> list[SceneOutcome]:
         self.run.begin()
         outcomes = []
-        for scene in ended:
+        for scene in islice(ended, most):
             judged = self.judgements.pop(scene.outcome.scene)
             outcome = self.run.end(self.judge, judged, scene.outcome, final=scene.final)
             self.lost_worker = self.lost_worker or scene.lost_worker

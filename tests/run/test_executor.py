@@ -20,10 +20,8 @@ from distributed.deploy.spec import SpecCluster
 from support.archives.scene_jobs import scene_jobs
 from support.archives.small_archive import Archive
 from support.poison import HALF, Poison, Sleep
-from typer.testing import CliRunner
 
 from lidarops.catalog.store import RunStatus, Store
-from lidarops.cli import app
 from lidarops.records import SceneOutcome
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
@@ -128,18 +126,11 @@ def test_the_pages_of_dask_are_served_to_this_machine_where_they_are_asked_for(
         address = told[0].removeprefix("dashboard: ")
         pages.append(httpx.get(address).content)
 
-    options = Options(workers=2, dashboard=told.append, progress=look)
+    options = Options(dashboard=told.append, progress=look)
     assert bring_up_to_date(archive.write(), options=options).record is not None
     assert len(told) == 1
     assert told[0].startswith("dashboard: http://127.0.0.1:")
     assert b"Dask" in pages[0]
-
-
-def test_pages_of_dask_without_dask_are_wrong_use(archive: Archive) -> None:
-    archive.write()
-    result = CliRunner().invoke(app, ["reprocess", str(archive.file), "--dashboard"])
-    assert result.exit_code == 2
-    assert "give --workers 2" in result.output
 
 
 @pytest.mark.slow
