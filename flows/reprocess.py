@@ -366,7 +366,6 @@ def _log_problems(campaign: Campaign, result: Result) -> str:
         "scenes ended with an internal error": result.internal_errors,
         "scenes failed": result.failed_scenes,
         "scenes without a usable value": dict.fromkeys(result.unusable_scenes, NO_USABLE_VALUE),
-        "products, which are all of the run, without a usable value": result.all_empty,
         "files refused": {
             granule.path: granule.reason
             for granule in refused_files(result)

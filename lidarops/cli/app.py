@@ -191,11 +191,12 @@ class Bar:
 
 def compiled_functions() -> int | None:
     """Return the number of compiled functions that are kept; None before numerics are loaded."""
-    if "lidarops.retrieve" not in sys.modules:
+    if "lidarops.retrieve.common.compiled_code" not in sys.modules:
         return None
     from numba import config
 
-    return sum(1 for _ in Path(vars(config)["CACHE_DIR"]).rglob("*.nbi"))
+    folder = vars(config)["CACHE_DIR"]
+    return sum(1 for _ in Path(folder).rglob("*.nbi")) if folder else None
 
 
 @contextmanager

@@ -414,8 +414,7 @@ def _print_result(
     empty = [p for scene in scenes for p in scene.products if p.usable == 0]
     if empty:
         names = listed({f"{product.kind} {product.channel}" for product in empty})
-        which = "none of the products has" if result.all_empty else "products without"
-        words = f"{which} a usable value, flags say why: {len(empty)} ({names})"
+        words = f"products without a usable value, flags say why: {len(empty)} ({names})"
         say_wrapped(words, "")
     if no_scene:
         typer.echo(NO_SCENE)

@@ -177,14 +177,6 @@ class Result:
         return tuple(dict.fromkeys((*self.unusable, *now)))
 
     @property
-    def all_empty(self) -> Mapping[str, str]:
-        """Products of the run -> why, where none of them has a usable value; else empty."""
-        products = [product for scene in self.scenes for product in scene.products]
-        if any(product.usable != 0 for product in products):
-            return {}
-        return {product.path: NO_USABLE_VALUE for product in products}
-
-    @property
     def lost(self) -> Mapping[str, str]:
         """Requested products of whose scene no raw file is left -> why."""
         return {orphan.path: orphan.reason for orphan in self.orphans if orphan.lost}
@@ -203,7 +195,6 @@ class Result:
             or not all(reason.startswith(ACKNOWLEDGED) for reason in self.set_aside.values())
             or self.findings.failed
             or self.lost
-            or self.all_empty
             or self.status is not RunStatus.FINISHED
             or (self.record is not None and self.record.failed)
         )
