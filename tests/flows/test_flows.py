@@ -628,14 +628,17 @@ def test_a_run_that_gives_up_is_tried_again_and_one_that_is_stopped_is_not(
 
 def test_a_run_with_failures_counts_as_completed() -> None:
     within = timedelta(hours=26)
-    plain = notifications.automations(uuid4(), within=within)
-    assert [each.name for each in plain] == [notifications.FAILED, notifications.ABSENT]
+    made = notifications.automations(uuid4(), within=within)
+    plain = {automation.name: automation.trigger for automation in made}
+    assert len(plain) == 3
     event = f"prefect.flow-run.{WITH_FAILURES}"
-    assert event in plain[1].trigger.expect
+    absent = plain[notifications.ABSENT]
+    assert event in absent.expect
     # Time counts from the last run of the same archive.
-    assert plain[1].trigger.after == plain[1].trigger.expect
-    assert plain[1].trigger.for_each == {"related:deployment:prefect.resource.id"}
-    assert event not in plain[0].trigger.expect
+    assert absent.after == absent.expect
+    assert absent.for_each == {"related:deployment:prefect.resource.id"}
+    assert event not in plain[notifications.FAILED].expect
+    assert plain[notifications.MISSING].expect == {NO_FILES}
     automations = notifications.automations(uuid4(), within=within, failures=True)
     (has_failures,) = [
         each for each in automations if each.name == notifications.COMPLETED_WITH_FAILURES
