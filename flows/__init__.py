@@ -31,12 +31,17 @@ WITH_FAILURES: Final = "Completed with failures"
 Its event is ``prefect.flow-run.Completed with failures``: Prefect names events after states.
 """
 
+NO_FILES: Final = "lidarops.archive.no-files"
+"""Event of an instrument whose expected files did not come, e.g. of a missing night."""
+
 use_one_thread()
 # By default Prefect waits 20 s for its server to start, too short on a busy machine.
 os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "120")
 # A station may have no network, and usage data should not leave it.
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
+# Warnings of the library are part of the log of a run.
+os.environ.setdefault("PREFECT_LOGGING_EXTRA_LOGGERS", "lidarops")
 # s; `flows.maintenance` ends runs without heartbeat. The default of 180 s would block schedules.
 os.environ.setdefault("PREFECT_FLOWS_HEARTBEAT_FREQUENCY", "30")
 # Services that a temporary server without deployments does not need.

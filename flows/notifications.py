@@ -1,9 +1,9 @@
 """Set up notifications of nightly runs that failed or are missing.
 
-``python -m flows.notifications https://hooks.example.org/lidar`` creates two automations on the
+``python -m flows.notifications https://hooks.example.org/lidar`` creates three automations on the
 Prefect server, which post ``{"text": ...}`` to that address; a further call replaces them. Chat
 services accept this format; mail and others can be selected in Prefect's pages, for the same
-automations. ``--failures`` adds a third, for runs in the state `flows.WITH_FAILURES`.
+automations. ``--failures`` adds a fourth, for runs in the state `flows.WITH_FAILURES`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,17 @@ from prefect.blocks.notifications import CustomWebhookNotificationBlock
 from prefect.events import EventTrigger, Posture, ResourceSpecification
 from prefect.events.actions import SendNotification
 
-from flows import WITH_FAILURES
+from flows import NO_FILES, WITH_FAILURES
 
 BLOCK = "lidarops-operators"
 FAILED = "lidarops: a run failed"
 ABSENT = "lidarops: no nightly run was completed"
+MISSING = "lidarops: an instrument has no new files"
 COMPLETED_WITH_FAILURES = "lidarops: a run completed with failures"
 
+_NO_FILES = (
+    "{{ event.payload.instrument }} of {{ event.payload.campaign }}: {{ event.payload.message }}"
+)
 _BODY = "{{ flow_run.name }} is {{ flow_run.state.name }}: {{ flow_run.state.message }}"
 
 
@@ -56,10 +60,10 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
         threshold=1,
         within=within,
     )
-    with_failures = [_ended(block, COMPLETED_WITH_FAILURES, WITH_FAILURES)] if failures else []
     return [
-        _ended(block, FAILED, "Failed", "Crashed", "TimedOut"),
-        *with_failures,
+        _told(block, FAILED, _events("Failed", "Crashed", "TimedOut")),
+        _told(block, MISSING, {NO_FILES}, _NO_FILES),
+        *([_told(block, COMPLETED_WITH_FAILURES, _events(WITH_FAILURES))] if failures else []),
         Automation(
             name=ABSENT,
             trigger=absent,
@@ -75,15 +79,15 @@ def automations(block: UUID, *, within: timedelta, failures: bool = False) -> li
     ]
 
 
-def _ended(block: UUID, name: str, *states: str) -> Automation:
-    """Return an automation that reports every run that ends in one of the states."""
+def _told(block: UUID, name: str, events: set[str], body: str = _BODY) -> Automation:
+    """Return an automation that reports every one of some events."""
     trigger = EventTrigger(
-        expect=_events(*states),
+        expect=events,
         match_related=_tagged("lidarops"),
         posture=Posture.Reactive,
         threshold=1,
     )
-    notification = SendNotification(block_document_id=block, subject=name, body=_BODY)
+    notification = SendNotification(block_document_id=block, subject=name, body=body)
     return Automation(name=name, trigger=trigger, actions=[notification])
 
 

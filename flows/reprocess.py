@@ -3,9 +3,9 @@
 ``python -m flows.reprocess catalogs/demo.yaml`` needs no set-up: if the environment names no
 Prefect server, it starts a temporary one.
 
-One Prefect task processes all stale scenes, with its own dask cluster, because a task costs tens of
-milliseconds, more than a file. The ledger records every scene as it ends, so that a retried task
-continues where it stopped.
+One Prefect task processes all stale scenes, with its own dask cluster. Each batch of scenes is a
+task run within it, because a task costs tens of milliseconds, more than a file. The ledger records
+every scene as it ends, so that a retried task continues where it stopped.
 
 If files are refused or scenes failed, in this run or since an earlier one, the run ends in the
 state `flows.WITH_FAILURES`, because nobody sees the exit code of a scheduled run.
@@ -14,11 +14,13 @@ state `flows.WITH_FAILURES`, because nobody sees the exit code of a scheduled ru
 from __future__ import annotations
 
 import base64
+import logging
 import time
 from collections import Counter
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 from uuid import UUID
@@ -32,13 +34,15 @@ from prefect.artifacts import (
     create_table_artifact,
     update_progress_artifact,
 )
+from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.events import emit_event
 from prefect.states import Completed
 from prefect.tasks import exponential_backoff
 from prefect.utilities.annotations import quote
 from pydantic import AfterValidator, Field
 
-from flows import WITH_FAILURES
+from flows import NO_FILES, WITH_FAILURES
 from flows.start import (
     CatalogUrl,
     Location,
@@ -50,12 +54,12 @@ from flows.start import (
 from lidarops.campaign.model import Campaign, load_campaign
 from lidarops.catalog.database import check_archive_and_catalog
 from lidarops.catalog.product_files import publish_products
-from lidarops.catalog.store import RunStatus
+from lidarops.catalog.store import RunStatus, Store
 from lidarops.cli import options
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.figures.wording import counted
 from lidarops.kinds import kinds
-from lidarops.records import ACKNOWLEDGED, RunRecord, SceneOutcome
+from lidarops.records import ACKNOWLEDGED, Role, RunRecord, SceneOutcome, day_of
 from lidarops.reports import run_tables
 from lidarops.reports.findings import finding_rows
 from lidarops.run import clusters
@@ -70,6 +74,7 @@ from lidarops.run.archive import (
 )
 from lidarops.run.options import (
     NO_USABLE_VALUE,
+    Batch,
     check_selection,
     selected,
     selects_no_scene,
@@ -80,6 +85,7 @@ _T = TypeVar("_T")
 
 Workers = Annotated[int, Field(ge=1, le=10_000)]
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
+Hours = Annotated[float, Field(gt=0, le=8_784)]
 
 
 def _known_kind(name: str) -> str:
@@ -92,6 +98,7 @@ KindName = Annotated[
     str, AfterValidator(_known_kind), Field(json_schema_extra={"enum": list(kinds())})
 ]
 
+_LEVELS = (logging.INFO, logging.WARNING)
 _PROGRESS_INTERVAL = 15.0
 """s between reports of progress; each is a request to the server."""
 _MOST_NAMED = 20
@@ -143,6 +150,18 @@ class _Progress:
         update_progress_artifact(self._artifact, 100.0)
 
 
+@task(name="scenes", task_run_name="batch {number}", cache_policy=NO_CACHE)
+def batch_task(number: int, carry_out: Batch) -> int:
+    """Carry out a batch of scenes, log how each of them ended, and return their number."""
+    scenes = carry_out()
+    logger = get_run_logger()
+    for scene in scenes:
+        ended = scene.error or counted(len(scene.products), "product")
+        logger.log(_LEVELS[bool(scene.error)], "%s: %s", scene.scene, ended)
+    logger.info("batch %d: %s", number, counted(len(scenes), "scene"))
+    return len(scenes)
+
+
 @task(name="process", **_RETRY)
 def process_task(
     campaign: Campaign,
@@ -153,13 +172,14 @@ def process_task(
     wait: float,
 ) -> Result:
     """Bring catalog and products up to date."""
-    progress = _Progress(campaign.name)
+    progress, numbers = _Progress(campaign.name), count(1)
     chosen = Options(
         force=full,
         wait=wait,
         journal=True,
         progress=progress.advance,
         expect=progress.expect,
+        batch=lambda carry_out: batch_task(next(numbers), _opaque(carry_out)),
     )
     if isinstance(cluster, clusters.Local):
         chosen = replace(chosen, workers=cluster.workers, memory=cluster.memory)
@@ -186,14 +206,17 @@ def _unfinished(result: Result) -> LidarOpsError:
 
 
 @task(name="report", **_RETRY)
-def report_task(campaign: Campaign, record: RunRecord, workers: int) -> Path:
+def report_task(campaign: Campaign, record: RunRecord, workers: int, pages_at: str | None) -> Path:
     """Write the report of a run, and publish its table, link and quicklook as artifacts."""
     built = report_run(campaign, record, workers=workers)
-    key = campaign.name.lower()
+    key, words = campaign.name.lower(), f"Run {record.id}, report {built.page}"
     create_table_artifact(
-        key=f"{key}-products", table=run_tables.instruments(record), description=f"Run {record.id}"
+        key=f"{key}-products", table=run_tables.instruments(record), description=words
     )
-    create_link_artifact(built.page.as_uri(), f"Report of run {record.id}", key=f"{key}-report")
+    if pages_at is not None:
+        # No browser follows a link from a page of the server to a file.
+        place = built.page.relative_to(campaign.output).as_posix()
+        create_link_artifact(f"{pages_at.rstrip('/')}/{place}", words, key=f"{key}-report")
     if built.quicklook is not None:
         from lidarops.figures.stills import still  # noqa: PLC0415 - imports matplotlib
 
@@ -211,6 +234,24 @@ def publish_task(campaign: Campaign, url: str) -> None:
     get_run_logger().info(
         "%s: %d sent, %d unchanged", url, len(published.uploaded), published.unchanged
     )
+
+
+def _tell_missing(campaign: Campaign, selection: Selection, within: float) -> None:
+    """Raise the event `flows.NO_FILES` for each instrument without a file in the last hours."""
+    due = runtime.flow_run.scheduled_start_time or datetime.now(UTC)
+    since = due - timedelta(hours=within)
+    with Store(campaign.catalog_url, campaign.name, create=False) as store:
+        files = store.granules_of(day_of(since), day_of(due), dark_days=0)
+    came = {f.instrument for f in files if f.role is Role.SIGNAL and f.start and f.start > since}
+    for name in campaign.instruments:
+        if name not in came and selection.owner(name, campaign):
+            words = f"no good file within the {within:g} h before {due:%Y-%m-%d %H:%M} UTC"
+            get_run_logger().warning("%s: %s", name, words)
+            emit_event(
+                NO_FILES,
+                {"prefect.resource.id": f"lidarops.archive.{campaign.name}.{name}"},
+                payload={"campaign": campaign.name, "instrument": name, "message": words},
+            )
 
 
 def _run_name() -> str:
@@ -238,6 +279,8 @@ def reprocess(
     stations: list[str] | None = None,
     products: list[KindName] | None = None,
     memory_limit: clusters.Memory | None = None,
+    files_within: Hours | None = None,
+    pages_at: Location | None = None,
     *,
     full: bool = False,
 ) -> tuple[Result, Path | None]:
@@ -265,6 +308,11 @@ def reprocess(
         SQLAlchemy URL of catalog and ledger; overrides the campaign file.
     memory_limit : str, optional
         Memory limit of a local worker, such as ``2GiB``.
+    files_within : float, optional
+        h before the scheduled time within which each instrument should have a good file; where one
+        has none, the event `flows.NO_FILES` is raised.
+    pages_at : str, optional
+        Address at which the output folder is served, for the link to the report.
     full : bool
         Whether to make also fresh products again.
 
@@ -285,6 +333,8 @@ def reprocess(
     settings = load_campaign(campaign, archive=archive, output=out, catalog=catalog)
     selection = selected(instruments, stations, products, since, until)
     result = process_task(_opaque(settings), _opaque(selection), chosen, full=full, wait=wait)
+    if files_within is not None:
+        _tell_missing(settings, selection, files_within)
     # First, because copy and report may fail.
     message = _log_problems(settings, result) if result.has_failures else ""
     # Even if nothing was stale: an earlier copy may have failed.
@@ -297,7 +347,7 @@ def reprocess(
         reason = "the selection contains no scene of the archive" if no_scene else "nothing to do"
         get_run_logger().info("campaign %s: %s", settings.name, reason)
     else:
-        built = report_task(_opaque(settings), _opaque(result.record), local)
+        built = report_task(_opaque(settings), _opaque(result.record), local, pages_at)
         scenes = len(result.record.scenes)
         get_run_logger().info("run %s: %d scenes, report %s", result.record.id, scenes, built)
     made = "" if result.record is None else result.record.id
@@ -378,6 +428,12 @@ def main(
     wait: options.Wait = 0.0,
     publish: Annotated[
         str | None, typer.Option(help="URL of a store to which the products are copied.")
+    ] = None,
+    files_within: Annotated[
+        float | None, typer.Option(help="Hours within which each instrument should have a file.")
+    ] = None,
+    pages_at: Annotated[
+        str | None, typer.Option(help="Address at which the output folder is served.")
     ] = None,
     *,
     full: Annotated[

@@ -238,6 +238,10 @@ class Store(Granules):
 
     # Outcomes
 
+    def campaign_folders(self) -> list[str]:
+        """Return the folders of the campaign files of all runs in the database."""
+        return self.read(sa.select(RUN.c.folder).distinct(), lambda row: str(row[0]))
+
     def begin_scene(self, scene: str, day: int, run: str, token: str) -> None:
         """Note the start of a scene; the note stays if the process dies."""
         row = {

@@ -8,19 +8,21 @@ import logging
 import os
 import sys
 import textwrap
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import wraps
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, ParamSpec
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec
 
 import typer
 
 from lidarops.errors import REFUSED, UNAVAILABLE, LidarOpsError, UnavailableError
-from lidarops.figures.wording import listed, visible
+from lidarops.figures.wording import counted, duration, listed, visible
 from lidarops.kinds import kinds
 
 if TYPE_CHECKING:
@@ -35,11 +37,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+CAMPAIGN_FILE: Final = "campaign.yaml"
 NO_SCENE: Final = "nothing to do: the selection contains no scene of the archive"
 
 Table = tuple[str, Iterable[str], Iterable[Iterable[Any]]]
 """Title, names of columns, and rows."""
 _P = ParamSpec("_P")
+
+PROGRESS_INTERVAL: float = 30.0
+"""s between lines of progress where there is no terminal."""
 
 _TABLE_LINES = 3
 """Characters between the columns of a table."""
@@ -144,38 +150,81 @@ def exit_with_status(*, failed: bool) -> None:
         raise typer.Exit(REFUSED)
 
 
-class Bar(NamedTuple):
-    """A progress bar: adds to its total, and advances."""
+class Bar:
+    """Progress in words: what is done, how long it took and will take, and what was compiled."""
 
-    grow: Callable[[int], None]
-    advance: Callable[[int], None]
+    def __init__(self, name: str, unit: str) -> None:
+        self._name, self._unit = name, unit
+        self._total = self._done = 0
+        self._started = monotonic()
+        self._known = compiled_functions()
+
+    def grow(self, number: int) -> None:
+        """Add to the number of things to do."""
+        self._total += number
+
+    def advance(self, number: int) -> None:
+        """Add to the number of things done."""
+        self._done += number
+
+    def __str__(self) -> str:
+        """Return one line."""
+        elapsed = monotonic() - self._started
+        done, share, remaining = counted(self._done, self._unit), "", "unknown"
+        if self._total:
+            done = f"{self._done:,} of {counted(self._total, self._unit)}"
+            share = f", {self._done / self._total:.0%}"
+            if self._done:
+                left = max(self._total - self._done, 0)
+                remaining = duration(elapsed * left / self._done)
+        words = f"{self._name}: {done}{share}, elapsed {duration(elapsed)}, remaining {remaining}"
+        return "; ".join(filter(None, (words, self.compiled())))
+
+    def compiled(self) -> str:
+        """Return how many functions were compiled meanwhile, in words; empty for none."""
+        known = compiled_functions()
+        # The numerics may have been loaded since.
+        self._known = known if self._known is None else self._known
+        new = (known or 0) - (self._known or 0)
+        return f"{counted(new, 'function')} compiled, once for this installation" if new else ""
+
+
+def compiled_functions() -> int | None:
+    """Return the number of compiled functions that are kept; None before numerics are loaded."""
+    if "lidarops.retrieve.common.compiled_code" not in sys.modules:
+        return None
+    from numba import config
+
+    folder = vars(config)["CACHE_DIR"]
+    return sum(1 for _ in Path(folder).rglob("*.nbi")) if folder else None
 
 
 @contextmanager
-def progress_bar(name: str) -> Iterator[Bar]:
-    """Show progress on standard error if that is a terminal; the total is what it grows to."""
-    if not sys.stderr.isatty():
-        yield Bar(lambda _: None, lambda _: None)
-        return
-    from rich import progress
-    from rich.console import Console
+def progress_bar(name: str, unit: str = "file") -> Iterator[Bar]:
+    """Show progress on standard error; a line every 30 s where that is no terminal."""
+    bar = Bar(name, unit)
+    with ExitStack() as stack:
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.live import Live
 
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeElapsedColumn(),
-        progress.TextColumn("remaining"),
-        progress.TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with progress.Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(name, total=None)
+            console = Console(stderr=True)
+            shown = Live(get_renderable=lambda: str(bar), console=console, transient=True)
+            stack.enter_context(shown)
+        else:
+            ended = threading.Event()
+            teller = threading.Thread(target=_tell, args=(bar, ended), daemon=True)
+            teller.start()
+            stack.callback(teller.join)
+            stack.callback(ended.set)
+        yield bar
+    if bar.compiled():
+        typer.echo(f"{name}: {bar.compiled()}", err=True)
 
-        def grow(number: int) -> None:
-            bar.update(task, total=(bar.tasks[0].total or 0) + number)
 
-        yield Bar(grow, lambda done: bar.advance(task, done))
+def _tell(bar: Bar, ended: threading.Event) -> None:
+    while not ended.wait(PROGRESS_INTERVAL):
+        typer.echo(bar, err=True)
 
 
 def show_rows(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
@@ -187,24 +236,14 @@ def show_tables(tables: Iterable[Table], most: int | None = None, lines: int = 0
     """Print tables of plain text, but those without rows, and return the number of lines.
 
     With `most`, so many rows of each, or fewer where all tables together would fill more than so
-    many lines: each has its next row in turn, while there is room. On a terminal, cells fold
-    between words only, so that names can be read and copied. Where the words are too long for
-    columns, each row is a paragraph, as are those of one column.
+    many lines. On a terminal, cells fold between words only, so that names can be read and copied.
+    Where the words are too long for columns, each row is a paragraph, as are those of one column.
     """
     whole = [(title, list(columns), list(rows)) for title, columns, rows in tables]
     shown = [_table(*table, most) for table in whole]
-    if most is not None and sum(map(len, shown)) > lines:
-        shown = [_table(*table, 0) for table in whole]
-        left = lines - sum(map(len, shown))
-        growing = list(range(len(whole)))
-        for rows, place in product(range(1, most + 1), range(len(whole))):
-            if place in growing:
-                higher = _table(*whole[place], rows)
-                more = len(higher) - len(shown[place])
-                if more > left:
-                    growing.remove(place)
-                else:
-                    left, shown[place] = left - more, higher
+    while most and sum(map(len, shown)) > lines:
+        most -= 1
+        shown = [_table(*table, most) for table in whole]
     for line in chain.from_iterable(shown):
         typer.echo(line)
     return sum(map(len, shown))
@@ -288,6 +327,33 @@ def _column_widths(names: list[str], cells: list[list[str]], width: int) -> list
     wanted = sum(whole) - sum(least)
     share = min(1.0, spare / wanted) if wanted else 0.0
     return [low + int(share * (high - low)) for low, high in zip(least, whole, strict=True)]
+
+
+def stated(place: Path) -> Path:
+    """Return the campaign file in a folder; without one the folder, and a file as it is."""
+    file = place / CAMPAIGN_FILE
+    return file if file.is_file() else place
+
+
+def campaign_file(place: Path) -> Path:
+    """Return the campaign file in a folder, or that of an output folder; a file as it is."""
+    if not (place := stated(place)).is_dir():
+        return place
+    from lidarops.campaign.model import load_campaign
+    from lidarops.catalog.store import Store
+
+    ledger, found = place / "catalog.sqlite", []
+    if ledger.exists():
+        with Store(f"sqlite:///{ledger}", "", create=False) as store:
+            folders = store.campaign_folders()
+        for path in chain.from_iterable(sorted(Path(name).glob("*.y*ml")) for name in folders):
+            with suppress(LidarOpsError):
+                if Path(load_campaign(path).output) == place.resolve():
+                    found.append(path)
+    if len(found) != 1:
+        several = f", but {', '.join(map(str, found))} write to it" if found else ""
+        raise typer.BadParameter(f"{place} holds no {CAMPAIGN_FILE}{several}: give a campaign file")
+    return found[0]
 
 
 def loaded_campaign(

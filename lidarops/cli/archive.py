@@ -31,8 +31,8 @@ from lidarops.cli.app import (
     show_error,
     show_rows,
     show_tables,
-    terminal_width,
 )
+from lidarops.cli.plan import Shown, show_scenes
 from lidarops.errors import UNAVAILABLE, LidarOpsError
 from lidarops.records import without_numbers
 
@@ -51,13 +51,8 @@ if TYPE_CHECKING:
     )
     from lidarops.run.archive import Result
 
-_MANY_PRODUCTS = 12
-"""More products are summed by kind and channel, unless --all is given."""
 _MANY_FILES = 20
 """Most rows of each table of a catalog, without --all."""
-_WIDE = 120
-"""Characters of a line; in shorter ones, the columns about a product do not fit, and all are
-summed."""
 _LINES = 45
 """Lines in the tables of a run, without --all."""
 _FEW = 8
@@ -87,7 +82,7 @@ def _size(text: str | None) -> str | None:
 
 @command()
 def catalog(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     archive: options.Archive = None,
     out: options.Out = None,
     catalog: options.Catalog = None,
@@ -161,7 +156,7 @@ def catalog(
 
 @command()
 def reprocess(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     archive: options.Archive = None,
     out: options.Out = None,
     catalog: options.Catalog = None,
@@ -212,6 +207,12 @@ def reprocess(
             help="Profiles that are processed together, whatever the limit; affects no result.",
         ),
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only show what would be made, and why.")
+    ] = False,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Serve the pages of dask, to this machine only.")
+    ] = False,
     everything: Annotated[
         bool, typer.Option("--all", help="List every product, file and finding.")
     ] = False,
@@ -229,6 +230,7 @@ def reprocess(
 ) -> None:
     """Update the catalog, make all stale products, and write a report.
 
+    Prints a line for each kind and channel, with the setting that most rejected values follow from.
     Writes nothing if there is nothing to do. Exit code 1 if anything was refused or failed, 3 if
     products could not be written, or a database, a store or a cluster does not serve.
 
@@ -241,6 +243,10 @@ def reprocess(
     set_up_log(log_level, as_json=log_json, file=log_file)
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
+    if dry_run:
+        stated = Shown(stale=True, everything=everything, as_json=as_json, force=force, thaw=thaw)
+        show_scenes(settings, selection, stated, wait=wait)
+        return
     connect = _cluster(workers, scheduler, tls, cluster, memory_limit)
     with progress_bar("reprocess") as bar:
         chosen = pipeline.Options(
@@ -252,6 +258,7 @@ def reprocess(
             wait=wait,
             profiles_per_chunk=profiles_per_chunk,
             journal=True,
+            dashboard=partial(typer.echo, err=True) if dashboard else None,
             progress=lambda outcome: bar.advance(outcome.granules),
             expect=bar.grow,
         )
@@ -464,8 +471,6 @@ def _tables(result: Result, *, removing: bool) -> Iterator[Table]:
     yield "Without a usable value", problem, now
     earlier = [row for row in (*result.failures.items(), *unusable) if row[0] not in processed]
     yield "From earlier runs, unchanged since", problem, earlier
-    title = "Rejected values, and the settings that they follow from"
-    yield title, ("product", "flag", "values", "settings"), _rejections(scenes)
 
 
 def _orphan_table(result: Result, fate: str) -> Table:
@@ -482,24 +487,28 @@ def _rejections(scenes: Sequence[SceneOutcome]) -> list[tuple[str, str, str, str
 
 
 def _product_tables(scenes: Sequence[SceneOutcome], *, everything: bool) -> Iterator[Table]:
-    """Yield what was made; of many products, the sums of each kind and channel."""
+    """Yield what was made: the sums of each kind and channel, and with `everything` each product.
+
+    A sum ends with advice: the settings that most rejected values follow from.
+    """
     from lidarops.figures.wording import counted
 
     made = [product for scene in scenes for product in scene.products]
-    if everything or (len(made) <= _MANY_PRODUCTS and terminal_width() >= _WIDE):
+    if everything:
         names = "scene", "kind", "channel", "values", "good", "care", "reject", "flags"
         yield "Products", names, (row for scene in scenes for row in _product_rows(scene))
-        return
     alike: dict[str, list[ProductRecord]] = defaultdict(list)
     for scene in scenes:
         for product in scene.products:
-            alike[f"{scene.instrument} {product.kind} {product.channel}"].append(product)
-    title = f"{counted(len(made), 'product')}, summed (--all lists them)"
+            alike[f"{product.kind} {product.channel} of {scene.instrument}"].append(product)
+    advice: dict[str, str] = {}
+    for name, flag, _, settings in _rejections(scenes):
+        advice.setdefault(name, f"; check, because of {flag}: {settings}")
     yield (
-        title,
+        f"{counted(len(made), 'product')}, summed (--all lists them)",
         ("",),
         (
-            (f"{name}: {counted(len(products), 'product')}, {_summed(products)}",)
+            (f"{name}: {_summed(products)}{advice.get(name, '')}",)
             for name, products in sorted(alike.items())
         ),
     )
@@ -508,7 +517,9 @@ def _product_tables(scenes: Sequence[SceneOutcome], *, everything: bool) -> Iter
 
 
 def _summed(products: Sequence[ProductRecord]) -> str:
-    """Return the shares of good values, of others and of the most frequent flags, in words."""
+    """Return totals, and the shares of good values, of others and of frequent flags, in words."""
+    from lidarops.figures.wording import counted
+
     values = sum(product.values for product in products)
     flags: Counter[str] = Counter()
     for product in products:
@@ -519,10 +530,12 @@ def _summed(products: Sequence[ProductRecord]) -> str:
         strict=True,
     )
     frequent = ((name.lower(), count) for name, count in flags.most_common(_FEW_FLAGS))
-    return "; ".join(
+    shares = (
         ", ".join(f"{name} {count / max(values, 1):.0%}" for name, count in each)
         for each in (counts, frequent)
     )
+    totals = f"{counted(len(products), 'product')}, {counted(values, 'value')}"
+    return "; ".join(filter(None, (totals, *shares)))
 
 
 def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
@@ -530,5 +543,3 @@ def _product_rows(scene: SceneOutcome) -> Iterator[tuple[object, ...]]:
         flags = ", ".join(f"{name.lower()} {count}" for name, count in product.flagged.items())
         numbers = (product.values, *product.verdicts)
         yield scene.scene, product.kind, product.channel, *numbers, flags
-    if scene.error:
-        yield scene.scene, "none", "", "", "", "", "", scene.error

@@ -53,9 +53,14 @@ def inspect(
     provenance: Annotated[
         bool, typer.Option("--provenance", help="Print the PROV-JSON of a product.")
     ] = False,
+    time: Annotated[
+        str, typer.Option(help="UTC, such as 2024-09-21T15:00: only the profile of this time.")
+    ] = "",
     as_json: options.Json = False,
 ) -> None:
     """Show the content of a raw file or a product, or the groups of raw files of a folder.
+
+    Of a product: quality, values, the steps with their settings, how to cite it, and attributes.
 
     Example: lidarops inspect demo/raw/coast/h2492106.010000
     """
@@ -65,9 +70,9 @@ def inspect(
         say(inspection.provenance(file))
         return
     if as_json:
-        typer.echo(json.dumps(inspection.describe(file), indent=2, ensure_ascii=False))
+        typer.echo(json.dumps(inspection.describe(file, time), indent=2, ensure_ascii=False))
         return
-    show_tables(inspection.tables(file))
+    show_tables(inspection.tables(file, time))
 
 
 @command()
@@ -190,7 +195,7 @@ def compare(
 
 @command()
 def runs(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     out: options.Out = None,
     catalog: options.Catalog = None,
     limit: Annotated[
@@ -200,7 +205,8 @@ def runs(
 ) -> None:
     """Show the runs of a campaign, the newest first, and who holds its catalog now.
 
-    Of a run its status, numbers and time per stage. A holder that is dead is overtaken by the next
+    Of a run its status, numbers and time per stage; then the scenes that failed when they were last
+    tried, and the report of the newest run. A holder that is dead is overtaken by the next
     command; one that only may be, because it ran elsewhere, by a command with --wait 60.
 
     Example: lidarops runs catalogs/demo.yaml
@@ -208,16 +214,22 @@ def runs(
     from lidarops.campaign.model import load_campaign
     from lidarops.catalog.lock import Lock
     from lidarops.catalog.store import Store
+    from lidarops.reports.run_record import INDEX
 
     settings = load_campaign(campaign, output=out, catalog=catalog)
     with Store(settings.catalog_url, settings.name, create=False) as store:
         listed, holder = store.runs(limit=limit), Lock(store).held_by()
+        failures = store.failures()
     if as_json:
         plain = [asdict(run) for run in listed]
         typer.echo(json.dumps(plain, indent=2, default=datetime.isoformat))
         return
     columns = ("run", "status", "took", "scenes", "products", "failed", "refused", "stages", "by")
     show_rows(f"Runs of {settings.name}", columns, map(_row, listed))
+    show_rows("Failed, as last tried", ("scene", "error"), failures.items())
+    reports = (settings.report_root / run.id / INDEX for run in listed)
+    for page in [page for page in reports if page.exists()][:1]:
+        say(f"newest report: {from_here(page)}")
     if holder:
         say(f"The catalog is {holder}.")
 
@@ -231,7 +243,7 @@ def _row(run: Run) -> tuple[object, ...]:
 
 @command()
 def verify(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     archive: options.Archive = None,
     out: options.Out = None,
     catalog: options.Catalog = None,

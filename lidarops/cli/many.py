@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,23 +27,13 @@ if TYPE_CHECKING:
 
 @command()
 def aggregate(
-    out: Annotated[
-        Path,
-        typer.Argument(
-            help="Output folder of a campaign, a folder of products, or a campaign file.",
-            metavar="OUT_OR_CAMPAIGN",
-        ),
-    ],
+    out: options.Output = Path(),
     kind: Annotated[str | None, typer.Option(help="Only this kind of product.")] = None,
     channel: Annotated[str | None, typer.Option(help="Only this channel.")] = None,
     station: Annotated[str | None, typer.Option(help="Only this station.")] = None,
     instrument: Annotated[str | None, typer.Option(help="Only this instrument.")] = None,
-    since: Annotated[
-        datetime | None, typer.Option(help="Only products that end after this UTC time.")
-    ] = None,
-    until: Annotated[
-        datetime | None, typer.Option(help="Only products that start before this UTC time.")
-    ] = None,
+    since: options.Since = None,
+    until: options.Until = None,
     means: Annotated[
         str | None, typer.Option(help="Also write means over each day or month.", metavar="PERIOD")
     ] = None,
@@ -89,7 +78,7 @@ def aggregate(
         raise typer.BadParameter(f"{error}; there are {choices}") from error
     selection = parse_selection(kind, channel, station, instrument, utc(since), utc(until))
     root, runs = _root(out, with_runs=store)
-    with progress_bar("aggregate") as bar:
+    with progress_bar("aggregate", "product") as bar:
         made = make_aggregates(
             root,
             selection,
@@ -145,9 +134,7 @@ def _tell(made: AggregateResult) -> None:
 
 @command()
 def site(
-    out: Annotated[
-        Path, typer.Argument(help="Output folder of a campaign, with its products.", metavar="OUT")
-    ],
+    out: options.Output = Path(),
     workers: options.Workers = 1,
     products_at: Annotated[
         str,
@@ -188,9 +175,9 @@ def site(
     from lidarops.figures.wording import counted
     from lidarops.site.build import build_site
 
-    with progress_bar("site") as bar:
+    with progress_bar("site", "product") as bar:
         made = build_site(
-            out,
+            _root(out, with_runs=False)[0],
             workers=workers,
             products_at=products_at,
             stac_at=stac_at,

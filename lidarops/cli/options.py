@@ -8,7 +8,28 @@ from typing import Annotated
 
 import typer
 
-Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN")]
+from lidarops.cli.app import campaign_file, stated
+
+Campaign = Annotated[
+    Path,
+    typer.Argument(
+        help="Campaign file (YAML), a folder with campaign.yaml, or the output folder of a campaign"
+        " that has run; default: the folder here.",
+        metavar="CAMPAIGN",
+        callback=campaign_file,
+        show_default=False,
+    ),
+]
+Output = Annotated[
+    Path,
+    typer.Argument(
+        help="Output folder of a campaign, or what names it: a campaign file, or a folder with"
+        " campaign.yaml; default: the folder here.",
+        metavar="OUT_OR_CAMPAIGN",
+        callback=stated,
+        show_default=False,
+    ),
+]
 Archive = Annotated[
     str | None,
     typer.Option("--archive", help="Folder or URL of the raw files; overrides the campaign file."),

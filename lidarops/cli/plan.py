@@ -1,16 +1,19 @@
 """The command that shows scenes, their plans, and what is stale.
 
-By default a screen of text, on which scenes of which the same is to be said are one; with --all
+By default a screen of text, with a block for each instrument and period of its facts; with --all
 tables of all steps of each scene.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 
@@ -45,6 +48,10 @@ _REASONS: Final = 3
 """Reasons of refused files that fit on the screen."""
 _SCREEN: Final = 25
 """Lines about scenes, without --all."""
+_LEAST: Final = 4
+"""Lines about one instrument in one period, at least."""
+_NUMBER: Final = re.compile(r"(?<![\w.])-?\d[\d.]*")
+"""A number, but not that in the name of a channel or a file."""
 _FEW: Final = 5
 """Rows of a table of findings, without --all."""
 _LINES: Final = 45
@@ -53,7 +60,7 @@ _LINES: Final = 45
 
 @command("plan")
 def show_plan(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     archive: options.Archive = None,
     out: options.Out = None,
     catalog: options.Catalog = None,
@@ -79,30 +86,38 @@ def show_plan(
     with something to be made, the first files are processed: what has no usable value in them is
     named with the setting.
 
-    Shows a screen of summaries, one for all scenes that are alike, with the memory that a process
-    needs for a scene; with --all every step of each scene with its settings and reasons. Exit code
-    1 if a file is refused, a scene cannot be planned, failed before or gave no usable value, a
-    pattern or channel is in no file, or headers contradict a station.
+    Shows a screen of summaries, one for each instrument and period of its facts, with the memory
+    that a process needs for a scene; with --all every step of each scene with its settings and
+    reasons. Exit code 1 if a file is refused, a scene cannot be planned, failed before or gave no
+    usable value, a pattern or channel is in no file, or headers contradict a station.
 
     Example: lidarops plan catalogs/demo.yaml
     """
-    from lidarops.catalog.database import without_writing
-
     settings = loaded_campaign(campaign, archive, out, catalog, all_steps=all_steps)
     selection = selection_of(instrument, station, product, since, until)
-    with without_writing(settings) as planned:
-        _plan(planned, selection, stale=stale, everything=everything, wait=wait, as_json=as_json)
+    shown = Shown(stale=stale, everything=everything, as_json=as_json)
+    show_scenes(settings, selection, shown, wait=wait)
 
 
-def _plan(
-    settings: Campaign,
-    selection: Selection,
-    *,
-    stale: bool,
-    everything: bool,
-    wait: float,
-    as_json: bool,
-) -> None:
+class Shown(NamedTuple):
+    """What is shown of scenes, and whether fresh or frozen ones would be made, too."""
+
+    stale: bool = False
+    everything: bool = False
+    as_json: bool = False
+    force: bool = False
+    thaw: bool = False
+
+
+def show_scenes(campaign: Campaign, selection: Selection, shown: Shown, *, wait: float) -> None:
+    """Show scenes, and exit with 1 where something is not as it should be; see `show_plan`."""
+    from lidarops.catalog.database import without_writing
+
+    with without_writing(campaign) as planned:
+        _plan(planned, selection, shown, wait)
+
+
+def _plan(settings: Campaign, selection: Selection, shown: Shown, wait: float) -> None:
     from lidarops.catalog.raw_files import acknowledged
     from lidarops.catalog.store import Store
     from lidarops.run.archive import assess, earlier_problems, survey
@@ -113,12 +128,18 @@ def _plan(
         refused = acknowledged(settings, store.refused())
     set_aside: list[Granule] = []
     judgements = assess(
-        settings, selection=selection, everything=not stale, update=False, set_aside=set_aside
+        settings,
+        selection=selection,
+        everything=not shown.stale,
+        update=False,
+        force=shown.force,
+        thaw=shown.thaw,
+        set_aside=set_aside,
     )
     earlier = earlier_problems(settings, selection)
     scenes = []
     first: dict[str, Scene] = {}
-    alike: dict[tuple[str, ...], list[Judgement]] = {}
+    blocks: dict[tuple[str, datetime | None], list[Judgement]] = {}
     count = to_be_made = 0
     failed = False
     for judged in judgements:
@@ -130,16 +151,16 @@ def _plan(
         if judged.due or judged.held:
             for problems in earlier:
                 problems.pop(judged.scene.id, None)
-        if as_json:
+        if shown.as_json:
             scenes.append(_plain(judged))
-        elif everything:
-            _show_judged(judged, stale=stale)
-        elif not stale or judged.stale or judged.failure:
-            lines = _scene_lines(judged, plan=not stale)
-            alike.setdefault((judged.scene.instrument, *lines), []).append(judged)
+        elif shown.everything:
+            _show_judged(judged, stale=shown.stale)
+        elif not shown.stale or judged.stale or judged.failure:
+            period = _period(settings, judged.scene)
+            blocks.setdefault((judged.scene.instrument, period), []).append(judged)
     empty = _empty(settings, first.values())
     no_scene = not count and selects_no_scene(settings, selection)
-    if as_json:
+    if shown.as_json:
         document = {
             "scenes": scenes,
             "no_scene_selected": no_scene,
@@ -153,7 +174,7 @@ def _plan(
         }
         typer.echo(json.dumps(document, indent=2))
     else:
-        printed = _show_alike(alike, stale=stale)
+        printed = _show_blocks([_block(group, shown) for group in blocks.values()])
         if no_scene:
             say(NO_SCENE)
         printed += _show_refused([granule.reason for granule in refused])
@@ -163,12 +184,14 @@ def _plan(
             ("Not used", ("file", "reason"), ((one.path, one.reason) for one in set_aside)),
         ]
         tables += [*finding_tables(findings), *_earlier(*earlier)]
-        show_tables(tables, None if everything else _FEW, _LINES - printed)
+        show_tables(tables, None if shown.everything else _FEW, _LINES - printed)
         lacking = ", ".join(settings.metadata.lacking)
         words = f"metadata of the campaign: products will lack {lacking}"
         say_wrapped(words if lacking else "", "")
         # With --stale, fresh scenes are not judged.
-        say_wrapped(counted(to_be_made, "stale scene") + ("" if stale else f" of {count}"), "")
+        say_wrapped(
+            counted(to_be_made, "stale scene") + ("" if shown.stale else f" of {count}"), ""
+        )
         say_wrapped("--all shows settings and reasons of every step; --json shows everything.", "")
     unexpected = (not granule.is_expected for granule in (*refused, *set_aside))
     exit_with_status(failed=any((failed, *unexpected, *earlier, findings.failed)))
@@ -312,60 +335,76 @@ def _plain(judged: Judgement) -> dict[str, Any]:
     }
 
 
-def _show_alike(alike: Mapping[tuple[str, ...], Sequence[Judgement]], *, stale: bool) -> int:
-    """Print scenes, those with equal lines together, until the screen is full: so many lines."""
+def _period(campaign: Campaign, scene: Scene) -> datetime | None:
+    """Return the begin of the facts that apply to a scene; None of a network or a month."""
+    if scene.instrument not in campaign.instruments or not scene.granules:
+        return None
+    start = scene.granules[0].start or scene.start
+    return campaign.instruments[scene.instrument].facts_at(start).valid_from
+
+
+def _block(group: Sequence[Judgement], shown: Shown) -> list[str]:
+    """Return title and lines about the scenes of one instrument in one period of its facts."""
+    first, last = group[0].scene, group[-1].scene
+    title = f"{first.id}: "
+    if len(group) > 1:
+        title = f"{first.id} to {last.id}: {counted(len(group), 'scene')}, "
+    files = zip(*((j.scene.granules, j.scene.dark) for j in group), strict=True)
+    granules, dark = (sum(map(len, part)) for part in files)
+    memory = max(_memory(j)["to_be_made" if shown.stale else "everything"] for j in group)
+    title += f"{granules} files, {dark} dark, about {memory / 1e6:.0f} MB of memory"
+    alike: dict[str, dict[str, list[str]]] = {}
+    for line in (line for judged in group for line in _scene_lines(judged, plan=not shown.stale)):
+        kinds_of_line = alike.setdefault(line.partition(":")[0], {})
+        kinds_of_line.setdefault(_NUMBER.sub("#", line), []).append(line)
+    lines = []
+    for said in (said for kinds_of_line in alike.values() for said in kinds_of_line.values()):
+        others = ", and the like" if len(set(said)) > 1 else ""
+        share = f" ({len(said)} of {len(group)} scenes)" if len(said) < len(group) else ""
+        lines.append(f"{said[0]}{others}{share}")
+    return [title, *lines]
+
+
+def _show_blocks(blocks: Sequence[Sequence[str]]) -> int:
+    """Print blocks of a title and lines each, until the screen is full: so many lines."""
     printed = 0
-    for place, (lines, group) in enumerate(alike.items()):
-        height = 2 + sum(len(wrapped(line, "")) for line in lines[1:])
-        if printed and printed + height > _SCREEN:
-            left = sum(len(more) for more in list(alike.values())[place:])
-            say_wrapped(f"{counted(left, 'further scene')} with other lines (--all)", "")
-            break
-        printed += height
-        first, last = group[0].scene, group[-1].scene
-        several = f"{first.id} to {last.id}: {counted(len(group), 'scene')}, "
-        title = several if len(group) > 1 else f"{first.id}: "
-        files = zip(*((j.scene.granules, j.scene.dark) for j in group), strict=True)
-        granules, dark = (sum(map(len, part)) for part in files)
-        title += f"{granules} files, {dark} dark"
-        if len(group) == 1:
-            title += f", plan {group[0].requested.hash[:12]}"
-        say_wrapped(title, "")
-        needs = "to_be_made" if stale else "everything"
-        memory = max(_memory(judged)[needs] for judged in group)
-        say_wrapped(f"about {memory / 1e6:.0f} MB of memory", "  ")
-        for line in lines[1:]:
-            words = line.lstrip()
-            say_wrapped(words, line[: len(line) - len(words)])
+    room = max(_SCREEN // max(len(blocks), 1), _LEAST)
+    for place, (title, *lines) in enumerate(blocks):
+        if printed >= _SCREEN:
+            words = f"{counted(len(blocks) - place, 'further block')} like these (--all)"
+            return printed + say_wrapped(words, "")
+        printed += say_wrapped(title, "")
+        end = printed + room
+        for number, line in enumerate(lines):
+            if number and printed + len(wrapped(line, "  ")) > end:
+                left = counted(len(lines) - number, "further line")
+                printed += say_wrapped(f"{left} (--all)", "  ")
+                break
+            printed += say_wrapped(line, "  ")
     return printed
 
 
 def _scene_lines(judged: Judgement, *, plan: bool) -> Iterator[str]:
     """Yield what is to be made of a scene and why; with `plan` its steps and what is left out."""
     stale = _stale_rows(judged)
-    yield "  to be made:" if stale else "  to be made: nothing"
+    if not stale:
+        yield "to be made: nothing"
     for kind, channels, reason in stale:
-        yield f"    {kind} {channels}: {reason}"
+        yield f"to be made: {kind} {channels}: {reason}"
     if judged.failure:
         held = "; not tried again, because nothing has changed" if judged.held else ""
-        yield f"  failed before{held}: {judged.failure.error}"
+        yield f"failed before{held}: {judged.failure.error}"
     if plan:
         yield from _step_lines(judged.requested)
     for what, products in _kept(judged):
         for kind, channels, reason in _grouped((p.kind, p.reason, p.channel) for p in products):
-            yield f"  {what}: {kind} {channels}: {reason}"
+            yield f"{what}: {kind} {channels}: {reason}"
 
 
 def _step_lines(plan: Plan) -> Iterator[str]:
     from lidarops.reports.rejections import settings_in_words
     from lidarops.scene.case import READ_STEP, REQUEST
 
-    names = dict.fromkeys(step.name for step in plan.steps)
-    if names:
-        yield f"  steps: {', '.join(names)}"
-    near = (step for step in plan.steps if step.name == "overlap")
-    states = (", ".join((*settings_in_words(step), step.reason)) for step in near)
-    yield from dict.fromkeys(f"  overlap: {each}" for each in states)
     requested = [left for left in plan.left_out if left.rule != REQUEST]
     missed = [left for left in requested if left.name in kinds()]
     told = {left.channel for left in missed}
@@ -376,13 +415,19 @@ def _step_lines(plan: Plan) -> Iterator[str]:
         ("without product: {1}: {2}", unread),
     ):
         for row in _grouped((left.name, left.reason, left.channel) for left in entries):
-            yield f"  {words.format(*row)}"
+            yield f"{words.format(*row)}"
     for name, channels, warning in _grouped((w.name, w.warning, w.channel) for w in warned):
-        yield f"  warning: {name} {channels}: {warning}"
+        yield f"warning: {name} {channels}: {warning}"
+    names = dict.fromkeys(step.name for step in plan.steps)
+    if names:
+        yield f"steps: {', '.join(names)}"
+    near = (step for step in plan.steps if step.name == "overlap")
+    states = (", ".join((*settings_in_words(step), step.reason)) for step in near)
+    yield from dict.fromkeys(f"overlap: {each}" for each in states)
     shown = {*kinds(), READ_STEP}
     others = dict.fromkeys(left.name for left in plan.left_out if left.name not in shown)
     if others:
-        yield f"  skipped for some channels: {', '.join(others)}"
+        yield f"skipped for some channels: {', '.join(others)}"
 
 
 def _show_refused(reasons: Sequence[str]) -> int:

@@ -9,7 +9,7 @@ import tempfile
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -22,6 +22,9 @@ from lidarops.cli.app import (
     say,
 )
 from lidarops.errors import SceneError
+
+if TYPE_CHECKING:
+    from lidarops.run.options import Progress
 
 _SCHEMA: Final = "campaign.schema.json"
 _OUTPUT: Final = "out"
@@ -107,7 +110,7 @@ def _free_output(campaign: Path) -> str:
 
 @command()
 def simulate(
-    campaign: options.Campaign,
+    campaign: options.Campaign = Path(),
     archive: options.Archive = None,
     out: options.Out = None,
     workers: options.Workers = 1,
@@ -147,10 +150,12 @@ def compile_code() -> None:
     Example: lidarops compile
     """
     say("compiling the retrievals: about two minutes")
-    say(f"compiled code is kept in {_compile_retrievals()}")
+    with progress_bar("compile", "scene") as bar:
+        folder = _compile_retrievals(lambda _: bar.advance(1))
+    say(f"compiled code is kept in {folder}")
 
 
-def _compile_retrievals() -> Path:
+def _compile_retrievals(progress: Progress) -> Path:
     """Compile what products of all kinds need, and return the folder that keeps the result.
 
     Later processes load the compiled code from there. What is kept for another processor is not
@@ -166,7 +171,7 @@ def _compile_retrievals() -> Path:
 
     from lidarops.campaign.model import load_campaign
     from lidarops.netcdf.write import write_plain
-    from lidarops.run.archive import bring_up_to_date
+    from lidarops.run.archive import Options, bring_up_to_date
     from lidarops.simulate.campaign import simulate_campaign
 
     with (
@@ -176,7 +181,7 @@ def _compile_retrievals() -> Path:
         campaign = load_campaign(path, archive=f"{folder}/raw", output=f"{folder}/out")
         simulated = simulate_campaign(campaign)
         write_plain(simulated.truth, campaign.truth_path)
-        result = bring_up_to_date(campaign)
+        result = bring_up_to_date(campaign, options=Options(progress=progress))
     if result.has_failures:
         raise SceneError(
             "not all products of the campaign for compilation were made",

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.catalog.folder import FileGroup, read_folder
-from lidarops.errors import RawFormatError
+from lidarops.errors import LidarOpsError, RawFormatError
 from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
@@ -28,8 +28,10 @@ from lidarops.netcdf.stored_flags import (
     quality_bits,
     rejecting_mask,
 )
+from lidarops.netcdf.variables import TIME_UNITS
 from lidarops.raw.formats import RawFile, raw_formats, read_raw_header
 from lidarops.records import UNKNOWN_FORMAT, Role
+from lidarops.reports import product_contents
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[Any]]]
 """Title, names of columns, and rows."""
@@ -40,6 +42,7 @@ _CHANNEL: Final = ("name", "wavelength", "bins", "bin_width", "shots", "adc_bits
 _GROUP: Final = ("files", "count", "role", "start", "stop", "site", "zenith_angle", "channels")
 """Properties of a group of raw files in the table."""
 _VARIABLE: Final = ("name", "dimensions", "units", "minimum", "maximum", "missing", "long_name")
+_STEP: Final = ("step", "channel", "settings", "reason")
 _FLAG: Final = ("flags", "name", "severity", "values", "share", "description")
 _UNITS: Final = {
     **dict.fromkeys(("altitude", "bin_width", "wavelength"), "m"),
@@ -59,12 +62,14 @@ _OTHERS: Final = 20
 _VERDICTS: Final = ("good", "use_with_care", "do_not_use")
 
 
-def describe(file: Path) -> dict[str, Any]:
+def describe(file: Path, time: str = "") -> dict[str, Any]:
     """Describe a raw file or a NetCDF product, or the raw files of a folder, grouped.
 
     Parameters
     ----------
     file : Path
+    time : str, optional
+        UTC, such as ``2024-09-21T15:00``: only the profile of a product that holds this time.
 
     Returns
     -------
@@ -75,16 +80,21 @@ def describe(file: Path) -> dict[str, Any]:
     Raises
     ------
     LidarOpsError
-        If the file cannot be read, or is neither.
+        If the file cannot be read, or is neither, or is no product that holds the time.
     """
-    if file.is_dir():
-        return _folder(file)
-    return _product(file) if is_netcdf(file) else _raw(file)
+    if not file.is_dir() and is_netcdf(file):
+        return _product(file, time)
+    if time:
+        raise LidarOpsError("is of products alone", field="time", file=file, wrong_use=True)
+    return _folder(file) if file.is_dir() else _raw(file)
 
 
-def tables(file: Path) -> Iterator[Table]:
-    """Yield the description of a file as tables: title, names of columns, rows; see `describe`."""
-    description = describe(file)
+def tables(file: Path, time: str = "") -> Iterator[Table]:
+    """Yield the description of a file as tables: title, names of columns, rows; see `describe`.
+
+    Of a product, quality and values come first.
+    """
+    description = describe(file, time)
     about = [
         (key.replace("_", " "), _with_unit(key, value))
         for key, value in description.items()
@@ -94,6 +104,9 @@ def tables(file: Path) -> Iterator[Table]:
         about += [("notes", note) for note in description["notes"] or ["none"]]
     elif description["type"] == "netcdf":
         about += [item for item in description["attributes"].items() if item[0] not in _LONG]
+        yield _table("Quality", description["quality"], _FLAG)
+        yield _table("Variables", description["variables"], _VARIABLE)
+        yield _table("Steps", description["steps"], _STEP)
     yield file.name, ("field", "value"), about
     if description["type"] == "folder":
         others = [{"file": path} for path in description["other"][:_OTHERS]]
@@ -104,9 +117,6 @@ def tables(file: Path) -> Iterator[Table]:
         yield _table("Channels", description["channels"], _CHANNEL)
         lines = description.get(_HEADER, "").splitlines()
         yield "Header as written", ("line",), [(line,) for line in lines]
-    else:
-        yield _table("Variables", description["variables"], _VARIABLE)
-        yield _table("Quality", description["quality"], _FLAG)
 
 
 def _with_unit(key: str, value: object) -> str:
@@ -173,17 +183,36 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
     }
 
 
-def _product(file: Path) -> dict[str, Any]:
-    with opened_product(file, decode_times=False) as dataset:
+def _product(file: Path, time: str) -> dict[str, Any]:
+    with opened_product(file, decode_times=False) as opened:
+        dataset = _profile(opened, time, file) if time else opened
+        steps = product_contents.origin(dataset).get("steps", [])
         return {
             "type": "netcdf",
             "file": str(file),
             "size": file.stat().st_size,
+            "citation": product_contents.citation(dataset),
             "dimensions": {str(name): size for name, size in dataset.sizes.items()},
             "attributes": _plain(dict(dataset.attrs)),
             "variables": [_variable(str(name), dataset[name]) for name in dataset.variables],
             "quality": _quality(dataset),
+            "steps": [dict(zip(_STEP, step, strict=True)) for step in steps],
         }
+
+
+def _profile(dataset: xr.Dataset, time: str, file: Path) -> xr.Dataset:
+    """Return the profile of a product that holds a time."""
+    try:
+        moment = np.datetime64(time.removesuffix("Z"), "s").astype(np.float64)
+    except ValueError:
+        form = "give a UTC time such as 2024-09-21T15:00"
+        raise LidarOpsError(f"is no time: {time!r}", field="time", remedy=form) from None
+    bounds = dataset.get("time_bnds")
+    begun = np.zeros(0) if bounds is None else (bounds <= moment).sum("nv").to_numpy()
+    inside = np.flatnonzero(begun == 1)
+    if not inside.size:
+        raise LidarOpsError(f"has no profile at {time}", field="time", file=file, wrong_use=True)
+    return dataset.isel(time=inside[:1])
 
 
 def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
@@ -203,7 +232,11 @@ def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
         ends += [float(finite.min()), float(finite.max())] if finite.size else []
     properties["missing"] = missing
     if ends:
-        properties |= {"minimum": min(ends), "maximum": max(ends)}
+        least: float | str = min(ends)
+        most: float | str = max(ends)
+        if properties["units"] == TIME_UNITS:
+            least, most = (str(np.datetime64(round(end(ends)), "s")) for end in (min, max))
+        properties |= {"minimum": least, "maximum": most}
     return properties
 
 

@@ -125,6 +125,8 @@ def assess(
     selection: Selection | None = None,
     everything: bool = False,
     update: bool = True,
+    force: bool = False,
+    thaw: bool = False,
     set_aside: list[Granule] | None = None,
 ) -> Iterator[Judgement]:
     """Judge what every scene needs, and why. Processes nothing.
@@ -138,6 +140,8 @@ def assess(
         Whether to yield also scenes that need nothing.
     update : bool
         Whether to update the catalog first.
+    force, thaw : bool
+        As of `Options`.
     set_aside : list of Granule, optional
         Takes the good files that belong to no scene, with the reason.
 
@@ -152,8 +156,9 @@ def assess(
     from lidarops.run.staleness import Judge  # noqa: PLC0415 - loads the numerics
 
     with Store(campaign.catalog_url, campaign.name) as store:
-        judge = Judge(campaign, store, selection=selection)
-        days = _days_to_judge(judge, judge.signatures(), store.verdicts(), everything=everything)
+        judge = Judge(campaign, store, selection=selection, force=force, thaw=thaw)
+        known = store.verdicts()
+        days = _days_to_judge(judge, judge.signatures(), known, everything=everything or force)
         months = set(judge.months(days)).intersection(days)
         # Months last: by then it is known which of their products are to be made.
         for part in (days, sorted(months)):

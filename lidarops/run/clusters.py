@@ -7,6 +7,7 @@ from more. Workers need the software and access to the archive and the folder of
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
 import signal
@@ -48,6 +49,10 @@ _DASK: Final = {
     "distributed.scheduler.allowed-failures": 0,
     # A worker that gives no sign of life, such as a stopped process, is replaced.
     "distributed.scheduler.worker-ttl": f"{WORKER_TIMEOUT:g}s",
+    # With it, small scenes spend much of their time on mapping and returning every array.
+    f"distributed.nanny.pre-spawn-environ.{MALLOC_TRIM_VARIABLE}": None,
+}
+_WITHOUT_PAGES: Final = {
     # Profiling would wake every process 100 times a second, and the tick 50 times, for a dashboard
     # that is not served.
     "distributed.worker.profile.enabled": False,
@@ -56,8 +61,6 @@ _DASK: Final = {
     "distributed.scheduler.http.routes": [],
     # For the same dashboard, each process would read a dozen system files twice a second.
     "distributed.admin.system-monitor.interval": "10s",
-    # With it, small scenes spend much of their time on mapping and returning every array.
-    f"distributed.nanny.pre-spawn-environ.{MALLOC_TRIM_VARIABLE}": None,
 }
 
 _SILENCED: Final = (
@@ -399,7 +402,9 @@ def _security(tls: Tls | None) -> Security | None:
 
 
 @contextmanager
-def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]:
+def local_client(
+    workers: int, *, memory: str | None = None, dashboard: bool = False
+) -> Iterator[Client]:
     """Start a dask cluster of single-threaded processes on this machine.
 
     netCDF4 writes from only one thread of a process, and BLAS and numba gain nothing from more.
@@ -411,13 +416,22 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
     memory : str, optional
         Memory limit of a worker, such as ``2GiB``; default an equal share of the machine's memory.
         A worker that exceeds it is restarted, and its scene is tried again.
+    dashboard : bool, optional
+        Whether to serve the pages of dask, which any user of this machine can read.
+
+    Raises
+    ------
+    ClusterError
+        If the pages need a package that is not installed.
     """
+    if dashboard and importlib.util.find_spec("bokeh") is None:
+        raise ClusterError("the pages of dask need bokeh", remedy="pip install lidarops[dashboard]")
     from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second to import
 
     started = {"distributed.worker.multiprocessing-method": start_method()}
     with (
         _quiet(),
-        dask.config.set({**_DASK, **started}),
+        dask.config.set(started | ({} if dashboard else _WITHOUT_PAGES) | _DASK),
         LocalCluster(
             # Workers start below: a signal during the start here would leave an unclosed cluster.
             n_workers=0,
@@ -427,7 +441,7 @@ def local_client(workers: int, *, memory: str | None = None) -> Iterator[Client]
             # With certificates of this run: any user of the machine reaches its loopback, and who
             # reaches a scheduler can run code on its workers.
             security=True,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0" if dashboard else None,
             # Without a dashboard dask still serves HTTP, by default on all interfaces.
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             memory_limit=memory or "auto",

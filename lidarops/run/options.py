@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from lidarops.run.leftovers import Orphan
 
 Progress = Callable[[SceneOutcome], None]
+Batch = Callable[[], Sequence[SceneOutcome]]
+"""Carries out the next scenes, and returns how they ended."""
+MOST_OF_A_BATCH: Final = 50
 NO_USABLE_VALUE: Final = "no retrieval gave a usable value"
 
 
@@ -103,6 +106,8 @@ class Options:
     """Memory limit of this process, or of a local worker, such as ``2GiB``."""
     cluster: Callable[[], AbstractContextManager[Client]] | None = None
     """Starts or reaches a cluster to run on instead; called only if something is stale."""
+    dashboard: Callable[[str], None] | None = None
+    """Called with the address of the pages of dask, which are then served to this machine."""
     wait: float = 0.0
     """s to wait for another run on the same catalog."""
     profiles_per_chunk: int | None = None
@@ -112,6 +117,8 @@ class Options:
     """Called with the outcome of each scene as it ends."""
     expect: Callable[[int], None] | None = None
     """Called with the number of granules of each group of stale scenes before processing."""
+    batch: Callable[[Batch], int] = lambda carry_out: len(carry_out())
+    """Carries out a batch, and returns the number of its scenes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 from lidarops.catalog.granules import joined_notes
@@ -14,13 +14,13 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.raw_files import acknowledged, acknowledged_reasons
 from lidarops.catalog.scan import ScanSummary
 from lidarops.catalog.store import RunStatus, Verdict
-from lidarops.records import FileNote
+from lidarops.records import FileNote, SceneOutcome
 from lidarops.run.clusters import local_client
 from lidarops.run.day_states import REACH, DayStates, Signature
 from lidarops.run.executor import EndedScene, StopRequest, process_jobs
 from lidarops.run.findings import find
 from lidarops.run.ledger_run import JudgedDays, LedgerRun
-from lidarops.run.options import Options, Result, unused
+from lidarops.run.options import MOST_OF_A_BATCH, Options, Result, unused
 from lidarops.run.staleness import DaysJudged, Judge, Judgement
 from lidarops.scene.job import Job
 from lidarops.system.processes import prefetch_one, preload_modules
@@ -89,7 +89,7 @@ class Pass:
         """Whether days are judged again, and whether for their months."""
         self.failing = 0
         """Number of scenes in a row that failed for a cause that may pass."""
-        self.on_workers = bool(options.cluster) or options.workers > 1
+        self.on_workers = bool(options.cluster or options.dashboard) or options.workers > 1
 
     def carry_out(self) -> Result:
         """Return what was done, and the state of the archive after it.
@@ -204,25 +204,34 @@ class Pass:
             memory=memory,
             alone=alone,
         )
-        self._enter(ended)
+        # Between batches, a cluster is as busy as within one.
+        carry_out = partial(self._enter, ended, MOST_OF_A_BATCH)
+        while self.options.batch(carry_out) == MOST_OF_A_BATCH:
+            pass
 
     def _cluster(self, stack: ExitStack, workers: int) -> Client | None:
         """Start or reach a cluster; None if a signal came first, which then ends the run."""
         options = self.options
-        start = options.cluster or partial(local_client, workers, memory=options.memory)
+        served = options.dashboard is not None
+        start = options.cluster or partial(
+            local_client, workers, memory=options.memory, dashboard=served
+        )
         client = None
         # A queue may take an hour; a signal must not wait for it.
         if not self.stop:
             with self.stop.idle():
                 client = stack.enter_context(start())
+            if options.dashboard and client is not None:
+                options.dashboard(f"dashboard: {client.dashboard_link}")
         if self.stop:
             self.run.begin()
             return None
         return client
 
-    def _enter(self, ended: Iterable[EndedScene]) -> None:
+    def _enter(self, ended: Iterable[EndedScene], most: int | None = None) -> list[SceneOutcome]:
         self.run.begin()
-        for scene in ended:
+        outcomes = []
+        for scene in islice(ended, most):
             judged = self.judgements.pop(scene.outcome.scene)
             outcome = self.run.end(self.judge, judged, scene.outcome, final=scene.final)
             self.lost_worker = self.lost_worker or scene.lost_worker
@@ -236,6 +245,8 @@ class Pass:
                 )
             if self.options.progress:
                 self.options.progress(outcome)
+            outcomes.append(outcome)
+        return outcomes
 
     def _jobs(self, days: Sequence[int]) -> Iterator[Job]:
         """Yield the jobs of stale scenes, the largest of each group of days first."""

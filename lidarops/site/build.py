@@ -31,7 +31,8 @@ from lidarops.netcdf.read import dataset_of, decoded
 from lidarops.netcdf.stored import UNREADABLE, StoredProduct, opened_stored, reading
 from lidarops.netcdf.stored_flags import flags_names, refuse_moved_flags
 from lidarops.netcdf.variables import QUALITY_FLAG, USABLE
-from lidarops.site import pages, product_contents
+from lidarops.reports import product_contents
+from lidarops.site import pages
 from lidarops.site.paths import (
     BESIDE,
     CALENDAR_HEIGHT,

@@ -19,8 +19,8 @@ from lidarops.figures.wording import SEVERITIES, counted, percent, size
 from lidarops.kinds import kinds, rank_of
 from lidarops.netcdf.stored import StoredProduct
 from lidarops.netcdf.variables import is_retrieved
+from lidarops.reports.product_contents import citation, contact, variables
 from lidarops.site.paths import Links, day_page, href, month_list, slug, year_page
-from lidarops.site.product_contents import citation, contact, variables
 from lidarops.site.product_entry import (
     GRADES,
     Entry,

@@ -7,6 +7,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+from setuptools import find_packages
+
 
 def test_flows_say_what_they_need() -> None:
     code = "import importlib.util as u; u.find_spec = lambda name: None; import flows"
@@ -30,3 +32,10 @@ def test_only_the_extra_names_prefect_and_the_demo_installs_it(repository: Path)
     assert any(name.startswith("prefect") for name in project["optional-dependencies"]["prefect"])
     for lock in ("requirements.lock", "deploy/requirements.lock"):
         assert "\nprefect==" in (repository / lock).read_text("utf-8")
+
+
+def test_the_wheel_takes_no_top_level_name_but_that_of_the_package(repository: Path) -> None:
+    project = tomllib.loads((repository / "pyproject.toml").read_text("utf-8"))
+    included = project["tool"]["setuptools"]["packages"]["find"]["include"]
+    found = find_packages(str(repository), include=included)
+    assert {name.partition(".")[0] for name in found} == {"lidarops"}

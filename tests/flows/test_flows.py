@@ -30,6 +30,7 @@ import yaml
 from click.testing import Result as Called
 from prefect import Flow, get_client, runtime
 from prefect.client.orchestration import SyncPrefectClient
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.client.schemas.objects import State, StateType
 from prefect.exceptions import ParameterTypeError
 from prefect.server.api.server import SubprocessASGIServer
@@ -43,7 +44,7 @@ from typer.testing import CliRunner
 
 import flows.catalog
 import flows.reprocess
-from flows import WITH_FAILURES, maintenance, notifications
+from flows import NO_FILES, WITH_FAILURES, maintenance, notifications
 from flows.catalog import catalog
 from flows.maintenance import reap_runs
 from flows.reprocess import process_task, reprocess
@@ -55,7 +56,7 @@ from lidarops.catalog.store import RunStatus, Store
 from lidarops.cli import app as cli
 from lidarops.errors import CatalogError, LidarOpsError, ProductError, SceneError
 from lidarops.records import SceneOutcome
-from lidarops.run import executor
+from lidarops.run import executor, processing
 from lidarops.run.archive import Result, Selection, bring_up_to_date, update_catalog
 from lidarops.run.clusters import Local
 from lidarops.scene.job import Failure, Job
@@ -445,6 +446,58 @@ def test_flows_catalog_and_reprocess(campaign_file: Path) -> None:
 
 
 @pytest.mark.usefixtures("prefect_server")
+def test_each_batch_of_scenes_is_a_task_run_that_logs_how_scenes_ended(
+    campaign_file: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for day in range(1, 3):
+        data = raw_archives.content(1440.0 * day, bins=1000)
+        raw_archives.write(campaign_file.parent / "raw/coast" / f"h{day}0", data)
+    monkeypatch.setattr(processing, "MOST_OF_A_BATCH", 2)
+    state = reprocess(str(campaign_file), return_state=True)
+    with get_client(sync_client=True) as client:
+        flow_run = FlowRunFilter(id=FlowRunFilterId(any_=[state.state_details.flow_run_id]))
+        names = {run.name for run in client.read_task_runs(flow_run_filter=flow_run)}
+    assert {"batch 1", "batch 2"} <= names
+    assert "batch 3" not in names
+    for words in ("lidar_20260301T000000: 1 product", "lidar_20260303T000000: 1 product"):
+        assert words in caplog.text
+    assert "batch 2: 1 scene" in caplog.text
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_an_instrument_without_new_files_raises_an_event(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[tuple[str, dict[str, Any]]] = []
+    monkeypatch.setattr(
+        flows.reprocess, "emit_event", lambda name, _, payload: events.append((name, payload))
+    )
+    for hour, expected in ((20, []), (30, ["lidar"])):
+        events.clear()
+        start = datetime(2026, 3, 1, tzinfo=UTC) + timedelta(hours=hour)
+        monkeypatch.setattr(runtime.flow_run, "scheduled_start_time", start, raising=False)
+        reprocess(str(campaign_file), files_within=24.0)
+        assert [payload["instrument"] for _, payload in events] == expected
+    assert events[0][0] == NO_FILES
+    assert events[0][1]["message"].startswith("no good file within the 24 h before 2026-03-02")
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_a_run_links_its_report_where_a_browser_finds_it(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    links: list[str] = []
+    monkeypatch.setattr(
+        flows.reprocess, "create_link_artifact", lambda link, *_, **__: links.append(link)
+    )
+    result, _ = reprocess(str(campaign_file))
+    assert links == []
+    result, _ = reprocess(str(campaign_file), full=True, pages_at="https://example.org/lidar/")
+    assert result.record is not None
+    assert links == [f"https://example.org/lidar/report/{result.record.id}/index.html"]
+
+
+@pytest.mark.usefixtures("prefect_server")
 def test_an_internal_error_is_reported_apart_with_its_traceback(
     campaign_file: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -575,14 +628,17 @@ def test_a_run_that_gives_up_is_tried_again_and_one_that_is_stopped_is_not(
 
 def test_a_run_with_failures_counts_as_completed() -> None:
     within = timedelta(hours=26)
-    plain = notifications.automations(uuid4(), within=within)
-    assert [each.name for each in plain] == [notifications.FAILED, notifications.ABSENT]
+    made = notifications.automations(uuid4(), within=within)
+    plain = {automation.name: automation.trigger for automation in made}
+    assert len(plain) == 3
     event = f"prefect.flow-run.{WITH_FAILURES}"
-    assert event in plain[1].trigger.expect
+    absent = plain[notifications.ABSENT]
+    assert event in absent.expect
     # Time counts from the last run of the same archive.
-    assert plain[1].trigger.after == plain[1].trigger.expect
-    assert plain[1].trigger.for_each == {"related:deployment:prefect.resource.id"}
-    assert event not in plain[0].trigger.expect
+    assert absent.after == absent.expect
+    assert absent.for_each == {"related:deployment:prefect.resource.id"}
+    assert event not in plain[notifications.FAILED].expect
+    assert plain[notifications.MISSING].expect == {NO_FILES}
     automations = notifications.automations(uuid4(), within=within, failures=True)
     (has_failures,) = [
         each for each in automations if each.name == notifications.COMPLETED_WITH_FAILURES

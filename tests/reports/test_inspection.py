@@ -44,6 +44,41 @@ def test_products_show_verdicts_bits_and_extremes(kind: str, tmp_path: Path):
     assert counts["good"]["values"] == good
     table = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"})
     assert all(word in table.output for word in ("Variables", "Quality", "do_not_use", "units"))
+    first = [table.output.index(word) for word in ("do_not_use", "Variables", "Conventions")]
+    assert first == sorted(first)
+
+
+def test_a_time_selects_the_profile_that_holds_it(tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write_product(build_product(MAKERS["elastic"](), context("elastic")), path)
+    with xr.open_dataset(path) as opened:
+        begin, end = opened["time_bnds"].values[1].astype("datetime64[s]")
+        second = opened.isel(time=1).load()
+    within = describe(path, f"{begin + (end - begin) // 2}Z")
+    values = {row["name"]: row for row in within["variables"]}
+    assert values["time"]["minimum"] == values["time"]["maximum"] == str(second.time.values)[:19]
+    largest = float(second["aerosol_backscatter"].max())
+    assert values["aerosol_backscatter"]["maximum"] == pytest.approx(largest)
+    assert sum(row["values"] for row in within["quality"][:3]) == second.sizes["range"]
+    for wrong in ("1999-01-01", "noon"):
+        shown = CliRunner().invoke(app, ["inspect", str(path), "--time", wrong])
+        assert shown.exit_code != 0
+        assert wrong in shown.output
+    folder = CliRunner().invoke(app, ["inspect", str(tmp_path), "--time", str(begin)])
+    assert folder.exit_code == 2
+
+
+def test_a_product_tells_its_settings_and_how_to_cite_it(tmp_path: Path):
+    path = tmp_path / "product.nc"
+    write_product(build_product(MAKERS["homogeneous"](), context("homogeneous")), path)
+    description = describe(path)
+    steps = {row["step"]: row["settings"] for row in description["steps"]}
+    assert steps["background"] == "range: [10000.0, 12000.0]"
+    with xr.open_dataset(path) as opened:
+        assert opened.attrs["title"] in description["citation"]
+    shown = CliRunner().invoke(app, ["inspect", str(path)], env={"COLUMNS": "200"}).output
+    assert "Steps" in shown
+    assert "citation" in shown
 
 
 def test_a_folder_shows_a_line_for_each_group_of_like_files(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -16,7 +17,10 @@ from lidarops.catalog.lock import Lock
 from lidarops.catalog.product_files import verify_archive
 from lidarops.catalog.store import Store
 from lidarops.cli import app
+from lidarops.records import SceneOutcome
+from lidarops.run import executor
 from lidarops.run.archive import reprocess
+from lidarops.scene.job import Failure, Job
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +78,21 @@ def test_verify_names_products_that_the_ledger_does_not_know(archive: Archive) -
     archive.tree["instruments"]["poor"]["products"] = {}
     other = {path for what, path in _mismatches(archive) if what == "unlisted"}
     assert other == {stray}
+
+
+def test_the_history_of_runs_names_what_failed_and_the_newest_report(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(job: Job) -> tuple[SceneOutcome, bool]:
+        return Failure("nowhere.csv: cannot be read").outcome(job.scene, job.plan), True
+
+    monkeypatch.setattr(executor, "attempt", failing)
+    file = str(archive.file)
+    CliRunner().invoke(app, ["reprocess", file, "--force", "--instrument", "poor"])
+    shown = CliRunner().invoke(app, ["runs", file], env={"COLUMNS": "300"}).stdout
+    assert len(re.findall("poor_202603.*nowhere.csv: cannot be read", shown)) == 2
+    (page,) = re.findall("newest report: (.*)", shown)
+    assert Path(page).is_file()
 
 
 def test_the_command_line_shows_runs_and_mismatches(archive: Archive) -> None:

@@ -22,6 +22,7 @@ from support.archives.small_archive import Archive
 from support.poison import HALF, Poison, Sleep
 
 from lidarops.catalog.store import RunStatus, Store
+from lidarops.records import SceneOutcome
 from lidarops.run import executor
 from lidarops.run.archive import Options, Selection, bring_up_to_date, reprocess
 from lidarops.run.clusters import ClusterError, local_client
@@ -112,6 +113,24 @@ def test_a_scene_that_kills_its_worker_is_refused_by_name(
     forced = Selection(instruments=("rich",))
     healed = bring_up_to_date(campaign, selection=forced, options=Options(force=True))
     assert not healed.failures
+
+
+@pytest.mark.slow
+def test_the_pages_of_dask_are_served_to_this_machine_where_they_are_asked_for(
+    archive: Archive,
+) -> None:
+    told: list[str] = []
+    pages: list[bytes] = []
+
+    def look(_: SceneOutcome) -> None:
+        address = told[0].removeprefix("dashboard: ")
+        pages.append(httpx.get(address).content)
+
+    options = Options(dashboard=told.append, progress=look)
+    assert bring_up_to_date(archive.write(), options=options).record is not None
+    assert len(told) == 1
+    assert told[0].startswith("dashboard: http://127.0.0.1:")
+    assert b"Dask" in pages[0]
 
 
 @pytest.mark.slow

@@ -466,7 +466,7 @@ def test_a_failed_report_hides_nothing_and_the_next_run_says_how_to_make_it(
             2,
         )
     else:
-        assert "poor_20260301T000000" in failed.stdout
+        assert "of poor: 1 product" in failed.stdout
         assert "_20260302T000000.nc" in failed.stdout
         assert "report:" not in failed.stdout
     shown = CliRunner().invoke(app, command)
@@ -508,7 +508,7 @@ def test_a_run_whose_record_could_not_be_saved_is_reported_without_making_it_aga
         patch.setattr(run_record, "write_atomically", _full)
         failed = CliRunner().invoke(app, command)
     assert failed.exit_code == 1
-    assert "poor_20260301T000000" in failed.stdout
+    assert "of poor: 1 product" in failed.stdout
     (folder,) = (archive.folder / "out/report").glob("*")
     assert f"lidarops report {folder}" in failed.stderr
     before = archive.contents("out/products")
@@ -726,7 +726,7 @@ def test_a_failed_removal_does_not_hide_the_products(archive: Archive) -> None:
         failed = CliRunner().invoke(app, ["reprocess", str(archive.file), "--remove-orphans"])
     assert failed.exit_code == 1
     assert "is held" in failed.stderr
-    assert "poor_20260301T000000" in failed.stdout
+    assert "of poor: 1 product" in failed.stdout
     (page,) = (archive.folder / "out/report").glob("*/index.html")
     assert "report:" in failed.stdout
     assert page.exists()

@@ -90,7 +90,11 @@ def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
     archive.write()
     first = planned(archive.file)
     assert len(first) <= MOST_LINES
-    assert "poor_20260301T000000 to poor_20260325T000000: 25 scenes, 65 files, 0 dark" in first
+    # One block for each instrument and period of its facts, however its scenes differ.
+    titles = [line for line in first if re.match(r"\w+_\d{8}T\d{6}( to|:)", line)]
+    assert [title.partition("_")[0] for title in titles] == ["poor", "rich", "rich"]
+    words = "poor_20260301T000000 to poor_20260325T000000: 25 scenes, 65 files, 0 dark"
+    assert titles[0].startswith(words)
     assert len(planned(archive.file, "--all")) > MOST_LINES
     for options in ([], ["--force"]):
         run = CliRunner().invoke(app, ["reprocess", str(archive.file), *options], env=terminal(80))
@@ -99,6 +103,68 @@ def test_many_scenes_and_products_fill_a_screen_or_two(tmp_path: Path) -> None:
         assert re.search(r"Refused, the first [3-9] of 10 \(--all\)", run.output)
     whole = CliRunner().invoke(app, ["reprocess", str(archive.file), "--force", "--all"])
     assert len(whole.output.splitlines()) > 150
+
+
+def test_a_block_is_of_one_period_of_facts_and_says_how_many_scenes_a_line_is_of(
+    tmp_path: Path,
+) -> None:
+    for day in range(6):
+        data = raw_archives.content(1440.0 * day, bins=1000)
+        raw_archives.write(tmp_path / f"raw/coast/h{day}", data)
+    # On one day of the second period, no analog record.
+    path = tmp_path / "raw/coast/h4"
+    path.write_bytes(path.read_bytes().replace(b"00532.o 0 0 00 000 12", b"00600.o 0 0 00 000 12"))
+    change = "2026-03-03T00:00:00Z"
+    facts = [{"valid_to": change, "full_overlap_range": 300.0}]
+    facts.append({"valid_from": change, "full_overlap_range": 450.0})
+    settings = factories.campaign(products={"signal": {"channels": "all"}}, facts=facts)
+    file = tmp_path / "campaign.yaml"
+    file.write_text(yaml.safe_dump(settings.model_dump(mode="json", exclude={"simulation"})))
+    lines = planned(file, width=300)
+    titles = [line.partition(" files")[0] for line in lines if "of memory" in line]
+    assert titles == [
+        "lidar_20260301T000000 to lidar_20260302T000000: 2 scenes, 2",
+        "lidar_20260303T000000 to lidar_20260306T000000: 4 scenes, 4",
+    ]
+    shares = [re.search(r"\(. of . scenes\)", line) for line in lines if "made: signal" in line]
+    assert [share and share[0] for share in shares] == [None, "(3 of 4 scenes)", "(1 of 4 scenes)"]
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_dry_run_shows_what_is_stale_and_makes_nothing(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    command = ["reprocess", str(file), "--dry-run"]
+    first = CliRunner().invoke(app, command, env=terminal(300))
+    assert "1 stale scene" in first.output
+    assert not (tmp_path / "out").exists()
+    CliRunner().invoke(app, ["reprocess", str(file)])
+    again, forced = (CliRunner().invoke(app, [*command, *more]) for more in ([], ["--force"]))
+    assert "0 stale scenes" in again.output
+    assert "1 stale scene" in forced.output
+    assert ": forced" in forced.output
+
+
+@pytest.mark.usefixtures("quickly")
+def test_commands_find_the_campaign_of_a_folder_and_of_an_output_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(tmp_path)
+    monkeypatch.chdir(tmp_path)
+
+    def output(*words: str) -> str:
+        shown = CliRunner().invoke(app, list(words))
+        return f"{shown.exit_code}: {shown.output}"
+
+    assert "products: " in output("reprocess")
+    for place in ("campaign.yaml", ".", "out"):
+        assert output("runs", place) == output("runs")
+    assert "Runs of " in output("runs")
+    (tmp_path / "campaign.yaml").rename(tmp_path / "other.yaml")
+    assert "Runs of " in output("runs", "out")
+    assert output("site", "other.yaml") == output("site", "out")
+    missing = output("plan")
+    assert missing.startswith("2: ")
+    assert "holds no campaign.yaml" in missing
 
 
 def without_usable_values(job: Job) -> tuple[SceneOutcome, bool]:
@@ -138,7 +204,10 @@ def test_scenes_that_all_differ_fill_a_screen_or_two(
     lines = planned(file, width=width)
     assert on_screen(lines, width) <= MOST_LINES
     text = " ".join(lines)
-    assert re.search(r"[0-9]+ further scenes with other lines \(--all\)", text)
+    # Files of a day to come are refused.
+    assert re.search(r"(\d+) scenes, \1 files", text)
+    assert "of memory" not in text.partition("of memory")[2]
+    assert re.search(r"[0-9]+ further lines \(--all\)", text)
     assert re.search(r"The archive is not what .*, the first [0-5] of [0-9]+ \(--all\)", text)
     run = CliRunner().invoke(app, ["reprocess", str(file)], env=terminal(width))
     shown = _STYLE.sub("", run.output)

@@ -20,9 +20,9 @@ from lidarops.cli import app
 from lidarops.errors import CatalogError
 from lidarops.figures import image_panels
 from lidarops.figures.panels import Axis
+from lidarops.reports.product_contents import campaign, citation
 from lidarops.site import build
 from lidarops.site.build import build_site
-from lidarops.site.product_contents import campaign, citation
 
 
 class _Links(HTMLParser):

@@ -1,4 +1,4 @@
-"""The content of a product for its page: times, position, provenance, variables, citation."""
+"""The content of a product in words: times, position, provenance, variables, citation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarops.netcdf.stored import StoredProduct
 PROVENANCE: Final = "provenance"
 _PLACES: Final = "range", "altitude", "latitude", "longitude", "station_altitude", "wavelength"
 USED: Final = PROVENANCE, *_PLACES
-"""Variables that the page of any product reads."""
+"""Variables that tell the content of any product."""
 
 
 def span(product: xr.Dataset) -> tuple[str, str]:
@@ -75,7 +75,7 @@ def middle(product: xr.Dataset, name: str) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def citation(product: StoredProduct) -> str:
+def citation(product: StoredProduct | xr.Dataset) -> str:
     """Return how to cite a product, from its attributes; empty without a title."""
     names = ("creator_name", "title", "product_version", "publisher_name", "naming_authority", "id")
     creator, title, version, publisher, authority, key = (
