@@ -36,7 +36,8 @@ from lidarops.raw.formats import RawFile, read_all_counts
 from lidarops.raw.header import RawHeader
 from lidarops.records import Scene, SceneOutcome, file_channels, is_glued
 from lidarops.reports.rejections import rejection_rows
-from lidarops.retrieve.signal.light import FEWEST, light_begins, rise_ends
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
+from lidarops.retrieve.signal.light import light_begins, rise_ends
 from lidarops.run.archive import bring_up_to_date
 from lidarops.run.scenes import scan_cycles_of
 from lidarops.scene.dependence import scene_facts
@@ -241,7 +242,9 @@ def empty_in_first_files(
         cycles = scan_cycles_of(scene.granules)
         ((whole, beams),) = Counter(cycles).most_common(1)
         own = (g for g, cycle in zip(scene.granules, cycles, strict=True) if cycle == whole)
-        first = replace(scene, granules=tuple(own) if beams > 1 else scene.granules[:FEWEST])
+        first = replace(
+            scene, granules=tuple(own) if beams > 1 else scene.granules[: COMMON.fewest_profiles]
+        )
         if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
             yield from _without_near_light(campaign, first)
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
@@ -293,9 +296,9 @@ def without_light(contents: FolderContents, root: Path) -> FolderContents:
 
 def _is_unlit(group: FileGroup, root: Path) -> bool:
     """Return whether some files of a group show no light, in no channel."""
-    if len(group.files) < FEWEST:
+    if len(group.files) < COMMON.fewest_profiles:
         return False
-    paths = [root / path for path in group.files[:: len(group.files) // FEWEST]]
+    paths = [root / path for path in group.files[:: len(group.files) // COMMON.fewest_profiles]]
     try:
         archive = open_archive(paths, mask_and_scale=False, header_position="ignore")
         return bool(_unlit(archive).all())
