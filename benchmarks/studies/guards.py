@@ -89,9 +89,9 @@ def without(name: str, *patches: Patch) -> Guard:
     return Guard(name, off=lambda: replaced(*patches))
 
 
-def with_thresholds(name: str, module: Any, **changes: Any) -> Guard:
+def with_thresholds(name: str, module: Any, table: str = "THRESHOLDS", **changes: Any) -> Guard:
     """Return the guard that other values of thresholds that a module reads switch off."""
-    return without(name, (module, "THRESHOLDS", module.THRESHOLDS._replace(**changes)))
+    return without(name, (module, table, getattr(module, table)._replace(**changes)))
 
 
 def measure(score: ScoreCluster, clusters: Sequence[int], guards: Sequence[Guard]) -> pd.DataFrame:
@@ -258,7 +258,7 @@ _OF_SKIES: Final = (
     ),
     without("error by undetected particles",
             (reference_window.ReferenceWindow, "undetected_particles", _NO_ERROR)),
-    with_thresholds("least certainty", inversion, least_certainty=0.0),
+    with_thresholds("least certainty", inversion, "COMMON", first_order=0.0),
     with_thresholds("skewed errors", inversion, skewed=0.0),
     with_thresholds("longest gap", inversion, longest_gap=np.inf),
     without("bridging of outliers", (outliers_of_skies, "bridge_outliers", _same)),
@@ -293,11 +293,11 @@ _BLOCK: Final = 50
 """Profiles of a random network."""
 _OF_NETWORKS: Final = (
     with_thresholds("stratified air", _changing_field, stratified=(0.1, 400.0)),
-    with_thresholds("changes in time", _changing_field, least_change=1e30),
+    with_thresholds("changes in time", _changing_field, "COMMON", significant=1e15),
     with_thresholds("running means", _block_solution, linear_change=1e30),
     with_thresholds("profiles that disagree", _block_solution, least_neighbourly=0.0),
     with_thresholds("default overlap error", _block_solution, default_overlap_error=0.0),
-    with_thresholds("curvature errors", _block_solution, profile_noise=1e30),
+    with_thresholds("curvature errors", _block_solution, "COMMON", significant=1e15),
     without("outlying bins", (outlying_bins, "search", lambda *_: None)),
     with_thresholds("weak signals", _beam_signals, largest_bin_error=1e6),
     with_thresholds("noisy profiles", _beam_signals, noisy_profile=1e30),

@@ -40,7 +40,7 @@ from lidarops.records import (
     file_channels,
     mode_of_signal,
 )
-from lidarops.retrieve.signal.light import FEWEST
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.scene.agreement import Retrieved, compare_channels
 from lidarops.scene.case import (
     READ_STEP,
@@ -202,7 +202,7 @@ class _Work(ABC):
         # All channels and bins tell, whatever is made of them.
         lightless = (
             lightless_profiles(opened(scene.granules, channels=layout), job.profiles_per_chunk)
-            if len(scene.granules) >= FEWEST
+            if len(scene.granules) >= COMMON.fewest_profiles
             else {}
         )
         for name in [name for name in held if name in lightless]:

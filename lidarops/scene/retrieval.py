@@ -30,6 +30,7 @@ from lidarops.raw.header import Stretches
 from lidarops.records import ChannelLayout, PlannedStep, Scene, file_channels, is_glued, products_of
 from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
 from lidarops.retrieve.common.arrays import widest_azimuth_gap
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.counts_to_signal import MIN_NOISE_BINS
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 from lidarops.scene.case import ChannelCase, Entries, Entry, prepared_channels, range_offset
@@ -257,7 +258,7 @@ def bins_before(channel: ChannelLayout, facts: ChannelFacts) -> int:
         return 0
     # Those in which the pulse leaves, by the offset of the channel, hold light.
     bins = channel.before - max(math.ceil(range_offset(channel, facts) / channel.bin_width), 0)
-    return bins if bins >= max(BACKGROUND.tail_share * channel.bins, BACKGROUND.fewest_bins) else 0
+    return bins if bins >= max(BACKGROUND.tail_share * channel.bins, COMMON.fewest_bins) else 0
 
 
 def before_pulse(case: ChannelCase[Any]) -> str:

@@ -16,7 +16,7 @@ from lidarops.products.homogeneous import HomogeneousSettings, Method, PathAssum
 from lidarops.products.homogeneous.variables import LAYOUT
 from lidarops.records import DetectionMode, is_glued
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
-from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.homogeneous import labeled
 from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -122,7 +122,7 @@ def _needs(case: Case) -> Entries:
     request, files = case.request, len(case.scene.granules)
     # Those that a fit needs, and a triple of the cubic.
     lagged = 0 if request.lag is None else 2 * request.lag + 1
-    fewest = max(BACKGROUND.fewest_bins, lagged)
+    fewest = max(COMMON.fewest_bins, lagged)
     inside = [
         (near, far)
         for near, far in request.sections
@@ -194,7 +194,7 @@ def _outside(case: Case, near: float, far: float, fewest: int) -> Entry:
         f"section {near:g}-{far:g} m extends beyond the last bin at {case.last:g} m, or"
         f" holds fewer than {fewest} bins"
     )
-    if fewest > BACKGROUND.fewest_bins and far <= case.last:
+    if fewest > COMMON.fewest_bins and far <= case.last:
         reason = (
             f"section {near:g}-{far:g} m holds {bins:.0f}, fewer than {fewest} bins, which the"
             f" cubic needs for lag: {case.request.lag}"

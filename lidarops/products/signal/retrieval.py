@@ -14,7 +14,7 @@ from lidarops.flags import Quality
 from lidarops.netcdf.variables import BACKGROUND_METHOD
 from lidarops.products.signal import RangeCorrection, SignalSettings
 from lidarops.products.signal.variables import LAYOUT
-from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
@@ -41,10 +41,10 @@ def _needs(case: ChannelCase[SignalSettings]) -> Entries:
     limits = case.request.background_range
     start, stop = tail(case, limits)
     bins = (stop - start) / case.channel.bin_width
-    if bins < BACKGROUND.fewest_bins:
+    if bins < COMMON.fewest_bins:
         stop = limits[1] if limits else case.last
         reason = (
-            f"background_range {start:g}-{stop:g} m holds fewer than {BACKGROUND.fewest_bins} bins;"
+            f"background_range {start:g}-{stop:g} m holds fewer than {COMMON.fewest_bins} bins;"
             f" the last bin ends at {case.last:g} m"
         )
         yield case.leave("signal", reason, number=bins)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Self
 from pydantic import Field, model_validator
 
 from lidarops.kinds import Kind
-from lidarops.retrieve.network.settings import NetworkAssumptions
+from lidarops.retrieve.network.settings import EXPONENTS, NetworkAssumptions
 from lidarops.settings import (
     BackgroundRange,
     NetworkProduct,
@@ -44,11 +44,11 @@ class VisibilityProductSettings(NetworkProduct, NetworkAssumptions):
     exponent: float = quantity(
         1.0,
         unit="1",
-        ge=0.1,
-        le=10,
+        ge=EXPONENTS[0],
+        le=EXPONENTS[1],
         description="m in backscatter proportional to extinction^(1/m)",
     )
-    exponents: dict[str, Annotated[float, Field(ge=0.1, le=10)]] = quantity(
+    exponents: dict[str, Annotated[float, Field(ge=EXPONENTS[0], le=EXPONENTS[1])]] = quantity(
         {}, unit="1", description="exponent of instruments that differ"
     )
     background_range: BackgroundRange | None = quantity(

@@ -14,6 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Flags, frozen
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 
 _SHORTEST: Final = 1e-9
 """m; half length of a window of one bin, to divide by."""
@@ -35,13 +36,6 @@ class Thresholds(NamedTuple):
 
     steps_per_window: int = 4
     """Candidates that start within the width of one. Assumed."""
-    fewest_bins: int = 8
-    """Bins with data. Assumed."""
-    least_share: float = 0.5
-    """Share of the bins of a window that must hold data. Assumed."""
-    most_deviation: float = 3.0
-    """Standard errors by which a window may depart from the shape of air or exceed the lowest ratio
-    to it, and must exceed zero. Assumed: 1 % of clean windows fail."""
     undetected_particles: float = 0.5
     """Errors of the lowest ratio by which particles that the comparison cannot show may raise a
     window beside the measured excess. With a layer of scattering ratio 1.15 in all windows but the
@@ -170,7 +164,7 @@ def choose_reference(
     orthogonal under the noise, so the three tests are independent. A candidate passes where
 
     - at least 8 bins and half of the window hold data, and none is excluded;
-    - :math:`a_0` exceeds k = `Thresholds.most_deviation` of its standard errors;
+    - :math:`a_0` exceeds k = 3 of its standard errors;
     - :math:`a_1` and :math:`a_2` are below k of theirs;
     - chi-square of the power against :math:`\phi a_0` is less than k standard deviations above its
       mean (as Gaussian: :math:`\chi^2/\nu < 1 + k \sqrt{2/\nu}`).
@@ -269,10 +263,10 @@ def choose_reference(
 
 def _rejections(statistics: Array, lengths: npt.NDArray[np.int64]) -> Flags:
     """Return the bits of `Rejection` of each window; 0 for those that pass all tests."""
-    f, most = np.moveaxis(statistics, -1, 0), THRESHOLDS.most_deviation
+    f, most = np.moveaxis(statistics, -1, 0), COMMON.significant
     count = np.nan_to_num(f[COUNT])
     freedom = np.maximum(count - 1.0, 1.0)
-    fewest = np.maximum(THRESHOLDS.fewest_bins, THRESHOLDS.least_share * lengths)
+    fewest = np.maximum(COMMON.fewest_bins, COMMON.least_share * lengths)
     passes = {
         Rejection.TOO_FEW_BINS: count >= fewest,
         Rejection.EXCLUDED: ~(f[EXCLUDED_BINS] > 0.0),
@@ -309,7 +303,7 @@ def _pick(
     """
     scale, error = statistics[..., SCALE], statistics[..., SCALE_ERROR]
     by_level = level_error * statistics[..., RESPONSE]
-    most = THRESHOLDS.most_deviation
+    most = COMMON.significant
     comparable = (rejections & ~np.int32(Rejection.LOW_SIGNAL)) == 0
     upper = np.where(comparable, scale + most * np.hypot(error, by_level), np.inf)
     anchor = np.argmin(upper, axis=-1)[:, np.newaxis]
@@ -354,7 +348,7 @@ def _detection_limit(
     # Without a window the index is -1, and the last one may have no signal.
     limit = np.full(index.size, np.nan)
     np.divide(total, of_chosen(scale)[:, 0], out=limit, where=index >= 0)
-    return np.asarray((THRESHOLDS.most_deviation + _PROBABLE) * limit)
+    return np.asarray((COMMON.significant + _PROBABLE) * limit)
 
 
 @summing

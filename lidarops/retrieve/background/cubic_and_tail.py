@@ -15,6 +15,7 @@ from lidarops.retrieve.background import _cubic_kernel
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Flags, Floats, frozen
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 
 _UNIFORM: Final = 2.0**-22
 """Largest deviation from a uniform grid, over the last range: rounding of float32 ranges."""
@@ -150,7 +151,7 @@ def solve_cubic(
         out[:, _cubic_kernel.CURVATURE_SHIFT] > THRESHOLDS.largest_shift
     )
     quality[moved] |= np.int32(Quality.LOW_SIGNAL)
-    if bins < THRESHOLDS.fewest_bins:
+    if bins < COMMON.fewest_bins:
         quality[status != _cubic_kernel.MISSING] |= np.int32(Quality.TOO_FEW_BINS)
     unsolved = status == _cubic_kernel.UNSOLVED
     background = np.where(unsolved, np.nan, out[:, _cubic_kernel.BACKGROUND])
@@ -211,8 +212,8 @@ def tail_mean(
             error = np.sqrt(scatter.sum(axis=-1) / (bins - 1) / bins)
         else:
             error = np.sqrt(np.where(valid, noise, 0.0).sum(axis=-1)) / bins
-    few = bins < THRESHOLDS.least_known * values.shape[-1]
-    scarce = few | (bins < THRESHOLDS.fewest_bins)
+    few = bins < COMMON.least_share * values.shape[-1]
+    scarce = few | (bins < COMMON.fewest_bins)
     quality = np.where(scarce, np.int32(Quality.TOO_FEW_BINS), np.int32(0))
     quality[bins == 0] = np.int32(Quality.INPUT_MISSING)
     mean[few] = np.nan

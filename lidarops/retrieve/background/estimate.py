@@ -26,6 +26,7 @@ from lidarops.retrieve.background import cubic_and_tail, known_shape
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +147,7 @@ def from_known_shape(
     fit = known_shape.fit_known_shape(power, range, shape, mask=mask, **noise)
     usable = ~fit.singular & np.isfinite(fit.background)
     known, bins = np.minimum(fit.degrees_of_freedom + 2, fit.allowed), fit.allowed
-    usable &= known >= THRESHOLDS.least_known * bins
+    usable &= known >= COMMON.least_share * bins
     doubtful = fit.poor_fit | _selected(known, bins)
     fitted_sky = Background(
         background=fit.background,
@@ -263,7 +264,7 @@ def from_cubic(
         np.int32(Quality.INPUT_MISSING),
         np.int32(Quality.NO_REAL_SOLUTION),
     )
-    calm = fit.waves <= special.chdtri(groups(grid.size) - 3.0, THRESHOLDS.false_alarm)
+    calm = fit.waves <= special.chdtri(groups(grid.size) - 3.0, COMMON.misfit_false_alarm)
     unjudged = np.isnan(left) | ~calm | ((root.quality & doubts) != 0)
     absent = np.where(usable, np.int32(0), absent)
     sky = _judged(value, error, (left, spread), unjudged, absent)
@@ -377,7 +378,7 @@ def _least_squares(values: Array, columns: tuple[Array, Array, Array]) -> _Solut
 def detected(left: Array, standard_error: Array) -> Array:
     """Return the signal left in a tail where that before it exceeds its noise, else 0."""
     with np.errstate(invalid="ignore"):
-        return np.where(left > THRESHOLDS.detected * standard_error, left, 0.0)
+        return np.where(left > COMMON.significant * standard_error, left, 0.0)
 
 
 def window_before(start: float) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from lidarops.retrieve.background import _shape_fit
 from lidarops.retrieve.background.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Flags, Integers, frozen
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 
 _UNKNOWN: Final = frozen(np.full(1, np.nan))
 _ENDLESS: Final = frozen(np.full(1, np.inf))
@@ -241,16 +242,16 @@ def _result(out: npt.NDArray[np.void], grid: Array, unit: Array) -> KnownShapeRe
     bins, condition = fit["bins"], fit["condition"]
     amplitude_error = np.sqrt(fit["amplitude_variance"]) / unit
     amplitude = fit["amplitude"] / unit
-    limits = _limits(THRESHOLDS.false_alarm, _shape_fit.WINDOWS)
+    limits = _limits(COMMON.misfit_false_alarm, _shape_fit.WINDOWS)
     poor = np.abs(fit["curvature"]) > limits.deviation
     poor |= fit["waves"] > limits.waves[fit["window"].astype(np.intp)]
-    few, empty = bins < THRESHOLDS.fewest_bins, bins == 0
+    few, empty = bins < COMMON.fewest_bins, bins == 0
     quality = np.zeros(len(out), dtype=np.int32)
     for bit, found in (
         (Quality.INPUT_MISSING, empty),
         (Quality.TOO_FEW_BINS, few & ~empty),
         (Quality.NO_SIGNAL, ~few & (fit["constant"] > 0)),
-        (Quality.NEGATIVE_AMPLITUDE, amplitude < -THRESHOLDS.negative * amplitude_error),
+        (Quality.NEGATIVE_AMPLITUDE, amplitude < -COMMON.significant * amplitude_error),
         (Quality.NOT_HOMOGENEOUS, poor),
     ):
         quality[found] |= np.int32(bit)

@@ -13,12 +13,6 @@ class Thresholds(NamedTuple):
 
     tail_share: float = 0.1
     """Share of the bins, the farthest, whose mean is the background by default; usual practice."""
-    fewest_bins: int = 8
-    """Bins below which a mean, a fit or a test is not trusted; assumed."""
-    least_known: float = 0.5
-    """Least share of the bins of a background that are known. Where saturated bins are left out,
-    the rest is the lower part of the noise, whose mean is phi(z) / share standard deviations of a
-    bin too low (`selection_bias`): 0.8 at a half, within the noise of a bin, and 1.0 at 0.38."""
 
     lag_share: float = 0.4
     """Lag of the cubic over the number of bins: least scatter; benchmark of accuracy."""
@@ -31,9 +25,6 @@ class Thresholds(NamedTuple):
 
     nearest_start: float = 0.3
     """Start of the longest window of the known shape, over the farthest usable range; assumed."""
-    false_alarm: float = 1e-4
-    """Probability that the residuals of a fit are called systematic where its shape is right;
-    chosen."""
     rejection: float = 1.1e-2
     """Probability that a window is rejected where the shape is right. With 1e-3, errors of clean
     ranges are 7 % smaller, but .4 instead of .3 % of elastic values beside bright sky are false;
@@ -41,8 +32,6 @@ class Thresholds(NamedTuple):
     aerosol_odds: float = 0.055
     """Odds of aerosol between the starts of two windows, before the data are seen; the same
     simulations."""
-    negative: float = 3.0
-    """Standard errors below zero beyond which an amplitude is flagged negative; assumed."""
     largest_condition: float = 30.0
     """Standard error of the background over that of the mean of the same bins, beyond which the
     shape does not differ from a constant; assumed."""
@@ -50,8 +39,6 @@ class Thresholds(NamedTuple):
     """Begin of the window that is compared with the tail, over the start of the tail; assumed."""
     farthest: float = 0.7
     """End of that window, over the start of the tail; assumed."""
-    detected: float = 3.0
-    """Standard errors by which signal before the tail is detected; assumed."""
     share_of_error: float = 0.5
     """Largest shift of a value by signal left in the tail that raises no flag, over the standard
     error of the value; assumed."""

@@ -19,10 +19,12 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.background import cubic_and_tail, estimate
 from lidarops.retrieve.background import known_shape as _known_shape
+from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
 from lidarops.retrieve.clouds import layers as _layers
 from lidarops.retrieve.clouds import outlying_bins as _outlying_bins
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.labeled import (
     ActualNoise,
     actual_noise,
@@ -184,7 +186,7 @@ class MeanProfiles:
     def ratio_to_air(self, power: Array) -> tuple[Array, Array]:
         """Return the ratio of a signal to air and its error, in means over the bins before each."""
         step = float(np.median(np.diff(self.distance)))
-        size = max(round(THRESHOLDS.overlap_length / step), 1)
+        size = max(round(THRESHOLDS.window_lengths[0] / step), 1)
         known = np.isfinite(power)
 
         def summed(values: Array) -> Array:
@@ -267,7 +269,7 @@ def _cloud_fraction(averages: xr.Dataset, means: MeanProfiles) -> Array:
         variance[there],
         molecular_attenuated=np.nan_to_num(seen_air),
         contrast=means.contrast,
-        false_alarm=THRESHOLDS.cloud_false_alarm / profiles.shape[1],
+        false_alarm=COMMON.false_alarm / profiles.shape[1],
         quantum=averages["part_quantum"].to_numpy()[there],
     )
     cloudy = np.zeros((*profiles.shape, cells), dtype=np.bool_)
@@ -365,7 +367,7 @@ def _signal_beyond_clouds(means: MeanProfiles, *, known_shape: bool) -> tuple[Me
     # Only beyond the cloud does the signal have the shape of air: fit the background there.
     hidden = with_margin(cloudy, means.distance)
     beyond = ~np.logical_or.accumulate(hidden[:, ::-1], axis=-1)[:, ::-1]
-    enough = beyond.sum(axis=-1) >= THRESHOLDS.least_share_beyond * means.distance.size
+    enough = beyond.sum(axis=-1) >= BACKGROUND.tail_share * means.distance.size
     refitted = cloudy.any(axis=-1) & enough
     signal = _subtract_background(means, beyond | ~refitted[:, np.newaxis], known_shape=True)
     return signal, means.find_clouds(signal.power)
@@ -391,7 +393,7 @@ def _less_than_air(
         values[:, np.newaxis]
         for values in (window.scale, window.scale_standard_error, window.bottom)
     )
-    less = level - ratio > THRESHOLDS.overlap_certainty * np.hypot(error, level_error)
+    less = level - ratio > COMMON.contradicted * np.hypot(error, level_error)
     less &= distance < bottom
     nearer = np.logical_or.accumulate(less, axis=-1)
     rises = np.any(_begins(near) & nearer, axis=-1, keepdims=True)

@@ -15,6 +15,7 @@ from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Integers, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS as SIGNAL_THRESHOLDS
@@ -33,7 +34,7 @@ def find_layers(
     *,
     molecular_attenuated: npt.ArrayLike,
     contrast: float = SIGNAL_THRESHOLDS.cloud_contrast,
-    false_alarm: float = THRESHOLDS.cloud_false_alarm,
+    false_alarm: float = COMMON.false_alarm,
     quantum: npt.ArrayLike = 0.0,
 ) -> Booleans:
     r"""Return the bins in layers at whose base the scattering ratio rises by more than a factor.
@@ -150,7 +151,7 @@ def find_visible_air(
     RetrievalInputError
         For invalid arguments.
     """
-    rate = THRESHOLDS.cloud_false_alarm
+    rate = COMMON.false_alarm
     tests = _tests(power, range, variance, molecular_attenuated, contrast, rate, quantum)
     bins = max(round(THRESHOLDS.visible_depth / tests.step), 2)
     of_depth = int(np.searchsorted(tests.lengths, bins))
@@ -383,7 +384,7 @@ def _end(sums: Array, base: int, length: int) -> int:
     end = base + 1
     for i in range(base + 1, bins):
         ratio, variance = _mean(sums, i, min(i + length, bins))
-        if ratio > level + THRESHOLDS.top * math.sqrt(variance + level_variance):
+        if ratio > level + COMMON.by_noise * math.sqrt(variance + level_variance):
             end = i + 1
         elif not math.isnan(ratio):
             return i
@@ -424,7 +425,7 @@ def _falls(
     half = length // 2
     near, near_variance = _mean_towards(sums, i, half, side)
     far, far_variance = _mean_towards(sums, i + side * half, length - half, side)
-    return not far - near > THRESHOLDS.top * math.sqrt(near_variance + far_variance)
+    return not far - near > COMMON.by_noise * math.sqrt(near_variance + far_variance)
 
 
 @compiled

@@ -12,6 +12,7 @@ from lidarops.retrieve.clouds.thresholds import THRESHOLDS
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, frozen, usable
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 
 _HALF: Final = 4
 """Neighbours on either side."""
@@ -108,8 +109,8 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
     right, right_range = right / right_count, right_range / right_count
     step = abs(right - left)
     allowed = max(
-        THRESHOLDS.step_by_noise * np.sqrt(largest_variance),
-        THRESHOLDS.largest_step * max(abs(left), abs(right)),
+        COMMON.contradicted * np.sqrt(largest_variance),
+        COMMON.largest_step * max(abs(left), abs(right)),
     )
     if not step <= allowed:
         return False
@@ -121,8 +122,8 @@ def _is_outlying(j: int, left_out: int, ranges: Array, q: Array, noise: Array) -
             low, high = min(low, residual), max(high, residual)
     own_residual = q[j] - left - slope * (ranges[j] - left_range)
     beyond = max(own_residual - high, low - own_residual)
-    noise_limit = THRESHOLDS.outlying * np.sqrt(max(largest_variance, noise[j]))
-    spread = high - low - THRESHOLDS.spread_by_noise * np.sqrt(largest_variance)
+    noise_limit = COMMON.outlier * np.sqrt(max(largest_variance, noise[j]))
+    spread = high - low - COMMON.by_noise * np.sqrt(largest_variance)
     return bool(beyond > noise_limit and beyond > THRESHOLDS.least_contrast * spread)
 
 
@@ -169,7 +170,7 @@ def _mark_outliers(
                 count += 1
         for j in range(_HALF, count - _HALF):
             below, above = q[j] - q[j - 1], q[j] - q[j + 1]
-            if below * below <= THRESHOLDS.outlying**2 * noise[j] or not below * above > 0.0:
+            if below * below <= COMMON.outlier**2 * noise[j] or not below * above > 0.0:
                 continue
             farthest = max(index[j + _HALF] - index[j], index[j] - index[j - _HALF])
             if farthest > _FARTHEST or _most_equal(j, usable_power) > THRESHOLDS.most_equal:

@@ -9,31 +9,17 @@ class Thresholds(NamedTuple):
     """Limits of outlying bins, clouds and the overlap."""
 
     # Isolated outlying bins
-    outlying: float = 6.0
-    """Standard deviations of the noise by which an outlier lies beyond all neighbours.
-    Simulations: none of 1e8 bins of normal noise."""
     least_contrast: float = 6.0
     """Distance of an outlier from its neighbours over their spread in excess of noise. Peaks with a
     full width at half maximum of 1.5 bins or more have less."""
-    spread_by_noise: float = 2.0
-    """Standard deviations of the noise that are subtracted from that spread. Assumed."""
     most_equal: int = 4
     """Neighbours of equal power: more of them mean few counts, whose noise is not normal. Assumed.
     """
-    largest_step: float = 0.1
-    """Relative change of the signal across a bin: a cloud attenuates by more. Assumed."""
-    step_by_noise: float = 4.0
-    """Standard deviations of the noise of a bin, or 5.7 of the difference of the means of 4, by
-    which the signal may change across a bin. Assumed."""
 
     # Clouds
     window_lengths: tuple[float, ...] = (60.0, 120.0, 240.0, 480.0, 960.0, 1920.0)
     """m; in which signals are averaged below and above a base: the longest finds cirrus that rises
     within 2 km."""
-    cloud_false_alarm: float = 0.001
-    """Probability of a false cloud in a profile. Required of the product."""
-    top: float = 2.0
-    """Standard errors of the level below the base within which a layer has ended. Assumed."""
     least_fall: float = 0.1
     """Fall of the ratio to air within a layer, in least excesses of a cloud. Assumed: aerosol
     above a cloud falls slower."""
@@ -50,8 +36,6 @@ class Thresholds(NamedTuple):
     """m before the first and beyond the last bin of a cloud, whose thin edges extend beyond it.
     Values there are to be used with care, and neither background nor reference window is sought
     there: noise hides up to 260 m of the upper part of a cirrus (`test_layers.py`)."""
-    least_share_beyond: float = 0.1
-    """Share of the bins that must lie beyond a cloud for a fit of the background there. Assumed."""
     visible_depth: float = 480.0
     """m; depth of the layer that noise must not hide where a bin is stated to be clear. By
     definition; a cirrus of optical depth 0.05 is deeper (`test_layers.py`)."""
@@ -59,11 +43,6 @@ class Thresholds(NamedTuple):
     """Its excess over the least one of a cloud. By definition; with 1, noise hides every layer."""
 
     # Overlap
-    overlap_length: float = 60.0
-    """m; in which the ratio to air is averaged below a base and where it is largest. Assumed."""
-    overlap_certainty: float = 4.0
-    """Standard errors by which a signal must lie below that of its air for an overlap that is not
-    full. As backscatter below zero: Manaus, 355 nm, has 57."""
 
 
 THRESHOLDS: Final = Thresholds()

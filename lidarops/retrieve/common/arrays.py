@@ -1,4 +1,4 @@
-"""Types of arrays of retrievals, tests of single values, and azimuths of several beams."""
+"""Types of arrays of retrievals, tests and medians of values, and azimuths of several beams."""
 
 from __future__ import annotations
 
@@ -46,6 +46,16 @@ def usable(power: float, variance: float) -> bool:
 def root_sum_square(parts: Iterable[Array]) -> Array:
     """Return the root of the sum of squares; NaN where any part is NaN."""
     return np.asarray(np.sqrt(sum(part**2 for part in parts)))
+
+
+def median(values: Array, known: Booleans) -> Array:
+    """Return medians over profiles of the known values; NaN where there is none."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
+    number, columns = known.sum(axis=0), np.arange(values.shape[1])
+    ordered = np.sort(np.where(known, values, np.inf), axis=0)
+    low, high = (ordered[place, columns] for place in (np.maximum(number - 1, 0) // 2, number // 2))
+    return np.where(number > 0, 0.5 * (low + high), np.nan)
 
 
 def widest_azimuth_gap(azimuth: Array) -> float:

@@ -17,12 +17,15 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Codes, frozen
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.elastic import _fernald
 
 CAUSES: Final = (
     "noise", "background", "reference", "lidar_ratio", "molecular", "dead_time", "baseline"
 )  # fmt: skip
 """Causes of error; see `ElasticResult.budget`."""
+_LARGEST_BACKSCATTER: Final = 5e-4
+"""m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
 
 
 class Thresholds(NamedTuple):
@@ -35,21 +38,13 @@ class Thresholds(NamedTuple):
     """Share of the denominator at the reference; errors grow as its inverse. It alone withholds
     values beyond a cloud where no error of the lidar ratio is stated
     (`test_integration_away_from_the_lidar_through_a_cloud_is_withheld`). Assumed."""
-    least_certainty: float = 5.0
-    """Standard errors by which the denominator must exceed zero for first-order errors to hold.
-    Simulations, with `skewed`."""
     skewed: float = 5.5
     """Ratio s of the denominator to its noise error at which noise errors are twice those of first
     order. A reference that is too high by noise makes both values and errors too low, so noise
     errors are multiplied by 0.98 + (5.5 / s)^3 where that exceeds 1. Simulations: less than 0.1 %
     of the values are then off by more than 4 errors, without it 1 to 3 % where s is 5 to 8."""
-    negative: float = 4.0
-    """Standard errors below zero at which backscatter contradicts the signal. Manaus, 355 nm, with
-    an overlap that is not full where it was stated to be: 57 standard errors."""
     negative_bins: int = 4
     """Bins in a row that must be that low, so that noise alone is none. Assumed."""
-    largest_backscatter: float = 5e-4
-    """m-1 sr-1; a check of units: air scatters less than a tenth of this at 0.25 micrometres."""
 
 
 THRESHOLDS: Final = Thresholds()
@@ -192,7 +187,7 @@ def invert_elastic(
         There is no value where the reference window has no positive signal (`calibrated`),
         beyond a gap of `Thresholds.longest_gap`, and where the denominator is below
         `Thresholds.least_denominator` of its value at the reference or
-        `Thresholds.least_certainty` of its standard errors (`unstable`). Beyond the reference, no
+        5 standard errors (`unstable`). Beyond the reference, no
         bin farther than an unstable one has a value. The lidar constant and quantities derived
         from it assume the particle extinction of the nearest solved bin from there down to the
         lidar. The errors of the attenuated backscatter neglect that the noise of a bin also enters
@@ -259,7 +254,7 @@ class _Solution:
         scalars = np.empty((len(self._rows), _fernald.SCALARS))
         state = np.empty(self._rows.shape, dtype=np.uint8)
         t = THRESHOLDS
-        limits = np.array([t.longest_gap, t.least_denominator, t.least_certainty**2, t.skewed**2])
+        limits = np.array([t.longest_gap, t.least_denominator, COMMON.first_order**2, t.skewed**2])
         _fernald.invert_fernald(frozen(rows), self._given, limits, out, scalars, state)
         return out, scalars, state
 
@@ -323,11 +318,10 @@ def _air(
     backscatter = inputs.noise_rows(air.backscatter, "molecular_backscatter", grid, leading)
     extinction = inputs.noise_rows(air.extinction, "molecular_extinction", grid, leading)
     ratio = inputs.noise_rows(lidar_ratio, "lidar_ratio", grid, leading)
-    largest = THRESHOLDS.largest_backscatter
     # The lidar ratio of air is below 10 sr.
     for rows, name, most in (
-        (backscatter, "molecular_backscatter", largest),
-        (extinction, "molecular_extinction", 10.0 * largest),
+        (backscatter, "molecular_backscatter", _LARGEST_BACKSCATTER),
+        (extinction, "molecular_extinction", 10.0 * _LARGEST_BACKSCATTER),
     ):
         _require(rows >= 0.0, rows, name, "give a molecular value of 0 or more for every bin")
         _require(rows < most, rows, name, "give m-1, not km-1")

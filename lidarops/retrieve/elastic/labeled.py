@@ -30,6 +30,7 @@ from lidarops.retrieve.clouds.labeled import (
     with_margin,
 )
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.elastic import inversion as _elastic
 from lidarops.retrieve.elastic.flags import ElasticQuality
 from lidarops.retrieve.elastic.inversion import THRESHOLDS
@@ -221,7 +222,7 @@ def _flags(
 def _negative(solution: _elastic.ElasticResult) -> Booleans:
     """Return where runs of bins have a backscatter that lies below zero by more than its error."""
     # Neither is known where there is no value.
-    low = solution.backscatter < -THRESHOLDS.negative * solution.backscatter_standard_error
+    low = solution.backscatter < -COMMON.contradicted * solution.backscatter_standard_error
     rows = np.flatnonzero(low.sum(axis=-1) >= THRESHOLDS.negative_bins)
     out = np.zeros_like(low)
     out[rows] = ndimage.binary_opening(low[rows], np.ones((1, THRESHOLDS.negative_bins)))

@@ -18,7 +18,7 @@ import numpy as np
 from lidarops.retrieve.common.arrays import HUGE, Array, Integers
 from lidarops.retrieve.common.compiled_code import compiled, inlined, summing
 from lidarops.retrieve.homogeneous._fit_quality import judge_residuals
-from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT
+from lidarops.retrieve.homogeneous._problem import CONSTANT, EMPTY, FITTED, TOO_SHORT, UNKNOWNS
 from lidarops.retrieve.homogeneous._projection import (
     BLOCK,
     NODES,
@@ -327,7 +327,7 @@ def _begin(
     scale, free = 1.0, 1.0 if math.isnan(background) else 0.0
     bins, size, total, place, value, square = load(power, reference, 1.0, g, s)
     row.bins = bins
-    if bins < THRESHOLDS.fewest_solved_bins:
+    if bins <= UNKNOWNS:
         row.status = EMPTY if last < 0 else TOO_SHORT
         return reference, 1.0, Sums(bins, total, 0.0, 0.0, 0.0, free)
     if size < TINY:

@@ -17,6 +17,7 @@ from scipy import special
 from lidarops.flags import Quality
 from lidarops.retrieve.common.arrays import Array, Flags
 from lidarops.retrieve.common.compiled_code import inlined, summing
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.homogeneous._problem import (
     CONSTANT,
     EMPTY,
@@ -48,6 +49,8 @@ _SELECTED: Final = float(-special.ndtri(THRESHOLDS.false_curved))
 _RATIO: Final = 4.611
 """Quantile of the logarithm of the ratio of two estimates of one variance from the same residuals,
 3.353 sqrt(17 / 9), times the root of the number of bins."""
+_DEPENDENT: Final = 1e-9
+"""Squared share of a shape outside the span of others, below which it is rounding."""
 _RATIO_SHORT: Final = 7.3
 """The same times the number of bins, for short sections; fitted to simulations."""
 
@@ -112,7 +115,7 @@ def judge_fit(
         )
         determined &= relative_error < THRESHOLDS.largest_relative_error
         tests = (
-            (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > THRESHOLDS.least_signal**2),
+            (Quality.LOW_SIGNAL, fit.signal_energy / mean_noise > COMMON.first_order**2),
             (HomogeneousQuality.POORLY_DETERMINED, determined),
             (Quality.NEGATIVE_AMPLITUDE, fit.amplitude > 0),
             (HomogeneousQuality.AT_BOUND, fit.bounded == 0),
@@ -128,7 +131,7 @@ def judge_fit(
             quality[fitted & ~passed] |= np.int32(bit)
     quality[fit.status == CONSTANT] |= np.int32(Quality.NO_SIGNAL)
     quality[fit.status == EMPTY] |= np.int32(Quality.INPUT_MISSING)
-    quality[(fit.bins > 0) & (fit.bins < THRESHOLDS.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
+    quality[(fit.bins > 0) & (fit.bins < COMMON.fewest_bins)] |= np.int32(Quality.TOO_FEW_BINS)
     return Verdict(noise, limits.widening, relative_error, reduced, quality)
 
 
@@ -216,7 +219,7 @@ def _known_limits(bins: Array, _: Array, shapes: Array, unknowns: int) -> tuple[
         special.chdtri(dof, 0.5 * THRESHOLDS.false_alarm) / dof,
         np.where(shapes > 0, special.chdtri(shapes, THRESHOLDS.false_alarm), np.inf),
         np.maximum(
-            THRESHOLDS.outlier,
+            COMMON.single_bin,
             -special.ndtri(0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0)),
         ),
         np.ones_like(bins),
@@ -239,7 +242,7 @@ def _estimated_limits(
             shapes > 0, shapes * special.fdtri(shapes, dof, 1.0 - THRESHOLDS.false_alarm), np.inf
         ),
         np.maximum(
-            THRESHOLDS.outlier,
+            COMMON.single_bin,
             -special.stdtrit(dof, 0.5 * THRESHOLDS.false_alarm / np.maximum(bins, 1.0)),
         ),
         widening,
@@ -326,12 +329,12 @@ def _trend(t: _TestShapes, p: Point, r: Residuals, w0: float) -> tuple[float, fl
     norm = _remainder(t.bent_norm, t.bent, t.bent, per)
     bent = r.bend - p.centroid * (2.0 * r.lever - p.centroid * r.shape)
     pulled = _remainder(bent, t.bent, model, per)
-    if norm > THRESHOLDS.independent * t.bent_norm:
+    if norm > _DEPENDENT * t.bent_norm:
         energy += pulled * pulled / norm
         count += 1.0
         shared = _remainder(t.shared, t.bent, t.square, per) / norm
     norm = _remainder(t.square_norm, t.square, t.square, per) - shared * shared * norm
-    if norm > THRESHOLDS.independent * t.square_norm:
+    if norm > _DEPENDENT * t.square_norm:
         along = _remainder(r.square, t.square, model, per) - shared * pulled
         energy += along * along / norm
         count += 1.0

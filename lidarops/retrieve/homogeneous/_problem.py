@@ -14,6 +14,8 @@ FITTED: Final = 0
 EMPTY: Final = 1
 CONSTANT: Final = 2
 TOO_SHORT: Final = 3
+UNKNOWNS: Final = 3
+"""Background, amplitude and extinction: a fit needs more bins."""
 
 
 @dataclass(frozen=True, slots=True)

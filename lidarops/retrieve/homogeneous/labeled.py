@@ -13,6 +13,7 @@ from lidarops.flags import WITHHELD, Quality
 from lidarops.retrieve.background.estimate import Background, from_bounded_tail
 from lidarops.retrieve.common.arrays import Array, Block, Flags
 from lidarops.retrieve.homogeneous import path_fit as _homogeneous
+from lidarops.retrieve.homogeneous._problem import UNKNOWNS
 from lidarops.retrieve.homogeneous.flags import HomogeneousQuality
 from lidarops.retrieve.homogeneous.path_fit import Noise
 from lidarops.retrieve.homogeneous.thresholds import THRESHOLDS
@@ -220,13 +221,12 @@ def _usable(arrays: Mapping[str, Block]) -> Block:
 
 def _bins(distance: Array, near: float, far: float) -> slice:
     inside = np.flatnonzero((distance >= near) & (distance < far))
-    fewest = THRESHOLDS.fewest_solved_bins
-    if inside.size < fewest:
+    if inside.size <= UNKNOWNS:
         raise RetrievalInputError(
             f"[{near:g}, {far:g}] m holds {inside.size} bins of the range grid, which reaches"
             f" from {distance.min():g} to {distance.max():g} m",
             field="sections",
-            remedy=f"choose sections that hold at least {fewest}, better 50, bins",
+            remedy=f"choose sections that hold at least {UNKNOWNS + 1}, better 50, bins",
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)
 

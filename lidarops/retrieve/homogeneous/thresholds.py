@@ -13,17 +13,11 @@ class Thresholds(NamedTuple):
     """1 / last range. Where extinction approaches -1 / range, the shape stops falling and a second
     minimum appears. Simulations: 7 % of the fits end there with -0.5 / length, none above this."""
     highest_optical_depth: float = 60.0
-    """Over the section: the signal vanishes after two of 225 bins. Assumed."""
-    largest_optical_depth: float = 300.0
-    """Over the section, of a given extinction: beyond, the exponential leaves the range of floats.
-    """
+    """Over the section, retrieved or given: the signal vanishes after two of 225 bins. Assumed."""
     least_curvature: float = 0.3
     """Curvature over that of Gauss-Newton, below which a step is one of Gauss-Newton. Assumed."""
 
     # The tests
-    least_signal: float = 5.0
-    """Amplitude over its standard error at known extinction. Simulations: with
-    `largest_relative_error`, none of 100,000 profiles of noise is accepted."""
     largest_relative_error: float = 0.15
     """Standard error of extinction over extinction + 1 / mean range, and over 1 / (2 bin widths).
     Simulations: above the first, coverage of the accepted values falls below 0.93; without the
@@ -32,13 +26,6 @@ class Thresholds(NamedTuple):
     false_alarm: float = 4e-4
     """Rate at which one test of residuals flags a profile that obeys the model. Assumed: half of
     the target of 1e-3 for needless flags."""
-    outlier: float = 5.0
-    """Least deviation of an outlier, standard deviations of the noise. Assumed; with many bins,
-    `false_alarm` sets a larger one."""
-    fewest_bins: int = 8
-    """With fewer, TOO_FEW_BINS. Assumed."""
-    fewest_solved_bins: int = 4
-    """With fewer, there are no more values than unknowns."""
     fewest_differences: int = 5
     """Second differences; with fewer, the noise is estimated from the residuals. Assumed."""
     false_estimated: float = 5.7e-4
@@ -49,8 +36,6 @@ class Thresholds(NamedTuple):
     """Probability beyond the deviation of a curvature that `curved_widening` allows for; 3 to 4 in
     a thousand backgrounds near the limit of determination are more than 4 errors off. Simulations:
     with less, 95 % intervals hold more than 97 %."""
-    independent: float = 1e-9
-    """Squared share of a shape outside the span of others, above which it is tested. Rounding."""
     model_error: float = 0.05
     """Departure of the logarithmic slope from the model, as a share of 2 (extinction + 1 / mean
     range). Simulations: reduces false values among accepted ones by a factor of 7."""

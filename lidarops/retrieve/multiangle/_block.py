@@ -14,6 +14,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Indices
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle.altitude_correlation import windowed
 from lidarops.retrieve.multiangle.slant_paths import Scan, surrounds_zenith
@@ -26,9 +27,10 @@ _STEPS: Final = 2
 """Fits from which the inhomogeneity is estimated."""
 _TYPICAL: Final = 32
 """Most profiles from which what a block has in common is estimated: every n-th."""
-_LARGEST_RATIO: Final = 1.0 / THRESHOLDS.unweighted_snr**2
-"""Largest variance over squared signal for which the moments of the logarithm are corrected: their
-series diverges for larger ones."""
+_LARGEST_RATIO: Final = 1.0 / COMMON.significant**2
+"""Largest variance over squared signal for which the moments of the logarithm are corrected, whose
+series diverges for larger ones, and of samples in methods without weights: with 1.5 standard
+errors, their optical depths are a fifth less exact (`benchmarks.accuracy`)."""
 _LEAST_NOISE: Final = 1e-12
 """Variance over squared signal where the stated variance is smaller, such as 0."""
 _FARTHEST: Final = 3.0

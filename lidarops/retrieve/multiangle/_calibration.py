@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Integers
+from lidarops.retrieve.common.arrays import Array, Booleans, Integers, median
 from lidarops.retrieve.common.compiled_code import compiled
 from lidarops.retrieve.multiangle import _smoothing
 from lidarops.retrieve.multiangle.altitude_correlation import AltitudeNoise
@@ -141,7 +141,7 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     square = np.where(reached, depth[:, tops] ** 2, np.nan)
     noise = np.where(reached, variance[:, tops], np.nan)
     # The median, because the square of a single noisy profile may exceed all others.
-    usual = np.maximum(_median(square, reached.sum(axis=0)), np.finfo(np.float64).tiny)
+    usual = np.maximum(median(square, reached), np.finfo(np.float64).tiny)
     weight = (usual / (usual + noise)) ** 2
     total = np.nansum(weight, axis=0)
     # Zero if no profile is known, or most have no optical depth at all.
@@ -152,12 +152,6 @@ def relative_squares(depth: Array, variance: Array, within: Booleans) -> Array:
     known = np.isfinite(own_square) & np.isfinite(usual_square) & (usual_square > 0.0)
     relative = np.where(known, own_square, 1.0) / np.where(known, usual_square, 1.0)
     return np.asarray(np.maximum(relative, THRESHOLDS.least_scale))
-
-
-def _median(values: Array, count: Integers) -> Array:
-    """Return the median of the first axis, of which `count` values are no NaN."""
-    ordered, each = np.sort(values, axis=0), np.arange(count.size)
-    return np.asarray(0.5 * (ordered[(count - 1) // 2, each] + ordered[count // 2, each]))
 
 
 def _smoothing_square(bias: Array, known: Array) -> Array:

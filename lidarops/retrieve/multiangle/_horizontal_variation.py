@@ -11,6 +11,7 @@ from scipy.special import polygamma, stdtrit
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.multiangle import _kano_hamilton as kh
 from lidarops.retrieve.multiangle._block import BeamBlock, Regression, refit
 from lidarops.retrieve.multiangle.altitude_correlation import windowed
@@ -269,7 +270,7 @@ def _gradient_beyond_chance(sums: Array) -> float:
     freedom = 1.0 / np.where(squares > 0.0, squares, np.inf) - _UNKNOWNS
     tested = freedom >= 1.0
     error = np.where(tested, np.sqrt(scatter) / known, np.inf)
-    chance = 0.5 * THRESHOLDS.gradient_false_alarm / max(int(np.count_nonzero(tested)), 1)
+    chance = 0.5 * COMMON.false_alarm / max(int(np.count_nonzero(tested)), 1)
     limit = stdtrit(np.maximum(freedom, 1.0), 1.0 - chance)
     size = np.abs(gradient)
     explained = np.abs(shift.sum(axis=1)) / known

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from lidarops.retrieve.common.arrays import Array, Block, Booleans, Indices, Integers
+from lidarops.retrieve.common.arrays import Array, Block, Booleans, Indices, Integers, median
 from lidarops.retrieve.multiangle.thresholds import THRESHOLDS
 
 _BEHIND: Final = 4
@@ -205,7 +205,9 @@ class BlockedBeams:
             return []
         means = np.stack(unblocked)
         # Where most are saturated, the others are the dark ones.
-        light = np.where(np.isfinite(means).mean(axis=0) > 0.5, _median(means), np.nan)
+        light = np.where(
+            np.isfinite(means).mean(axis=0) > 0.5, median(means, np.isfinite(means)), np.nan
+        )
         profiles = [
             own._replace(obstruction=float(self._edges[1])) if _never_lit(own, light) else own
             for own in self._profiles
@@ -233,15 +235,7 @@ def _block_edges(end: float) -> Array:
 
 def _length(start: float) -> float:
     """Return the length of the block that begins at a range, m."""
-    return max(THRESHOLDS.baseline_block, THRESHOLDS.baseline_share * start)
-
-
-def _median(values: Array) -> Array:
-    """Return the median over profiles of each block; NaN where there is no value."""
-    known = np.isfinite(values).any(axis=0)
-    middle = np.full(values.shape[1], np.nan)
-    middle[known] = np.nanmedian(values[:, known], axis=0)
-    return middle
+    return max(THRESHOLDS.baseline_guard, THRESHOLDS.baseline_share * start)
 
 
 def _is_dark(behind: Array, light: Array) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags, Indices, Integers
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.multiangle import optical_depth, scan_cycles, slant_paths
 from lidarops.retrieve.multiangle._horizontal_variation import gradient_scale
 from lidarops.retrieve.multiangle.beam_backgrounds import ScanSignals
@@ -305,7 +306,7 @@ def _quality(retrieval: MultiAngleResult) -> Flags:
     negative = np.zeros(bits.shape, dtype=np.bool_)
     for name in ("optical_depth", "extinction"):
         error = getattr(retrieval, f"{name}_standard_error")
-        negative |= getattr(retrieval, name) < -THRESHOLDS.negative * error
+        negative |= getattr(retrieval, name) < -COMMON.by_noise * error
     depth, error = retrieval.optical_depth, retrieval.optical_depth_standard_error
     negative |= _below_others(depth, error, (bits == 0) & ~negative)
     bits |= np.where(negative, np.int32(MultiAngleQuality.NEGATIVE_OPTICAL_DEPTH), np.int32(0))
@@ -320,6 +321,6 @@ def _below_others(depth: Array, error: Array, good: Booleans) -> Booleans:
     below = np.zeros(depth.shape, dtype=np.bool_)
     for k in range(depth.shape[-1]):
         known = (good & ~below)[:, [k]]
-        most = THRESHOLDS.negative * np.hypot(error[:, k:], error[:, [k]])
+        most = COMMON.by_noise * np.hypot(error[:, k:], error[:, [k]])
         below[:, k:] |= known & (depth[:, [k]] - depth[:, k:] > most)
     return below

@@ -48,13 +48,12 @@ class Thresholds(NamedTuple):
     """degree of elevation from which no tree or building blocks a beam: what ends it is a cloud;
     assumed."""
     baseline_guard: float = 300.0
-    """m behind an obstruction from which the record shows no echo of it: in the beam of a real scan
-    it falls from 25 to 2 uV within 100 m behind the first 100 m, and to its noise."""
+    """m behind an obstruction from which the record shows no echo of it, and shortest block over
+    which the baseline is averaged there: in the beam of a real scan it falls from 25 to 2 uV within
+    100 m behind the first 100 m, and to its noise."""
     baseline_light: float = 0.1
     """Power behind an obstruction over that of free beams from which it is light: an echo at the
     window of a lidar without overlap nearby is no obstruction; assumed."""
-    baseline_block: float = 300.0
-    """m, shortest block over which the baseline is averaged; assumed."""
     baseline_share: float = 0.2
     """Length of a block over its range, where that is more; assumed."""
 
@@ -74,10 +73,6 @@ class Thresholds(NamedTuple):
     optical depths in weak light are 15 percent less exact (`benchmarks.accuracy`, SNR 300), and
     fewer have a value."""
 
-    unweighted_snr: float = 3.0
-    """The same of a sample, below which methods without weights leave it out; with 1.5, optical
-    depths of "two_angle" and "mld_prior" are a fifth less exact (`benchmarks.accuracy`)."""
-
     # Fit at single altitudes (`_block`, `optical_depth`).
     pooled: int = 15
     """Altitudes over which the inhomogeneity is pooled; assumed."""
@@ -92,9 +87,6 @@ class Thresholds(NamedTuple):
     definition."""
 
     # Values (`labeled`).
-    negative: float = 2.0
-    """Standard errors below zero from which NEGATIVE_OPTICAL_DEPTH is raised; chosen: by noise
-    alone in 2.3 percent of the altitudes where the air is clear."""
 
     # Horizontal gradient (`_block`, `_horizontal_variation`, `optical_depth`).
     gradient_variance: float = 9.0
@@ -107,8 +99,6 @@ class Thresholds(NamedTuple):
     """Variance of a logarithm from which a sample is left out of that test. Noisier samples are
     biased, and together look like a gradient: deviations from level air are 1.1 standard errors
     without them, 1.4 with them (`test_level_air_shows_no_gradient`)."""
-    gradient_false_alarm: float = 1e-3
-    """Probability that chance shows a gradient along an axis at any altitude of a block; chosen."""
     largest_gradient: float = 3e-4
     """m-1, gradient beyond which residuals show no gradient of air: in haze with 2e-4 to one side,
     no optical depth deviates by more than 4 stated errors, with 5e-4 every fourth does. Distorted

@@ -25,6 +25,8 @@ from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _PASSES: Final = 24
 _ROUNDING: Final = 1e-9
+_PIVOT: Final = 1e-13
+"""Smallest pivot of a regular matrix over its diagonal."""
 _TINY: Final = float(np.finfo(float).tiny)
 
 
@@ -104,7 +106,7 @@ def _linearise(
             _carry(half.T, weight, size, matrix)
             for p in range(size):
                 # A little more keeps it regular.
-                matrix[p, p] *= 1.0 + THRESHOLDS.smallest_pivot
+                matrix[p, p] *= 1.0 + _PIVOT
             invert(matrix)
             known = 0.0
             for p in range(size):
@@ -182,7 +184,7 @@ def start_constants(beams: Beams) -> Array:
     """
     last = np.maximum(beams.reach - 1, 0)[..., np.newaxis]
     end = np.take_along_axis(beams.value, last, axis=2)[..., 0]
-    fall = -np.expm1(np.minimum(end, THRESHOLDS.largest_rise)).sum(axis=1, keepdims=True)
+    fall = -np.expm1(end).sum(axis=1, keepdims=True)
     level = np.log(
         np.maximum(fall, THRESHOLDS.least_fall) / beams.integral.sum(axis=(1, 2))[:, None]
     )

@@ -12,17 +12,18 @@ import numpy.typing as npt
 
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
-from lidarops.retrieve.common.arrays import Array, Booleans, Codes, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Codes, Indices, median
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network import _condensed_signals
 from lidarops.retrieve.network._changing_field import change_roots, field_precision
 from lidarops.retrieve.network._condensed_signals import (
     NOT_POSITIVE,
     CleanBeam,
     FitLayout,
-    median,
     places,
 )
 from lidarops.retrieve.network.geometry import Network, per_beam
+from lidarops.retrieve.network.settings import EXPONENTS
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 _MEDIAN_OVER_MEAN: Final = np.pi / 2.0
@@ -219,7 +220,7 @@ def prepare_signals(
     )
     block = _blocks(blocks, leading)
     nearest, overlap_function = _overlap(overlap, full_overlap_range, ranges)
-    exponents = per_beam(exponent, network.beams, "exponent", *THRESHOLDS.exponents)
+    exponents = per_beam(exponent, network.beams, "exponent", *EXPONENTS)
     bins = THRESHOLDS.fit_bins
     layout = _condensed_signals.lay_out_fits(network, ranges, overlap_function, nearest, bins)
     signal = np.where(np.isnan(ranges), np.nan, signal)
@@ -324,7 +325,7 @@ def _weak_passages(
         mean = np.where(counted, spreads, 0.0).sum(axis=0) / counted.sum(axis=0)
         profiles = known.sum(axis=0)
         error = np.sqrt(_MEDIAN_OVER_MEAN * mean / (profiles * bins))
-        negative[rows] = typical < -THRESHOLDS.negative * error
+        negative[rows] = typical < -COMMON.contradicted * error
         noisy = spreads > THRESHOLDS.noisy_profile * mean
         noisy &= spreads > limit * np.maximum(levels, 0.0) ** 2
         averaged = profiles if together else 1.0

@@ -21,8 +21,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import special
 
-from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.common.arrays import Array, Booleans, Indices, median
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network import _beam_fit, _changing_field
 from lidarops.retrieve.network._beam_fit import Linear, Solution
 from lidarops.retrieve.network._beam_signals import Block, Causes, Estimates, Response
@@ -33,7 +34,6 @@ from lidarops.retrieve.network._condensed_signals import (
     Condensed,
     FitLayout,
     condense,
-    median,
 )
 from lidarops.retrieve.network.outlying_bins import GOOD, KEPT, LOST
 from lidarops.retrieve.network.thresholds import THRESHOLDS
@@ -171,7 +171,7 @@ class _Means(NamedTuple):
         means = [each.mean(half) for each in scaled]
         condensed = condense(means, layout)
         error, noise = np.moveaxis(condensed.curvature, -1, 0)
-        curved = error**2 > THRESHOLDS.profile_noise * noise
+        curved = error**2 > COMMON.significant**2 * noise
         left = noise + (THRESHOLDS.curvature_left * error) ** 2
         curvature = np.where(curved, error, 0.0), np.where(curved, left, 0.0)
         _straighten(condensed.beams, curvature)
@@ -490,7 +490,7 @@ def _changing(
     rest = side - normal @ middle
     seen = np.flatnonzero((signals.reach > 0).any(axis=1))
     change = former
-    if seen.size >= THRESHOLDS.least_profiles:
+    if seen.size >= COMMON.fewest_profiles:
         change = _changing_field.likeliest_change(
             normal[seen].mean(axis=0), rest[seen] - rest[seen].mean(axis=0), block.roots,
             tuple(seen.tolist()),

@@ -19,6 +19,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network._beam_fit import invert
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
@@ -98,10 +99,10 @@ def likeliest_change(
     amplitude = np.array(THRESHOLDS.changes)
     costs = np.zeros((len(amplitude), len(roots), len(variance)))
     _fill_costs(amplitude**2, variance, np.maximum(size, 0.0), square, costs)
-    if not costs.min() < -THRESHOLDS.least_change:
+    if not costs.min() < -(COMMON.significant**2):
         return None
     # The likelihood is that of small changes: of those about as likely, the largest is safe.
-    likely = np.argwhere(costs <= costs.min() + THRESHOLDS.least_change)
+    likely = np.argwhere(costs <= costs.min() + COMMON.significant**2)
     largest = likely[likely[:, 0] == likely[-1, 0]]
     k, length, rho = largest[np.argmin(costs[tuple(largest.T)])]
     return Change(amplitude[k] * roots[length], THRESHOLDS.correlations[rho])

@@ -19,9 +19,10 @@ from scipy.ndimage import uniform_filter1d
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Codes, Indices
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network import outlying_bins
 from lidarops.retrieve.network.geometry import Network, Passages
-from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST
+from lidarops.retrieve.network.outlying_bins import BRIDGED, GOOD, KEPT, LOST, MARGIN
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 MISSING: Final = 1
@@ -350,8 +351,8 @@ def _take_logarithms(
     """Return the logarithms of a beam, and why they end before its last used bin."""
     first, last = layout.first_passage[beam], layout.first_passage[beam + 1] - 1
     low, high = layout.window[first], layout.window[last] + layout.weights.shape[1]
-    start = max(layout.limits[beam, 0], low - THRESHOLDS.margin)
-    end = min(layout.limits[beam, 1], high + THRESHOLDS.margin)
+    start = max(layout.limits[beam, 0], low - MARGIN)
+    end = min(layout.limits[beam, 1], high + MARGIN)
     power, variance = power[:, start:end].copy(), variance[:, start:end].copy()
     positive = (power > 0.0) & (power < HUGE)
     safe = np.where(positive, power, 1.0)
@@ -384,8 +385,8 @@ def _negative_by_noise(power: Array, variance: Array) -> Booleans:
     known = np.isfinite(power) & np.isfinite(variance)
     values, noise = np.where(known, power, 0.0), np.where(known, variance, 0.0)
     level = uniform_filter1d(values, _NEIGHBOURS, axis=1, mode="nearest")
-    whole = values.sum(axis=1) > THRESHOLDS.outlier * np.sqrt(noise.sum(axis=1))
-    near = known & (level - power < THRESHOLDS.outlier * np.sqrt(noise))
+    whole = values.sum(axis=1) > COMMON.outlier * np.sqrt(noise.sum(axis=1))
+    near = known & (level - power < COMMON.outlier * np.sqrt(noise))
     return np.asarray(near & (power <= 0.0) & whole[:, np.newaxis])
 
 
@@ -424,13 +425,3 @@ def _transfer_derivatives(derivatives: Array, row: CleanBeam, grid: Array) -> No
         by_bin = derivatives.transpose(0, 2, 1)
         np.add.at(by_bin, (profiles[:, np.newaxis], nodes), weights[..., np.newaxis] * own)
         by_bin[profiles, bins] = 0.0
-
-
-def median(values: Array, known: Booleans) -> Array:
-    """Return medians over profiles of the known values; NaN where there is none."""
-    if not len(values):
-        return np.full(values.shape[1], np.nan)
-    number, columns = known.sum(axis=0), np.arange(values.shape[1])
-    ordered = np.sort(np.where(known, values, np.inf), axis=0)
-    low, high = (ordered[place, columns] for place in (np.maximum(number - 1, 0) // 2, number // 2))
-    return np.where(number > 0, 0.5 * (low + high), np.nan)

@@ -32,13 +32,13 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air import visibility as air_visibility
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network import _beam_signals
 from lidarops.retrieve.network._beam_signals import BeamSignals, Causes, Estimates, Response
 from lidarops.retrieve.network._block_solution import solve_alone, solve_block
 from lidarops.retrieve.network._condensed_signals import MISSING, NOT_POSITIVE, OUTLYING
 from lidarops.retrieve.network.flags import NetworkQuality
 from lidarops.retrieve.network.geometry import Network
-from lidarops.retrieve.network.thresholds import THRESHOLDS
 from lidarops.retrieve.network.triangles import CHOSEN, solve_triangles
 
 _HARMLESS: Final = NetworkQuality.LOW_LEVERAGE | Quality.OUTLIER
@@ -214,7 +214,7 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
         finite &= np.abs(estimate.extinction) < air_visibility.LARGEST_EXTINCTION
         finite &= estimate.extinction > 0
         # Amplified noise hides the error of a profile alone.
-        limit = 1.0 if beams.together else THRESHOLDS.largest_relative_error
+        limit = 1.0 if beams.together else 1.0 / COMMON.significant
         uncertain = estimate.variance > (limit * estimate.extinction) ** 2
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     poor = _improbable(chi_square, freedom).any(axis=1)
@@ -254,12 +254,12 @@ def _flag_result(beams: BeamSignals, estimate: Estimates) -> NetworkResult:
 
 
 def _improbable(chi_square: Array, freedom: Array) -> Booleans:
-    """Return where a chi-square this large has a probability below `least_probability`."""
+    """Return where a chi-square this large has a probability below `misfit_false_alarm`."""
     known = np.isfinite(chi_square) & (freedom > 0)
     probability = special.gammaincc(
         np.where(known, freedom, 1.0) / 2.0, np.where(known, np.maximum(chi_square, 0.0), 0.0) / 2.0
     )
-    return np.asarray(known & (probability < THRESHOLDS.least_probability))
+    return np.asarray(known & (probability < COMMON.misfit_false_alarm))
 
 
 def _lost_signal(beams: BeamSignals, reason: int) -> Booleans:

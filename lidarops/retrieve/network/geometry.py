@@ -19,6 +19,7 @@ import numpy.typing as npt
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices
+from lidarops.retrieve.network.settings import NetworkAssumptions
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 SEMI_MAJOR_AXIS: Final = 6_378_137.0
@@ -193,10 +194,10 @@ def locate(beams: Sequence[Beam]) -> tuple[Array, Array]:
 def build_network(
     beams: Sequence[Beam],
     *,
-    tolerance: float = THRESHOLDS.tolerance,
+    tolerance: float = NetworkAssumptions.tolerance,
     nearest: float | Sequence[float] = 0.0,
     farthest: float | Sequence[float] = np.inf,
-    smallest_angle: float = THRESHOLDS.smallest_angle,
+    smallest_angle: float = NetworkAssumptions.smallest_angle,
 ) -> Network:
     """Find the crossings where beams of stations meet. Results are cached by the arguments.
 
@@ -234,10 +235,10 @@ def network_of_lines(
     origin: npt.ArrayLike,
     direction: npt.ArrayLike,
     *,
-    tolerance: float = THRESHOLDS.tolerance,
+    tolerance: float = NetworkAssumptions.tolerance,
     nearest: float | Sequence[float] = 0.0,
     farthest: float | Sequence[float] = np.inf,
-    smallest_angle: float = THRESHOLDS.smallest_angle,
+    smallest_angle: float = NetworkAssumptions.smallest_angle,
 ) -> Network:
     """Find the crossings of beams given in a local frame; otherwise as `build_network`.
 

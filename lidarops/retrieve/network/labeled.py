@@ -15,6 +15,7 @@ from lidarops.flags import Quality
 from lidarops.retrieve.air.visibility import VisibilityDefinition, visibility_of_extinction
 from lidarops.retrieve.background.estimate import detected, from_tail, shifts
 from lidarops.retrieve.common.arrays import Array, Flags, Indices, Integers, root_sum_square
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network import extinction_field
 from lidarops.retrieve.network._beam_signals import SignalChange
 from lidarops.retrieve.network.extinction_field import NetworkResult
@@ -296,7 +297,7 @@ def _quality_flags(
     bits[(bits & np.int32(Quality.INPUT_MISSING)) == 0] &= ~np.int32(Quality.NO_SIGNAL)
     with np.errstate(invalid="ignore"):
         error = np.hypot(random, systematic)
-        uncertain = ~(error < THRESHOLDS.largest_relative_error * result.extinction)
+        uncertain = ~(COMMON.significant * error < result.extinction)
     background_doubt = shifts(tail_signal, random)
     bits |= np.where(background_doubt, np.int32(Quality.BACKGROUND_UNCERTAIN), np.int32(0))
     bits |= np.where(

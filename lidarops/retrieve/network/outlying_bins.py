@@ -20,6 +20,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Codes, Indices
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 GOOD: Final = 0
@@ -33,8 +34,11 @@ NODES: Final = 6
 
 _SIDE: Final[int] = np.int64(3)  # type: ignore[assignment]
 """Neighbours on either side; no literal, for which numba would compile functions once more."""
-_SMOOTH_SIDE: Final[int] = np.int64(4)  # type: ignore[assignment]
-"""Neighbours on either side that decide which of several bins is the worst."""
+MARGIN: Final[int] = np.int64(4)  # type: ignore[assignment]
+"""Neighbours on either side that decide which of several bins is the worst; so many bins before and
+behind the used ones of a beam help to test these."""
+_REACH: Final = 2 * MARGIN
+"""Bins on either side among which neighbours are searched."""
 _SMOOTH_DEGREE: Final = 3
 _ONE_SIDED_DEGREE: Final = 2
 _LARGEST_LOGARITHM: Final = 300.0
@@ -72,7 +76,7 @@ def fit_weights(grid: Array, at: int, nodes: Indices, count: int, degree: int, o
 def _good_bins(codes: Codes, at: int, way: int, most: int, nodes: Indices, count: int) -> int:
     """Append the nearest good bins on one side of a bin; return the number of all."""
     g, end = at + way, count + most
-    while count < end and 0 <= g < codes.size and abs(g - at) <= THRESHOLDS.reach:
+    while count < end and 0 <= g < codes.size and abs(g - at) <= _REACH:
         if codes[g] == GOOD:
             nodes[count] = g
             count += 1
@@ -164,7 +168,7 @@ def _worst_bin(
     worst, largest = suspect, 0.0
     for g in range(max(0, suspect - _SIDE), min(codes.size, suspect + _SIDE + 1)):
         if codes[g] == GOOD:
-            deviation = _deviation(row, codes, g, _SMOOTH_SIDE, work)
+            deviation = _deviation(row, codes, g, MARGIN, work)
             if deviation > largest:
                 worst, largest = g, deviation
     return worst
@@ -185,7 +189,7 @@ def _jumps(logs: Array, noise: Array, exponent: float, codes: Codes, at: int) ->
             spread += noise[g] / (count * count)
         if count == 0:
             return False
-    return abs(step) > max(THRESHOLDS.step * exponent, THRESHOLDS.outlier * math.sqrt(spread))
+    return abs(step) > max(COMMON.largest_step * exponent, COMMON.outlier * math.sqrt(spread))
 
 
 @compiled
@@ -200,7 +204,7 @@ def _all_isolated(
     for at in range(codes.size):
         if codes[at] != BRIDGED:
             continue
-        for g in range(max(0, at - THRESHOLDS.reach), min(codes.size, at + THRESHOLDS.reach + 1)):
+        for g in range(max(0, at - _REACH), min(codes.size, at + _REACH + 1)):
             near = g != at and abs(g - at) <= _SIDE
             if deviations[g] > THRESHOLDS.suspect or (near and codes[g] == BRIDGED):
                 return False
@@ -251,7 +255,7 @@ def _all_fit(
         ratio = math.exp(min(gap / exponent, _LARGEST_LOGARITHM))
         size = exponent * (ratio - 1.0)
         # A little less than what is outlying: rounding does not count.
-        limit = 0.99 * THRESHOLDS.outlier**2 * (spread + noise[g] * ratio * ratio)
+        limit = 0.99 * COMMON.outlier**2 * (spread + noise[g] * ratio * ratio)
         if not size * size < limit:
             return False
     return True
@@ -278,17 +282,17 @@ def _search_row(
             deviations[g] = 0.0
             if codes[g] == GOOD:
                 deviations[g] = _deviation(row, codes, g, _SIDE, work)
-        if number == 0 and not np.any(deviations[used[0] : used[1]] > THRESHOLDS.outlier):
+        if number == 0 and not np.any(deviations[used[0] : used[1]] > COMMON.outlier):
             return True
-        if number == 0 and np.sum(deviations > THRESHOLDS.outlier) > most:
+        if number == 0 and np.sum(deviations > COMMON.outlier) > most:
             return False
         farthest = int(np.argmax(deviations))
-        if number > most or not deviations[farthest] > THRESHOLDS.outlier:
+        if number > most or not deviations[farthest] > COMMON.outlier:
             break
         worst = _worst_bin(row, codes, farthest, work)
         codes[worst] = BRIDGED
         number += 1
-        low, high = max(0, worst - THRESHOLDS.reach), min(size, worst + THRESHOLDS.reach + 1)
+        low, high = max(0, worst - _REACH), min(size, worst + _REACH + 1)
     if number > most or not _all_isolated(row[0], row[1], row[2], codes, deviations):
         _keep_in_place(row[0], codes, doubt)
     return True
@@ -324,11 +328,11 @@ def search(
     doubt : (profile, bin) float64
         In: 0. Out: deviations of the bins that are KEPT.
     """
-    work = np.zeros(2 * _SMOOTH_SIDE, dtype=np.intp), np.zeros(2 * _SMOOTH_SIDE)
+    work = np.zeros(2 * MARGIN, dtype=np.intp), np.zeros(2 * MARGIN)
     plan = _adjacent_weights(grid)
     for n in range(logs.shape[0]):
         if stops[n] > low:
-            codes[n, stops[n] + THRESHOLDS.margin :] = LOST
+            codes[n, stops[n] + MARGIN :] = LOST
             row = logs[n], noise[n], exponent, grid, plan
             used = low, stops[n]
             # On most beams, no used bin is outlying.

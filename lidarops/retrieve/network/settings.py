@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
 from lidarops.settings import quantity
+
+EXPONENTS: Final = (0.1, 10.0)
+"""Smallest and largest exponent m of backscatter ~ extinction^(1/m); assumed."""
 
 Multiplier = Annotated[float, Field(ge=0, le=1)] | Literal["chosen"]
 

@@ -15,17 +15,10 @@ class Thresholds(NamedTuple):
     """
 
     # Crossings
-    tolerance: float = 15.0
-    """m, largest distance of beams that meet: two bins of 7.5 m; assumed."""
-    smallest_angle: float = 2.0
-    """degree between beams that meet. Below, a pointing error of 0.1 degree moves the crossing by
-    more than 5 percent of its range; geometry."""
     most_beams: int = 512
     """Largest number of beams of a network; assumed."""
 
     # Signals
-    exponents: tuple[float, float] = (0.1, 10.0)
-    """Smallest and largest exponent m of backscatter ~ extinction^(1/m); assumed."""
     fit_bins: int = 7
     """Bins of the fit that gives the signal at a crossing; the study of the method."""
     lowest_overlap: float = 0.5
@@ -33,23 +26,14 @@ class Thresholds(NamedTuple):
     largest_bin_error: float = 0.3
     """Relative standard error of a bin at a crossing in a block, beyond which the beam is not used:
     signals that are positive by chance would be selected; assumed."""
-    negative: float = 4.0
-    """Standard errors below zero at which a mean signal is faulty, not weak; assumed."""
     noisy_profile: float = 10.0
     """Ratio to the median variance of a block, beyond which a profile does not count for it;
     assumed."""
 
     # Outlying bins: ablation
-    outlier: float = 6.0
-    """Standard errors by which a bin deviates from its neighbours: 2e-9 of the normal
-    distribution lie beyond 6 on either side, where the variance is known."""
     suspect: float = 4.5
     """Standard errors of a deviation near a bridged bin, beyond which the bin may be an edge of a
     layer; assumed."""
-    reach: int = 8
-    """Bins on either side among which neighbours are searched; assumed."""
-    margin: int = 4
-    """Bins before and behind the used ones of a beam that help to test these; assumed."""
     air_deviation: float = 1e-3
     """Largest relative deviation that air causes, with one neighbour on one side; a plume of 50 m
     in bins of 7.5 m; calculated."""
@@ -57,8 +41,6 @@ class Thresholds(NamedTuple):
     """The same at an end of a beam, where all neighbours are on one side; assumed."""
     widest_bin: float = 10.0
     """m. A layer may fill a wider bin; assumed."""
-    step: float = 0.1
-    """Change of the logarithm over 4 bins that air may cause: for a visibility of 2 km; assumed."""
     edge_bins: int = 14
     """Bins that deviate at two edges of layers; assumed."""
     outlying_share: float = 0.2
@@ -71,9 +53,6 @@ class Thresholds(NamedTuple):
     curvature_left: float = 0.1
     """Share of the error of a straight line that a polynomial may leave: 0.24 of a Gaussian layer
     of 10 m, 0.05 of one of 15 m in bins of 5 m; calculated."""
-    profile_noise: float = 9.0
-    """Square of the difference of polynomial and line over its noise variance, beyond which a mean
-    signal is curved: 3 standard errors."""
 
     # The field: ablation
     stratified: tuple[float, float] = (2.0, 300.0)
@@ -89,17 +68,12 @@ class Thresholds(NamedTuple):
     follow the noise of triangles: errors in a drifting plume grow by a fifth; simulations."""
     correlations: tuple[float, ...] = (0.3, 0.7, 0.95, 0.995)
     """Correlations of changes from one profile to the next that are tried; assumed."""
-    least_change: float = 9.0
-    """Gain in -2 ln likelihood that tells changes, or changes from larger ones: 3 standard
-    errors."""
     linear_change: float = 0.02
     """Standard deviation of ln extinction in a block, beyond which profiles are not linear about
     its mean; simulations."""
     linear_noise: float = 0.015
     """Standard deviation by noise of the logarithm of a signal at a crossing, below which a profile
     needs no running mean; simulations."""
-    least_profiles: int = 5
-    """Profiles below which a block has no changes: a bad one would make them; simulations."""
     settled_share: float = 0.1
     """Share of its error by which a field may change in the last pass; chosen."""
     neighbours: int = 3
@@ -119,21 +93,12 @@ class Thresholds(NamedTuple):
     """Largest change of a logarithm in the last pass of a converged solution; assumed."""
     least_fall: float = 1e-3
     """Least fall of the signals along all beams, for the start constants; assumed."""
-    largest_rise: float = 30.0
-    """Largest rise of the logarithm along a beam, for these; assumed."""
-    smallest_pivot: float = 1e-13
-    """Smallest pivot of a regular matrix over its diagonal; rounding."""
     weak_precision: float = 1e-2
     """Precision of ln extinction in place of a prior: a standard deviation of 10; assumed."""
     largest_variance: float = 4.0
     """Variance of ln extinction beyond which it is not determined; assumed."""
 
     # Flags
-    largest_relative_error: float = 1.0 / 3.0
-    """Relative standard error beyond which a linear error does not describe a value: it is flagged;
-    assumed."""
-    least_probability: float = 1e-4
-    """Probability of a chi-square below which a fit is poor; chosen."""
     bins_beyond: int = 200
     """Bins kept beyond the farthest crossing: over twice the widest window of a bin."""
 

@@ -28,6 +28,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 _LEAST_WEIGHT: Final = 1e-2
@@ -84,7 +85,7 @@ class DepthFit:
     @property
     def certain(self) -> Booleans:
         """Whether first-order errors hold for the depth, (cell,)."""
-        return np.asarray(self.expected_error <= THRESHOLDS.most_uncertain)
+        return np.asarray(self.expected_error <= 1.0 / COMMON.first_order)
 
     @property
     def first(self) -> int:
@@ -129,7 +130,7 @@ def fit_depth(signal: Array, noise: SignalNoise) -> DepthFit | None:
     `patterson1971` (restricted likelihood, by which the smoothness is chosen).
     """
     known = np.isfinite(signal) & np.isfinite(noise.fixed)
-    if known.sum() < THRESHOLDS.fewest_cells:
+    if known.sum() < COMMON.fewest_bins:
         return None
     values = np.where(known, signal, 0.0)
     level = _level(values, noise, known)

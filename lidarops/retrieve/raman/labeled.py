@@ -20,7 +20,12 @@ from lidarops.retrieve.clouds import labeled as _clouds
 from lidarops.retrieve.common.arrays import Array, Booleans, Flags
 from lidarops.retrieve.raman.backscatter import overlap_of
 from lidarops.retrieve.raman.flags import CONCERNING, OF_MEANS, RamanQuality, concerning
-from lidarops.retrieve.raman.retrieval import RamanResult, retrieve_raman
+from lidarops.retrieve.raman.retrieval import (
+    RamanResult,
+    mixing_ratio,
+    particle_transmission,
+    retrieve_raman,
+)
 from lidarops.retrieve.raman.scattering import nitrogen_line_share
 from lidarops.retrieve.raman.settings import RamanSettings
 from lidarops.retrieve.raman.signals import (
@@ -34,7 +39,6 @@ from lidarops.retrieve.raman.signals import (
     touched,
 )
 from lidarops.retrieve.raman.thresholds import THRESHOLDS
-from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 from lidarops.retrieve.signal.averaging import cloud_contrast
 from lidarops.retrieve.signal.labeled import (
     actual_noise,

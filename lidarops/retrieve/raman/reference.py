@@ -20,10 +20,10 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air import reference_window
 from lidarops.retrieve.air.reference_window import THRESHOLDS as WINDOW_THRESHOLDS
 from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.raman.errors import Profile
 from lidarops.retrieve.raman.settings import RamanReference
 from lidarops.retrieve.raman.signals import AirColumn, Cells, ChannelSignal
-from lidarops.retrieve.raman.thresholds import THRESHOLDS
 
 
 def choose_window(
@@ -68,7 +68,7 @@ def choose_window(
             power[number] = np.nan
             continue
         raman, fit = profile.raman, profile.fit
-        power[number, fit.expected_error > THRESHOLDS.most_uncertain] = np.nan
+        power[number, ~fit.certain] = np.nan
         # Of the fit, only the small difference of both transmissions is used.
         mean = np.exp(-fit.depth)
         per_raman = of_air * np.exp((1.0 - 2.0 / (1.0 + ratio)) * fit.depth)
@@ -145,4 +145,4 @@ def _level(
     of_power, of_air, noise, noise_of_air = (values[lit] for values in sums)
     ratio = of_power / of_air
     error = np.sqrt(noise + ratio**2 * noise_of_air) / of_air
-    return float(ratio[np.argmin(ratio + WINDOW_THRESHOLDS.most_deviation * error)])
+    return float(ratio[np.argmin(ratio + COMMON.significant * error)])

@@ -16,12 +16,6 @@ class Thresholds(NamedTuple):
     """The same for the weight from which the errors by resolution follow. In the same simulations,
     intervals cover 95 to 96 %; with the weight that is used, up to 96.1 %, with a share of 0.3 down
     to 94.0 %."""
-    most_uncertain: float = 0.2
-    """Expected standard error of the logarithm of the smoothed signal, beyond which first-order
-    errors do not hold: a signal of less than 5 standard errors. Assumed."""
-    least_ratio_certainty: float = 3.0
-    """Standard errors by which backscatter must exceed zero for a lidar ratio. Below, no error is
-    symmetrical; with 5, none is left at 355 nm of the published simulations."""
     typical_lidar_ratio: float = 50.0
     """sr, by which extinction helps to decide whether backscatter is certain enough for a lidar
     ratio. Decided by backscatter alone, lidar ratios of few counts are too small on average: those
@@ -38,17 +32,10 @@ class Thresholds(NamedTuple):
     percent, and 0.01(6) percent are off by more than 4 errors; with errors of the first order,
     93.5(5), 77.0(8) and 0.30(6). With 0.4, 95 percent intervals cover 86 instead of 89 percent of
     lidar ratios above 80 sr; with 0.5, 68 percent intervals cover 75 percent of all."""
-    negative: float = 4.0
-    """Standard errors by which the optical depth between two cells must be below zero to contradict
-    the signal. 1 of 3,000 profiles of simulated haze does
-    (`tests/retrieve/raman/test_raman_coverage.py`); in the night of Manaus, whose overlap is not
-    full where it was stated to be, all values up to 6 km (`tests/end_to_end/test_raman.py`)."""
     overlap_scales: tuple[float, ...] = (0.3, 1.0)
     """Scales over which what overlap lacks falls, over the range where it is stated to be full. Of
     5 percent that fall over 50 m or more, .01 percent of extinctions are off by more than 4 errors,
     with one of the scales .03 and .07 percent (skies of ``benchmarks stability``)."""
-    fewest_cells: int = 8
-    """Cells with data of a profile that is fitted. Assumed."""
     standard_slope_error: float = 1.6e-5
     """m-1, of the derivative of the logarithm of the density of the standard atmosphere: root mean
     square from 0.1 to 12 km of its deviation from the sounding of Manaus

@@ -14,6 +14,7 @@ import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Booleans
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
@@ -146,7 +147,7 @@ def _fit(light: Array, square: Array, dark: float) -> float:
 def _line(blocks: _Blocks, dark: float, drift: float) -> _Line:
     """Return the noise as a function of light."""
     # Windows of the smoothed signal hold a block or more.
-    clear = THRESHOLDS.bright * max(drift, math.sqrt(dark / BLOCK))
+    clear = COMMON.first_order * max(drift, math.sqrt(dark / BLOCK))
     bright = (blocks.light > clear) & (blocks.square < math.inf)
     known = bright & blocks.usable
     if np.sum(known) >= _FEWEST or np.sum(bright) < _FEWEST:
@@ -186,10 +187,10 @@ def _bands(blocks: _Blocks, line: _Line) -> tuple[Array, Array, bool]:
         ratio[k] = blocks.square[k] / _variance(line, blocks.light[k])
     centres, excesses = np.empty(count), np.empty(count)
     found, significant = 0, False
-    bands = max(count // THRESHOLDS.noise_band, 1)
+    bands = max(count // THRESHOLDS.noise_sample, 1)
     for band in range(bands):
-        start = band * THRESHOLDS.noise_band
-        end = start + THRESHOLDS.noise_band if band < bands - 1 else count
+        start = band * THRESHOLDS.noise_sample
+        end = start + THRESHOLDS.noise_sample if band < bands - 1 else count
         places = np.flatnonzero(blocks.usable[start:end])
         # Without noise above zero, nothing is known of the band.
         excess = _clipped_mean(ratio[start + places])

@@ -17,6 +17,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
@@ -310,11 +311,11 @@ def outlying_parts(cells: PartCells, compared: slice, *, contrast: float) -> Boo
     """
     count, size = cells.power[:, compared].shape
     outlying = np.zeros(count, dtype=np.bool_)
-    most = count // THRESHOLDS.fewest_parts
+    most = count // COMMON.fewest_profiles
     if not most:
         return outlying
     excess = estimate_noise_correlation(cells.power, cells.variance).excess
-    least = -float(ndtri(THRESHOLDS.false_alarm / (len(_SIGNS) * count * size)))
+    least = -float(ndtri(COMMON.false_alarm / (len(_SIGNS) * count * size)))
     margin = float(skewness_margin(least)) * cells.quantum
     power, variance = cells.power[:, compared], cells.variance[:, compared]
     whole = np.isfinite(power + variance).all(axis=0)

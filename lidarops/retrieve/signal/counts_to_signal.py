@@ -25,6 +25,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.flags import Quality
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Flags, Indices, frozen
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal import _noise_kernels as noise_kernels
 from lidarops.retrieve.signal import _signal_kernels as kernels
 from lidarops.retrieve.signal.noise_correlation import estimate_noise_correlation
@@ -306,7 +307,7 @@ def photon_signal(
             # The error relative to the rate is the relative one of the dead time times x / (1 - x).
             largest_load=THRESHOLDS.largest_dead_time_error
             / (THRESHOLDS.largest_dead_time_error + relative),
-            undecided=THRESHOLDS.undecided,
+            undecided=COMMON.single_bin,
         ),
         _overlap_bits(grid, full_overlap_range),
         _windows(grid, THRESHOLDS.noise_window),

@@ -177,7 +177,7 @@ def _drift(signals: Array) -> float:
 
 def _far_variance(signals: Array) -> Array:
     """Return the noise variance from second differences of the far bins, (1, 1)."""
-    far = signals[:, int(signals.shape[-1] * (1.0 - THRESHOLDS.far_share)) :]
+    far = signals[:, signals.shape[-1] // 2 :]
     second = np.diff(far, n=2, axis=-1) ** 2 / _SECOND_DIFFERENCE_VARIANCE
     finite = np.isfinite(second)
     total = np.where(finite, second, 0.0).sum(axis=(-2, -1), keepdims=True)

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from lidarops.retrieve.common.arrays import Array, Integers
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _TAIL: Final = 10
@@ -110,7 +111,7 @@ def estimate_dead_time(groups: Sequence[ProfileGroup], lag: float) -> DeadTimeEs
     if whole is None or low is None:
         return None
     dead_time, noise, load = whole
-    if not dead_time > THRESHOLDS.least_significance * noise or load < THRESHOLDS.least_load:
+    if not dead_time > COMMON.first_order * noise or load < THRESHOLDS.least_load:
         return None
     # A quadratic analog record looks like a dead time: this changes the largest signal by a share.
     bent = THRESHOLDS.analog_nonlinearity * (1.0 - load) / load * dead_time
@@ -193,7 +194,7 @@ def _fit(
         Load up to which cells count.
     """
     known = np.isfinite(analog) & np.isfinite(variance)
-    known &= analog > THRESHOLDS.least_analog * np.sqrt(np.where(known, variance, 1.0))
+    known &= analog > COMMON.significant * np.sqrt(np.where(known, variance, 1.0))
     known &= counted.light(0.0).rate > THRESHOLDS.least_rate
     fastest, dead_time = math.inf, 0.0
     solution: tuple[float, float, float] | None = None

@@ -14,6 +14,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Block, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _HUGE: Final = 1e150
@@ -152,7 +153,7 @@ def glue(
         common = misfit & _misfits(changed)
     empty, error = past == 0, np.sqrt(line["slope_variance"])
     with np.errstate(invalid="ignore"):
-        poor_fit = misfit | ~(line["slope"] >= THRESHOLDS.least_significance * error)
+        poor_fit = misfit | ~(line["slope"] >= COMMON.first_order * error)
     result = GluedSignal(
         power=power,
         variance=variance,
@@ -217,7 +218,7 @@ def _search(x: Array, y: Array, xv: Array, highest: Array) -> tuple[Indices, Ind
     inside = (index >= first[:, np.newaxis]) & (index < past[:, np.newaxis])
     highest_rate = np.where(inside, rate, 0.0).max(axis=1, initial=0.0)
     lowest_rate = np.where(inside, rate, np.inf).min(axis=1, initial=np.inf)
-    wide = past - first >= THRESHOLDS.fewest_glued_bins
+    wide = past - first >= COMMON.fewest_bins
     wide &= highest_rate >= THRESHOLDS.least_fall * lowest_rate
     return np.where(wide, first, 0), np.where(wide, past, 0)
 
@@ -239,7 +240,7 @@ def _smooth(values: Array) -> Array:
 def _misfits(line: Block) -> Booleans:
     """Return which lines have a chi-square that noise does not explain."""
     freedom = np.maximum(np.nan_to_num(line["points"]).astype(np.int64) - 2, 0)
-    noise = special.chdtri(freedom, THRESHOLDS.misfit_false_alarm)
+    noise = special.chdtri(freedom, COMMON.misfit_false_alarm)
     with np.errstate(invalid="ignore"):
         return np.asarray(line["chi2"] > np.maximum(THRESHOLDS.largest_misfit * freedom, noise))
 

@@ -12,6 +12,7 @@ import xarray as xr
 from lidarops.flags import Quality
 from lidarops.retrieve.background import cubic_and_tail
 from lidarops.retrieve.common.arrays import Array, Block
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal import gluing
 from lidarops.retrieve.signal import lag as _lag
 from lidarops.retrieve.signal.labeled import (
@@ -243,7 +244,7 @@ def _glue(
     by_photons = gluing.lit_bins(y, yv, THRESHOLDS.count_rates[1] - sky)
     line = ~(glued.no_window | glued.poor_fit)
     alone = ~(line | glued.misfit)
-    alone &= np.maximum(by_analog, by_photons) >= THRESHOLDS.fewest_glued_bins
+    alone &= np.maximum(by_analog, by_photons) >= COMMON.fewest_bins
     records = line, alone & (by_analog >= by_photons), alone & (by_analog < by_photons)
 
     def of_records(*values: Block) -> Block:

@@ -16,6 +16,7 @@ from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.common import inputs
 from lidarops.retrieve.common.arrays import Array, Booleans, Indices, Integers, frozen
 from lidarops.retrieve.common.compiled_code import compiled, summing
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 _PARTS: Final = 16
@@ -111,7 +112,7 @@ def estimate_lag(groups: Iterable[tuple[Array, Array]]) -> ChannelLag:
     scatter = np.sqrt((deviation**2).sum(axis=-1) * (_PARTS - 1) / _PARTS)
     confidence, defined = _confidence(total, lag), bool(np.isfinite(lag))
     error = float(np.hypot(scatter, systematic)) if defined else math.nan
-    significant = confidence >= 1.0 - THRESHOLDS.false_alarm and error < 0.5 * THRESHOLDS.peak_width
+    significant = confidence >= 1.0 - COMMON.false_alarm and error < 0.5 * THRESHOLDS.peak_width
     return ChannelLag(float(lag), error, confidence, significant and not at_end)
 
 
@@ -138,7 +139,7 @@ def _noise(profiles: Array) -> Array:
     deviation = np.sqrt(square / np.maximum(bins, 1.0))
     floor = 1e-12 * np.max(deviation, axis=-1, keepdims=True, initial=0.0)
     scaled = np.where(deviation > floor, rough / np.where(deviation > floor, deviation, 1.0), 0.0)
-    return np.clip(scaled, -THRESHOLDS.clip, THRESHOLDS.clip)
+    return np.clip(scaled, -COMMON.single_bin, COMMON.single_bin)
 
 
 def _box(values: Array, window: int) -> Array:

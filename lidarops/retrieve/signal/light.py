@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import Array, Booleans
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.averaging import skewness_margin
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
@@ -34,9 +35,7 @@ _CLIPPED: Final = 6.0
 _WITNESSES: Final = 2
 """Other channels without light beside which a faint excess is pick-up of the electronics."""
 _PICK_UP: Final = 2.0
-"""Largest such excess over `shows_light`. Dark files of Sao Paulo show up to 1.3."""
-FEWEST: Final = 5
-"""Profiles; fewer tell nothing."""
+"""Largest such excess over `outlier`. Dark files of Sao Paulo show up to 1.3."""
 _NEAREST: Final = 60.0
 _FARTHEST: Final = 3000.0
 """m; signals are expected to stop rising between these."""
@@ -65,7 +64,7 @@ class Light(NamedTuple):
     @property
     def dark(self) -> Booleans:
         """(time,), whether a profile shows no light."""
-        return self.measured & (self.excess < THRESHOLDS.shows_light)
+        return self.measured & (self.excess < COMMON.outlier)
 
     @property
     def tells(self) -> bool:
@@ -74,9 +73,9 @@ class Light(NamedTuple):
         Of the profiles that show light, at least a tenth of all, nine tenths show so much that a
         twentieth of it would do. They may be few: a laser may be off for most of a scene.
         """
-        lit = self.excess[self.measured & (self.excess >= THRESHOLDS.shows_light)]
+        lit = self.excess[self.measured & (self.excess >= COMMON.outlier)]
         share = THRESHOLDS.telling_share
-        if lit.size < max(FEWEST, share * self.excess.size):
+        if lit.size < max(COMMON.fewest_profiles, share * self.excess.size):
             return False
         return bool(np.quantile(lit, share) >= THRESHOLDS.tells_of_light)
 
@@ -134,7 +133,7 @@ def light_of(excess: Array, variance: Array, blank: Booleans, measured: Booleans
         np.vstack([part, total]) for part, total in zip((excess, variance), sums, strict=True)
     )
     # Beyond what few counts may show.
-    beyond = np.maximum(np.abs(excess) - skewness_margin(THRESHOLDS.shows_light), 0.0)
+    beyond = np.maximum(np.abs(excess) - skewness_margin(COMMON.outlier), 0.0)
     with np.errstate(invalid="ignore"):
         *greatest, of_sum = (beyond / np.sqrt(variance)).max(axis=-1)
     return Light(np.array(greatest), float(of_sum), measured, blank)
@@ -156,7 +155,8 @@ def lightless(found: Mapping[str, Light], lasers: Mapping[str, str]) -> dict[str
         Channel -> its laser, as headers number it.
     """
     nothing = all(
-        len(one.excess) >= FEWEST and one.of_sum < THRESHOLDS.shows_light for one in found.values()
+        len(one.excess) >= COMMON.fewest_profiles and one.of_sum < COMMON.outlier
+        for one in found.values()
     )
     dark: dict[str, Booleans] = {}
     own = _dark_of_their_own(found, lasers)
@@ -177,7 +177,7 @@ def _dark_of_their_own(
     own = {}
     for name, dark in shown.items():
         others = [shown[o] for o in shown if o != name and lasers[o] == lasers[name]]
-        faint = found[name].excess < _PICK_UP * THRESHOLDS.shows_light
+        faint = found[name].excess < _PICK_UP * COMMON.outlier
         if len(others) < _WITNESSES:
             faint = dark
         own[name] = dark | (found[name].measured & faint & np.logical_and.reduce([faint, *others]))

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from lidarops.retrieve.common.arrays import HUGE, Array, Booleans, frozen
 from lidarops.retrieve.common.compiled_code import compiled
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
 
@@ -68,14 +69,14 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
     residuals give chi-square per bin and the correlations :math:`r_k` of bins at the distance
     :math:`k`; those of the profile are the medians over sections, so that a cloud in some of them
     does not count as noise. Correlations are taken up to the first one that is within
-    `Thresholds.significant_correlation` of its standard errors, :math:`n^{-1/2}`; chi-square
+    3 of its standard errors, :math:`n^{-1/2}`; chi-square
     counts as 1 below 1 plus as many of its own.
 
     Parameters
     ----------
     power : (profile, range) float
         NaN where missing; sections with gaps are left out. Without half of the sections, and
-        where they would have fewer than `Thresholds.fewest_noise_bins`, nothing is known.
+        where they would have fewer than `Thresholds.noise_sample`, nothing is known.
     variance : (profile or 1, range) float
         Stated noise variance, in the square of the unit of the power.
 
@@ -89,13 +90,13 @@ def estimate_noise_correlation(power: Array, variance: Array) -> NoiseCorrelatio
     known = np.zeros(count, dtype=np.bool_)
     correlations = np.zeros((count, reach))
     size = bins // (2 * THRESHOLDS.noise_sections)
-    if size >= THRESHOLDS.fewest_noise_bins:
+    if size >= THRESHOLDS.noise_sample:
         far = slice(bins - THRESHOLDS.noise_sections * size, bins)
         _estimate(
             frozen(power[:, far].astype(np.float64, copy=False)),
             frozen(variance[:, far].astype(np.float64, copy=False)),
             frozen(_polynomials(size)),
-            THRESHOLDS.significant_correlation,
+            COMMON.significant,
             excess,
             correlations,
             error,

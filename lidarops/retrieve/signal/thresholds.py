@@ -19,25 +19,17 @@ class Thresholds(NamedTuple):
     """Relative error of a rate by one standard error of the dead time above which it is rejected.
     With 20 %, the rate of a paralyzable counter deviates by 1.5 of these errors here, by 2.4 at
     0.10, and beyond 0.117 it has none: m tau stays below 1 / e. Computed."""
-    undecided: float = 5.0
-    """Standard deviations of a bin about a limit within which the mean of its neighbours decides:
-    a choice by the noise of the bin would bias every mean of those that are left."""
 
     # Parts of a mean
     most_parts: int = 16
     """Parts into which the profiles of a mean are divided: 15 profiles of 2 minutes in half an hour
     are parts of their own. More parts take more memory and have more noise. Assumed."""
-    fewest_parts: int = 5
-    """Parts of which one may be left out: at most a fifth of a mean. Assumed."""
     cell_length: float = 30.0
     """m; in which signals of parts are averaged, half of the shortest window in which a cloud is
     found."""
     cloud_contrast: float = 3.0
     """Factor of the rise at a cloud, at 532 nm. The scattering ratio of aerosol rarely rises by
     this factor within 2 km, that of thin cirrus does. Assumed."""
-    false_alarm: float = 0.001
-    """Probability that noise makes a part of a mean outlying, which is required of the product, and
-    that noise without a common cause gives a lag."""
 
     # Analog
     baseline: float = 0.02
@@ -67,25 +59,19 @@ class Thresholds(NamedTuple):
     """Noise variance of a block over that of the others from which it is a cloud edge."""
     darkest: float = 0.5
     """Least noise variance over that in the far half, where the signal lies below its level."""
-    bright: float = 5.0
-    """Light over the drift of the baseline, and over the noise of its mean, from which it gives the
-    noise of light: they change the slope by a fifth at most."""
-    noise_band: int = 32
-    """Blocks of a band, which give its noise within 5 %."""
     significant_band: float = 3.5
     """Standard errors beyond which the noise of a band differs from the line. With 0 the stated
     variance of white noise scatters five times as much in the first bins of 16,380."""
 
+    noise_sample: int = 32
+    """Blocks of a band, which give its noise within 5 %, and fewest bins of a section, which give a
+    correlation within 0.1."""
+
     # Correlation of noise
     noise_sections: int = 8
     """Parts of the far half of a profile. Assumed."""
-    fewest_noise_bins: int = 32
-    """Bins of each of them; a correlation is then known within 0.1. Assumed."""
     most_correlated_bins: int = 10
     """Greatest distance at which noise is correlated, bins. Assumed."""
-    significant_correlation: float = 3.0
-    """Standard errors beyond which noise is taken as correlated, or larger than stated. Assumed.
-    """
 
     # Dark signals
     session_gap: float = 1800.0
@@ -93,9 +79,6 @@ class Thresholds(NamedTuple):
     variance_window: int = 65
     """Bins over which the scatter of repeats is averaged, and that of the noise that gives a lag:
     that of 3 repeats alone is off by 100 %."""
-    far_share: float = 0.5
-    """Share of the bins, from the far end, that gives the noise of a file without repeats.
-    Assumed."""
 
     # Lag
     largest_lag: int = 30
@@ -104,8 +87,6 @@ class Thresholds(NamedTuple):
     """Bins between the largest lags. Assumed."""
     high_pass: int = 17
     """Bins of the running mean that is subtracted to leave the noise. Assumed."""
-    clip: float = 5.0
-    """Standard deviations at which the noise is clipped, against spikes. Assumed."""
     peak_width: int = 4
     """Bins on either side of a peak that belong to it; a lag is applied up to an error of half of
     them (`test_a_lag_that_parts_of_the_range_contradict_is_not_significant`). Assumed."""
@@ -116,21 +97,14 @@ class Thresholds(NamedTuple):
     Specification of the elastic chain."""
     least_snr: float = 10.0
     """Signal-to-noise ratio of analog in the window. Specification of the elastic chain."""
-    fewest_glued_bins: int = 8
-    """Bins of a window. Assumed."""
     least_fall: float = 1.5
     """Factor by which the smoothed count rate must fall within a window: bins without a sufficient
     fall give the slope of their noise. Assumed."""
     smoothing: int = 31
     """Bins over which signals are averaged before the window is chosen. Edges that follow the noise
     of single bins would bias the slope. Assumed."""
-    least_significance: float = 5.0
-    """Standard errors by which the slope must exceed 0, as must a dead time: else weak light gives
-    up to 100 ns (`test_noise_shows_no_dead_time`)."""
     largest_misfit: float = 1.5
     """Chi-square of the line over its degrees of freedom, for many bins. Assumed."""
-    misfit_false_alarm: float = 1e-4
-    """Probability with which noise exceeds the largest chi-square, for few bins. Assumed."""
 
     # Dead time against analog (`dead_time`).
     highest_load: float = 0.95
@@ -146,15 +120,10 @@ class Thresholds(NamedTuple):
     (`test_a_nonlinear_analog_record_lies_within_the_error`)."""
     least_rate: float = 1.0
     """MHz, rate from which bins count: below, noise gives 100 ns (the same test)."""
-    least_analog: float = 3.0
-    """Analog signal over its noise from which bins count; assumed."""
     dead_time_block: int = 2
     """Bins that are averaged; few, because the rate is no linear function of the light; assumed."""
 
     # Profiles without light (`light`).
-    shows_light: float = 6.0
-    """Standard errors by which a profile that shows light differs from a constant: of 12 real dark
-    files at most 5.4 in strong channels (`tests/scene/test_laser_off.py`)."""
     tells_of_light: float = 220.0
     """The same of a channel that tells: a twentieth, 11, shows in all but 1 of 10,000 profiles."""
     telling_share: float = 0.1

@@ -11,11 +11,11 @@ from support.inversions import invert_elastic
 from lidarops.errors import RetrievalInputError
 from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.air.reference_window import (
-    THRESHOLDS,
     Rejection,
     candidate_windows,
     choose_reference,
 )
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 
 AIR = MolecularProfile.us_standard()
 RANGE = 15.0 * (np.arange(900) + 0.5)[20:]
@@ -106,7 +106,7 @@ def test_clean_windows_pass_at_the_rate_of_the_tests():
     window = choose_reference(
         power, r, spread**2, molecular_attenuated=shape, candidates=np.array([[6e3, 7e3]])
     )
-    most, freedom = THRESHOLDS.most_deviation, r.size - 1
+    most, freedom = COMMON.significant, r.size - 1
     of_scatter = stats.chi2.sf(freedom * (1.0 + most * np.sqrt(2.0 / freedom)), freedom)
     of_shape = 2.0 * stats.norm.sf(most)
     for reason, expected in (

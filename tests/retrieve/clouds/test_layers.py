@@ -20,6 +20,7 @@ from lidarops.retrieve.air.reference_window import (
 from lidarops.retrieve.clouds.labeled import with_margin
 from lidarops.retrieve.clouds.layers import find_layers, find_visible_air
 from lidarops.retrieve.clouds.thresholds import THRESHOLDS
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.averaging import cloud_contrast
 
 AIR = MolecularProfile.us_standard()
@@ -119,7 +120,7 @@ def test_noise_makes_layers_at_most_at_the_stated_rate(contrast):
     spread = np.sqrt(SHAPE * SHAPE[300])
     power = SHAPE + spread * rng.standard_normal((4000, RANGE.size))
     layers = detect(power, spread**2, contrast=contrast)
-    rate = THRESHOLDS.cloud_false_alarm
+    rate = COMMON.false_alarm
     assert np.mean(layers.cloudy) <= rate + 3.0 * np.sqrt(rate / 4000)
 
 
@@ -137,7 +138,7 @@ def test_correlated_noise_makes_no_layers(correlation):
     spread = np.sqrt(SHAPE * SHAPE[300])
     power = SHAPE + spread * correlated_noise((10_000, RANGE.size), correlation, rng)
     layers = detect(power, (1.0 - correlation) * spread**2)
-    assert np.mean(layers.cloudy) <= THRESHOLDS.cloud_false_alarm
+    assert np.mean(layers.cloudy) <= COMMON.false_alarm
 
 
 @pytest.mark.parametrize(("correlation", "ratio"), [(0.0, 1.0), (0.3, 1.5), (0.6, 2.0)])
@@ -193,7 +194,7 @@ def test_power_of_the_test_is_what_gaussian_noise_allows():
     power = SHAPE * ratio + spread * rng.standard_normal((2000, RANGE.size))
     layers = detect(power, spread**2, contrast=contrast)
     lengths = len(THRESHOLDS.window_lengths)
-    threshold = stats.norm.isf(THRESHOLDS.cloud_false_alarm / (2.0 * lengths))
+    threshold = stats.norm.isf(COMMON.false_alarm / (2.0 * lengths))
     expected = (2.6 - contrast) / (noise * np.sqrt((1.0 + contrast**2) / bins))
     alone = stats.norm.sf(threshold - expected)
     # Bins beside the step may detect it too.
@@ -210,7 +211,7 @@ def test_an_edge_of_aerosol_that_rises_by_the_factor_is_no_cloud(contrast):
         spread = noise * SHAPE * np.sqrt(32.0)
         noisy = power + spread * rng.standard_normal((2000, RANGE.size))
         cloudy.append(detect(noisy, spread**2, contrast=contrast).cloudy)
-    rate = THRESHOLDS.cloud_false_alarm
+    rate = COMMON.false_alarm
     assert np.mean(cloudy) <= rate + 3.0 * np.sqrt(rate / np.size(cloudy))
 
 

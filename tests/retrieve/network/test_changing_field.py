@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.network import _changing_field
 from lidarops.retrieve.network._changing_field import (
     Change,
@@ -153,9 +154,9 @@ def test_the_change_is_the_largest_of_the_likeliest_by_dense_likelihoods(seed):
         for rho in THRESHOLDS.correlations
     }
     least = min(costs.values())
-    assert least < -THRESHOLDS.least_change
+    assert least < -(COMMON.significant**2)
     # Of the changes that are about as likely, the largest, and of these the likeliest.
-    likely = {key: cost for key, cost in costs.items() if cost <= least + THRESHOLDS.least_change}
+    likely = {key: cost for key, cost in costs.items() if cost <= least + COMMON.significant**2}
     size = max(key[1] for key in likely)
     best = min(cost for key, cost in likely.items() if key[1] == size)
     assert marginal(normal, side, found, places) == pytest.approx(best, abs=1e-3)

@@ -157,7 +157,7 @@ def test_errors_of_smooth_signals_do_not_change(field, relative, profiles, monke
 
     value, stated = both()
     monkeypatch.setattr(
-        _block_solution, "THRESHOLDS", _block_solution.THRESHOLDS._replace(profile_noise=1e30)
+        _block_solution, "COMMON", _block_solution.COMMON._replace(significant=1e15)
     )
     value_without, stated_without = both()
     assert np.nanmax(np.abs(value - value_without) / stated_without) < 0.5

@@ -15,6 +15,7 @@ from lidarops.kinds import flags_of
 from lidarops.retrieve.air.visibility import VisibilityDefinition
 from lidarops.retrieve.network import labeled
 from lidarops.retrieve.network.flags import NetworkQuality
+from lidarops.retrieve.network.settings import EXPONENTS
 from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 
@@ -65,7 +66,7 @@ def test_a_larger_declared_error_gives_a_larger_systematic_error(setting):
     )
 
 
-@pytest.mark.parametrize("exponent", [THRESHOLDS.exponents[0], THRESHOLDS.exponents[1]])
+@pytest.mark.parametrize("exponent", EXPONENTS)
 def test_an_exponent_at_its_bound_has_an_error_too(exponent):
     beams = [beam(number, noise=0.001, exponent=exponent) for number in range(3)]
     declared = {"overlap_relative_error": 0.0, "lidar_ratio_relative_error": 0.0}

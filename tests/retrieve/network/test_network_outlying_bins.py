@@ -22,7 +22,6 @@ from lidarops.flags import Quality
 from lidarops.retrieve.network import _condensed_signals, outlying_bins
 from lidarops.retrieve.network.extinction_field import retrieve_network
 from lidarops.retrieve.network.flags import NetworkQuality
-from lidarops.retrieve.network.thresholds import THRESHOLDS
 
 BINS = 7
 
@@ -336,7 +335,7 @@ def test_variances_of_bridged_beams_agree_with_their_scatter(where, relative):
 
 
 def test_a_jump_is_seen_from_the_farthest_bins_within_reach():
-    reach = THRESHOLDS.reach
+    reach = 2 * outlying_bins.MARGIN
     bins = 2 * reach + 1
     codes = np.full(bins, outlying_bins.GOOD + 1, dtype=np.uint8)
     codes[[0, -1]] = outlying_bins.GOOD

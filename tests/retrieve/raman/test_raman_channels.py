@@ -15,6 +15,7 @@ from lidarops.retrieve.air.molecular import MolecularProfile
 from lidarops.retrieve.raman.depth_fit import SignalNoise
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.labeled import WaterVapour, retrieve
+from lidarops.retrieve.raman.retrieval import mixing_ratio, particle_transmission
 from lidarops.retrieve.raman.scattering import (
     NITROGEN_SHIFT,
     WATER_SHIFT,
@@ -23,7 +24,6 @@ from lidarops.retrieve.raman.scattering import (
 )
 from lidarops.retrieve.raman.settings import RamanReference, RamanSettings
 from lidarops.retrieve.raman.signals import CellSignal
-from lidarops.retrieve.raman.water_vapour import mixing_ratio, particle_transmission
 
 STEP = 15.0
 R = STEP * (np.arange(1000) + 0.5)
@@ -97,12 +97,14 @@ def retrieved(
     return retrieve(
         averages(seen * elastic_power()) if elastic is None else elastic,
         nitrogen,
-        molecules=AIR,
         station_altitude=0.0,
         wavelengths=(LASER, RAMAN),
-        settings=replace(SETTINGS, filter_width=filter_width),
         water=None if water is None else WaterVapour(water, WATER, 1.0, 0.03),
-        **arguments,
+        **{
+            "molecules": AIR,
+            "settings": replace(SETTINGS, filter_width=filter_width),
+            **arguments,
+        },
     )
 
 
@@ -248,6 +250,18 @@ def test_an_overlap_that_nobody_states_is_missing(exact):
     np.testing.assert_array_equal(product["aerosol_extinction"], exact["aerosol_extinction"])
     # Full from the first bin, as the range of full overlap says.
     assert np.all(exact["overlap"] == 1.0)
+
+
+@pytest.mark.parametrize(("standard", "stated"), [(True, 1.6e-5), (False, 2e-6)])
+def test_the_slope_of_the_air_is_as_uncertain_as_its_source(standard, stated):
+    def error(slope_error):
+        settings = replace(SETTINGS, molecular_slope_error=slope_error)
+        product = retrieved(molecules=replace(AIR, standard=standard), settings=settings)
+        return product["aerosol_extinction_error_molecular"].to_numpy()
+
+    assumed = error(None)
+    np.testing.assert_array_equal(assumed, error(stated))
+    assert np.nanmax(assumed) > np.nanmax(error(0.0))
 
 
 CELLS = 60.0 * (np.arange(100) + 0.5)

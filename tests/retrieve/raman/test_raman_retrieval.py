@@ -10,6 +10,7 @@ from support.raman_signals import make_sky
 
 from lidarops.flags import Quality
 from lidarops.retrieve.air.molecular import MolecularProfile
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.raman.flags import RamanQuality
 from lidarops.retrieve.raman.retrieval import retrieve_raman
 from lidarops.retrieve.raman.scattering import (
@@ -89,7 +90,7 @@ def test_extinction_begins_with_the_data(sky):
         known = np.isfinite(getattr(found, name)[0])
         np.testing.assert_array_equal(known[near], R[near] > 600.0)
     between = (R > 300.0) & (R < 600.0)
-    assert np.all(found.raman_depth_error[0, between] < THRESHOLDS.most_uncertain)
+    assert np.all(found.raman_depth_error[0, between] < 1.0 / COMMON.first_order)
 
 
 @pytest.mark.parametrize(

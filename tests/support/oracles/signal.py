@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarops.constants import DEFAULT_DEAD_TIME, LICEL_RANGE_PER_MICROSECOND
 from lidarops.flags import Quality
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.counts_to_signal import Signal
 from lidarops.retrieve.signal.thresholds import THRESHOLDS
 
@@ -155,7 +156,7 @@ def photon(
         error = dead_time_uncertainty if dead_time is not None else 1.0
         largest = THRESHOLDS.largest_dead_time_error
         largest = largest / (largest + error)
-        margin = THRESHOLDS.undecided * np.sqrt(load * assumed / exposure) * (1.0 - load)
+        margin = COMMON.single_bin * np.sqrt(load * assumed / exposure) * (1.0 - load)
         over = np.where(np.abs(load - largest) < margin, 1.0 - live, load) > largest
         over &= (quality & np.int32(Quality.INPUT_MISSING)) == 0
         power[over] = np.nan

@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidar_extras.integrated.integral import Window
 from lidar_extras.integrated.settings import IntegratedSettings
-from lidarops.retrieve.background.thresholds import THRESHOLDS as BACKGROUND
+from lidarops.retrieve.common.thresholds import THRESHOLDS as COMMON
 from lidarops.retrieve.signal.labeled import background_words, correct_for_range
 from lidarops.scene.case import REQUESTED, ChannelCase, Entries, channel_ranges
 from lidarops.scene.profiles import ChannelSignal, Chunk, ProductStream, gluing
@@ -39,10 +39,8 @@ def needs(case: ChannelCase[IntegratedSettings]) -> Entries:
     limits = case.request.background_range
     start, stop = tail(case, limits)
     bins = (stop - start) / case.channel.bin_width
-    if bins < BACKGROUND.fewest_bins:
-        reason = (
-            f"background_range {start:g}-{stop:g} m holds fewer than {BACKGROUND.fewest_bins} bins"
-        )
+    if bins < COMMON.fewest_bins:
+        reason = f"background_range {start:g}-{stop:g} m holds fewer than {COMMON.fewest_bins} bins"
         yield case.leave("integrated", reason, number=bins)
         return
     centres = channel_ranges(case.channel, case.facts_of_channel)
