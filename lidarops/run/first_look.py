@@ -249,7 +249,7 @@ def empty_in_first_files(
         if dark := len(begin) - len(lit):
             share = f"{dark} of the first {len(begin)} files"
             yield f"all of {scene.instrument}", "no light", share, UNLIT
-        first = replace(scene, granules=tuple(own) if beams > 1 else lit[:COMMON.fewest_profiles])
+        first = replace(scene, granules=tuple(own) if beams > 1 else lit[: COMMON.fewest_profiles])
         if "pre_trigger" not in scene_facts(campaign, first).model_fields_set:
             yield from _without_near_light(campaign, first)
         with tempfile.TemporaryDirectory(prefix="lidarops-") as folder:
@@ -299,7 +299,9 @@ def _full_overlap(lit: xr.Dataset, channels: Iterable[str]) -> tuple[float | Non
     if not ends:
         return None, _OF_ONE
     last = max(ends, key=ends.__getitem__)
-    parts = np.array_split(np.arange(lit.sizes["time"]), min(COMMON.fewest_profiles, lit.sizes["time"]))
+    parts = np.array_split(
+        np.arange(lit.sizes["time"]), min(COMMON.fewest_profiles, lit.sizes["time"])
+    )
     known = [rise_ends(*_mean(lit.isel(time=part), last)) for part in parts]
     apart = [end for end in known if end is not None]
     scatter = max(float(np.std(apart, ddof=1)), _STEP) if len(apart) > 1 else _OF_ONE
@@ -337,7 +339,10 @@ def _is_unlit(group: FileGroup, groups: Iterable[FileGroup], root: Path) -> bool
         largest = max(alike, key=lambda one: len(one.files))
         members += zip(largest.files, largest.headers, strict=True)
     step = len(members) // (2 * COMMON.fewest_profiles) or 1
-    starts = {path: header.start for path, header in (*members[:COMMON.fewest_profiles], *members[::step])}
+    starts = {
+        path: header.start
+        for path, header in (*members[: COMMON.fewest_profiles], *members[::step])
+    }
     try:
         paths = [root / path for path in starts]
         unlit = _unlit(open_archive(paths, mask_and_scale=False, header_position="ignore"))
