@@ -366,9 +366,9 @@ class Plan:
             for name, owner, words in (*steps, *omitted)
         ]
 
-    @cached_property
+    @property
     def text(self) -> str:
-        """The canonical JSON form."""
+        """The canonical JSON form; not kept, because it is larger than all else of a run."""
         return canonical(self.as_dict())
 
     @cached_property
