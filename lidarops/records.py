@@ -122,6 +122,7 @@ INVALID: Final = "is of a period that the facts declare invalid"
 """Start of the reason if a campaign wants no product of a file."""
 ACKNOWLEDGED: Final = "acknowledged"
 """Start of the reason if a campaign knows that a file is refused, or belongs to no scene."""
+EXPECTED: Final = (INVALID, ACKNOWLEDGED)
 FEWEST_ALIKE: Final = 3
 """Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 LONGEST_REASON: Final = 300
@@ -179,7 +180,7 @@ class Granule(Header):
     @property
     def is_expected(self) -> bool:
         """Whether the campaign says that the file is not used."""
-        return self.reason.startswith((INVALID, ACKNOWLEDGED))
+        return self.reason.startswith(EXPECTED)
 
 
 # An archive has few layouts.
