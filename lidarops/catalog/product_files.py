@@ -137,7 +137,7 @@ def last_kept(product: Path) -> Path:
 
 
 def sweep(output: Path, store: Store) -> bool:
-    """Remove hidden temporary files that killed processes left among products and reports.
+    """Remove what killed processes left: temporary files, and kept versions that are present.
 
     Parameters
     ----------
@@ -162,6 +162,12 @@ def sweep(output: Path, store: Store) -> bool:
             _LOG.warning("removed %s, left by a killed process", path)
         except OSError as error:
             failures.append(error)
+    for kept in (output / FOLDER).rglob("*.nc"):
+        present = kept.relative_to(output / FOLDER).with_suffix("").with_suffix(".nc")
+        with suppress(FileNotFoundError):
+            # The killed process has not replaced it.
+            if kept.samefile(output / "products" / present):
+                kept.unlink()
     return not failures
 
 

@@ -535,6 +535,24 @@ def test_a_version_that_a_killed_run_kept_is_not_mistaken_for_the_one_that_it_wr
         assert [file for file in verify_archive(campaign, store) if file.problem] == []
 
 
+def test_a_version_that_a_killed_run_has_not_replaced_is_not_kept(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.tree["superseded"] = "keep"
+    campaign = archive.write()
+    with monkeypatch.context() as patch:
+        patch.setattr(executor, "attempt", lambda _job: sys.exit("dies within a scene"))
+        with pytest.raises(SystemExit):
+            reprocess(campaign, options=Options(force=True))
+    assert archive.contents("out/superseded")
+    archive.raw("poor/h39", 3 * DAY + 630, seed=9)
+    before = archive.contents("out/products")
+    assert reprocess(campaign) is not None
+    assert set(archive.contents("out/superseded").values()) <= set(before.values()) - set(
+        archive.contents("out/products").values()
+    )
+
+
 def test_replaced_versions_are_kept_for_a_month(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
