@@ -124,6 +124,7 @@ MISDATED: Final = "more than a day away from the files beside it by name"
 """Start of the reason if names only count, and the date in a header cannot be right."""
 ACKNOWLEDGED: Final = "acknowledged"
 """Start of the reason if a campaign knows that a file is refused, or belongs to no scene."""
+EXPECTED: Final = (INVALID, ACKNOWLEDGED)
 FEWEST_ALIKE: Final = 3
 """Fewest other files that must agree; with fewer, any of them may be the damaged one."""
 LONGEST_REASON: Final = 300
@@ -181,7 +182,7 @@ class Granule(Header):
     @property
     def is_expected(self) -> bool:
         """Whether the campaign says that the file is not used."""
-        return self.reason.startswith((INVALID, ACKNOWLEDGED))
+        return self.reason.startswith(EXPECTED)
 
 
 # An archive has few layouts.
@@ -368,9 +369,9 @@ class Plan:
             for name, owner, words in (*steps, *omitted)
         ]
 
-    @cached_property
+    @property
     def text(self) -> str:
-        """The canonical JSON form."""
+        """The canonical JSON form; not kept, because it is larger than all else of a run."""
         return canonical(self.as_dict())
 
     @cached_property

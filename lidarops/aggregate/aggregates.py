@@ -27,7 +27,7 @@ from lidarops.errors import ProductError
 from lidarops.system.files import settled_before
 
 if TYPE_CHECKING:
-    from lidarops.aggregate.means import MeansFile
+    from lidarops.aggregate.means import Means, MeansFile
     from lidarops.aggregate.versioned_store import StoreUpdate
 
 Progress = Callable[[int], None]
@@ -111,18 +111,16 @@ def make_aggregates(
         made.index = f"{FOLDER}/{INDEX}" if kept else write_index(root, products, as_of)
     else:
         made.notes.append("the index lists all products; run without a selection to update it")
+    means: Means | None = None
     if period is not None:
-        from lidarops.aggregate.means import write_means  # noqa: PLC0415 - the index is without xarray
+        from lidarops.aggregate.means import Means  # noqa: PLC0415 - the index is without xarray
 
-        for alike in by_group.values():
-            with _failures(made):
-                done = write_means(root, alike, period, weights=weights)
-                made.means += done.files
-                made.refused += done.refused
-                made.notes += [done.note] if done.note else []
+        means = Means(root, by_group, period, weights)
     if store:
         with _failures(made):
-            _update_stores(made, products, selection, runs)
+            _update_stores(made, products, selection, runs, means)
+    if means is not None:
+        _make_means(made, means)
     if stac:
         from lidarops.aggregate.stac import write_stac  # noqa: PLC0415
 
@@ -132,6 +130,15 @@ def make_aggregates(
                 raise ProductError("the STAC catalog lists all products", remedy=remedy)
             made.stac = write_stac(root, products, products_at)
     return made
+
+
+def _make_means(made: AggregateResult, means: Means) -> None:
+    for group in means.groups:
+        with _failures(made):
+            done = means.of(group)
+            made.means += done.files
+            made.refused += done.refused
+            made.notes += [done.note] if done.note else []
 
 
 def _products(
@@ -192,6 +199,7 @@ def _update_stores(
     products: Sequence[Facts],
     selection: ProductSelection,
     runs: Mapping[str, str],
+    means: Means | None,
 ) -> None:
     from lidarops.aggregate.versioned_store import (  # noqa: PLC0415
         stored_kinds,
@@ -205,7 +213,7 @@ def _update_stores(
             continue
         with _failures(made):
             alike = [product for product in products if product.kind == kind]
-            done = update_store(made.root, kind, alike, selection, runs)
+            done = update_store(made.root, kind, alike, selection, runs, means)
             made.stores.append(done)
             made.refused += done.refused
             made.failed += done.failed

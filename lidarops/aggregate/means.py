@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +21,7 @@ from lidarops.aggregate.facts import (
     FOLDER,
     PERIOD,
     Facts,
+    Group,
     Period,
     Refused,
     Weights,
@@ -69,46 +72,62 @@ class MeansResult:
     """Why the group has no means by its nature; empty where it has."""
 
 
-def write_means(
-    root: Path, products: Sequence[Facts], period: Period, *, weights: Weights = Weights.SHOTS
-) -> MeansResult:
-    """Write the means of one group of products, one file per calendar year.
+class Means:
+    """Writes the means of groups of products, one file per calendar year of each.
 
     Products are read one after the other, so that only one product and its periods are in memory.
-    Unreadable products are reported and left out.
 
     Parameters
     ----------
     root : path
         Folder that product paths are relative to; files are written to its ``aggregates/means``.
-    products : sequence of Facts
-        Of one group, sorted by time (`lidarops.aggregate.facts.groups`).
+    groups : mapping of Group to sequence of Facts
+        As of `lidarops.aggregate.facts.groups`.
     period : Period
     weights : Weights
-
-    Raises
-    ------
-    ProductError
-        If two products have a profile at the same time, or a file cannot be
-        written.
     """
-    averaging = _Averaging(period, weights)
-    refused: list[Refused] = []
-    for facts in products:
-        try:
-            with facts.opened(root) as product, reading(facts.path):
-                source = layout_of(facts.kind)
-                profiles, times = read_profiles(product, source), product["time"][...]
-                if any(product[name].dims for name in _MOVING if name in product):
-                    note = f"no means of {facts.kind}: profiles of several directions have none"
-                    return MeansResult((), tuple(refused), f"{note} ({facts.path})")
-                averaging.frame = averaging.frame or _frame(product, facts.kind)
-                stated = product.attrs.whole()
-        except ProductError as error:
-            refused.append(Refused(facts.path, error.problem))
-        else:
-            averaging.add(facts, profiles, times, stated)
-    return MeansResult(tuple(averaging.written(root)), tuple(refused))
+
+    def __init__(
+        self,
+        root: Path,
+        groups: Mapping[Group, Sequence[Facts]],
+        period: Period,
+        weights: Weights = Weights.SHOTS,
+    ) -> None:
+        self._root, self.groups = root, groups
+        self._new = partial(_Averaging, period, weights)
+        self._done: dict[Group, MeansResult] = {}
+
+    @contextmanager
+    def averaging(self, group: Group) -> Iterator[_Averaging]:
+        """Take the products of a group, which others read too, in order; then write its means."""
+        averaging = self._new()
+        yield averaging
+        # `of` tries again what fails, and tells it.
+        if averaging.taken == len(self.groups[group]):
+            with suppress(ProductError):
+                self._done[group] = averaging.write(self._root)
+
+    def of(self, group: Group) -> MeansResult:
+        """Return the means of a group, written unless they are; unreadable products are left out.
+
+        Raises
+        ------
+        ProductError
+            If two products have a profile at the same time, or a file cannot be written.
+        """
+        if group in self._done:
+            return self._done[group]
+        averaging = self._new()
+        for facts in self.groups[group]:
+            if averaging.note:
+                break
+            try:
+                with facts.opened(self._root) as product:
+                    averaging.take(facts, product)
+            except ProductError as error:
+                averaging.refused.append(Refused(facts.path, error.problem))
+        return averaging.write(self._root)
 
 
 @dataclass(slots=True)
@@ -194,23 +213,46 @@ def _year(key: np.datetime64) -> int:
 
 @dataclass(slots=True)
 class _Averaging:
-    """Accumulates products and collects the means by year."""
+    """Accumulates products of one group, in order of their start, and collects means by year."""
 
     period: Period
     weights: Weights
-    frame: dict[str, xr.Variable] = field(default_factory=dict)
+    refused: list[Refused] = field(default_factory=list)
+    """Products that could not be read."""
+    taken: int = 0
+    """Number of products, with those that could not be read."""
+    note: str = ""
+    """Why there are no means; the others then need not be taken."""
+    _frame: dict[str, xr.Variable] = field(default_factory=dict)
     """Variables of the first product that its means take over."""
     _years: dict[int, _Year] = field(default_factory=dict)
     _open: dict[np.datetime64, PeriodSums] = field(default_factory=dict)
     _times: list[tuple[str, Array]] = field(default_factory=list)
 
-    def add(
+    def take(self, facts: Facts, product: StoredProduct) -> None:
+        """Add an open product; one that cannot be read is refused."""
+        self.taken += 1
+        if self.note:
+            return
+        try:
+            with reading(facts.path):
+                source = layout_of(facts.kind)
+                profiles, times = read_profiles(product, source), product["time"][...]
+                if any(product[name].dims for name in _MOVING if name in product):
+                    note = f"no means of {facts.kind}: profiles of several directions have none"
+                    self.note = f"{note} ({facts.path})"
+                    return
+                self._frame = self._frame or _frame(product, facts.kind)
+                stated = product.attrs.whole()
+        except ProductError as error:
+            self.refused.append(Refused(facts.path, error.problem))
+        else:
+            self._add(facts, profiles, times, stated)
+
+    def _add(
         self, facts: Facts, profiles: Profiles, times: Array, stated: Mapping[str, Any]
     ) -> None:
-        """Add a product, with its times (s since 1970) and what it states.
-
-        Products must be added in order of their start.
-        """
+        """Add a product, with its times (s since 1970) and what it states."""
         self._close(before=np.datetime64(facts.start.replace(tzinfo=None), "ms"))
         self._times.append((facts.path, times))
         # Rounded to milliseconds, the accuracy of the middle of a profile.
@@ -229,7 +271,7 @@ class _Averaging:
             year.keys.append(key)
             year.records.append(self._open.pop(key).record())
 
-    def written(self, root: Path) -> Iterator[MeansFile]:
+    def write(self, root: Path) -> MeansResult:
         """Close all periods and write the files.
 
         Raises
@@ -237,13 +279,15 @@ class _Averaging:
         ProductError
             If two products have a profile at the same time, or a file cannot be written.
         """
-        if not self.frame:
-            return
-        refuse_duplicates(self._times)
-        self._close()
-        for _, year in sorted(self._years.items()):
-            done = write_product(_encoded(self.frame, year), root / year.path)
-            yield MeansFile(year.path, done.sha256, done.size, len(year.keys), len(year.inputs))
+        files = []
+        if not self.note:
+            refuse_duplicates(self._times)
+            self._close()
+            for _, year in sorted(self._years.items()):
+                done = write_product(_encoded(self._frame, year), root / year.path)
+                periods, inputs = len(year.keys), len(year.inputs)
+                files.append(MeansFile(year.path, done.sha256, done.size, periods, inputs))
+        return MeansResult(tuple(files), tuple(self.refused), self.note)
 
 
 def _frame(product: StoredProduct, kind: str) -> dict[str, xr.Variable]:

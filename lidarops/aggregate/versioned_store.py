@@ -8,13 +8,13 @@ products are replaced. Products are copied, because a reference to a replaced fi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -35,6 +35,9 @@ from lidarops.aggregate.means_variables import PRODUCT, PRODUCT_INDEX
 from lidarops.errors import ProductError
 from lidarops.netcdf.stored import StoredProduct, StoredVariable, reading
 from lidarops.system.files import only_one
+
+if TYPE_CHECKING:
+    from lidarops.aggregate.means import Means
 
 FOLDER: Final = "stores"
 """Folder of stores beside the products; unlike aggregates, they cannot be made again."""
@@ -71,6 +74,8 @@ class StoreUpdate:
 class Changes:
     """What an update changes."""
 
+    means: Means | None
+    """As of `update_store`."""
     added: list[tuple[str, str]] = field(default_factory=list)
     """Path and version of products."""
     dropped: int = 0
@@ -102,6 +107,7 @@ def update_store(
     products: Sequence[Facts],
     selection: ProductSelection,
     runs: Mapping[str, str],
+    means: Means | None = None,
 ) -> StoreUpdate:
     """Bring the store of a kind up to date; without a change there is no new snapshot.
 
@@ -116,6 +122,8 @@ def update_store(
         By names only. Other groups of the store are left alone.
     runs : mapping of str to str
         Product path -> run that made it, for the message of the commit.
+    means : Means, optional
+        Takes the products of each group of which all are read.
 
     Raises
     ------
@@ -136,7 +144,8 @@ def update_store(
         while True:
             session = repository.writable_session(_BRANCH)
             try:
-                changes = _write_groups(session.store, root, wanted, replace(selection, kind=kind))
+                changes = Changes(means)
+                _write_groups(session.store, root, wanted, replace(selection, kind=kind), changes)
                 break
             except UnreadableProductError as error:
                 facts, reason = error.args
@@ -186,9 +195,12 @@ def _message(kind: str, changes: Changes, runs: Mapping[str, str]) -> str:
 
 
 def _write_groups(
-    store: Any, root: Path, products: Sequence[Facts], selection: ProductSelection
-) -> Changes:
-    changes = Changes()
+    store: Any,
+    root: Path,
+    products: Sequence[Facts],
+    selection: ProductSelection,
+    changes: Changes,
+) -> None:
     by_name = {group.name: alike for group, alike in groups(products).items()}
     stored = dict(_stored_groups(store, selection))
     for name in stored.keys() - by_name.keys():
@@ -199,7 +211,6 @@ def _write_groups(
             _write_group(store, name, root, alike, changes)
         except ProductError as error:
             changes.failed.append(str(error))
-    return changes
 
 
 def _stored_groups(store: Any, selection: ProductSelection) -> Iterator[tuple[str, Any]]:
@@ -241,20 +252,24 @@ def _write_group(
         rows = _resized(_root(store)[name], starts[-1], len(products))
     # What all have in common is known of those that stay, unless others go.
     shared = [] if gone or 0 in lacking else [held.attributes]
-    for at in range(len(ids)) if gone else sorted(lacking):
-        facts = products[at]
-        with _unreadable(facts), facts.opened(root) as product:
-            with reading(facts.path):
-                shared = [shared_attributes([*shared, product.attrs])]
-                version = product.attrs["product_version"]
-                pattern = None if at or 0 not in lacking else pattern_of(product, facts)
-            if pattern is not None:
-                _create(store, name, pattern)
-                rows = _resized(_root(store)[name], starts[-1], len(products))
-            if at in lacking:
-                _add(rows, product, facts, at, starts[at])
-        if at in lacking and facts.id not in held.places:
-            changes.added.append((facts.path, version))
+    means = changes.means if 0 in lacking else None
+    with means.averaging(products[0].group) if means else nullcontext() as averaging:
+        for at in range(len(ids)) if gone else sorted(lacking):
+            facts = products[at]
+            with _unreadable(facts), facts.opened(root) as product:
+                with reading(facts.path):
+                    shared = [shared_attributes([*shared, product.attrs])]
+                    version = product.attrs["product_version"]
+                    pattern = None if at or 0 not in lacking else pattern_of(product, facts)
+                if pattern is not None:
+                    _create(store, name, pattern)
+                    rows = _resized(_root(store)[name], starts[-1], len(products))
+                if at in lacking:
+                    _add(rows, product, facts, at, starts[at])
+                if averaging is not None:
+                    averaging.take(facts, product)
+            if at in lacking and facts.id not in held.places:
+                changes.added.append((facts.path, version))
     for parts in rows.values():
         parts.write()
     attributes = {key: plain(value) for key, value in shared[0].items()}

@@ -178,6 +178,12 @@ class Granules(Database):
         """Return the granules that the catalog refuses."""
         return self.granules(status=Status.REFUSED)
 
+    def reasons(self) -> dict[str, str]:
+        """Return why the catalog refuses granules, by path."""
+        query = sa.select(_C.path, _C.reason)
+        query = query.where(_C.campaign == self.campaign, _C.status == Status.REFUSED.value)
+        return dict(self.read(query, tuple))
+
     def files_in(self, folder: str) -> list[DatedFile]:
         """Return the files with headers in a folder itself; of the archive where it is empty."""
         columns = (_C.path, _C.instrument, _C.role, _C.start, _C.format, _C.reason)

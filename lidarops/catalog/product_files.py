@@ -54,7 +54,7 @@ def _kept(output: Path, product: str, sha256: str) -> Path:
 
 
 def keep(output: Path, product: str, sha256: str) -> None:
-    """Keep the present file of a product under a name of its own.
+    """Keep the present file of a product under a name of its own, if it has the digest given.
 
     Parameters
     ----------
@@ -70,13 +70,15 @@ def keep(output: Path, product: str, sha256: str) -> None:
     CatalogError
         If the version cannot be kept.
     """
-    target = _kept(output, product, sha256)
+    source, target = output / "products" / product, _kept(output, product, sha256)
     try:
+        # A run that was killed has kept the version, and replaced the file but not entered it.
+        if not source.exists() or sha256_of(source) != sha256:
+            return
         target.parent.mkdir(parents=True, exist_ok=True)
         # New products replace old ones by renaming, so a hard link keeps the old file.
         target.unlink(missing_ok=True)
-        with suppress(FileNotFoundError):
-            _link(output / "products" / product, target)
+        _link(source, target)
     except OSError as error:
         raise UnavailableError(
             f"the replaced version cannot be kept: {error.strerror or error}",
@@ -135,7 +137,7 @@ def last_kept(product: Path) -> Path:
 
 
 def sweep(output: Path, store: Store) -> bool:
-    """Remove hidden temporary files that killed processes left among products and reports.
+    """Remove what killed processes left: temporary files, and kept versions that are present.
 
     Parameters
     ----------
@@ -160,6 +162,12 @@ def sweep(output: Path, store: Store) -> bool:
             _LOG.warning("removed %s, left by a killed process", path)
         except OSError as error:
             failures.append(error)
+    for kept in (output / FOLDER).rglob("*.nc"):
+        present = kept.relative_to(output / FOLDER).with_suffix("").with_suffix(".nc")
+        with suppress(FileNotFoundError):
+            # The killed process has not replaced it.
+            if kept.samefile(output / "products" / present):
+                kept.unlink()
     return not failures
 
 

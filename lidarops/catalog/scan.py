@@ -21,7 +21,7 @@ from lidarops.catalog.raw_files import (
     RemoteSource,
     Source,
     UnreadFile,
-    acknowledged,
+    acknowledged_reasons,
     path_pattern,
     printable,
     read_row,
@@ -30,7 +30,15 @@ from lidarops.catalog.raw_files import (
 from lidarops.catalog.store import Store
 from lidarops.errors import CatalogError, UnavailableError
 from lidarops.raw.formats import raw_formats, time_in_path
-from lidarops.records import MISDATED, UNREADABLE, IdlePattern, Role, Status, digest
+from lidarops.records import (
+    EXPECTED,
+    MISDATED,
+    UNREADABLE,
+    IdlePattern,
+    Role,
+    Status,
+    digest,
+)
 from lidarops.system.code_version import reading_version
 from lidarops.system.processes import CRASHED, Processes
 from lidarops.system.stores import Stored, without_keys
@@ -345,16 +353,14 @@ class _Scan:
             self._store.bind_channel_names()
         self._progress(self._files % _BATCH)
         added = self._added - len(moved)
+        reasons = acknowledged_reasons(self._campaign, self._store.reasons())
         return ScanSummary(
             files=self._files,
             added=added,
             changed=self._changed,
             unchanged=self._files - added - self._changed - len(moved),
             vanished=len(self._gone) - len(moved),
-            refused=sum(
-                not granule.is_expected
-                for granule in acknowledged(self._campaign, self._store.refused())
-            ),
+            refused=sum(not reason.startswith(EXPECTED) for reason in reasons.values()),
             moved=len(moved),
             idle_patterns=tuple(
                 IdlePattern(

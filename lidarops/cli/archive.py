@@ -293,10 +293,11 @@ def reprocess(
         show_tables([_orphan_table(result, f"{removed} removed")], most, _FEW)
     if result.signal:
         raise typer.Exit(128 + result.signal)
-    if result.status is RunStatus.STOPPED:
+    # A page fails by the disk alone.
+    if result.status is RunStatus.STOPPED or (result.record is not None and page is None):
         raise typer.Exit(UNAVAILABLE)
     left = result if removed is None else replace(result, orphans=())
-    exit_with_status(failed=left.has_failures or (result.record is not None and page is None))
+    exit_with_status(failed=left.has_failures)
 
 
 def _page(campaign: Campaign, run: RunRecord, workers: int) -> Path | None:

@@ -22,7 +22,7 @@ from lidarops.figures.panels import (
     time_axis,
     units,
 )
-from lidarops.figures.raster import Raster
+from lidarops.figures.raster import Kept, Raster
 from lidarops.figures.time_axis import days
 from lidarops.figures.wording import percent
 
@@ -83,7 +83,7 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     # Of a quantity that noise hides, such as particles of clean air, all usable bins are shown.
     last = reach or max(raster.usable_to for raster in rasters)
     far = min(full, _BEYOND * last) if last > 0 else full
-    shown = [raster.shown_to(far) for raster in rasters]
+    shown = Kept(raster.shown_to(far) for raster in rasters)
     near = min(float(raster.edges[0]) for raster in shown)
     far = max(float(raster.edges[-1]) for raster in shown)
     values = quantity.factor * np.concatenate([r.mean[~r.flagged] for r in shown], axis=None)
@@ -95,7 +95,7 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
     panel = Panel(
         x,
         y,
-        (*(_image(raster, quantity.factor, ends, line) for raster in shown), *_clouds(shown, line)),
+        (*_images(shown, quantity.factor, ends, line), *_clouds(shown, line)),
         height=_HEIGHT,
         bar=Axis(label, *ends, log=True) if ends else None,
     )
@@ -109,20 +109,23 @@ def image_figure(rasters: Sequence[Raster], quantity: ImageQuantity, along: str)
 _ENDS: Final = ("start", "stop")
 
 
-def _image(
-    raster: Raster, factor: float, ends: tuple[float, float] | None, line: Line | None
-) -> Image:
-    mean = factor * raster.mean
-    shares = np.full(mean.shape, np.nan)
-    if ends is not None:
-        low, high = ends
-        shares = np.log(np.clip(mean, low, high) / low) / np.log(high / low)
-    codes = np.where(mean <= 0.0, NEGATIVE, codes_of(shares))
-    codes = np.where(raster.flagged, REJECTED, codes).astype(np.uint8)
-    edges = _kilometres(line, raster.edges)
-    if edges[-1] < edges[0]:
-        codes, edges = codes[:, ::-1], edges[::-1]
-    return Image(codes, days(raster.start), days(raster.stop), edges)
+def _images(
+    rasters: Sequence[Raster], factor: float, ends: tuple[float, float] | None, line: Line | None
+) -> Iterator[Image]:
+    known: dict[bytes, Floats] = {}
+    for raster in rasters:
+        mean = factor * raster.mean
+        shares = np.full(mean.shape, np.nan)
+        if ends is not None:
+            low, high = ends
+            shares = np.log(np.clip(mean, low, high) / low) / np.log(high / low)
+        codes = np.where(mean <= 0.0, NEGATIVE, codes_of(shares))
+        codes = np.where(raster.flagged, REJECTED, codes).astype(np.uint8)
+        edges = _kilometres(line, raster.edges)
+        if edges[-1] < edges[0]:
+            codes, edges = codes[:, ::-1], edges[::-1]
+        edges = known.setdefault(edges.tobytes(), edges)
+        yield Image(codes, days(raster.start), days(raster.stop), edges)
 
 
 def _kilometres(line: Line | None, ranges: Floats) -> Floats:

@@ -5,9 +5,11 @@ Products are read in blocks of bounded memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import pickle
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from tempfile import SpooledTemporaryFile
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -27,6 +29,7 @@ from lidarops.flags import Quality
 from lidarops.netcdf.stored_flags import bits_of, flags_names, quality_bits, rejecting_mask
 from lidarops.netcdf.variables import judging, possible_judges
 
+_Item = TypeVar("_Item")
 Floats = NDArray[np.float64]
 Sums = NDArray[np.float32]
 """Computed in double and kept in single precision, enough for an image."""
@@ -42,6 +45,8 @@ _READ_ROWS: Final = 4096
 """Most rows while reading, because the range to show is known only afterwards."""
 _READ_BYTES: Final = 48_000_000
 """Most bytes of one variable in memory."""
+_IN_MEMORY: Final = 4_000_000
+"""Most bytes of `Kept` in memory."""
 _VISIBLE: Final = 1.0
 """The reach of a signal ends where its median falls below this many standard errors."""
 _SOMETIMES: Final = 90.0, 3.0
@@ -49,6 +54,32 @@ _SOMETIMES: Final = 90.0, 3.0
 noise alone it is 1.3."""
 _SMOOTH: Final = 25
 """Places of the running mean along range, so that a single noisy one does not count as signal."""
+
+
+class Kept(Sequence[_Item]):
+    """Items that are kept as bytes, in a temporary file where they are many, and read one by one.
+
+    Raises
+    ------
+    OSError
+        If the folder of temporary files cannot hold them.
+    """
+
+    def __init__(self, items: Iterable[_Item]) -> None:
+        self._file = SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 - open as long as this lives
+        self._places: list[int] = []
+        for item in items:
+            self._places.append(self._file.tell())
+            pickle.dump(item, self._file, pickle.HIGHEST_PROTOCOL)
+
+    def __len__(self) -> int:
+        """Return the number of items."""
+        return len(self._places)
+
+    def __getitem__(self, at: Any) -> Any:
+        """Return an item."""
+        self._file.seek(self._places[at])
+        return pickle.load(self._file)  # noqa: S301 - written above
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,8 @@ from lidarops.errors import ProductError
 from lidarops.figures.time_axis import Times, segments
 
 Floats = NDArray[np.float64]
+_TOGETHER: Final = 64
+"""Series that are joined before more are read, because short arrays take more memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,15 +65,17 @@ def join(series: Iterable[TimeSeries]) -> list[TimeSeries]:
     """
     groups: dict[tuple[float, ...], list[TimeSeries]] = {}
     for part in series:
-        groups.setdefault(part.key, []).append(part)
-    return [_joined(group) for _, group in sorted(groups.items())]
+        group = groups.setdefault(part.key, [])
+        group.append(part)
+        if len(group) == _TOGETHER:
+            group[:] = [_joined(group)]
+    joined = (_joined(group) for _, group in sorted(groups.items()))
+    return [one.at(np.argsort(one.time, kind="stable")) for one in joined]
 
 
 def _joined(group: Sequence[TimeSeries]) -> TimeSeries:
-    first, *others = group
-    if not others:
-        return first
-    whole = replace(
+    first = group[0]
+    return replace(
         first,
         time=np.concatenate([part.time for part in group]),
         quantities={
@@ -79,7 +84,6 @@ def _joined(group: Sequence[TimeSeries]) -> TimeSeries:
         },
         flag=np.concatenate([part.flag for part in group]),
     )
-    return whole.at(np.argsort(whole.time, kind="stable"))
 
 
 def thin(section: TimeSeries, points: int) -> TimeSeries:

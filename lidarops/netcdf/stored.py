@@ -101,7 +101,8 @@ class Attributes(Mapping[str, Any]):
 
     def whole(self) -> dict[str, Any]:
         """Return all attributes."""
-        self._known = {name: self._read(name) for name in self}
+        known = self._known
+        self._known = {name: known[name] if name in known else self._read(name) for name in self}
         return dict(self._known)
 
     def _read(self, name: str) -> Any:

@@ -21,7 +21,7 @@ from lidarops.errors import ProductError
 from lidarops.figures.kind_figures import View, views_of
 from lidarops.figures.panels import Figure
 from lidarops.figures.product_names import attribute, light_in_words
-from lidarops.figures.raster import COLUMNS
+from lidarops.figures.raster import COLUMNS, Kept
 from lidarops.figures.wording import counted, named_shares
 from lidarops.flags import Severity
 from lidarops.kinds import flags_of, kinds, rank_of
@@ -130,7 +130,7 @@ def fill(record: RunRecord, *, limit: int = FIGURES, workers: int = 1) -> Galler
                 gallery.undrawn.append(f"{group.label}, {group.kind}")
                 continue
             for view in views_of(group.kind):
-                contents = list(_read(processes, group, view, gallery.problems))
+                contents = Kept(_read(processes, group, view, gallery.problems))
                 if contents:
                     title = _title(group, gallery.problems)
                     gallery.pictures += [_picture(one, group, title) for one in view.draw(contents)]

@@ -269,7 +269,7 @@ def _pass(states: DayStates, lock: Lock, options: Options) -> Result:
         empty_scenes=empty_scenes,
         set_aside=set_aside,
         findings=find(states, summary.idle_patterns, settled=verdicts),
-        refused=acknowledged(campaign, store.refused()),
+        refused=acknowledged(campaign, states.all_refused),
     )
 
 

@@ -166,9 +166,14 @@ class DayStates:
         return ChannelNames(self.campaign, self.store)
 
     @cached_property
+    def all_refused(self) -> list[Granule]:
+        """Files that the catalog refuses."""
+        return self.store.refused()
+
+    @cached_property
     def refused(self) -> tuple[RefusedFile, ...]:
-        """Files that the catalog refuses, with times to which they belong."""
-        return tuple(dated(self.campaign, self.store))
+        """Those with times to which they belong."""
+        return tuple(dated(self.campaign, self.store, self.all_refused))
 
     def ancillary(self, name: str) -> str:
         """Return the SHA-256 of an ancillary file when it was first needed."""

@@ -38,6 +38,7 @@ from lidarops.records import (
     Findings,
     Granule,
     LeftOut,
+    Plan,
     ProductRecord,
     Role,
     RunRecord,
@@ -126,6 +127,8 @@ class LedgerRun:
         self._named = 0
         """Granules that the record names."""
         self._left_out: dict[tuple[LeftOut, ...], tuple[LeftOut, ...]] = {}
+        self._plans: dict[str, Plan] = {}
+        """Last plan by instrument."""
         self.fresh: set[str] = set()
         """Scenes whose products are all fresh now."""
 
@@ -185,7 +188,8 @@ class LedgerRun:
         planned = set(() if outcome.plan is None else outcome.plan.left_out)
         others = tuple(left for left in judged.requested.left_out if left not in planned)
         # Share equal tuples: nearly all scenes of an instrument have the same.
-        outcome = replace(outcome, left_out=self._left_out.setdefault(others, others))
+        others = self._left_out.setdefault(others, others)
+        outcome = replace(outcome, left_out=others, plan=self._shared(outcome))
         self._named += outcome.granules
         # A million file names would fill memory, and the page shows few.
         brief = outcome if self._named <= MOST_INPUTS else replace(outcome, inputs=())
@@ -206,6 +210,16 @@ class LedgerRun:
         _log(outcome)
         self._outcomes[outcome.scene] = brief
         return outcome
+
+    def _shared(self, outcome: SceneOutcome) -> Plan | None:
+        """Return the plan of a scene with the entries of the last one where they are equal."""
+        if outcome.plan is None:
+            return None
+        plan, last = outcome.plan, self._plans.get(outcome.instrument, outcome.plan)
+        if (plan.steps, plan.left_out) == (last.steps, last.left_out):
+            plan = Plan(plan.scene, last.steps, last.left_out)
+        self._plans[outcome.instrument] = plan
+        return plan
 
     def _new_products(
         self, judge: Judge, judged: Judgement, outcome: SceneOutcome

@@ -394,7 +394,9 @@ class RefusedFile(NamedTuple):
     """Whether it belongs only to scenes without dark files, of which it may be the one."""
 
 
-def dated(campaign: Campaign, catalog: Granules) -> Iterator[RefusedFile]:
+def dated(
+    campaign: Campaign, catalog: Granules, refused: Iterable[Granule]
+) -> Iterator[RefusedFile]:
     """Yield refused files with the times of the good files beside which they belong.
 
     These are the ones before and after in the order of names, of the same folder, instrument and
@@ -405,7 +407,7 @@ def dated(campaign: Campaign, catalog: Granules) -> Iterator[RefusedFile]:
     the dark file before to the one after.
     """
     folders: dict[str, list[Granule]] = defaultdict(list)
-    for granule in catalog.refused():
+    for granule in refused:
         folders[granule.path.rpartition("/")[0]].append(granule)
     for folder, granules in sorted(folders.items()):
         rows: dict[tuple[str, Role], list[DatedFile]] = defaultdict(list)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections import Counter
 from pathlib import Path
 
+import h5py
 import pytest
 from support.archives.aggregate_archive import add_day
 from typer.testing import CliRunner
@@ -82,6 +84,26 @@ def test_stores_are_made_and_their_snapshots_shown(tmp_path: Path):
     code, output = run(tmp_path, "--store", "--since", "2026-01-01")
     assert code == 1
     assert output.count("a store holds all times") == 1
+
+
+def test_means_and_a_new_store_read_a_product_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("icechunk")
+    products = [add_day(tmp_path, day) for day in range(3)]
+    opened = []
+    file_of = h5py.File
+    monkeypatch.setattr(
+        h5py, "File", lambda path, *rest, **how: opened.append(path) or file_of(path, *rest, **how)
+    )
+    means = json.loads(run(tmp_path, "--means", "day", "--store", "--json")[1])["means"]
+    # For its facts, and for both.
+    counts = Counter(opened)
+    assert [counts[tmp_path / path] for path in products] == [2, 2, 2]
+    (file,) = (tmp_path / mean["path"] for mean in means)
+    together = file.read_bytes()
+    assert json.loads(run(tmp_path, "--means", "day", "--json")[1])["means"] == means
+    assert file.read_bytes() == together
 
 
 def test_signals_of_a_scan_have_no_mean_and_the_others_are_made(tmp_path: Path):

@@ -14,7 +14,7 @@ from support.products.compliance import findings
 from support.products.made_products import MAKERS
 
 from lidarops.aggregate.facts import Period, Refused, Weights, groups, read_product_facts
-from lidarops.aggregate.means import MeansResult, write_means
+from lidarops.aggregate.means import Means, MeansResult
 from lidarops.aggregate.means_variables import (
     averaged,
     layout,
@@ -33,8 +33,8 @@ from lidarops.retrieve.air.visibility import (
 
 
 def means_of(root: Path, period: Period = Period.DAY, **options) -> MeansResult:
-    (products,) = groups(facts_of(root)).values()
-    return write_means(root, products, period, **options)
+    (group,) = grouped = groups(facts_of(root))
+    return Means(root, grouped, period, **options).of(group)
 
 
 def only(root: Path, done: MeansResult) -> xr.Dataset:
@@ -452,9 +452,9 @@ def test_equal_products_give_equal_bytes_and_other_settings_another_id(tmp_path:
 
 def test_a_damaged_product_is_reported_and_the_others_averaged(tmp_path: Path):
     paths = [add_day(tmp_path, day) for day in range(2)]
-    products = facts_of(tmp_path)
+    (group,) = grouped = groups(facts_of(tmp_path))
     (tmp_path / paths[0]).write_bytes(b"nothing")
-    done = write_means(tmp_path, products, Period.DAY)
+    done = Means(tmp_path, grouped, Period.DAY).of(group)
     assert [product.path for product in done.refused] == [paths[0]]
     assert [file.products for file in done.files] == [1]
 

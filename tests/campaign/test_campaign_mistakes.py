@@ -210,6 +210,12 @@ def test_a_mistake_is_located_and_explained(
     assert expected in _message(tmp_path, CAMPAIGN.replace(old, new))
 
 
+@pytest.mark.parametrize("files", ["&a [*a]", "&a {b: *a}", "[&a [[*a]]]"])
+def test_a_value_that_holds_itself_is_a_mistake_like_others(tmp_path: Path, files: str) -> None:
+    message = _message(tmp_path, CAMPAIGN.replace('["h*"]', files))
+    assert "line 10: instruments.lidar.files" in message
+
+
 def test_a_number_without_a_point_is_read(tmp_path: Path) -> None:
     """YAML 1.1 reads 4e-9 as a text."""
     path = tmp_path / "campaign.yaml"

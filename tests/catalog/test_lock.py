@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import socket
 import sqlite3
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import synchronize
 from pathlib import Path
 from threading import Barrier
 
@@ -217,3 +219,25 @@ def test_several_users_start_on_a_catalog_that_does_not_exist(tmp_path: Path) ->
                     return [run.id for run in store.runs()]
 
             assert [user.result() for user in [pool.submit(use) for _ in range(4)]] == [[]] * 4
+
+
+def _open_fresh_catalogs(folder: Path, start: synchronize.Barrier) -> None:
+    for number in range(8):
+        start.wait()
+        with Store(f"sqlite:///{folder}/{number}/catalog.sqlite", "test") as store:
+            assert store.runs() == []
+            with Lock(store, wait=30.0) as lock:
+                lock.acquire()
+
+
+def test_processes_that_start_together_on_a_fresh_catalog_make_one(tmp_path: Path) -> None:
+    several = multiprocessing.get_context("fork")
+    start = several.Barrier(3)
+    processes = [
+        several.Process(target=_open_fresh_catalogs, args=(tmp_path, start)) for _ in range(3)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60.0)
+    assert [process.exitcode for process in processes] == [0, 0, 0]

@@ -13,7 +13,7 @@ from support.products.encoded_products import build_product
 from support.products.made_products import MAKERS, context
 
 from lidarops.aggregate.facts import Facts, Period, read_product_facts
-from lidarops.aggregate.means import write_means
+from lidarops.aggregate.means import Means
 from lidarops.errors import ProductError
 from lidarops.flags import PLACES, Quality, Severity
 from lidarops.kinds import flags_of
@@ -59,7 +59,8 @@ def test_who_goes_by_the_places_of_now_refuses_others(tmp_path: Path):
         pass
     with xr.open_dataset(tmp_path / "older.nc") as product, pytest.raises(ProductError):
         refuse_moved_flags(product)
-    result = write_means(tmp_path, [facts_of(tmp_path / "older.nc")], Period.DAY)
+    facts = facts_of(tmp_path / "older.nc")
+    result = Means(tmp_path, {facts.group: [facts]}, Period.DAY).of(facts.group)
     assert not result.files
     assert [words in refused.reason for refused in result.refused] == [True]
 

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sqlite3
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -512,6 +513,44 @@ def test_replaced_versions_are_kept_if_the_campaign_says_so(archive: Archive) ->
     # A forced run gives the same bytes, so no further version is kept.
     reprocess(campaign, options=Options(force=True))
     assert archive.contents("out/superseded") == kept
+
+
+def test_a_version_that_a_killed_run_kept_is_not_mistaken_for_the_one_that_it_wrote(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.tree["superseded"] = "keep"
+    first = set(archive.contents("out/products").values())
+    archive.raw("poor/h03", 604, seed=9)
+    campaign = archive.write()
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "record", lambda *_, **__: sys.exit("dies before it enters products"))
+        with pytest.raises(SystemExit):
+            reprocess(campaign)
+    assert set(archive.contents("out/products").values()) - first
+    archive.raw("poor/h04", 605, seed=10)
+    assert reprocess(campaign) is not None
+    kept = archive.contents("out/superseded")
+    assert set(kept.values()) <= first
+    with Store(campaign.catalog_url, campaign.name) as store:
+        assert [file for file in verify_archive(campaign, store) if file.problem] == []
+
+
+def test_a_version_that_a_killed_run_has_not_replaced_is_not_kept(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive.tree["superseded"] = "keep"
+    campaign = archive.write()
+    with monkeypatch.context() as patch:
+        patch.setattr(executor, "attempt", lambda _job: sys.exit("dies within a scene"))
+        with pytest.raises(SystemExit):
+            reprocess(campaign, options=Options(force=True))
+    assert archive.contents("out/superseded")
+    archive.raw("poor/h39", 3 * DAY + 630, seed=9)
+    before = archive.contents("out/products")
+    assert reprocess(campaign) is not None
+    assert set(archive.contents("out/superseded").values()) <= set(before.values()) - set(
+        archive.contents("out/products").values()
+    )
 
 
 def test_replaced_versions_are_kept_for_a_month(

@@ -295,7 +295,9 @@ def test_many_dark_files_of_unknown_time_cost_little(archive: Archive) -> None:
     catalog = create_autospec(Granules, instance=True)
     catalog.refused.return_value, catalog.files_in.return_value = refused, []
     catalog.nearest_days.return_value = days
-    assert sum(1 for _ in dated(archive.write(), catalog)) == MOST_IN_DOUBT * len(days)
+    assert sum(
+        1 for _ in dated(archive.write(), catalog, catalog.refused())
+    ) == MOST_IN_DOUBT * len(days)
 
 
 @pytest.mark.parametrize(
@@ -387,4 +389,4 @@ def test_a_refused_file_belongs_beside_the_files_of_like_names(
     catalog = create_autospec(Granules, instance=True)
     catalog.refused.return_value = [refused]
     catalog.files_in.side_effect = lambda folder: files.get(folder, [])
-    assert [file.time.day for file in dated(archive.write(), catalog)] == days
+    assert [file.time.day for file in dated(archive.write(), catalog, catalog.refused())] == days

@@ -19,7 +19,7 @@ from support.products.made_products import MAKERS
 from lidarops import kinds
 from lidarops.aggregate import means as means_of_products
 from lidarops.aggregate.facts import Period, groups
-from lidarops.aggregate.means import write_means
+from lidarops.aggregate.means import Means
 from lidarops.netcdf.variables import layout_of
 from lidarops.reports import run_page
 from lidarops.reports.gallery import Gallery, fill
@@ -172,8 +172,8 @@ def test_means_follow_its_budget(
     # It has no source on disk whose digest could be taken.
     monkeypatch.setattr(means_of_products, "code_version", lambda *_: "0" * 16)
     path = site_archive.add(tmp_path, "smooth")
-    (products,) = groups(facts_of(tmp_path)).values()
-    (file,) = write_means(tmp_path, products, Period.DAY).files
+    (group,) = grouped = groups(facts_of(tmp_path))
+    (file,) = Means(tmp_path, grouped, Period.DAY).of(group).files
     with xr.open_dataset(path) as data, xr.open_dataset(tmp_path / file.path) as means:
         error = data.total_extinction_standard_error.where(data.usable < 2).astype(float)
         np.testing.assert_allclose(
