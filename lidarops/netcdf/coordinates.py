@@ -119,6 +119,46 @@ def auxiliary_names(row: Row, coordinates: Mapping[str, xr.Variable]) -> tuple[s
     )
 
 
+def on_altitude(variables: Mapping[str, xr.Variable]) -> dict[str, xr.Variable]:
+    """Return the variables of a product as they are written: of a vertical lidar along altitude.
+
+    ``altitude`` is then the dimension and its coordinate, so that any tool selects values by it,
+    and ``range`` an auxiliary coordinate. What reads products takes them back to ``range``
+    (`lidarops.netcdf.stored.StoredProduct`).
+
+    Parameters
+    ----------
+    variables : mapping of str to xr.Variable
+        All of the product; coordinates that do not change with time are in memory.
+
+    Returns
+    -------
+    dict of str to xr.Variable
+        Those of a beam that moves, or is more than `NEAR_VERTICAL` off the zenith, as they are.
+    """
+    zenith, altitude = (variables.get(name) for name in ("zenith_angle", "altitude"))
+    if zenith is None or altitude is None or altitude.dims != ("range",):
+        return dict(variables)
+    if zenith.values > NEAR_VERTICAL or (np.diff(altitude.values) <= 0.0).any():
+        return dict(variables)
+    return {
+        name: _on_altitude(variable) if "range" in variable.dims else variable
+        for name, variable in variables.items()
+    }
+
+
+def _on_altitude(variable: xr.Variable) -> xr.Variable:
+    dims = ("altitude" if dim == "range" else dim for dim in variable.dims)
+    attrs = dict(variable.attrs)
+    for key, old, new in (
+        ("coordinates", "altitude", "range"),
+        ("cell_methods", "range:", "altitude:"),
+    ):
+        if key in attrs:
+            attrs[key] = " ".join(new if word == old else word for word in attrs[key].split(" "))
+    return xr.Variable(tuple(dims), variable.data, attrs)
+
+
 class _Vertical(NamedTuple):
     """Vertical coverage of a product."""
 

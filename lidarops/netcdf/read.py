@@ -44,12 +44,14 @@ class _Lazy(BackendArray):
         return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, support, read))
 
 
-def dataset_of(product: StoredProduct) -> xr.Dataset:
+def dataset_of(product: StoredProduct, *, as_written: bool = False) -> xr.Dataset:
     """Return an open product as a dataset that is not decoded.
 
     Parameters
     ----------
     product : StoredProduct
+    as_written : bool
+        Whether to keep the dimension ``altitude`` of a vertical lidar, which is else ``range``.
 
     Returns
     -------
@@ -57,6 +59,9 @@ def dataset_of(product: StoredProduct) -> xr.Dataset:
         Variables of 16 KiB and more are lazy: only indexed values are read.
     """
     variables = {name: as_variable(stored) for name, stored in product.variables.items()}
+    if as_written:
+        for name, stored in product.variables.items():
+            variables[name].dims = stored.written
     return xr.Dataset(variables, attrs=product.attrs.whole())
 
 
@@ -92,7 +97,12 @@ def as_variable(stored: StoredVariable) -> xr.Variable:
 
 @contextmanager
 def opened_product(
-    path: str | Path, *, in_parts: bool = False, decode_cf: bool = True, **decoding: Any
+    path: str | Path,
+    *,
+    in_parts: bool = False,
+    as_written: bool = False,
+    decode_cf: bool = True,
+    **decoding: Any,
 ) -> Iterator[xr.Dataset]:
     """Open a whole product; what is raised while it is open names it.
 
@@ -101,6 +111,8 @@ def opened_product(
     path : path or str
     in_parts : bool
         Whether the product may be larger than memory, because no variable is read as a whole.
+    as_written : bool
+        As of `dataset_of`.
     decode_cf : bool
     **decoding
         As for `xarray.decode_cf`.
@@ -125,7 +137,7 @@ def opened_product(
                 yield product
             return
     with opened_stored(path, in_parts=in_parts) as stored:
-        whole = dataset_of(stored)
+        whole = dataset_of(stored, as_written=as_written)
         yield xr.decode_cf(whole, **decoding) if decode_cf else whole
 
 

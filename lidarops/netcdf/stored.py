@@ -174,11 +174,14 @@ class StoredVariable:
         """Bytes in memory; at least one chunk is read."""
         self.attrs = Attributes(stored)
         self.dims: tuple[str, ...] = ()
+        self.written: tuple[str, ...] = ()
+        """Its dimensions in the file, where ``altitude`` may stand for ``range``."""
 
     def lie_along(self, along: Mapping[tuple[int, int], str]) -> None:
         """Take its dimensions from those of a file; one without other dimensions is its own."""
         own = (f"{self._name}_{axis}" if axis else self._name for axis in range(len(self.shape)))
         self.dims = tuple(along.get((self._address, axis), name) for axis, name in enumerate(own))
+        self.written = self.dims
 
     def attached(self) -> Iterator[tuple[int, int]]:
         """Yield the address of each variable along this dimension, and which axis of it this is."""
@@ -257,6 +260,20 @@ class StoredProduct:
             if not one.is_bare:
                 one.lie_along(along)
                 self.variables[name.removeprefix(OTHER_DIMENSION)] = one
+        self._lie_along_range()
+
+    def _lie_along_range(self) -> None:
+        """Name the dimension of a vertical lidar ``range``, as `coordinates.on_altitude` found it.
+
+        So all that reads products works alike for vertical and slant beams, and with files of
+        versions that had no dimension ``altitude``.
+        """
+        distance = self.variables.get("range")
+        if distance is None or distance.dims != ("altitude",) or "range" in self.sizes:
+            return
+        self.sizes = {_along_range(dim): size for dim, size in self.sizes.items()}
+        for one in self.variables.values():
+            one.dims = tuple(map(_along_range, one.dims))
 
     def __contains__(self, name: str) -> bool:
         """Return whether there is a variable of this name."""
@@ -327,6 +344,10 @@ def stored_values(path: str | Path, key: str, name: str, rows: slice = slice(Non
 def changed(path: str | Path) -> ProductError:
     """Return the error of a file that holds another product than before."""
     return ProductError("changed while it was read", file=path, remedy="run again")
+
+
+def _along_range(dim: str) -> str:
+    return "range" if dim == "altitude" else dim
 
 
 def _variables(root: Any, path: str | Path) -> Iterator[tuple[str, StoredVariable]]:

@@ -174,7 +174,7 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
 
 
 def _product(file: Path) -> dict[str, Any]:
-    with opened_product(file, decode_times=False) as dataset:
+    with opened_product(file, as_written=True, decode_times=False) as dataset:
         return {
             "type": "netcdf",
             "file": str(file),
