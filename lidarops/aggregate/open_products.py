@@ -24,7 +24,7 @@ from lidarops.aggregate.facts import (
 from lidarops.aggregate.index import INDEX, find_in_index, without_unselected
 from lidarops.aggregate.versioned_store import is_store, open_store
 from lidarops.errors import ProductError, RetrievalInputError
-from lidarops.netcdf.stored import opened_stored, reading
+from lidarops.netcdf.stored import open_stored, reading
 from lidarops.netcdf.variables import judging, summary_of
 from lidarops.system.files import within
 
@@ -68,8 +68,9 @@ def open_products(
     -------
     xarray.Dataset
         Decoded, with units as attributes, on dask arrays, with one chunk per product unless it is
-        of a store. Those of vertical lidars have the dimension ``altitude``, m above the geoid, those
-        of slant beams ``range``.
+        of a store.
+        Those of vertical lidars have the dimension ``altitude``, m above the geoid, of slant beams
+        ``range``.
         ``product`` (product) is the id of each product, ``product_index`` (time) the index of the
         product of each profile. Variables of a whole product, such as the assumed lidar ratio,
         have the dimension ``product``.
@@ -142,7 +143,7 @@ def _read(root: Path, paths: Iterable[str], selection: ProductSelection) -> dict
     for path in paths:
         try:
             file = within(root, path)
-            with opened_stored(file) as product:
+            with reading(file), open_stored(file) as product:
                 header = read_header(product, path, selection)
                 if header is not None:
                     parts[header] = Part(header, file, product.attrs.whole(), product["time"][...])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -19,7 +19,8 @@ import xarray as xr
 
 from lidarops.catalog.folder import FileGroup, read_folder
 from lidarops.errors import RawFormatError
-from lidarops.netcdf.read import is_netcdf, opened_product, read_provenance
+from lidarops.netcdf.read import decoded, is_netcdf, read_provenance
+from lidarops.netcdf.stored import open_stored, reading
 from lidarops.netcdf.stored_flags import (
     FlagCounter,
     bits_of,
@@ -174,22 +175,27 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
 
 
 def _product(file: Path) -> dict[str, Any]:
-    with opened_product(file, as_written=True, decode_times=False) as dataset:
+    with reading(file), open_stored(file) as stored:
+        dataset = decoded(stored, stored.variables, decode_times=False)
+        sizes = {
+            name: dict(zip(one.written, one.shape, strict=True))
+            for name, one in stored.variables.items()
+        }
         return {
             "type": "netcdf",
             "file": str(file),
             "size": file.stat().st_size,
-            "dimensions": {str(name): size for name, size in dataset.sizes.items()},
+            "dimensions": {dim: size for own in sizes.values() for dim, size in own.items()},
             "attributes": _plain(dict(dataset.attrs)),
-            "variables": [_variable(str(name), dataset[name]) for name in dataset.variables],
+            "variables": [_variable(name, sizes[name], dataset.variables[name]) for name in sizes],
             "quality": _quality(dataset),
         }
 
 
-def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
+def _variable(name: str, sizes: Mapping[str, int], variable: xr.Variable) -> dict[str, Any]:
     properties = {
         "name": name,
-        "dimensions": ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
+        "dimensions": ", ".join(f"{dim} {size}" for dim, size in sizes.items()),
         **{key: variable.attrs.get(key) for key in ("units", "standard_name", "long_name")},
         "type": str(variable.dtype),
         **dict.fromkeys(("minimum", "maximum", "missing")),
