@@ -385,7 +385,7 @@ def _grid_digest(product: StoredProduct, kind: str) -> str:
         if name in UNSHARED:
             continue
         dims = variable.dims
-        sizes = [(dim, n) for dim, n in variable.sizes.items() if dim != "time"]
+        sizes = [each for each in zip(dims, variable.shape, strict=True) if each[0] != "time"]
         schema = [plain(variable.attrs.get(key)) for key in _SCHEMA_ATTRIBUTES]
         digest.update(repr((name, variable.dtype.str, dims, sizes, schema)).encode())
         if name in coordinates and "time" not in dims:

@@ -60,17 +60,15 @@ _OF_HDF5: Final = (
 
 
 @contextmanager
-def reading(
-    path: str | Path, families: tuple[type[Exception], ...] = _OF_LIBRARIES
-) -> Iterator[None]:
-    """Raise what a library raises for a damaged product, by default anything, as `ProductError`."""
+def reading(path: str | Path) -> Iterator[None]:
+    """Raise what a library raises for a damaged product as `ProductError`, which names the file."""
     try:
         yield
     except LidarOpsError:
         raise
     except NO_FILE as error:
         raise ProductError("the file is missing", file=path) from error
-    except families as error:
+    except _OF_LIBRARIES as error:
         words = " ".join(str(error).replace(str(path), Path(path).name).split())
         raise ProductError(
             f"cannot be read: {words[:_MOST_WORDS] or type(error).__name__}",
@@ -202,11 +200,6 @@ class StoredVariable:
         stated: np.dtype[Any] = self._type.dtype
         return stated.newbyteorder("=")
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Length along each dimension."""
-        return dict(zip(self.dims, self.shape, strict=True))
-
     def __getitem__(self, key: Any) -> NDArray[Any]:
         """Return values as stored.
 
@@ -228,14 +221,15 @@ class StoredVariable:
             return values
 
     def _refuse_more_than_fits(self, key: Any) -> None:
-        keys = key if isinstance(key, tuple) else (key,)
+        most = _MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if self.stated <= most:
+            return
+        keys = () if key is ... else key if isinstance(key, tuple) else (key,)
         taken = (
             len(range(size)[part]) if isinstance(part, slice) else np.size(part)
             for size, part in zip(self.shape, keys, strict=False)
         )
-        rest = self.shape[len(keys) :]
-        size = self.stated if key is ... else self._type.get_size() * math.prod((*taken, *rest))
-        most = _MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        size = self._type.get_size() * math.prod((*taken, *self.shape[len(keys) :]))
         if size > most:
             raise _too_large(size, most, "be read on this machine", self._path, self._name)
 
@@ -271,20 +265,12 @@ class StoredProduct:
             if not one.is_bare:
                 one.lie_along(along)
                 self.variables[name.removeprefix(OTHER_DIMENSION)] = one
-        self._lie_along_range()
-
-    def _lie_along_range(self) -> None:
-        """Name the dimension of a vertical lidar ``range``, as `coordinates.on_altitude` found it.
-
-        So all that reads products works alike for vertical and slant beams, and with files of
-        versions that had no dimension ``altitude``.
-        """
+        # Named alike for vertical and slant beams, and in files without a dimension ``altitude``.
         distance = self.variables.get("range")
-        if distance is None or distance.dims != ("altitude",) or "range" in self.sizes:
-            return
-        self.sizes = {_along_range(dim): size for dim, size in self.sizes.items()}
-        for one in self.variables.values():
-            one.dims = tuple(map(_along_range, one.dims))
+        if distance is not None and distance.dims == ("altitude",) and "range" not in self.sizes:
+            self.sizes = {"range" if d == "altitude" else d: n for d, n in self.sizes.items()}
+            for one in self.variables.values():
+                one.dims = tuple("range" if dim == "altitude" else dim for dim in one.dims)
 
     def __contains__(self, name: str) -> bool:
         """Return whether there is a variable of this name."""
@@ -348,10 +334,6 @@ def stored_values(path: str | Path, key: str, name: str, rows: slice = slice(Non
 def changed(path: str | Path) -> ProductError:
     """Return the error of a file that holds another product than before."""
     return ProductError("changed while it was read", file=path, remedy="run again")
-
-
-def _along_range(dim: str) -> str:
-    return "range" if dim == "altitude" else dim
 
 
 def _variables(root: Any, path: str | Path) -> Iterator[tuple[str, StoredVariable]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from enum import Enum
@@ -176,26 +176,24 @@ def _grouped(group: FileGroup) -> dict[str, Any]:
 
 def _product(file: Path) -> dict[str, Any]:
     with reading(file), open_stored(file) as stored:
+        for one in stored.variables.values():
+            one.dims = one.written
         dataset = decoded(stored, stored.variables, decode_times=False)
-        sizes = {
-            name: dict(zip(one.written, one.shape, strict=True))
-            for name, one in stored.variables.items()
-        }
         return {
             "type": "netcdf",
             "file": str(file),
             "size": file.stat().st_size,
-            "dimensions": {dim: size for own in sizes.values() for dim, size in own.items()},
+            "dimensions": {str(name): size for name, size in dataset.sizes.items()},
             "attributes": _plain(dict(dataset.attrs)),
-            "variables": [_variable(name, sizes[name], dataset.variables[name]) for name in sizes],
+            "variables": [_variable(str(name), dataset[name]) for name in dataset.variables],
             "quality": _quality(dataset),
         }
 
 
-def _variable(name: str, sizes: Mapping[str, int], variable: xr.Variable) -> dict[str, Any]:
+def _variable(name: str, variable: xr.DataArray) -> dict[str, Any]:
     properties = {
         "name": name,
-        "dimensions": ", ".join(f"{dim} {size}" for dim, size in sizes.items()),
+        "dimensions": ", ".join(f"{dim} {size}" for dim, size in variable.sizes.items()),
         **{key: variable.attrs.get(key) for key in ("units", "standard_name", "long_name")},
         "type": str(variable.dtype),
         **dict.fromkeys(("minimum", "maximum", "missing")),
