@@ -46,10 +46,10 @@ def decoded(product: StoredProduct, names: Iterable[str], **decoding: Any) -> xr
     """Return some variables of an open product, decoded, without indexes; see `open_product`."""
     stored = {name: as_variable(product[name]) for name in names if name in product}
     options = {"decode_coords": False, "decode_timedelta": False, **decoding}
-    variables, attributes, _ = xr.conventions.decode_cf_variables(
+    variables, attributes, named = xr.conventions.decode_cf_variables(
         stored, product.attrs.whole(), **options
     )
-    own = {name: one for name, one in variables.items() if one.dims == (name,)}
+    own = {name: v for name, v in variables.items() if v.dims == (name,) or name in named}
     others = {name: one for name, one in variables.items() if name not in own}
     return xr.Dataset(others, xr.Coordinates(own, indexes={}), attributes)
 

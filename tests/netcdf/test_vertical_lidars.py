@@ -76,6 +76,14 @@ def test_other_lidars_keep_range(kind: str, beam: dict[str, Any], tmp_path: Path
         assert "altitude" not in product.dims
 
 
+def test_altitudes_that_rounding_makes_equal_are_no_dimension(tmp_path: Path):
+    data = MAKERS["signal"](zenith=0.0)
+    fine = data.assign_coords(range=1e-8 * data["range"])
+    write_product(build_product(fine, context("signal")), tmp_path / "product.nc")
+    with xr.open_dataset(tmp_path / "product.nc") as product:
+        assert product["altitude"].dims == ("range",)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_products_of_earlier_versions_are_read_alike(
     kind: str, tmp_path: Path, former: pytest.MonkeyPatch
